@@ -1,0 +1,51 @@
+# Two commands set everything up on a fresh machine: `make demo` and `make test`.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# Many small solves: one BLAS thread each, on every machine.
+export OPENBLAS_NUM_THREADS := 1
+
+.PHONY: install install-dev system-packages demo test lint format clean
+
+# What running takes; the tools of the tests and the static checks come with `install-dev`.
+install: $(VENV)/.installed
+install-dev: $(VENV)/.installed-dev
+
+$(VENV)/.installed: pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+$(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@
+
+# From Debian, for the tests of the service alone: they skip where it is missing.
+system-packages:
+	command -v systemd-analyze >/dev/null || { apt-get update -qq && apt-get install -y -qq --no-install-recommends systemd; }
+
+# The whole emulated rig; with RECORDING=FILE one fingertip, whose board plays a recorded stream (.mat).
+DEMO := $(if $(RECORDING),config/fingertip_demo.yaml --recording '$(RECORDING)',config/demo.yaml)
+demo: install run/demo.bank
+	$(BIN)/shearloop run $(DEMO) --show
+
+run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
+	mkdir -p run
+	$(BIN)/shearloop bank build --config $< --out $@
+
+# Files are shared out over the processors; those that wait for devices leave theirs to the others.
+test: install-dev
+	$(BIN)/python -m pytest -n 3 --dist loadfile $(PYTEST_ARGS)
+
+lint: install-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: install-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

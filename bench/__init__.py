@@ -1,0 +1,1 @@
+"""Measurements: each script writes its numbers as JSON and draws its chart."""

@@ -1,0 +1,1 @@
+"""The process: configuration, tasks, estimator, controller, safety, publisher, command line."""

@@ -1,0 +1,67 @@
+"""What every test is held to: no task, thread, child process or file handle is left over."""
+
+import asyncio
+import gc
+import inspect
+import os
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """Return the folder of reference data, where there is one."""
+    if not SHARED.is_dir():
+        pytest.skip("needs the reference data in ../shared, which is not on this machine")
+    return SHARED
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> bool | None:
+    """Run a coroutine test in an event loop of its own, and fail it for every task that it leaves behind."""
+    if not inspect.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+
+    async def checked() -> None:
+        await pyfuncitem.obj(**arguments)
+        left = asyncio.all_tasks() - {asyncio.current_task()}
+        assert not left, f"tasks left over: {left}"
+
+    asyncio.run(checked())
+    return True
+
+
+def _open_files() -> dict[str, str]:
+    found = {}
+    for descriptor in os.listdir("/proc/self/fd"):
+        try:
+            found[descriptor] = os.readlink(f"/proc/self/fd/{descriptor}")
+        except FileNotFoundError:  # the listing's own descriptor
+            continue
+    return found
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_over(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Fail a test that leaves threads or file handles; session fixtures requested here are made beforehand."""
+    for name in request.fixturenames:
+        if name != "nothing_left_over" and _is_shared(request, name):
+            request.getfixturevalue(name)
+    threads, files = set(threading.enumerate()), _open_files()
+    yield
+    gc.collect()
+    new_threads = [thread for thread in threading.enumerate() if thread not in threads]
+    assert not new_threads, f"threads left over: {new_threads}"
+    new_files = {n: target for n, target in _open_files().items() if files.get(n) != target}
+    assert not new_files, f"file handles left over: {new_files}"
+
+
+def _is_shared(request: pytest.FixtureRequest, name: str) -> bool:
+    definitions = request._fixturemanager.getfixturedefs(name, request.node)
+    return bool(definitions) and definitions[-1].scope in ("session", "module", "package")

@@ -1,0 +1,96 @@
+"""The five basis models of a sheared fingertip: conductivity 1 + f(y; k, σ), y along the fingertip's height.
+
+Trehan et al. 2025, equations (1) to (5).
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.errors import ModelError
+from bank.mesh import Mesh
+
+Values = NDArray[np.float64]
+
+_SUBDIVISIONS = 5
+
+
+@dataclass(frozen=True, slots=True)
+class BasisModel:
+    """One basis function f(y, k, σ, c), where c is half the fingertip's height, and the units of its parameters."""
+
+    name: str
+    title: str
+    k_unit: str
+    sigma_unit: str
+    function: Callable[[Values, float, float, float], Values]
+
+
+def _step(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - all five have one signature
+    return np.where(y > k, 0.5, -0.5)
+
+
+def _linear(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - as above
+    return (y - k) / sigma
+
+
+def _cut_linear(y: Values, k: float, sigma: float, c: float) -> Values:
+    return np.where((c - k / 2 <= y) & (y <= c + k / 2), (y - c) / sigma, 0.0)
+
+
+def _gaussian_derivative(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - as above
+    return -(y - k) / sigma**2 * np.exp(-((y - k) ** 2) / (2 * sigma**2))
+
+
+def _modulated_gaussian(y: Values, k: float, sigma: float, c: float) -> Values:
+    return np.exp(-((y - c) ** 2) / (2 * sigma**2)) * np.cos(k * (y - c))
+
+
+MODELS = {
+    model.name: model
+    for model in (
+        BasisModel("step", "Step", "cm", "not used", _step),
+        BasisModel("linear", "Linear", "cm", "cm", _linear),
+        BasisModel("cut_linear", "Cut linear", "cm", "cm", _cut_linear),
+        BasisModel("gaussian_derivative", "Gaussian derivative", "cm", "cm", _gaussian_derivative),
+        BasisModel("modulated_gaussian", "Modulated Gaussian", "rad/cm", "cm", _modulated_gaussian),
+    )
+}
+
+
+def model_named(name: str) -> BasisModel:
+    """Return a basis model; raises ModelError, with the names that exist, for one that does not."""
+    try:
+        return MODELS[name]
+    except KeyError:
+        raise ModelError(f"there is no basis model {name!r}; choose one of {', '.join(MODELS)}") from None
+
+
+def averaging_points() -> NDArray[np.float64]:
+    """Return the (15, 3) barycentric coordinates that f is averaged over in a triangle.
+
+    Each edge is cut into five and lines parallel to the edges are drawn through the cuts: 25 equal triangles. The
+    points are the centroids of the 15 that stand as the whole one does: ((3i + 1)/15, (3j + 1)/15, (3l + 1)/15) with
+    i + j + l = 4.
+    """
+    n = _SUBDIVISIONS
+    steps = [(i, j, n - 1 - i - j) for i in range(n) for j in range(n - i)]
+    return (3.0 * np.array(steps) + 1.0) / (3 * n)
+
+
+def conductivity(mesh: Mesh, model: str, k: float, sigma: float) -> NDArray[np.float64]:
+    """Return the (T,) conductivity of a mesh's triangles: 1 + the mean of f over the triangle's averaging points.
+
+    It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
+    """
+    basis = model_named(model)
+    if not (np.isfinite(k) and np.isfinite(sigma)):
+        raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
+    if sigma <= 0 and basis.sigma_unit != "not used":
+        raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
+    heights = mesh.nodes[:, 1][mesh.triangles] @ averaging_points().T
+    centre = (mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2
+    values: NDArray[np.float64] = 1.0 + basis.function(heights, k, sigma, float(centre)).mean(axis=1)
+    return values

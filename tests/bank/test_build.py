@@ -1,0 +1,218 @@
+"""Building banks: the same bytes however it is done, nothing lost when killed, nothing damaged when it fails."""
+
+import os
+import select
+import signal
+import subprocess
+import sys
+from multiprocessing import resource_tracker
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bank.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
+from bank.build import RowSolver, build_bank
+from bank.errors import BankFileError, ConductivityError
+from bank.journal import RowJournal
+from bank.mesh import Mesh
+from bank.models import conductivity
+
+MODEL = "gaussian_derivative"
+K, SIGMA = np.linspace(0.4, 9.0, 5), np.linspace(0.3, 1.2, 4)
+
+# Builds the same bank in a process of its own, and waits for a line before it goes on after each row.
+BUILDER = """
+import sys
+from pathlib import Path
+from bank.build import build_bank
+from tests.bank.conftest import small_fingertip
+from tests.bank.test_build import K, MODEL, SIGMA
+
+def on_row(done, total):
+    print(done, flush=True)
+    sys.stdin.readline()
+
+if __name__ == "__main__":
+    build_bank(small_fingertip(), MODEL, K, SIGMA, Path(sys.argv[1]), jobs=int(sys.argv[2]), on_row=on_row)
+"""
+
+
+@pytest.fixture(scope="module")
+def finished(fingertip: Mesh, tmp_path_factory) -> Path:
+    """Return a bank built in one go by one process."""
+    path = tmp_path_factory.mktemp("finished") / "one.bank"
+    build_bank(fingertip, MODEL, K, SIGMA, path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def spawning() -> None:
+    """Start what Python keeps running, with a file handle, once a process has spawned another."""
+    resource_tracker.ensure_running()
+
+
+def build(mesh, path, **options):
+    """Build the same bank and return the progress and the notices."""
+    progress, notices = [], []
+    build_bank(
+        mesh,
+        MODEL,
+        K,
+        options.pop("sigma", SIGMA),
+        path,
+        on_row=lambda *state: progress.append(state),
+        on_notice=notices.append,
+        **options,
+    )
+    return progress, notices
+
+
+def test_every_cell_is_the_difference_of_two_solutions_or_marked_not_valid(finished, fingertip, forward):
+    bank = Bank.open(finished, verify=True)
+    np.testing.assert_array_equal(bank.homogeneous, forward.homogeneous())
+    kinds = set()
+    for i, k in enumerate(K):
+        for j, sigma in enumerate(SIGMA):
+            values = conductivity(fingertip, MODEL, k, sigma)
+            assert bank.min_conductivity[i, j] == values.min()
+            try:
+                signal_ = forward.voltages(values) - forward.homogeneous()
+            except ConductivityError:
+                kinds.add("not positive")
+                expected = None
+            else:
+                expected = signal_ if np.linalg.norm(signal_) >= MIN_SIGNAL_NORM else None
+                kinds.add("signal" if expected is not None else "no signal")
+            assert bank.valid[i, j] == (expected is not None)
+            np.testing.assert_array_equal(bank.signals[i, j], np.float32(0 if expected is None else expected))
+    assert kinds == {"signal", "no signal", "not positive"}
+
+
+@pytest.mark.usefixtures("spawning")
+def test_processes_build_the_same_bytes(finished, fingertip, tmp_path):
+    progress, notices = build(fingertip, tmp_path / "two.bank", jobs=2)
+    assert (tmp_path / "two.bank").read_bytes() == finished.read_bytes()
+    assert progress == [(done, len(K)) for done in range(len(K) + 1)]
+    assert notices == []
+    assert [each.name for each in tmp_path.iterdir()] == ["two.bank"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_build_that_is_killed_goes_on_without_solving_a_row_again(finished, fingertip, tmp_path, jobs):
+    path = tmp_path / "killed.bank"
+    script = tmp_path / "builder.py"
+    script.write_text(BUILDER)
+    root = Path(__file__).parents[2]
+    for round_ in range(2):
+        with subprocess.Popen(
+            [sys.executable, script, path, str(jobs)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": str(root)},
+            text=True,
+        ) as builder:
+            taken_over = int(builder.stdout.readline())
+            assert taken_over == 2 * round_
+            for _ in range(2):
+                builder.stdin.write("go on\n")
+                builder.stdin.flush()
+                builder.stdout.readline()
+            # It waits for a line now, with its rows on the disk, and its workers wait for it.
+            children = [os.pidfd_open(int(pid)) for pid in _children(builder.pid)]
+            assert (len(children) > 0) == (jobs > 1)
+            builder.send_signal(signal.SIGKILL)
+        _wait_for_end(children)
+    assert not path.exists()
+
+    progress, notices = build(fingertip, path)
+    assert progress == [(4, 5), (5, 5)]
+    assert len(notices) == 1
+    assert "killed.bank.part: taking over 4 of 5 rows" in notices[0]
+    assert path.read_bytes() == finished.read_bytes()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["builder.py", "killed.bank"]
+
+
+def _children(pid: int) -> list[str]:
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return [child for task in tasks for child in (task / "children").read_text().split()]
+
+
+def _wait_for_end(pidfds: list[int]) -> None:
+    for pidfd in pidfds:
+        ended, _, _ = select.select([pidfd], [], [], 20)
+        os.close(pidfd)
+        assert ended, "a worker outlived the killed build"
+
+
+@pytest.fixture
+def interrupted(fingertip, tmp_path):
+    """Return where a bank was being built, with three rows in its journal, out of order."""
+    path = tmp_path / "half.bank"
+    definition = BankDefinition(fingertip.digest, MODEL, K, SIGMA)
+    solver = RowSolver(fingertip, definition)
+    with RowJournal(path, definition, pytest.fail) as journal:
+        for row in (3, 0, 4):
+            journal.append(row, solver.solve(row))
+    return path
+
+
+def test_a_journal_cut_off_or_damaged_anywhere_loses_the_rows_behind_it_only(finished, fingertip, interrupted):
+    part = interrupted.with_name("half.bank.part")
+    whole = part.read_bytes()
+    record = (len(whole) - 40) // 3
+    for length, rows in [(0, 0), (20, 0), (41, 0), (39 + record, 0), (40 + 2 * record, 2), (len(whole) - 1, 2)]:
+        part.write_bytes(whole[:length])
+        progress, _ = build(fingertip, interrupted)
+        assert progress[0] == (rows, 5)
+        assert interrupted.read_bytes() == finished.read_bytes()
+    damaged = bytearray(whole)
+    damaged[40 + record + 100] ^= 1
+    part.write_bytes(damaged)
+    progress, _ = build(fingertip, interrupted)
+    assert progress[0] == (1, 5)
+    assert interrupted.read_bytes() == finished.read_bytes()
+
+
+def test_the_rows_of_another_bank_are_not_reused_and_that_is_said(fingertip, interrupted):
+    progress, notices = build(fingertip, interrupted, sigma=SIGMA + 0.1)
+    assert progress[0] == (0, 5)
+    assert len(notices) == 1
+    assert "half.bank.part: the rows there belong to another bank and are not reused" in notices[0]
+    np.testing.assert_array_equal(Bank.open(interrupted, verify=True).sigma_grid, SIGMA + 0.1)
+
+
+def test_a_foreign_file_in_the_journals_place_is_left_alone(fingertip, tmp_path):
+    (tmp_path / "a.bank.part").write_text("my thesis")
+    with pytest.raises(BankFileError, match=r"a\.bank\.part is in the way: it is not the journal"):
+        build(fingertip, tmp_path / "a.bank")
+    assert (tmp_path / "a.bank.part").read_text() == "my thesis"
+
+
+def test_two_builds_of_one_target_do_not_mix(fingertip, interrupted):
+    definition = BankDefinition(fingertip.digest, MODEL, K, SIGMA)
+    with (
+        RowJournal(interrupted, definition, lambda _: None),
+        pytest.raises(BankFileError, match=r"half\.bank: another build is at work"),
+    ):
+        build(fingertip, interrupted)
+
+
+def test_a_build_that_fails_leaves_the_old_bank_as_it_was(finished, fingertip, tmp_path, monkeypatch):
+    path = tmp_path / "old.bank"
+    path.write_bytes(finished.read_bytes())
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(BankFileError, match="cannot be written: No space left on device"):
+        build(fingertip, path, sigma=SIGMA + 0.1)
+    assert path.read_bytes() == finished.read_bytes()
+
+
+def test_places_that_cannot_be_written_are_refused_before_anything_is_solved(fingertip, tmp_path):
+    with pytest.raises(BankFileError, match="is a directory; give the name of a file in it"):
+        build(fingertip, tmp_path)
+    with pytest.raises(BankFileError, match=r"none/a\.bank\.part: the bank cannot be written: No such file"):
+        build(fingertip, tmp_path / "none" / "a.bank")

@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bank.errors import CalibrationError
+from bank.grouping import group_means, kmeans_groups, place_in_series
+
+LEVELS = np.array([0.01, 0.03, 0.05, 0.06, 0.07, 0.08, 0.10, 0.11])
+
+
+@given(
+    repeats=st.integers(2, 9),
+    lacking=st.dictionaries(st.integers(0, 8), st.integers(0, 7), max_size=4),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_series_are_found_though_some_lack_a_level(repeats: int, lacking: dict[int, int], seed: int) -> None:
+    # One repeat is complete; the others may lack any one level but the outermost together.
+    lacking = {repeat: level for repeat, level in lacking.items() if 0 < repeat < repeats}
+    places = [(repeat, level) for repeat in range(repeats) for level in range(8) if lacking.get(repeat) != level]
+    drift = np.random.default_rng(seed).uniform(-0.003, 0.003, len(places))
+    series = place_in_series(np.array([LEVELS[level] for _, level in places]) + drift)
+    assert series is not None
+    assert list(zip(series.repeat.tolist(), series.level.tolist(), strict=True)) == places
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        np.linspace(0, 1, 20),  # one series is no repeat
+        np.linspace(1, 0, 20),
+        np.tile([0.0, 1.0], 10),  # two levels
+        np.random.default_rng(0).permutation(np.linspace(0, 1, 40)),
+        np.full(10, 0.3),
+        np.array([0.1]),
+    ],
+)
+def test_what_is_no_repeated_series_is_told(values: np.ndarray) -> None:
+    assert place_in_series(values) is None
+
+
+def test_kmeans_finds_groups_that_are_there_and_the_same_ones_each_time() -> None:
+    generator = np.random.default_rng(3)
+    truth = generator.permutation(np.repeat(np.arange(4), 6))
+    points = np.column_stack([truth * 10.0, -truth * 1e-3]) + generator.normal(size=(24, 2)) * [0.5, 5e-5]
+    groups = kmeans_groups(points, 4)
+    assert groups.tolist() == truth.tolist()
+    assert kmeans_groups(points, 4).tolist() == groups.tolist()
+    np.testing.assert_allclose(group_means(points[:, 0], groups), [0, 10, 20, 30], atol=1)
+
+
+def test_kmeans_refuses_more_groups_than_points() -> None:
+    assert kmeans_groups(np.array([[1.0], [1.0], [5.0]]), 2).tolist() == [0, 0, 1]
+    assert kmeans_groups(np.ones((3, 1)), 1).tolist() == [0, 0, 0]
+    with pytest.raises(CalibrationError, match="2 distinct points cannot be sorted into 3 groups"):
+        kmeans_groups(np.array([[1.0], [1.0], [5.0]]), 3)
+
+
+def test_group_means_leave_out_groups_without_members() -> None:
+    assert group_means(np.array([1.0, 3.0, 10.0]), np.array([2, 2, 7])).tolist() == [2.0, 10.0]

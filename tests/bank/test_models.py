@@ -1,0 +1,77 @@
+"""The five basis models, and the averaging over triangles."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bank.errors import ModelError
+from bank.mesh import Mesh
+from bank.models import MODELS, averaging_points, conductivity
+
+
+def test_the_averaging_points_are_those_of_the_reference(shared):
+    with np.load(shared / "reference" / "fingertip_mesh.npz") as archive:
+        expected = archive["averaging_barycentric"]
+    np.testing.assert_allclose(averaging_points(), expected, rtol=0, atol=1e-15)
+
+
+def test_the_averaging_points_are_symmetric_and_exact_for_linear_functions():
+    points = averaging_points()
+    assert points.shape == (15, 3)
+    np.testing.assert_allclose(points.sum(axis=1), 1, atol=1e-15)
+    np.testing.assert_allclose(points.mean(axis=0), 1 / 3, atol=1e-15)
+    for order in ([1, 0, 2], [2, 0, 1]):
+        assert {tuple(p) for p in points[:, order]} == {tuple(p) for p in points}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_every_conductivity_has_the_smallest_value_that_the_reference_has(name, paper_mesh, eidors):
+    for set_name in [n for n in eidors if n.startswith(name) and n.endswith("_min_conductivity")]:
+        stem = set_name.removesuffix("_min_conductivity")
+        for k, sigma, smallest in zip(eidors[f"{stem}_k"], eidors[f"{stem}_sigma"], eidors[set_name], strict=True):
+            assert conductivity(paper_mesh, name, k, sigma).min() == pytest.approx(smallest, rel=1e-9)
+
+
+def test_a_conductivity_agrees_with_the_reference_in_every_triangle(paper_mesh, eidors):
+    k, sigma = eidors["gaussian_derivative_random_k"][0], eidors["gaussian_derivative_random_sigma"][0]
+    found = conductivity(paper_mesh, "gaussian_derivative", k, sigma)
+    np.testing.assert_allclose(found, eidors["element_conductivity_random_0"], rtol=1e-13)
+
+
+@given(k=st.floats(0, 3), sigma=st.floats(0.3, 5))
+def test_the_linear_model_averages_to_its_value_at_the_centroid(fingertip, k, sigma):
+    centroid = fingertip.nodes[fingertip.triangles, 1].mean(axis=1)
+    np.testing.assert_allclose(conductivity(fingertip, "linear", k, sigma), 1 + (centroid - k) / sigma, atol=1e-12)
+
+
+def test_the_means_converge_to_the_functions_on_finer_meshes(fingertip):
+    """A smooth f differs from its value at the centroid by O(h²)."""
+    errors = []
+    for mesh in (fingertip, fingertip.refined(), fingertip.refined().refined()):
+        y = mesh.nodes[mesh.triangles, 1].mean(axis=1)
+        exact = 1 + np.exp(-((y - 1.6) ** 2) / 2) * np.cos(1.3 * (y - 1.6))
+        errors.append(np.abs(conductivity(mesh, "modulated_gaussian", 1.3, 1.0) - exact).max())
+    np.testing.assert_allclose(np.log2(np.divide(errors[:-1], errors[1:])), 2, atol=0.1)
+
+
+def test_the_functions_have_the_values_of_the_equations():
+    y = np.array([1.0, 2.0, 3.0])
+    values = {name: model.function(y, 2.0, 0.5, 1.5) for name, model in MODELS.items()}
+    np.testing.assert_array_equal(values["step"], [-0.5, -0.5, 0.5])
+    np.testing.assert_array_equal(values["linear"], [-2, 0, 2])
+    np.testing.assert_array_equal(values["cut_linear"], [-1, 1, 0])
+    np.testing.assert_allclose(values["gaussian_derivative"], [4 * np.exp(-2), 0, -4 * np.exp(-2)])
+    np.testing.assert_allclose(
+        values["modulated_gaussian"], np.exp([-0.5, -0.5, -4.5]) * np.cos([1.0, 1.0, 3.0]), rtol=1e-15
+    )
+
+
+def test_mistakes_are_refused(fingertip: Mesh):
+    with pytest.raises(ModelError, match="no basis model 'square'; choose one of step, linear"):
+        conductivity(fingertip, "square", 1, 1)
+    with pytest.raises(ModelError, match="sigma must be above 0 for the model linear, not 0"):
+        conductivity(fingertip, "linear", 1, 0)
+    with pytest.raises(ModelError, match="finite"):
+        conductivity(fingertip, "linear", np.nan, 1)
+    assert conductivity(fingertip, "step", 1, 0).min() == 0.5

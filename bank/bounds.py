@@ -1,0 +1,175 @@
+"""One frame against a compressed bank: estimates of scores, and what their bounds leave, at lag 0 or at all lags.
+
+What is computed here, in float32, decides only where it is worth while to score exactly.
+"""
+
+from abc import ABC, abstractmethod
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from bank.channels import N_CHANNELS
+from bank.compression import COARSE_RANK, ROUNDING, CompressedBank, FloatArray, Indices, Single, column, columns
+
+Mask = NDArray[np.bool_]
+
+# Lags from 0 up, then from −896 up; at −896 nothing overlaps.
+_LAGS = np.concatenate([np.arange(N_CHANNELS), np.arange(-N_CHANNELS, 0)])
+_CHANNELS = np.arange(N_CHANNELS)
+# Lags at which groups are compared for a cell of a high score.
+_SEED_LAGS = 8
+# The runner-up may be this much worse than the best cell at lag 0 before groups are bounded a second time.
+_SLACK = 0.01
+# More bounds than this (16 MB) are not computed: all cells and lags are left.
+_MOST_BOUNDS = 1 << 22
+
+
+class Left(NamedTuple):
+    """Cells (n,), bounds of their scores (n,), and the (m, 896) frame at the lags where they may have those scores."""
+
+    cells: Indices
+    bounds: Single
+    frames: FloatArray
+
+    def among(self, allowed: Mask) -> "Left":
+        """Return what is left of some cells."""
+        return Left(self.cells[allowed], self.bounds[allowed], self.frames)
+
+
+class Neighbourhood:
+    """The cells at most `radius` away from one, in k and in σ; rows and columns (n,) are the places of all cells."""
+
+    def __init__(self, rows: NDArray[np.int32], columns: NDArray[np.int32], cell: int, radius: int) -> None:
+        self._rows, self._columns, self._cell, self._radius = rows, columns, cell, radius
+
+    def lacks(self, cells: Indices | slice) -> Mask:
+        """Return which of some cells are outside."""
+        rows = np.abs(self._rows[cells] - self._rows[self._cell])
+        columns = np.abs(self._columns[cells] - self._columns[self._cell])
+        outside: Mask = np.maximum(rows, columns) > self._radius
+        return outside
+
+
+class Bounds(ABC):
+    """A unit frame, (896,), estimated and bounded at a matcher's lags."""
+
+    @abstractmethod
+    def seed(self, around: Neighbourhood | None) -> tuple[int, FloatArray] | None:
+        """Return a cell outside a neighbourhood that is likely to score high, and the (1, 896) frame at its lag.
+
+        None where there is no such cell, or none is found at once.
+        """
+
+    @abstractmethod
+    def left(self, score: float) -> Left:
+        """Return the cells that may have a score, or a higher one."""
+
+
+class ZeroLagBounds(Bounds):
+    """At lag 0 alone all cells are estimated at once."""
+
+    def __init__(self, bank: CompressedBank, frame: FloatArray) -> None:
+        self._bank = bank
+        self._frames = frame[None]
+        parts = bank.basis @ frame.astype(np.float32)
+        self._fine = column(parts)
+        self._coarse = column(parts[:COARSE_RANK])
+        self._estimates = self._coarse[:-2] @ bank.estimators
+
+    def seed(self, around: Neighbourhood | None) -> tuple[int, FloatArray] | None:
+        """Return the cell of the highest estimate."""
+        if around is None:
+            return int(np.argmax(self._estimates)), self._frames
+        outside = around.lacks(slice(None))
+        cell = int(np.argmax(np.where(outside, self._estimates, -np.inf)))
+        return (cell, self._frames) if outside[cell] else None
+
+    def left(self, score: float) -> Left:
+        """Bound all cells at the coarse rank, and what is left at the fine one."""
+        bounds = self._bank.left_out * self._coarse[-1]
+        bounds += self._estimates
+        cells = np.flatnonzero(bounds >= score - ROUNDING)
+        return Left(cells, self._bank.fine.take(cells, axis=0) @ self._fine, self._frames)
+
+
+class AllLagsBounds(Bounds):
+    """Lags are left out first, then groups, then cells. Lags are numbered as in _LAGS.
+
+    spectra (r, 897) are the conjugate transforms of the basis's first directions, from `spectra_of`.
+    """
+
+    def __init__(self, bank: CompressedBank, spectra: NDArray[np.complex64], frame: FloatArray) -> None:
+        self._bank = bank
+        self._padded = np.zeros(3 * N_CHANNELS)
+        self._padded[N_CHANNELS : 2 * N_CHANNELS] = frame
+        parts = fft.irfft(fft.rfft(frame.astype(np.float32), len(_LAGS)) * spectra, len(_LAGS))
+        before = np.concatenate([[0.0], np.cumsum(frame * frame)[:-1]])
+        self._columns = columns(parts, np.concatenate([1.0 - before, before]))
+        self._bound_groups(self._reached_at_0() - _SLACK)
+        n_seeds = min(_SEED_LAGS, len(self._lags))
+        self._seed_lags = self._lags[np.argpartition(self._highest, -n_seeds)[-n_seeds:]]
+        self._estimates = _products(bank.groups[:, :-2], self._columns[:-2, self._seed_lags])
+
+    def seed(self, around: Neighbourhood | None) -> tuple[int, FloatArray] | None:
+        """Return the cell of the highest estimate in the group of the highest estimate, at the likeliest lags."""
+        estimates = self._estimates
+        if around is not None:
+            estimates = np.where(around.lacks(self._bank.centres), estimates, -np.inf)
+        lag, group = divmod(int(np.argmax(estimates)), estimates.shape[1])
+        if estimates[lag, group] == -np.inf:
+            return None
+        cells = self._bank.members[group]
+        if around is not None:
+            cells = cells[around.lacks(cells)]
+        return self._best_of(cells, self._seed_lags[lag]), self._frames(self._seed_lags[lag, None])
+
+    def left(self, score: float) -> Left:
+        """Bound groups, then the cells of those that are left, at the lags that are left, at both ranks."""
+        if score < self._bounded_down_to:
+            self._bound_groups(score)
+        bank, least = self._bank, score - ROUNDING
+        chosen = self._highest >= least
+        lags = self._lags[chosen]
+        groups = (self._group_bounds[chosen] >= least).any(axis=0)
+        cells = np.flatnonzero(groups.take(bank.group_of))
+        if len(cells) * len(lags) <= _MOST_BOUNDS:
+            alive = _products(bank.coarse.take(cells, axis=0), self._columns[:, lags]) >= least
+            cells, lags = cells[alive.any(axis=0)], lags[alive.any(axis=1)]
+        frames = self._frames(lags)
+        if len(cells) * len(lags) > _MOST_BOUNDS:
+            return Left(cells, np.full(len(cells), np.inf, dtype=np.float32), frames)
+        at_lags = columns(bank.basis @ frames.T.astype(np.float32), np.einsum("ij,ij->i", frames, frames))
+        return Left(cells, _products(bank.fine.take(cells, axis=0), at_lags).max(axis=0), frames)
+
+    def _reached_at_0(self) -> float:
+        """Return a score that some cell surely has at lag 0."""
+        at_0 = self._columns[:, 0]
+        cell = self._best_of(self._bank.members[np.argmax(self._bank.groups[:, :-2] @ at_0[:-2])], 0)
+        row = self._bank.coarse[cell]
+        return float(row[:-2] @ at_0[:-2] - row[-1] * at_0[-1])
+
+    def _best_of(self, cells: Indices, lag: int) -> int:
+        return int(cells[np.argmax(self._bank.coarse[cells, :-2] @ self._columns[:-2, lag])])
+
+    def _bound_groups(self, score: float) -> None:
+        """Bound the groups at all lags at which any cell may reach a score."""
+        self._bounded_down_to = score
+        self._lags = np.flatnonzero(self._bank.widest @ self._columns[-2:] >= score - ROUNDING)
+        self._group_bounds = _products(self._bank.groups, self._columns[:, self._lags])
+        self._highest = self._group_bounds.max(axis=1)
+
+    def _frames(self, lags: Indices) -> FloatArray:
+        return self._padded.take(N_CHANNELS + _LAGS[lags, None] + _CHANNELS)
+
+
+def spectra_of(bank: CompressedBank) -> NDArray[np.complex64]:
+    """Return what `AllLagsBounds` needs of a bank."""
+    spectra: NDArray[np.complex64] = np.conj(fft.rfft(bank.basis[:COARSE_RANK], len(_LAGS)))
+    return spectra
+
+
+def _products(rows: Single, at_lags: Single) -> Single:
+    """Return the bounds or estimates (lags, rows): reducing over either axis then runs along the memory."""
+    return at_lags.T @ rows.T

@@ -1,0 +1,159 @@
+"""The same match as from the whole heatmap, but from a few of its cells: what cannot be the maximum is never scored.
+
+A compressed bank (`bank.compression`) bounds the scores of groups of cells, then of cells; whatever is bounded below a
+score that some cell reaches is dropped (`bank.bounds`), and what is left is scored in float64. How well the bank
+compresses decides how long it takes, never what comes out.
+"""
+
+from abc import abstractmethod
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bank.bounds import AllLagsBounds, Bounds, Left, Mask, Neighbourhood, ZeroLagBounds, spectra_of
+from bank.compression import ROUNDING, Indices, compress
+from bank.matching import (
+    CHUNK_CELLS,
+    RUNNER_UP_RADIUS,
+    TIE,
+    FloatArray,
+    Match,
+    Matcher,
+    ReferenceMatcher,
+    ZeroLagMatcher,
+    unit_magnitudes,
+)
+
+# How far two ways of adding up 896 products in float64 may be apart: where a tie hangs on less, the reference decides.
+_ROUNDING_64 = 1e-14
+# And in float32: 896 roundings of 6e-8.
+_ROUNDING_32 = 6e-5
+# With more lags, a transform costs a cell less than its products.
+_FEW_LAGS = 128
+
+
+class _Undecided(Exception):  # noqa: N818 - it is not an error
+    """It hangs on the rounding of float64 which cells tie."""
+
+
+class _PruningMatcher(Matcher):
+    """What all lags and one have in common: the search, and settling in float64 what the bounds leave."""
+
+    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+        """Compress the bank, which takes about a second for 10⁴ cells; arguments as of any matcher.
+
+        Raises MatchingError as any matcher, and here, not at the first frame, where a valid cell has no signal.
+        """
+        super().__init__(signals, valid, k_grid, sigma_grid)
+        self._bank = compress(lambda: map(self._unit_signals, self._chunks()))
+        self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in self._chunks()])
+        self._row, self._column = (each.astype(np.int32) for each in np.divmod(self._cells, valid.shape[1]))
+
+    def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
+        """Return what `best_match` finds in the heatmap of one (896,) difference, at a fraction of its cost.
+
+        Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
+        """
+        (frame,) = unit_magnitudes(np.asarray(difference)[None])
+        try:
+            return self._search(frame, runner_up)
+        except _Undecided:
+            return super().match(difference)
+
+    @abstractmethod
+    def _bounds(self, frame: FloatArray) -> Bounds: ...
+
+    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
+        bounds = self._bounds(frame)
+        near, reached = self._reached(bounds, None)
+        if not runner_up:
+            return self._match(self._settled(frame, bounds.left(reached), reached), None)
+        # What is outside at twice the radius is outside of the peak of every cell in this one's peak.
+        far, least = self._reached(bounds, self._around(near, 2 * RUNNER_UP_RADIUS))
+        left = bounds.left(min(reached, least))
+        best = self._settled(frame, left, reached)
+        peak = self._around(best[0], RUNNER_UP_RADIUS)
+        if far >= 0 and not peak.lacks(np.array([far]))[0]:
+            _, least = self._reached(bounds, peak)
+            left = bounds.left(least)
+        left = left.among(peak.lacks(left.cells))
+        return self._match(best, self._settled(frame, left, least) if len(left.cells) else None)
+
+    def _around(self, cell: int, radius: int) -> Neighbourhood:
+        return Neighbourhood(self._row, self._column, cell, radius)
+
+    def _reached(self, bounds: Bounds, around: Neighbourhood | None) -> tuple[int, float]:
+        """Return a cell outside a neighbourhood and a score that it reaches; −1 and 0 where there is none."""
+        seed = bounds.seed(around)
+        if seed is None:
+            return -1, 0.0
+        cell, frames = seed
+        return cell, self._score(cell, frames)
+
+    def _settled(self, frame: FloatArray, left: Left, reached: float) -> tuple[int, float]:
+        """Return the cell of the highest score, the lowest of those that tie, and the score.
+
+        One of the cells that are left must reach the score `reached`.
+        """
+        reached = max(reached, self._score(int(left.cells[np.argmax(left.bounds)]), left.frames))
+        cells = left.cells[left.bounds >= reached - ROUNDING]
+        parts = [
+            self._contenders(frame, cells[i : i + CHUNK_CELLS], left.frames, reached)
+            for i in range(0, len(cells), CHUNK_CELLS)
+        ]
+        cells, scores = (np.concatenate(each) for each in zip(*parts, strict=True))
+        behind = scores.max() - scores
+        if (np.abs(behind - TIE) < _ROUNDING_64).any():
+            raise _Undecided
+        winner = int(np.argmax(behind <= TIE))
+        return int(cells[winner]), min(float(scores[winner]), 1.0)
+
+    def _contenders(
+        self, frame: FloatArray, cells: Indices, frames: FloatArray, reached: float
+    ) -> tuple[Indices, FloatArray]:
+        """Return those of the cells that may score `reached`, and their scores at the lags of (m, 896) frames."""
+        if len(frames) > _FEW_LAGS:
+            return cells, self._scores(frame[None], self._unit_signals(self._cells[cells]))[0]
+        magnitudes = np.abs(self._signals.take(self._cells[cells], axis=0))
+        nearly = (frames.astype(np.float32) @ magnitudes.T).max(axis=0) / self._norms[cells]
+        close = np.flatnonzero(nearly >= reached - _ROUNDING_32)
+        scores = (frames @ magnitudes[close].astype(np.float64).T).max(axis=0) / self._norms[cells[close]]
+        return cells[close], scores
+
+    def _score(self, cell: int, frames: FloatArray) -> float:
+        """Return a cell's highest score at the lags of (m, 896) frames."""
+        magnitudes = np.abs(self._signals[self._cells[cell]], dtype=np.float64)
+        return float((frames @ magnitudes).max() / self._norms[cell])
+
+    def _match(self, best: tuple[int, float], runner_up: tuple[int, float] | None) -> Match:
+        row, column = cell = self._place(best[0])
+        return Match(
+            k=float(self.k_grid[row]),
+            sigma=float(self.sigma_grid[column]),
+            cell=cell,
+            score=best[1],
+            runner_up=None if runner_up is None else runner_up[1],
+            runner_up_cell=None if runner_up is None else self._place(runner_up[0]),
+        )
+
+    def _place(self, cell: int) -> tuple[int, int]:
+        return int(self._row[cell]), int(self._column[cell])
+
+
+class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
+    """Matches at lag 0 alone; its heatmaps are those of `ZeroLagMatcher`, at that one's price."""
+
+    def _bounds(self, frame: FloatArray) -> Bounds:
+        return ZeroLagBounds(self._bank, frame)
+
+
+class FastMatcher(_PruningMatcher, ReferenceMatcher):
+    """Matches at all lags; its heatmaps are those of the reference, at the reference's price."""
+
+    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+        """Compress the bank; arguments and errors as of `FastZeroLagMatcher`."""
+        super().__init__(signals, valid, k_grid, sigma_grid)
+        self._spectra = spectra_of(self._bank)
+
+    def _bounds(self, frame: FloatArray) -> Bounds:
+        return AllLagsBounds(self._bank, self._spectra, frame)

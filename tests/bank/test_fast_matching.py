@@ -1,0 +1,193 @@
+"""Fast matching: the same cell, score and runner-up as the slow matcher finds, whatever the frame and the bank."""
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.io import loadmat
+
+from bank import bounds, fast_matching
+from bank.channels import N_CHANNELS, channels_of_line
+from bank.errors import MatchingError
+from bank.fast_matching import FastMatcher, FastZeroLagMatcher
+from bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher
+
+SHAPE = (22, 20)
+
+
+def smooth_bank() -> tuple[np.ndarray, np.ndarray]:
+    """Return signals that change little from cell to cell, as a bank's do, with plateaus of cells that are alike."""
+    k, sigma = np.meshgrid(np.linspace(0, 1, SHAPE[0]), np.linspace(0.1, 1, SHAPE[1]), indexing="ij")
+    channel = np.arange(N_CHANNELS)
+    phase = 2 * np.pi * (channel % 28) / 28
+    signals = np.sin(phase + 6 * k[..., None]) * np.exp(
+        -(((channel / N_CHANNELS - k[..., None]) / sigma[..., None]) ** 2)
+    )
+    signals += 0.3 * np.cos(3 * phase * sigma[..., None]) * k[..., None]
+    signals[10:14, 3:9] = signals[10, 3]
+    signals[18:] = signals[18]
+    valid = k + sigma < 1.8
+    valid[4, 4] = False
+    signals[~valid] = np.nan  # must never be read
+    return signals.astype(np.float32), valid
+
+
+def pair(slow: type[Matcher], fast: type[Matcher], bank: tuple[np.ndarray, np.ndarray]) -> tuple[Matcher, Matcher]:
+    grids = np.arange(1.0, bank[1].shape[0] + 1), np.arange(1.0, bank[1].shape[1] + 1)
+    return slow(*bank, *grids), fast(*bank, *grids)
+
+
+KINDS = ((ReferenceMatcher, FastMatcher), (ZeroLagMatcher, FastZeroLagMatcher))
+BANK = smooth_bank()
+PAIRS = [pair(*kind, BANK) for kind in KINDS]
+both = pytest.mark.parametrize(("slow", "fast"), PAIRS, ids=["all lags", "zero lag"])
+amplitudes = hnp.arrays(np.float64, N_CHANNELS, elements=st.floats(-10, 10, width=32)).filter(np.any)
+cells = st.sampled_from([tuple(cell) for cell in np.argwhere(BANK[1]).tolist()])
+
+
+def assert_same(fast: Match, slow: Match) -> None:
+    assert fast.cell == slow.cell
+    assert fast.runner_up_cell == slow.runner_up_cell
+    assert fast.score == pytest.approx(slow.score, abs=1e-13)
+    assert (fast.runner_up is None) == (slow.runner_up is None)
+    if slow.runner_up is not None:
+        assert fast.runner_up == pytest.approx(slow.runner_up, abs=1e-13)
+    assert (fast.k, fast.sigma) == (slow.k, slow.sigma)
+
+
+@both
+@given(frame=amplitudes)
+@settings(max_examples=25, deadline=None)
+def test_random_frames(slow: Matcher, fast: FastMatcher, frame: np.ndarray) -> None:
+    assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+@given(
+    cell=cells,
+    other=cells,
+    share=st.sampled_from([0.0, 1e-9, 0.3, 0.5]),
+    noise=st.sampled_from([0.0, 1e-7, 1e-3, 0.3]),
+    lag=st.sampled_from([0, 0, 1, -28, 300, -890]),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=50, deadline=None)
+def test_frames_like_those_of_the_bank(slow, fast, cell, other, share, noise, lag, seed) -> None:
+    signals = BANK[0].astype(np.float64)
+    frame = np.abs((1 - share) * signals[cell] + share * signals[other])
+    frame += noise * np.abs(np.random.default_rng(seed).normal(size=N_CHANNELS))
+    moved = np.zeros(N_CHANNELS)
+    moved[max(lag, 0) : N_CHANNELS + min(lag, 0)] = frame[max(-lag, 0) : N_CHANNELS - max(lag, 0)]
+    if moved.any():
+        assert_same(fast.match(moved), slow.match(moved))
+
+
+@both
+@given(
+    channels=st.lists(st.integers(0, N_CHANNELS - 1), min_size=1, max_size=3), size=st.sampled_from([1e-300, 1, 1e300])
+)
+@settings(max_examples=15, deadline=None)
+def test_frames_of_single_channels(slow, fast, channels, size) -> None:
+    frame = np.zeros(N_CHANNELS)
+    frame[channels] = size
+    assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+def test_constant_frames_and_cells_that_tie(slow, fast) -> None:
+    for frame in (np.ones(N_CHANNELS), BANK[0][12, 6], BANK[0][20, 3], np.arange(N_CHANNELS), np.eye(N_CHANNELS)[895]):
+        assert_same(fast.match(frame), slow.match(frame))
+    assert fast.match(BANK[0][12, 6]).cell == (10, 3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(n_k=st.integers(1, 14), n_sigma=st.integers(1, 14), few=st.integers(1, 40), seed=st.integers(0, 1000))
+@settings(max_examples=8, deadline=None)
+def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, seed) -> None:
+    random = np.random.default_rng(seed)
+    signals = np.zeros((n_k, n_sigma, N_CHANNELS), dtype=np.float32)
+    signals[..., random.choice(N_CHANNELS, few)] = random.choice([0, 1, 2, 1e-3], (n_k, n_sigma, few))
+    valid, frame = signals.any(axis=2), random.choice([0, 1, 0.5], N_CHANNELS, p=[0.9, 0.05, 0.05])
+    if valid.any() and frame.any():
+        slow, fast = pair(*kind, (signals, valid))
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, monkeypatch) -> None:
+    frame = BANK[0][6, 6] + BANK[0][16, 5]
+    expected = slow.match(frame)
+    scored = []
+    monkeypatch.setattr(type(slow), "heatmap", lambda self, each: scored.append(each) or Matcher.heatmap(self, each))
+    assert_same(fast.match(frame), expected)
+    assert not scored
+    monkeypatch.setattr(fast_matching, "_ROUNDING_64", 2.0)
+    assert_same(fast.match(frame), expected)
+    assert len(scored) == 1
+
+
+@both
+@pytest.mark.parametrize(("module", "limit", "value"), [(bounds, "_MOST_BOUNDS", 10), (fast_matching, "_FEW_LAGS", 0)])
+def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, module, limit, value) -> None:
+    monkeypatch.setattr(module, limit, value)
+    for frame in np.random.default_rng(5).random((4, N_CHANNELS)):
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
+    """What makes it fast: of a frame near to the bank's, most cells are never read."""
+    read = []
+    contenders = type(fast)._contenders
+
+    def counted(self, frame, cells, frames, reached):
+        read.append(len(cells))
+        return contenders(self, frame, cells, frames, reached)
+
+    monkeypatch.setattr(type(fast), "_contenders", counted)
+    frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(6).normal(size=N_CHANNELS))
+    assert_same(fast.match(frame), slow.match(frame))
+    assert sum(read) < BANK[1].sum() / 4
+
+
+@both
+def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast) -> None:
+    frame = np.random.default_rng(7).normal(size=N_CHANNELS)
+    assert fast.match(frame, runner_up=False) == dataclasses.replace(
+        fast.match(frame), runner_up=None, runner_up_cell=None
+    )
+    np.testing.assert_array_equal(fast.heatmap(frame), slow.heatmap(frame))
+
+
+@both
+def test_what_cannot_be_matched_is_refused_alike(slow, fast) -> None:
+    for frame, says in ((np.zeros(N_CHANNELS), "zero in all channels"), (np.full(N_CHANNELS, np.nan), "not finite")):
+        for matcher in (slow, fast):
+            with pytest.raises(MatchingError, match=says):
+                matcher.match(frame)
+    with pytest.raises(MatchingError, match="build the bank anew"):
+        type(fast)(np.zeros_like(BANK[0]), BANK[1], np.arange(22.0), np.arange(20.0))
+
+
+def recorded_differences(shared: Path) -> Iterator[np.ndarray]:
+    for path in sorted((shared / "recordings").glob("*_slices/*_*.mat")):
+        yield loadmat(path)["data_diff"].ravel()
+    for path in sorted((shared / "recordings" / "streams").glob("*/*.mat")):
+        for values in loadmat(path).values():
+            if getattr(values, "shape", (0, 0))[-1] == 1025:
+                channels = channels_of_line(values[:, 1:])
+                yield from channels[20::701] - channels[:10].mean(axis=0)
+
+
+@both
+def test_recorded_frames(shared: Path, slow, fast) -> None:
+    """Far from anything in this bank, as they are from every bank: a hard case."""
+    frames = list(recorded_differences(shared))
+    assert len(frames) > 60
+    for frame in frames:
+        assert_same(fast.match(frame), slow.match(frame))

@@ -1,0 +1,19 @@
+"""Estimators: `fit` makes a calibration from recordings, a `Tracker` turns frames into estimates with it."""
+
+from bank.estimators.calibrated import NAMES, Calibration, Name, Tracker
+from bank.estimators.fitting import Physics, fit
+from bank.estimators.values import Estimate, FrameSeries, Measured, TactileFrame, fused
+
+__all__ = [
+    "NAMES",
+    "Calibration",
+    "Estimate",
+    "FrameSeries",
+    "Measured",
+    "Name",
+    "Physics",
+    "TactileFrame",
+    "Tracker",
+    "fit",
+    "fused",
+]

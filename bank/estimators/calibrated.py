@@ -1,0 +1,212 @@
+"""A calibration of one estimator, and the tracker that follows one session with it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Self
+
+import numpy as np
+
+from bank.bank_file import Bank
+from bank.channels import CHANNEL_TABLE_HASH
+from bank.errors import CalibrationError
+from bank.estimators.archive import read_archive, write_archive
+from bank.estimators.guard import DifferenceGuard, SideGuard
+from bank.estimators.memory import Memory, Moment, Motion
+from bank.estimators.physics import BestCell, Locator, NearestCell, Place, Registration
+from bank.estimators.reader import Reader
+from bank.estimators.values import BoolArray, Estimate, FloatArray, Kind, TactileFrame
+
+Name = Literal["paper", "bank", "regression", "reconstruction", "fused"]
+NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
+NEEDS_BANK: tuple[Name, ...] = ("paper", "bank")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Task:
+    """How one quantity is read: its reader, and for differences the guard of those it was fitted to."""
+
+    reader: Reader
+    guard: DifferenceGuard | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """All that an estimator knows of its fingertips; `source` says in words what it was fitted to.
+
+    guards and motion are there for raw frames; scale (m, 896) divides differences channel by channel; image (p, 896)
+    turns them into pixels. bank_identity is empty for an estimator without a bank.
+    """
+
+    estimator: Name
+    kind: Kind
+    sides: tuple[str, ...]
+    source: str
+    bank_identity: str
+    registration: Registration
+    scale: FloatArray
+    guards: tuple[SideGuard, ...]
+    motion: Motion | None
+    image: FloatArray | None
+    torque: Task | None
+    diameter: Task | None
+
+    def save(self, path: str | Path) -> None:
+        """Write the calibration's file, the same bytes for the same calibration; CalibrationError where it fails."""
+        write_archive(path, {"channel_table": CHANNEL_TABLE_HASH}, self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a calibration; CalibrationError, naming the file, for one that cannot be used."""
+        return read_archive(path, {"channel_table": CHANNEL_TABLE_HASH}, cls)
+
+    def locator(self, bank: Bank | None) -> Locator | None:
+        """Return what finds places in the bank, None for an estimator that does without.
+
+        Raises CalibrationError when the estimator needs a bank that is not given or is another one.
+        """
+        if self.estimator not in NEEDS_BANK:
+            return None
+        if bank is None:
+            raise CalibrationError(f"the estimator {self.estimator} needs its bank; name it with --bank")
+        if bank.identity != self.bank_identity:
+            raise CalibrationError(
+                f"the calibration was made with the bank {self.bank_identity[:12]}…, and {bank.path} is "
+                f"{bank.identity[:12]}…; name the bank it was made with, or calibrate again"
+            )
+        return locator_for(self.estimator, bank, self.registration)
+
+
+def locator_for(name: Name, bank: Bank, registration: Registration) -> Locator:
+    """Return the locator of an estimator that has one."""
+    return BestCell(bank) if name == "paper" else NearestCell(bank, registration)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Seen:
+    """The features of one frame, and the place in the bank where there is one."""
+
+    features: FloatArray
+    place: Place | None = None
+
+
+def features_of(
+    calibration: Calibration, locator: Locator | None, difference: FloatArray, recent: FloatArray | None
+) -> Seen:
+    """Return the features of (m, 896) differences, or of the motion in the recent frames for an estimator of motion."""
+    if calibration.motion is not None:
+        if recent is None:
+            raise ValueError("features of motion need the recent frames")
+        return Seen(calibration.motion.features(calibration.motion.places(recent)))
+    if locator is not None:
+        places = [locator.locate(layer) for layer in difference]
+        if calibration.estimator == "paper":
+            # The paper considers one fingertip, and reads torque from sigma and diameter from k.
+            return Seen(np.array([places[0].k, places[0].sigma, places[0].sigma ** 2]), places[0])
+        return Seen(np.concatenate([place.features for place in places]), places[0])
+    if calibration.image is not None:
+        return Seen((difference @ calibration.image.T).ravel())
+    return Seen((difference / calibration.scale).ravel())
+
+
+# The features that each quantity is read from, where that is not all of them: the paper's sigma and its square, and k.
+PAPER_COLUMNS = {"torque": slice(1, 3), "diameter": slice(0, 1)}
+
+
+class Tracker:
+    """Follows one session: `estimate` takes every frame in order and keeps what must be remembered, causally."""
+
+    def __init__(self, calibration: Calibration, bank: Bank | None = None) -> None:
+        """Begin a session; raises CalibrationError for a bank that is missing or another one."""
+        self.calibration = calibration
+        self._locator = calibration.locator(bank)
+        self.tare()
+
+    def tare(self) -> None:
+        """Forget the session: the next frame is its first."""
+        calibration = self.calibration
+        self._memory = Memory(calibration.guards, calibration.motion) if calibration.kind == "raw" else None
+
+    def estimate(self, frame: TactileFrame) -> Estimate:
+        """Return what a frame of the calibration's sides says.
+
+        Raises CalibrationError for a frame of another number of sides.
+        """
+        if frame.channels.shape != self.calibration.scale.shape:
+            raise CalibrationError(
+                f"the calibration is of {len(self.calibration.sides)} sides ({', '.join(self.calibration.sides)}), "
+                f"and the frame has the shape {frame.channels.shape}"
+            )
+        if self._memory is None:
+            difference = np.abs(frame.channels)
+            return self._read(difference, None, frame.usable, float(frame.usable.mean()))
+        moment = self._memory.see(frame)
+        if moment.why:
+            return Estimate(valid=False, why=moment.why)
+        return self._read_moment(moment, frame.usable)
+
+    def _read_moment(self, moment: Moment, usable: BoolArray) -> Estimate:
+        assert self._memory is not None  # noqa: S101 - only called for raw frames
+        return self._read(moment.difference, self._memory.recent, usable, moment.usable_share)
+
+    def _read(
+        self, difference: FloatArray, recent: FloatArray | None, usable: BoolArray, usable_share: float
+    ) -> Estimate:
+        calibration = self.calibration
+        refused: list[str] = []
+        tasks = {"torque": (calibration.torque, "N·m"), "diameter": (calibration.diameter, "mm")}
+        wanted = {}
+        for name, (task, _) in tasks.items():
+            if task is None:
+                continue
+            why = task.guard.refuse(difference[0], usable[0]) if task.guard is not None else ()
+            refused += [reason for reason in why if reason not in refused]
+            if not why:
+                wanted[name] = task
+        if not wanted:
+            return Estimate(valid=False, why=tuple(refused))
+        if task_guard := next((task.guard for task in wanted.values() if task.guard is not None), None):
+            # What a dead channel would have said is taken from the frames of the calibration.
+            difference = np.where(usable, difference, task_guard.mean)
+        seen = features_of(calibration, self._locator, difference, recent)
+        if seen.place is not None and seen.place.ambiguous:
+            return _with_place(
+                Estimate(valid=False, why=("two places of the bank far apart fit the frame equally well",)), seen.place
+            )
+        values: dict[str, tuple[float, float]] = {}
+        for name, task in wanted.items():
+            features = columns_for(calibration.estimator, name, seen.features)
+            value, half = task.reader.read(features, usable_share)
+            why = task.reader.refuse(value, features, name, tasks[name][1])
+            refused += [reason for reason in why if reason not in refused]
+            if not why:
+                values[name] = (value, half)
+        return _with_place(_estimate(values, tuple(refused)), seen.place)
+
+
+def columns_for(estimator: Name, quantity: str, features: FloatArray) -> FloatArray:
+    """Return those (…, d) features that a quantity is read from."""
+    return features[..., PAPER_COLUMNS[quantity]] if estimator == "paper" else features
+
+
+def _estimate(values: dict[str, tuple[float, float]], refused: Sequence[str]) -> Estimate:
+    if not values:
+        return Estimate(valid=False, why=tuple(refused))
+    torque, diameter = values.get("torque"), values.get("diameter")
+    return Estimate(
+        valid=True,
+        why=(),
+        torque_nm=torque[0] if torque else None,
+        torque_low_nm=torque[0] - torque[1] if torque else None,
+        torque_high_nm=torque[0] + torque[1] if torque else None,
+        diameter_mm=diameter[0] if diameter else None,
+        diameter_low_mm=diameter[0] - diameter[1] if diameter else None,
+        diameter_high_mm=diameter[0] + diameter[1] if diameter else None,
+    )
+
+
+def _with_place(estimate: Estimate, place: Place | None) -> Estimate:
+    if place is None:
+        return estimate
+    values = {name: getattr(estimate, name) for name in Estimate.__slots__}
+    return Estimate(**values | {"k": place.k, "sigma": place.sigma, "score": place.score, "runner_up": place.runner_up})

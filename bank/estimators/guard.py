@@ -1,0 +1,246 @@
+"""Whether a frame is one that a calibration can speak of: the right fingertip, gripping, undisturbed.
+
+`SideGuard` for raw frames knows a fingertip by its pattern of voltages: the same one keeps it from day to day but for
+a common gain and a few per cent, another does not (median deviation 0.03–0.07 against 0.15–0.19 between recordings of
+two fingertips on two days). A grip is told by a linear discriminant that looks away from what twisting and the gel's
+slow recovery change.
+"""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from bank.channels import N_CHANNELS
+from bank.errors import CalibrationError
+from bank.estimators.values import BoolArray, FloatArray
+
+# One step of the board's converter, as measured on recorded frames; its rounding is the least noise there is.
+CONVERTER_STEP_V = 0.00215
+LEAST_NOISE_V = CONVERTER_STEP_V / np.sqrt(12.0)
+
+# Median relative deviation, after the common gain, beyond which this is not the fingertip of the calibration.
+LARGEST_DEVIATION = 0.12
+# Added to voltages that others are divided by: below it a channel's relative change is noise.
+_SMALL_V = 0.01
+# Channels whose shape a fingertip is known by.
+_WELL_ABOVE_NOISE_V = 0.03
+# A channel that jumps from frame to frame by more than this many times its noise, and this much, is disturbed.
+JUMP_NOISES, JUMP_V = 6.0, 0.008
+LARGEST_JUMPING_SHARE = 0.12
+LARGEST_UNUSABLE_SHARE = 0.25
+# Directions in which frames move while gripped or idle, which the grip's discriminant looks away from.
+_N_NUISANCE = 2
+# A difference is judged against those left out in turn, with this margin.
+_MISFIT_MARGIN, _LEAST_OUTLYING, _OUTLYING_NOISES = 2.0, 0.05, 5.0
+_FOLDS, _LEAST_DIFFERENCES = 7, 8
+# Closing and opening take this many frames, and move the frame so much further than twisting under load.
+STEP_FRAMES, _STEP_MARGIN = 4, 1.25
+# Where between the idle frames' highest score and the gripped frames' lowest the line is drawn.
+_THRESHOLD_SHARE = 0.35
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SideGuard:
+    """One fingertip as it was at calibration: idle and gripped mean frames, noise (896,) in volts, grip discriminant.
+
+    Channels that were dead then have infinite noise. Where no frame after a release was among them, the slow recovery
+    of the gel could pass for a grip; a release is then known by its step: further than step_limit (in noises) within
+    STEP_FRAMES frames, with a grip score that falls by more than fall_limit. Both are infinite otherwise.
+    """
+
+    side: str
+    idle: FloatArray
+    gripped: FloatArray
+    noise: FloatArray
+    grip_weights: FloatArray
+    grip_threshold: float
+    step_limit: float
+    fall_limit: float
+
+    @classmethod
+    def fit(cls, side: str, idle: FloatArray, gripped: FloatArray, released: FloatArray) -> Self:
+        """Fit to the (n, 896) frames before the grip, in it, and after it (which may be none)."""
+        if len(idle) < 5 or len(gripped) < 20:
+            raise CalibrationError(
+                f"side {side}: {len(idle)} idle and {len(gripped)} gripped frames are too few to tell a grip; "
+                "begin the recording some seconds before gripping"
+            )
+        base, noise = np.median(idle, axis=0), channel_noise(gripped)
+        relative, scale = base + _SMALL_V, np.where(np.isfinite(noise), noise, 1.0) / (base + _SMALL_V)
+        floor = 0.3 * float(np.median(scale))
+        scale = np.where(np.isfinite(noise), np.maximum(scale, floor), np.inf)
+
+        parts = [part for part in (idle, gripped, released) if len(part)]
+
+        def seen(rows: slice) -> list[FloatArray]:
+            return [(part[rows] - base) / relative / scale for part in parts]
+
+        weights = _discriminant(seen(slice(None))) / scale
+        # Of 896 channels some combination parts any frames: whether they differ shows on those it was not made from.
+        half = _discriminant(seen(slice(0, None, 2))) / scale
+        low, high = _apart([(part[1::2] - base) / relative @ half for part in parts])
+        if high <= low:
+            raise CalibrationError(
+                f"side {side}: gripped frames cannot be told from idle ones; did the fingertip touch the tool?"
+            )
+        score = [(part - base) / relative @ weights for part in parts]
+        low, high = _apart(score)
+        threshold = low + _THRESHOLD_SHARE * (high - low)
+        step_limit = fall_limit = np.inf
+        if len(released) == 0:
+            step_limit = _STEP_MARGIN * float(steps(gripped, noise).max())
+            fall_limit = _STEP_MARGIN * float(-(score[1][STEP_FRAMES:] - score[1][:-STEP_FRAMES]).min())
+        return cls(side, base, gripped.mean(axis=0), noise, weights, threshold, step_limit, fall_limit)
+
+    def foreign(self, frame: FloatArray, usable: BoolArray) -> str | None:
+        """Return why this is not the fingertip of the calibration, or None."""
+        deviation = min(_deviation(frame, known, usable) for known in (self.idle, self.gripped))
+        if deviation <= LARGEST_DEVIATION:
+            return None
+        return (
+            f"{self.side} fingertip: the voltages deviate by {100 * deviation:.0f} % from those at calibration, more "
+            f"than {100 * LARGEST_DEVIATION:.0f} %; this is another fingertip or another gel, calibrate it"
+        )
+
+    def idle_like(self, frame: FloatArray) -> bool:
+        """Return whether a frame is nearer to the calibration's idle frame than to the gripped one."""
+        known = np.isfinite(self.noise)
+        return _deviation(frame, self.idle, known) <= _deviation(frame, self.gripped, known)
+
+    def grip(self, frame: FloatArray, idle: FloatArray) -> float:
+        """Return the grip's score, about 0 when idle and 1 as gripped at calibration; idle is this session's frame."""
+        return float((frame - idle) / (idle + _SMALL_V) @ self.grip_weights)
+
+    def released(self, frame: FloatArray, earlier: FloatArray, idle: FloatArray) -> bool | None:
+        """Return whether the grip opened (True) or closed (False) since a frame STEP_FRAMES ago; None for neither."""
+        fall = self.grip(earlier, idle) - self.grip(frame, idle)
+        if float((np.abs(frame - earlier) / self.noise).mean()) <= self.step_limit or abs(fall) <= self.fall_limit:
+            return None
+        return fall > 0
+
+    def jumping_share(self, frame: FloatArray, before: FloatArray, usable: BoolArray) -> float:
+        """Return the share of usable channels that jump between two frames further than their noise explains."""
+        limit = np.maximum(JUMP_NOISES * np.sqrt(2.0) * self.noise, JUMP_V)
+        return float(np.mean(np.abs(frame - before)[usable] > limit[usable])) if usable.any() else 1.0
+
+
+def _discriminant(parts: list[FloatArray]) -> FloatArray:
+    """Return the weights of idle, gripped and maybe released frames: 0 for the mean idle frame, 1 for the gripped one.
+
+    Directions in which the parts vary, and the one from idle to released, have no weight.
+    """
+    means = [part.mean(axis=0) for part in parts]
+    spread = np.linalg.svd(np.vstack([part - mean for part, mean in zip(parts, means, strict=True)]), False)[2]
+    nuisance = list(spread[:_N_NUISANCE])
+    step = means[1] - means[0]
+    if len(parts) == 3:
+        nuisance.append(means[2] - means[0])
+        step = means[1] - 0.5 * (means[0] + means[2])
+    q = np.linalg.qr(np.array(nuisance).T)[0]
+    direction = step - q @ (q.T @ step)
+    return np.asarray(direction / float(direction @ step))
+
+
+def _apart(scores: list[FloatArray]) -> tuple[float, float]:
+    """Return the highest score of idle and released frames and the lowest of gripped ones, but for one in a hundred."""
+    free = np.concatenate([scores[0], *scores[2:]])
+    return float(np.quantile(free, 0.99)), float(np.quantile(scores[1], 0.01))
+
+
+def channel_noise(frames: FloatArray) -> FloatArray:
+    """Return the (896,) standard deviation of fast noise in (n, 896) frames, from their second differences.
+
+    Slow signals cancel there. At least the converter's rounding; infinite for a channel that never changes at all.
+    """
+    noise = np.sqrt((np.diff(frames, 2, axis=0) ** 2).mean(axis=0) / 6.0)
+    still = np.ptp(frames, axis=0) == 0
+    return np.where(still, np.inf, np.maximum(noise, LEAST_NOISE_V))
+
+
+def steps(frames: FloatArray, noise: FloatArray) -> FloatArray:
+    """Return the (n − STEP_FRAMES,) mean distances in noises that (n, 896) frames move within STEP_FRAMES frames."""
+    return np.asarray((np.abs(frames[STEP_FRAMES:] - frames[:-STEP_FRAMES]) / noise).mean(axis=1))
+
+
+def _deviation(frame: FloatArray, known: FloatArray, usable: BoolArray) -> float:
+    """Return the median relative deviation of a frame from a known one after the common gain."""
+    judged = usable & (known > _WELL_ABOVE_NOISE_V)
+    x, reference = frame[judged], known[judged]
+    if len(x) < N_CHANNELS // 4:
+        return np.inf
+    gain = float(np.median(x / reference))
+    if gain <= 0:
+        return np.inf
+    return float(np.median(np.abs(x / gain - reference) / reference))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DifferenceGuard:
+    """Which differences a calibration can speak of: as large, and as well explained, as those it was made from.
+
+    They lie about the mean (896,) along the directions (r, 896), with noise in volts beside; the misfit of a
+    difference is its mean squared residual in units of noise².
+    """
+
+    mean: FloatArray
+    directions: FloatArray
+    noise: float
+    least_norm: float
+    largest_misfit: float
+    largest_outlying: float
+
+    @classmethod
+    def fit(cls, differences: FloatArray) -> Self:
+        """Fit to (n, 896) differences; the limits come from frames that were left out in turn."""
+        n = len(differences)
+        if n < _LEAST_DIFFERENCES:
+            raise CalibrationError(f"{n} slices are too few to know what is familiar; record {_LEAST_DIFFERENCES}")
+        seen = []
+        for fold in range(_FOLDS):
+            left_out = np.arange(n) % _FOLDS == fold
+            part = cls._explaining(differences[~left_out])
+            seen += [part.misfit(one, np.ones(N_CHANNELS, dtype=np.bool_)) for one in differences[left_out]]
+        misfit, outlying = np.array(seen).max(axis=0)
+        whole = cls._explaining(differences)
+        least = 0.5 * float(np.linalg.norm(differences, axis=1).min() / np.sqrt(N_CHANNELS))
+        return cls(
+            whole.mean, whole.directions, whole.noise, least,
+            _MISFIT_MARGIN * float(misfit), max(_MISFIT_MARGIN * float(outlying), _LEAST_OUTLYING),
+        )  # fmt: skip
+
+    @classmethod
+    def _explaining(cls, differences: FloatArray) -> Self:
+        mean, rank = differences.mean(axis=0), min(4, len(differences) // 4)
+        _, s, vt = np.linalg.svd(differences - mean, full_matrices=False)
+        freedom = len(differences) - 1 - rank
+        noise = float(np.sqrt((s[rank:] ** 2).sum() / freedom / N_CHANNELS))
+        if noise == 0:
+            raise CalibrationError("the slices have no noise at all: this is no recording of a real board")
+        return cls(mean, vt[:rank], noise, 0.0, np.inf, np.inf)
+
+    def misfit(self, difference: FloatArray, usable: BoolArray) -> tuple[float, float]:
+        """Return the misfit of a (896,) difference and the share of channels beyond five times the noise."""
+        v, x = self.directions[:, usable], (difference - self.mean)[usable]
+        residual = (x - np.linalg.lstsq(v.T, x, rcond=None)[0] @ v) / self.noise
+        return float((residual**2).mean()), float((np.abs(residual) > _OUTLYING_NOISES).mean())
+
+    def refuse(self, difference: FloatArray, usable: BoolArray) -> tuple[str, ...]:
+        """Return the reasons against a (896,) difference, judged by its usable channels."""
+        if 1.0 - usable.mean() > LARGEST_UNUSABLE_SHARE:
+            return (
+                f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; look at the ribbon cable",
+            )
+        size = float(np.sqrt((difference[usable] ** 2).mean()))
+        if size < self.least_norm:
+            return (
+                f"no grip: the difference to the homogeneous frame is {1e3 * size:.1f} mV a channel, and gripping "
+                f"makes at least {1e3 * self.least_norm:.1f} mV",
+            )
+        misfit, outlying = self.misfit(difference, usable)
+        if misfit > self.largest_misfit or outlying > self.largest_outlying:
+            return (
+                f"outside of the calibration: the misfit is {misfit:.1f} (at most {self.largest_misfit:.1f}), with "
+                f"{100 * outlying:.0f} % of the channels far off (at most {100 * self.largest_outlying:.0f} %)",
+            )
+        return ()

@@ -1,0 +1,221 @@
+"""From features to a value: three regressions, each with its strength chosen on data later than what it was fitted to.
+
+`Ridge` for features that hold the value linearly. `Censored` for a load cell that a lever pushes from one side only:
+where it reads nothing the twist may be anything below, so those frames bound the value instead of fixing it (Tobin
+1958). `Curve` the other way round, frames as a smooth curve over the value with correlated drift beside it (classical
+calibration by generalised least squares): it does not pull estimates towards the mean as a ridge does.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Self, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from bank.errors import CalibrationError
+from bank.estimators.values import BoolArray, FloatArray
+
+# Readings below this share of the largest torque count as "the lever does not touch".
+CENSORED_SHARE = 0.02
+_LEAST_SIGMA_SHARE = 0.01
+_EM_ROUNDS = 100
+N_BLOCKS = 5
+# The paper's own number: with so many of the 896 channels its regression was four fifths as good as with all.
+N_RANKED = 272
+
+Rows: TypeAlias = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ridge:
+    """value = offset + (features − mean) · weights, clipped to nothing; strength is the penalty that was chosen."""
+
+    mean: FloatArray
+    weights: FloatArray
+    offset: float
+    strength: float
+
+    @classmethod
+    def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
+        """Fit to (n, d) features of one unit and (n,) values; strength is in units of the features' sum of squares."""
+        mean, offset = features.mean(axis=0), float(values.mean())
+        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
+        penalty = strength * float((s**2).sum())
+        weights = vt.T @ (s / (s**2 + penalty) * (u.T @ (values - offset)))
+        return cls(mean, weights, offset, strength)
+
+    @classmethod
+    def fit_scaled(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
+        """Fit as `fit` does, with each feature in units of its own spread: for features of different kinds."""
+        spread = features.std(axis=0)
+        spread = np.where(spread > 0, spread, 1.0)
+        scaled = cls.fit(features / spread, values, strength)
+        return cls(scaled.mean * spread, scaled.weights / spread, scaled.offset, strength)
+
+    def predict(self, features: FloatArray) -> FloatArray:
+        """Return the (n,) values of (n, d) features."""
+        return np.asarray(self.offset + (features - self.mean) @ self.weights)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Censored:
+    """As a ridge, fitted with readings of no load as bounds; `sign` is the direction the lever is pushed in.
+
+    The prediction is the latent value: beyond zero against the sign the lever does not touch, and the torque is zero.
+    """
+
+    mean: FloatArray
+    weights: FloatArray
+    offset: float
+    strength: float
+    sigma: float
+    sign: float
+
+    @classmethod
+    def fit(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
+        """Fit by expectation–maximisation to (n, d) features and (n,) values of one sign."""
+        largest = float(values[np.argmax(np.abs(values))])
+        sign = 1.0 if largest > 0 else -1.0
+        y = sign * values
+        touching = y >= CENSORED_SHARE * y.max()
+        mean = features.mean(axis=0)
+        u, s, vt = np.linalg.svd(features - mean, full_matrices=False)
+        gain = s / (s**2 + strength * float((s**2).sum()))
+        latent, sigma = y.copy(), max(float(y[touching].std()), _LEAST_SIGMA_SHARE * y.max())
+        for _ in range(_EM_ROUNDS):
+            offset = float(latent.mean())
+            coefficients = gain * (u.T @ (latent - offset))
+            predicted = offset + u @ (s * coefficients)
+            expected, variance = _below_zero(predicted[~touching], sigma)
+            latent = y.copy()
+            latent[~touching] = expected
+            sigma = max(
+                float(np.sqrt((((latent - predicted) ** 2).sum() + variance.sum()) / len(y))),
+                _LEAST_SIGMA_SHARE * float(y.max()),
+            )
+        offset = float(latent.mean())
+        weights = vt.T @ (gain * (u.T @ (latent - offset)))
+        return cls(mean, weights, offset, strength, sigma, sign)
+
+    def predict(self, features: FloatArray) -> FloatArray:
+        """Return the (n,) latent values of (n, d) features, in the direction of the lever's push."""
+        return np.asarray(self.offset + (features - self.mean) @ self.weights)
+
+
+def _below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
+    """Return mean and variance of Gaussians of this mean and sigma, given that they are below zero."""
+    u = -mean / sigma
+    ratio = np.exp(-0.5 * u**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(u))
+    return mean - sigma * ratio, sigma**2 * np.clip(1 - u * ratio - ratio**2, 0.0, 1.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curve:
+    """Frames as a polynomial of the value, coefficients (degree + 1, q), with drift along `drift` (r, q) and noise.
+
+    Of a frame's d channels only the q `channels` count that go best with the value: the others bring more drift.
+
+    The value of a frame minimises (x − curve)ᵀ Σ⁻¹ (x − curve), Σ = driftᵀ diag(drift_variance) drift + noise² I.
+    """
+
+    channels: NDArray[np.int64]
+    coefficients: FloatArray
+    drift: FloatArray
+    drift_variance: FloatArray
+    noise: float
+    centre: float
+    scale: float
+    low: float
+    high: float
+
+    @classmethod
+    def fit(cls, frames: FloatArray, values: FloatArray, degree: int, n_drift: int, curvature: float = 3.0) -> Self:
+        """Fit to (n, d) frames of (n,) values; `curvature` holds the terms beyond the linear one back, in frames."""
+        n = len(values)
+        centre, scale = float(values.mean()), float(values.std())
+        distinct = len(np.unique(values))
+        if distinct <= degree or n < degree + n_drift + 3 or scale == 0:
+            raise CalibrationError(
+                f"{n} frames at {distinct} distinct values do not determine a curve of degree {degree} and its noise; "
+                f"record at least {degree + n_drift + 3}"
+            )
+        channels = np.sort(ranked_channels(frames, values)[:N_RANKED])
+        frames = frames[:, channels]
+        powers = np.vander((values - centre) / scale, degree + 1, increasing=True)
+        penalty = np.diag([0.0, 0.0] + [curvature] * (degree - 1))
+        coefficients: FloatArray = np.linalg.solve(powers.T @ powers + penalty, powers.T @ frames).astype(np.float64)
+        _, s, vt = np.linalg.svd(frames - powers @ coefficients, full_matrices=False)
+        freedom = n - degree - 1
+        noise = float(np.sqrt((s[n_drift:freedom] ** 2).sum() / (freedom - n_drift) / frames.shape[1]))
+        if noise == 0:
+            raise CalibrationError("the frames have no noise at all: this is no recording of a real board")
+        span = float(np.ptp(values))
+        return cls(
+            channels, coefficients, vt[:n_drift], s[:n_drift] ** 2 / freedom, noise, centre, scale,
+            float(values.min()) - 0.5 * span, float(values.max()) + 0.5 * span,
+        )  # fmt: skip
+
+    def predict(self, features: FloatArray) -> FloatArray:
+        """Return the (n,) values of (n, d) frames."""
+        return np.array([self.estimate(frame) for frame in features])
+
+    def estimate(self, frame: FloatArray, usable: BoolArray | None = None) -> float:
+        """Return a (d,) frame's value; channels that are not usable are left out."""
+        keep = np.ones(len(self.channels), dtype=np.bool_) if usable is None else usable[self.channels]
+        b, v, x = self.coefficients[:, keep], self.drift[:, keep], frame[self.channels[keep]]
+        inner = np.linalg.inv(np.diag(self.noise**2 / self.drift_variance) + v @ v.T)
+
+        def whitened(rows: FloatArray) -> FloatArray:
+            return np.asarray((rows - (rows @ v.T) @ inner @ v) / self.noise**2)
+
+        gram, projection = whitened(b) @ b.T, whitened(b) @ x
+        grid = np.linspace(self.low, self.high, 401)
+        powers = np.vander((grid - self.centre) / self.scale, len(b), increasing=True)
+        cost = np.einsum("ij,jk,ik->i", powers, gram, powers) - 2 * powers @ projection
+        return _refined(grid, cost)
+
+
+def _refined(grid: FloatArray, cost: FloatArray) -> float:
+    """Return the minimum of a smooth cost on an even grid, by a parabola through the least three."""
+    i = int(np.argmin(cost))
+    if i in (0, len(grid) - 1):
+        return float(grid[i])
+    before, here, after = cost[i - 1 : i + 2]
+    bend = before - 2 * here + after
+    return float(grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (grid[1] - grid[0]))
+
+
+def left_out_blocks(n: int) -> Iterator[tuple[Rows, Rows]]:
+    """Yield pairs of (rest, block) for N_BLOCKS blocks of n rows, each of them one stretch of time."""
+    block = np.arange(n) * N_BLOCKS // n
+    for one in range(N_BLOCKS):
+        yield np.flatnonzero(block != one), np.flatnonzero(block == one)
+
+
+def ranked_channels(frames: FloatArray, values: FloatArray) -> NDArray[np.int64]:
+    """Return the numbers of the (n, d) frames' channels by falling |correlation| with the (n,) values."""
+    spread = frames.std(axis=0)
+    covariance = np.abs((frames - frames.mean(axis=0)).T @ (values - values.mean()))
+    return np.argsort(-covariance / np.where(spread > 0, spread, np.inf), kind="stable")
+
+
+def later_splits(n: int) -> Iterator[tuple[Rows, Rows]]:
+    """Yield pairs of (earlier, later) parts of n rows in time order: fit on the one, judge on the other."""
+    for share in (0.4, 0.6, 0.8):
+        cut, end = round(n * share), round(n * min(share + 0.2, 1.0))
+        if cut >= 2 and end > cut:
+            yield np.arange(cut), np.arange(cut, end)
+
+
+def best_strength(
+    strengths: Sequence[float],
+    error_of: Callable[[float, Rows, Rows], float],
+    splits: Sequence[tuple[Rows, Rows]],
+) -> float:
+    """Return the strength with the least mean squared error on the later parts; of equals, the strongest."""
+    if not splits:
+        raise CalibrationError("the values do not change within the earlier part; begin with the calibration's loads")
+    errors = [float(np.mean([error_of(strength, *split) for split in splits])) for strength in strengths]
+    return max(strength for strength, error in zip(strengths, errors, strict=True) if error <= min(errors) * 1.001)

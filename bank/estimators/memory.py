@@ -1,0 +1,251 @@
+"""What an estimator of raw frames remembers, and nothing more: the idle frame, and the last few seconds.
+
+Two kinds of feature are made from it. `difference` is to the idle frame, for what has no memory. `motion` is how far
+the frame has moved, in a few directions per fingertip, since each of the last frames: the gel creeps under a held
+twist for seconds, so how fast it moves tells of the torque what its place does not, and a slow drift of the baseline
+leaves no trace in it.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from bank.errors import CalibrationError
+from bank.estimators.guard import (
+    LARGEST_JUMPING_SHARE,
+    LARGEST_UNUSABLE_SHARE,
+    STEP_FRAMES,
+    SideGuard,
+    channel_noise,
+    steps,
+)
+from bank.estimators.values import BoolArray, FloatArray, FrameSeries, TactileFrame
+
+# Frames that an idle baseline is averaged over at the most recent end.
+_BASELINE_FRAMES = 10
+# Frames further apart than this many periods of 0.54 s have lost the thread.
+_LARGEST_GAP_S = 1.4
+# A large step is so much more than what twisting under load makes.
+_LARGE_STEP = 1.4
+# Fewer frames than this after a step are not yet the gel let go.
+_LEAST_RELEASED = 10
+# Bridged frames among those remembered: more, and the memory is made up.
+_LARGEST_BRIDGED = 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """A frame that passed: channels (m, 896) with unusable ones filled in, differences to the idle frame, reasons."""
+
+    channels: FloatArray
+    difference: FloatArray
+    why: tuple[str, ...]
+    usable_share: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """The directions (m, p, 896) that each side's motion is measured along, in units of noise, and how far back."""
+
+    directions: FloatArray
+    n_lags: int
+
+    @classmethod
+    def fit(cls, parts: list[FloatArray], guards: tuple[SideGuard, ...], n_directions: int, n_lags: int) -> Self:
+        """Fit to (n, m, 896) gripped frames of each recording: the main directions of motion within the memory."""
+        directions = []
+        for layer, guard in enumerate(guards):
+            moved = np.vstack([(part[n_lags:, layer] - part[:-n_lags, layer]) / guard.noise for part in parts])
+            rows = np.linalg.svd(moved, full_matrices=False)[2][:n_directions] / guard.noise
+            directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
+        return cls(np.array(directions), n_lags)
+
+    def places(self, channels: FloatArray) -> FloatArray:
+        """Return the (…, m·p) places of (…, m, 896) frames along the directions."""
+        found = np.einsum("...mc,mpc->...mp", channels, self.directions)
+        return np.asarray(found.reshape(*found.shape[:-2], -1))
+
+    def step(self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
+        """Return how far all (896,) channels of a side moved, going by the usable ones and the known directions."""
+        shapes = self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2
+        weights = np.where(usable & np.isfinite(noise), 1.0 / noise, 0.0)
+        found = np.linalg.lstsq((shapes * weights).T, moved * weights, rcond=None)[0]
+        return np.asarray(found @ shapes)
+
+    def features(self, places: FloatArray) -> FloatArray:
+        """Return the (n_lags · m·p,) features of the (n_lags + 1, m·p) places of the last frames, the newest last."""
+        return np.asarray((places[-1] - places[-2::-1]).ravel())
+
+
+class Memory:
+    """The state of one session; every frame goes through `see` in order."""
+
+    def __init__(self, guards: tuple[SideGuard, ...], motion: Motion | None) -> None:
+        self._guards = guards
+        self._motion = motion
+        n_lags = motion.n_lags if motion is not None else 0
+        self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
+        self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
+        self._idle: list[deque[FloatArray]] = [deque(maxlen=_BASELINE_FRAMES) for _ in guards]
+        self._baselines: FloatArray | None = None
+        self._before: FloatArray | None = None
+        self._refused: FloatArray | None = None
+        self._t_s = -np.inf
+        self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
+        self._let_go = [False for _ in guards]
+
+    @property
+    def recent(self) -> FloatArray | None:
+        """The (n_lags + 1, m, 896) last frames, the newest last; None while they are not complete."""
+        return np.array(self._recent) if len(self._recent) == self._recent.maxlen else None
+
+    def see(self, frame: TactileFrame) -> Moment:
+        """Take a frame in and return what it looks like with what speaks against it."""
+        if frame.t_s - self._t_s > _LARGEST_GAP_S:
+            self._forget()
+        self._t_s = frame.t_s
+        why: list[str] = []
+        share = float(frame.usable.mean())
+        channels = self._filled(frame)
+        for layer, guard in enumerate(self._guards):
+            usable = frame.usable[layer]
+            unusable = 1.0 - float(usable.mean())
+            if unusable > LARGEST_UNUSABLE_SHARE:
+                why.append(
+                    f"{guard.side} fingertip: {100 * unusable:.0f} % of the channels are dead or saturated; look at "
+                    "the ribbon cable and the gel's contact with the electrodes"
+                )
+            elif reason := guard.foreign(channels[layer], usable):
+                why.append(reason)
+        disturbed = self._disturbed(channels, frame)
+        if why:
+            self._forget()
+            return Moment(channels, np.zeros_like(channels), tuple(why), share)
+        if disturbed:
+            return self._bridge(channels, disturbed, share)
+        if self._before is None:
+            self._before = channels
+            return Moment(channels, np.zeros_like(channels), ("there is no frame before to compare with",), share)
+        self._refused, self._before = None, channels
+        self._learn_baseline(channels)
+        self._notice_release(channels)
+        return self._judged(channels, share)
+
+    def _judged(self, channels: FloatArray, share: float) -> Moment:
+        assert self._baselines is not None  # noqa: S101 - set by _learn_baseline just before
+        loose = [
+            guard.side
+            for layer, guard in enumerate(self._guards)
+            if self._let_go[layer] or guard.grip(channels[layer], self._baselines[layer]) < guard.grip_threshold
+        ]
+        difference = channels - self._baselines
+        if loose:
+            self._recent.clear()
+            self._bridged.clear()
+            return Moment(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), share)
+        self._recent.append(channels)
+        self._bridged.append(False)
+        if self.recent is None:
+            missing = (self._recent.maxlen or 0) - len(self._recent)
+            return Moment(channels, difference, (f"gripped too lately: {missing} more frames are needed",), share)
+        if sum(self._bridged) > _LARGEST_BRIDGED:
+            return Moment(channels, difference, ("too many of the last frames were disturbed",), share)
+        return Moment(channels, difference, (), share)
+
+    def _notice_release(self, channels: FloatArray) -> None:
+        self._passed.append(channels)
+        if self._baselines is None or len(self._passed) <= STEP_FRAMES:
+            return
+        for layer, guard in enumerate(self._guards):
+            released = guard.released(channels[layer], self._passed[0][layer], self._baselines[layer])
+            if released is not None:
+                self._let_go[layer] = released
+
+    def _bridge(self, channels: FloatArray, disturbed: str, share: float) -> Moment:
+        """Leave a disturbed frame out; when the next one agrees with it, the change is real and the past is not."""
+        if self._refused is not None and all(
+            guard.jumping_share(channels[i], self._refused[i], np.isfinite(guard.noise)) <= LARGEST_JUMPING_SHARE
+            for i, guard in enumerate(self._guards)
+        ):
+            self._recent.clear()
+            self._bridged.clear()
+            self._refused, self._before = None, channels
+        else:
+            self._refused = channels
+            if self._recent:
+                self._recent.append(self._recent[-1])
+                self._bridged.append(True)
+        return Moment(channels, np.zeros_like(channels), (disturbed,), share)
+
+    def _disturbed(self, channels: FloatArray, frame: TactileFrame) -> str | None:
+        if self._before is None:
+            return None
+        for layer, guard in enumerate(self._guards):
+            share = guard.jumping_share(channels[layer], self._before[layer], frame.usable[layer])
+            if share > LARGEST_JUMPING_SHARE:
+                return (
+                    f"{guard.side} fingertip: {100 * share:.0f} % of the channels jumped since the frame before; "
+                    "the tool was gripped, released or knocked, or the board is disturbed"
+                )
+        return None
+
+    def _filled(self, frame: TactileFrame) -> FloatArray:
+        """Return the channels with unusable ones moved on from where they were as the usable ones say."""
+        if self._before is None:
+            return np.where(frame.usable, frame.channels, np.array([guard.gripped for guard in self._guards]))
+        assumed = self._before.copy()
+        if self._motion is not None and not frame.usable.all():
+            for layer, guard in enumerate(self._guards):
+                moved = frame.channels[layer] - self._before[layer]
+                assumed[layer] += self._motion.step(layer, moved, frame.usable[layer], guard.noise)
+        return np.where(frame.usable, frame.channels, assumed)
+
+    def _learn_baseline(self, channels: FloatArray) -> None:
+        """Follow the idle frame while nothing is gripped; a session that begins gripped has the calibration's."""
+        first = self._baselines is None
+        if self._baselines is None:
+            self._baselines = np.array(
+                [one if guard.idle_like(one) else guard.idle for one, guard in zip(channels, self._guards, strict=True)]
+            )
+        for layer, guard in enumerate(self._guards):
+            idle = self._idle[layer]
+            begun = first and guard.idle_like(channels[layer])
+            following = bool(idle) and guard.grip(channels[layer], self._baselines[layer]) < 0.3 * guard.grip_threshold
+            if (begun or following) and not self._recent:
+                idle.append(channels[layer])
+                self._baselines[layer] = np.mean(idle, axis=0)
+
+    def _forget(self) -> None:
+        self._recent.clear()
+        self._bridged.clear()
+        self._before = self._refused = None
+        self._passed.clear()
+
+
+def gripped_part(series: FrameSeries) -> tuple[slice, slice, slice]:
+    """Return which frames came before the grip, in it, and after it, going by the torque and the largest steps.
+
+    The grip begins with the last large step of the frames before the first torque, and ends with the first large one
+    after the last torque. Raises CalibrationError for a recording without torque.
+    """
+    torque = np.abs(np.nan_to_num(series.torque_at_frames()))
+    loaded = np.flatnonzero(torque > 0.1 * torque.max()) if torque.max() > 0 else np.zeros(0, dtype=np.int64)
+    if len(loaded) == 0:
+        raise CalibrationError("the recording holds no torque to calibrate on; record the load cell beside the frames")
+    span = slice(int(loaded[0]), int(loaded[-1]) + 1)
+    step = np.zeros(len(series.t_s))
+    for layer in range(len(series.sides)):
+        frames = series.channels[:, layer]
+        step[STEP_FRAMES:] = np.maximum(step[STEP_FRAMES:], steps(frames, channel_noise(frames[span])))
+    large = np.flatnonzero(step > _LARGE_STEP * float(np.quantile(step[span], 0.99)))
+    before, after = large[large < loaded[0]], large[large > loaded[-1]]
+    begin = int(before[-1]) + 1 if len(before) else 0
+    end = int(after[0]) - 1 if len(after) else len(series.t_s)
+    # The transients of closing and opening belong to neither side.
+    idle_end = int(before[0]) - 1 if len(before) else 0
+    released = int(after[-1]) + 1 if len(after) else len(series.t_s)
+    if len(series.t_s) - released < _LEAST_RELEASED:
+        released = len(series.t_s)
+    return slice(0, idle_end), slice(begin, end), slice(released, len(series.t_s))

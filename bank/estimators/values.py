@@ -1,0 +1,146 @@
+"""What estimators are made from and what they give: series of frames, single frames, estimates. No I/O, no clock."""
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.channels import N_CHANNELS
+from bank.errors import CalibrationError
+
+FloatArray: TypeAlias = NDArray[np.float64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+# A raw frame is in volts as the board sends it; a difference is |frame − homogeneous frame|, already smoothed over
+# time by whoever made it, and without the frames around it.
+Kind = Literal["raw", "difference"]
+
+# A load cell that this tells apart from nothing hangs on a lever that bears some N·m: more is a damaged line.
+LARGEST_TORQUE_NM = 20.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameSeries:
+    """Frames in time order with what was known beside them.
+
+    t_s (n,) is the middle of each acquisition in seconds, not its arrival; channels (n, m, 896) in volts, one layer
+    for each of the m sides. torque_nm (p,) was measured at torque_t_s (p,) on the same clock; diameter_mm (n,) is NaN
+    where it is not known. Raises CalibrationError for shapes that do not belong together and for times that fall.
+    """
+
+    kind: Kind
+    sides: tuple[str, ...]
+    t_s: FloatArray
+    channels: FloatArray
+    torque_t_s: FloatArray
+    torque_nm: FloatArray
+    diameter_mm: FloatArray
+
+    def __post_init__(self) -> None:
+        """Refuse what is no series."""
+        n, m = len(self.t_s), len(self.sides)
+        if self.channels.shape != (n, m, N_CHANNELS) or self.diameter_mm.shape != (n,):
+            raise CalibrationError(
+                f"{n} frames of {m} sides need channels of shape {(n, m, N_CHANNELS)} and {n} diameters, not "
+                f"{self.channels.shape} and {self.diameter_mm.shape}"
+            )
+        if self.torque_t_s.shape != self.torque_nm.shape:
+            raise CalibrationError(f"{self.torque_t_s.shape} times do not go with {self.torque_nm.shape} torques")
+        for name, times in (("frames", self.t_s), ("torques", self.torque_t_s)):
+            if (np.diff(times) < 0).any():
+                raise CalibrationError(f"the times of the {name} must not fall; sort them")
+
+    def torque_at_frames(self) -> FloatArray:
+        """Return the (n,) torque in N·m at the middle of each frame, NaN outside of what was measured."""
+        if len(self.torque_t_s) == 0:
+            return np.full(len(self.t_s), np.nan)
+        return np.interp(self.t_s, self.torque_t_s, self.torque_nm, left=np.nan, right=np.nan)
+
+    def of_sides(self, sides: tuple[str, ...]) -> "FrameSeries":
+        """Return the same series with these sides only; raises CalibrationError for a side that it does not have."""
+        missing = [side for side in sides if side not in self.sides]
+        if missing:
+            raise CalibrationError(
+                f"the recording has the sides {', '.join(self.sides)}, and not {' and '.join(missing)}; "
+                "calibrate on the sides that are there"
+            )
+        layers = [self.sides.index(side) for side in sides]
+        return FrameSeries(
+            self.kind, sides, self.t_s, self.channels[:, layers], self.torque_t_s, self.torque_nm, self.diameter_mm
+        )
+
+    def between(self, start: int, stop: int) -> "FrameSeries":
+        """Return frames `start` to `stop` with all of the torques."""
+        return FrameSeries(
+            self.kind,
+            self.sides,
+            self.t_s[start:stop],
+            self.channels[start:stop],
+            self.torque_t_s,
+            self.torque_nm,
+            self.diameter_mm[start:stop],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TactileFrame:
+    """One moment: t_s in seconds (the middle of the acquisition), channels (m, 896) in volts of the m sides.
+
+    usable (m, 896) is False at channels that are dead or saturated.
+    """
+
+    t_s: float
+    channels: FloatArray
+    usable: BoolArray
+
+    @classmethod
+    def of(cls, t_s: float, channels: FloatArray, usable: BoolArray | None = None) -> "TactileFrame":
+        """Return a frame; channels that are not finite are never usable."""
+        finite = np.isfinite(channels)
+        return cls(t_s, np.where(finite, channels, 0.0), finite if usable is None else finite & usable)
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What one frame says: values with 95 % intervals, None where not known; `why` speaks against them.
+
+    An estimate that is not valid has no torque and no diameter. score and runner_up are the bank's, k and sigma in
+    the bank's units.
+    """
+
+    valid: bool
+    why: tuple[str, ...] = ()
+    torque_nm: float | None = None
+    torque_low_nm: float | None = None
+    torque_high_nm: float | None = None
+    diameter_mm: float | None = None
+    diameter_low_mm: float | None = None
+    diameter_high_mm: float | None = None
+    k: float | None = None
+    sigma: float | None = None
+    score: float | None = None
+    runner_up: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A value and the half width of its 95 % interval."""
+
+    value: float
+    half_width: float
+
+
+def fused(*measured: Measured | None) -> Measured | None:
+    """Return the mean of independent measurements of one thing, weighted by their variances; None without any.
+
+    Used for the diameter, which the fingertips and the gripper's width both give. The half widths are taken as the
+    same multiple of the standard deviations.
+    """
+    present = [one for one in measured if one is not None]
+    if not present:
+        return None
+    if any(one.half_width <= 0 for one in present):
+        raise ValueError("a measurement with no uncertainty cannot be weighed against others")
+    weights = np.array([one.half_width**-2 for one in present])
+    value = float(weights @ [one.value for one in present] / weights.sum())
+    return Measured(value, float(weights.sum() ** -0.5))

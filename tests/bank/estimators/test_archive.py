@@ -1,0 +1,74 @@
+import zipfile
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bank.errors import BankError, CalibrationError
+from bank.estimators import Calibration, TactileFrame, Tracker
+from bank.estimators.archive import write_archive
+
+
+@pytest.fixture(scope="module")
+def saved(fused_calibration, tmp_path_factory):
+    path = tmp_path_factory.mktemp("calibration") / "fused.cal"
+    fused_calibration.save(path)
+    return path
+
+
+def test_the_same_calibration_is_the_same_bytes(saved, tmp_path):
+    again = tmp_path / "again.cal"
+    Calibration.load(saved).save(again)
+    assert again.read_bytes() == saved.read_bytes()
+
+
+def test_a_loaded_calibration_estimates_alike(fused_calibration, saved, recorded):
+    trackers = [Tracker(fused_calibration), Tracker(Calibration.load(saved))]
+    for t, x in zip(recorded.t_s[:120], recorded.channels, strict=False):
+        one, other = (tracker.estimate(TactileFrame.of(float(t), x)) for tracker in trackers)
+        assert one == other
+
+
+@settings(max_examples=40, deadline=None)
+@given(where=st.floats(0, 1), length=st.integers(1, 40), cut=st.booleans())
+def test_damage_is_refused_by_name_or_does_no_harm(saved, tmp_path_factory, where, length, cut):
+    content = saved.read_bytes()
+    at = int(where * (len(content) - 1))
+    spoilt = bytes(255 - byte for byte in content[at : at + length])
+    path = tmp_path_factory.mktemp("damaged") / "x.cal"
+    path.write_bytes(content[:at] if cut else content[:at] + spoilt + content[at + length :])
+    try:
+        loaded = Calibration.load(path)
+    except BankError as error:
+        told = str(error)
+    else:
+        # Bytes that nothing reads, such as a date in the directory of the zip.
+        loaded.save(path)
+        assert path.read_bytes() == content
+        return
+    assert str(path) in told
+
+
+def test_foreign_and_stale_files_are_refused(tmp_path, fused_calibration):
+    foreign = tmp_path / "foreign.cal"
+    with zipfile.ZipFile(foreign, "w") as archive:
+        archive.writestr("notes.txt", "hello")
+    with pytest.raises(CalibrationError, match="no header"):
+        Calibration.load(foreign)
+    (tmp_path / "text.cal").write_text("not a zip")
+    with pytest.raises(CalibrationError, match="not a calibration, or it is truncated"):
+        Calibration.load(tmp_path / "text.cal")
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        Calibration.load(tmp_path / "none.cal")
+    stale = tmp_path / "stale.cal"
+    write_archive(stale, {"channel_table": "0" * 64}, fused_calibration)
+    with pytest.raises(CalibrationError, match="channel table 000000000000…, expected"):
+        Calibration.load(stale)
+
+
+def test_what_cannot_be_kept_is_an_error(tmp_path):
+    with pytest.raises(TypeError, match="cannot be kept"):
+        write_archive(tmp_path / "x.cal", {}, {"a": 1})
+    with pytest.raises(CalibrationError, match="choose another --out"):
+        write_archive(tmp_path / "none" / "x.cal", {}, np.zeros(1))

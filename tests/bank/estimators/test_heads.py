@@ -1,0 +1,117 @@
+import numpy as np
+import pytest
+from scipy.stats import truncnorm
+
+from bank.errors import CalibrationError
+from bank.estimators.heads import Censored, Curve, Ridge, _below_zero, best_strength, later_splits, left_out_blocks
+
+
+def test_a_ridge_without_strength_is_least_squares():
+    rng = np.random.default_rng(0)
+    x, weights = rng.normal(size=(60, 5)), np.arange(5.0)
+    y = 2 + x @ weights + 0.01 * rng.normal(size=60)
+    ridge = Ridge.fit(x, y, 1e-12)
+    expected = np.linalg.lstsq(np.column_stack([np.ones(60), x]), y, rcond=None)[0]
+    np.testing.assert_allclose(ridge.weights, expected[1:], rtol=1e-7)
+    np.testing.assert_allclose(ridge.predict(np.zeros((1, 5))), expected[:1], rtol=1e-7)
+
+
+def test_a_scaled_ridge_does_not_care_for_units():
+    rng = np.random.default_rng(1)
+    x, y = rng.normal(size=(40, 3)), rng.normal(size=40)
+    units = np.array([1.0, 1e3, 1e-4])
+    metric = Ridge.fit_scaled(x, y, 0.1).predict(x)
+    np.testing.assert_allclose(Ridge.fit_scaled(x * units, y, 0.1).predict(x * units), metric, rtol=1e-9)
+
+
+def test_what_a_free_lever_hides_is_not_taken_for_zero():
+    """y = max(0, z): least squares through the zeros finds half the slope, the censored fit all of it."""
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(800, 2))
+    latent = x @ [0.05, 0.02] - 0.03
+    y = np.maximum(latent + 0.002 * rng.normal(size=800), 0.0)
+    censored = Censored.fit(x, y, 1e-9)
+    np.testing.assert_allclose(censored.weights, [0.05, 0.02], rtol=0.05)
+    assert censored.offset - censored.weights @ censored.mean == pytest.approx(-0.03, rel=0.05)
+    assert Ridge.fit(x, y, 1e-9).weights[0] < 0.03
+
+
+def test_a_lever_may_be_pushed_either_way():
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(300, 1))
+    y = -np.maximum(0.05 * x[:, 0], 0.0)
+    pushed = Censored.fit(x, y, 1e-9)
+    assert pushed.sign == -1.0
+    assert pushed.sign * pushed.predict(np.array([[1.0]]))[0] == pytest.approx(-0.05, rel=0.1)
+
+
+@pytest.mark.parametrize(("mean", "sigma"), [(-0.5, 1.0), (0.0, 0.2), (0.7, 0.3), (3.0, 0.5)])
+def test_the_moments_of_a_gaussian_below_zero(mean, sigma):
+    found = _below_zero(np.array([mean]), sigma)
+    expected = truncnorm.stats(-np.inf, -mean / sigma, loc=mean, scale=sigma, moments="mv")
+    np.testing.assert_allclose(np.ravel(found), expected, rtol=1e-6)
+
+
+def frames_on_a_curve(values, rng, noise=0.05, drift=1.0):
+    shapes = np.random.default_rng(9).normal(size=(4, 200))
+    z = np.asarray(values)[:, None]
+    return (
+        shapes[0]
+        + z * shapes[1]
+        + 0.2 * z**2 * shapes[2]
+        + drift * rng.normal(size=z.shape) * shapes[3]
+        + noise * (rng.normal(size=(len(z), 200)))
+    )
+
+
+def test_a_curve_finds_the_value_through_drift_ten_times_the_noise():
+    rng = np.random.default_rng(4)
+    values = rng.uniform(-1, 2, 60)
+    curve = Curve.fit(frames_on_a_curve(values, rng), values, 2, 1)
+    later = rng.uniform(-1, 2, 40)
+    errors = curve.predict(frames_on_a_curve(later, rng)) - later
+    assert np.sqrt((errors**2).mean()) < 0.03
+
+
+def test_a_curve_does_not_pull_towards_the_mean():
+    """With few frames of many noisy channels a ridge shrinks what it predicts; a curve does not."""
+    rng = np.random.default_rng(5)
+    values = rng.uniform(-1, 2, 25)
+    noisy = frames_on_a_curve(values, rng, noise=1.5, drift=0.1)
+    later = np.linspace(-1, 2, 60)
+    future = frames_on_a_curve(later, rng, noise=1.5, drift=0.1)
+
+    def slope(predicted):
+        return np.polyfit(later, predicted, 1)[0]
+
+    assert slope(Ridge.fit(noisy, values, 0.1).predict(future)) < 0.8
+    assert 0.85 < slope(Curve.fit(noisy, values, 1, 0).predict(future)) < 1.15
+
+
+def test_a_curve_works_on_with_the_channels_that_are_left():
+    rng = np.random.default_rng(6)
+    values = rng.uniform(-1, 2, 60)
+    curve = Curve.fit(frames_on_a_curve(values, rng), values, 2, 1)
+    frame = frames_on_a_curve([1.3], rng)[0]
+    usable = rng.random(200) > 0.4
+    frame[~usable] = 1e3
+    assert curve.estimate(frame, usable) == pytest.approx(1.3, abs=0.05)
+
+
+def test_a_curve_needs_enough_frames():
+    rng = np.random.default_rng(7)
+    with pytest.raises(CalibrationError, match="4 frames at 2 distinct values do not determine"):
+        Curve.fit(rng.normal(size=(4, 9)), np.array([1.0, 1.0, 2.0, 2.0]), 2, 1)
+
+
+@pytest.mark.parametrize("n", [8, 13, 49, 500])
+def test_what_is_judged_comes_later_or_is_left_out(n):
+    for past, future in later_splits(n):
+        assert past.max() < future.min()
+    blocks = [block for _, block in left_out_blocks(n)]
+    np.testing.assert_array_equal(np.concatenate(blocks), np.arange(n))
+    assert all(not set(rest) & set(block) for rest, block in left_out_blocks(n))
+
+
+def test_of_equal_strengths_the_strongest():
+    assert best_strength((0.1, 1.0, 10.0), lambda s, *_: 5.0 if s == 10.0 else 1.0, list(later_splits(20))) == 1.0

@@ -1,0 +1,94 @@
+"""Slices: frames by themselves, with a torque or a diameter each."""
+
+import numpy as np
+import pytest
+
+from bank.errors import CalibrationError
+from bank.estimators import FrameSeries, TactileFrame, Tracker, fit
+
+
+def follow(calibration, series, usable=None):
+    tracker = Tracker(calibration)
+    return [
+        tracker.estimate(TactileFrame.of(float(t), x, usable)) for t, x in zip(series.t_s, series.channels, strict=True)
+    ]
+
+
+def errors(estimates, series):
+    return np.array([one.torque_nm - y for one, y in zip(estimates, series.torque_at_frames(), strict=True)])
+
+
+@pytest.mark.parametrize("name", ["fused", "regression"])
+def test_later_slices_are_read_through_the_drift(sliced, name):
+    whole = sliced()
+    later = whole.between(30, 50)
+    estimates = follow(fit(name, [whole.between(0, 30)], "earlier"), later)
+    assert np.sqrt((errors(estimates, later) ** 2).mean()) < 0.008
+    inside = [
+        one.torque_low_nm <= y <= one.torque_high_nm for one, y in zip(estimates, later.torque_at_frames(), strict=True)
+    ]
+    assert np.mean(inside) >= 0.85
+
+
+def test_what_is_not_familiar_is_not_valid(sliced):
+    calibration = fit("fused", [sliced()], "all")
+    later = sliced(seed=3)
+    assert np.mean([one.valid for one in follow(calibration, later)]) > 0.95
+    rng = np.random.default_rng(0)
+    noisy = later.channels.copy()
+    for frame in noisy[:, 0]:
+        frame[rng.choice(896, 224, replace=False)] = np.abs(rng.normal(0, 0.02, 224))
+    idle = np.abs(rng.normal(0, 0.0008, later.channels.shape))
+    foreign = later.channels[..., ::-1]
+    for frames, why in ((noisy, "outside of the calibration"), (idle, "no grip"), (foreign, "outside of the")):
+        strange = FrameSeries(
+            later.kind, later.sides, later.t_s, frames, later.torque_t_s, later.torque_nm, later.diameter_mm
+        )
+        estimates = follow(calibration, strange)
+        assert not any(one.valid for one in estimates)
+        assert all(why in one.why[0] and one.torque_nm is None for one in estimates)
+
+
+def test_dead_channels_are_filled_in(sliced):
+    whole, later = sliced(), sliced(seed=4)
+    calibration = fit("fused", [whole], "all")
+    usable = np.random.default_rng(1).random((1, 896)) > 0.1
+    estimates = follow(calibration, later, usable)
+    assert np.sqrt((errors(estimates, later) ** 2).mean()) < 0.012
+
+
+def test_cylinders_give_a_diameter_and_no_torque(sliced):
+    torque = sliced()
+    rng = np.random.default_rng(2)
+    shape = np.abs(np.random.default_rng(55).normal(0, 4e-3, (2, 896)))
+    diameter = np.tile([10.0, 20.0, 30.0, 40.0], 4)
+    frames = shape[0] + (diameter / 25 - 1)[:, None] * 0.5 * shape[1] + rng.normal(0, 3e-4, (16, 896))
+    t = np.arange(16.0)
+    cylinders = FrameSeries("difference", ("right",), t, np.abs(frames)[:, None], t, np.full(16, 0.1), diameter)
+    calibration = fit("fused", [torque, cylinders.between(0, 12)], "both")
+    for one, truth in zip(follow(calibration, cylinders.between(12, 16)), diameter[12:], strict=True):
+        assert one.valid
+        assert one.diameter_mm == pytest.approx(truth, abs=4)
+        assert one.torque_nm is None
+    assert all(one.diameter_mm is None for one in follow(calibration, torque))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("paper", {}, "needs a bank"),
+        ("reconstruction", {}, "needs a mesh"),
+        ("fused", {"torque_nm": np.full(50, 0.1)}, "determine no calibration"),
+        ("fused", {"torque_nm": np.full(50, np.nan)}, "neither torque nor diameter"),
+    ],
+)
+def test_what_cannot_be_calibrated_says_why(sliced, name, change, message):
+    whole = sliced()
+    content = {key: getattr(whole, key) for key in FrameSeries.__slots__} | change
+    with pytest.raises(CalibrationError, match=message):
+        fit(name, [FrameSeries(**content)], "x")
+
+
+def test_raw_frames_and_slices_do_not_mix(sliced, recorded):
+    with pytest.raises(CalibrationError, match="do not go into one calibration"):
+        fit("fused", [sliced(), recorded], "x")

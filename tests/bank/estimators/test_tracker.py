@@ -1,0 +1,161 @@
+"""The default estimator on a rig that is played by formulas, fitted to one recording and tried on another."""
+
+import numpy as np
+import pytest
+
+from bank.errors import CalibrationError
+from bank.estimators import Estimate, FrameSeries, TactileFrame, Tracker, fit
+
+
+def changed(series, **content):
+    return FrameSeries(**{key: getattr(series, key) for key in FrameSeries.__slots__} | content)
+
+
+def follow(calibration, series, usable=None) -> list[Estimate]:
+    tracker = Tracker(calibration)
+    return [
+        tracker.estimate(TactileFrame.of(float(t), x, usable)) for t, x in zip(series.t_s, series.channels, strict=True)
+    ]
+
+
+def judged(estimates, series):
+    truth = series.torque_at_frames()
+    rows = [
+        (one.torque_nm, y, one.torque_low_nm <= y <= one.torque_high_nm)
+        for one, y in zip(estimates, truth, strict=True)
+        if one.valid and np.isfinite(y)
+    ]
+    value, y, inside = np.array(rows).T
+    return np.corrcoef(value, y)[0, 1], np.sqrt(((value - y) ** 2).mean()), inside.mean()
+
+
+def test_another_recording_is_read_with_honest_intervals(fused_calibration, twisting):
+    other = twisting(seed=5, peak_nm=0.07)
+    r, rmse, coverage = judged(follow(fused_calibration, other), other)
+    assert r > 0.97
+    assert rmse < 0.004
+    assert 0.90 < coverage <= 1.0
+
+
+def test_a_slow_drift_of_the_baseline_changes_little(fused_calibration, twisting):
+    other = twisting(seed=6)
+    drifting = other.channels * (1 + 0.03 * np.linspace(0, 1, len(other.t_s)))[:, None, None]
+    shifted = changed(other, channels=drifting)
+    assert (
+        judged(follow(fused_calibration, shifted), shifted)[1]
+        < 1.5 * judged(follow(fused_calibration, other), other)[1] + 0.001
+    )
+
+
+def test_no_idle_frame_is_valid(fused_calibration, twisting):
+    other = twisting(seed=7)
+    idle = (other.t_s < 19) | (other.t_s > other.t_s[-1] - 18)
+    estimates = follow(fused_calibration, other)
+    assert not any(one.valid for one, free in zip(estimates, idle, strict=True) if free)
+    assert any(one.valid for one in estimates)
+    assert estimates[0].why == ("there is no frame before to compare with",)
+    assert all("no grip" in one.why[0] for one in estimates[1:10])
+
+
+@pytest.mark.parametrize("amplitude_v", [0.02, 0.1, 0.5])
+def test_frames_with_a_quarter_of_noise_are_not_valid_and_the_others_are(fused_calibration, twisting, amplitude_v):
+    rng = np.random.default_rng(8)
+    other = twisting(seed=8)
+    channels, noisy = other.channels.copy(), np.zeros(len(other.t_s), dtype=bool)
+    noisy[60::25] = True
+    for i in np.flatnonzero(noisy):
+        for layer in channels[i]:
+            layer[rng.choice(896, 224, replace=False)] = np.abs(rng.normal(0, amplitude_v, 224))
+    spoiled = changed(other, channels=channels)
+    estimates = follow(fused_calibration, spoiled)
+    assert not any(one.valid for one, spoilt in zip(estimates, noisy, strict=True) if spoilt)
+    r, rmse, _ = judged(estimates, spoiled)
+    assert r > 0.95
+    assert rmse < 0.005
+
+
+def test_another_fingertip_is_told_by_its_pattern(fused_calibration, twisting):
+    for tips in ((2, 1), (1, 3), (4, 5)):
+        estimates = follow(fused_calibration, twisting(seed=9, tips=tips))
+        assert not any(one.valid for one in estimates)
+        assert "another fingertip" in " ".join(estimates[80].why)
+
+
+def test_dead_channels_are_done_without_and_widen_the_interval(fused_calibration, twisting):
+    other = twisting(seed=10)
+    usable = np.random.default_rng(0).random((2, 896)) > 0.2
+    damaged = changed(other, channels=np.where(usable, other.channels, 0.0))
+    whole, less = follow(fused_calibration, other), follow(fused_calibration, damaged, usable)
+    assert judged(less, damaged)[1] < 1.5 * judged(whole, other)[1]
+    pairs = [(a, b) for a, b in zip(whole, less, strict=True) if a.valid and b.valid and a.torque_nm == 0.0]
+    widths = [(a.torque_high_nm - a.torque_low_nm, b.torque_high_nm - b.torque_low_nm) for a, b in pairs]
+    assert widths
+    assert all(b > a for a, b in widths)
+
+
+def test_too_many_dead_channels_end_it(fused_calibration, twisting):
+    usable = np.random.default_rng(0).random((2, 896)) > 0.4
+    estimates = follow(fused_calibration, twisting(seed=11), usable)
+    assert not any(one.valid for one in estimates)
+    assert "dead or saturated" in estimates[100].why[0]
+
+
+def test_the_future_changes_nothing(fused_calibration, twisting):
+    other = twisting(seed=12)
+    assert follow(fused_calibration, other.between(0, 150)) == follow(fused_calibration, other)[:150]
+
+
+def test_after_a_gap_the_memory_is_filled_anew(fused_calibration, twisting):
+    other = twisting(seed=13)
+    times = other.t_s + np.where(np.arange(len(other.t_s)) >= 150, 3.0, 0.0)
+    torn = changed(other, t_s=times)
+    estimates = follow(fused_calibration, torn)
+    assert estimates[149].valid
+    assert all("more frames are needed" in one.why[0] for one in estimates[151:162])
+    assert not estimates[150].valid
+    assert estimates[166].valid
+
+
+def test_one_fingertip_does_too_and_two_do_better(twisting):
+    other = twisting(seed=14, noise_v=0.003)
+    errors = {}
+    for sides in (("right",), ("right", "left")):
+        calibration = fit("fused", [twisting(seed=1, noise_v=0.003).of_sides(sides)], "one")
+        estimates = follow(calibration, other.of_sides(sides))
+        errors[sides] = judged(estimates, other.of_sides(sides))[1]
+    assert errors["right", "left"] < errors["right",]
+
+
+def test_squeezing_alone_is_no_torque(fused_calibration, twisting):
+    """A grip that tightens and loosens by a third without twisting does not read as torque."""
+    other = twisting(seed=15)
+    still = twisting(seed=15, peak_nm=0.06)
+    gripped = (other.t_s > 25) & (other.t_s < 135)
+    reference = still.channels[50]
+    squeeze = 1 + 0.15 * np.sin(2 * np.pi * other.t_s / 20.0)
+    idle = still.channels[5]
+    frames = np.where(
+        gripped[:, None, None], idle + squeeze[:, None, None] * (reference - idle), still.channels
+    ) + np.random.default_rng(3).normal(0, 0.001, still.channels.shape)
+    squeezed = changed(other, channels=frames)
+    torques = [
+        one.torque_nm
+        for one, held in zip(follow(fused_calibration, squeezed), gripped, strict=True)
+        if one.valid and held
+    ]
+    assert len(torques) > 100
+    assert np.quantile(np.abs(torques), 0.9) < 0.02
+
+
+def test_a_frame_of_other_sides_is_refused(fused_calibration):
+    with pytest.raises(CalibrationError, match=r"of 2 sides \(right, left\)"):
+        Tracker(fused_calibration).estimate(TactileFrame.of(0.0, np.zeros((1, 896))))
+
+
+def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(fused_calibration, twisting):
+    """What the first frame says is believed only when the next one says the same."""
+    other = twisting(seed=16).between(60, 200)
+    channels = other.channels.copy()
+    channels[0, :, ::4] = 0.01
+    estimates = follow(fused_calibration, changed(other, channels=channels))
+    assert all(one.valid for one in estimates[20:])

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bank.errors import CalibrationError
+from bank.estimators import FrameSeries, Measured, TactileFrame, fused
+
+measurements = st.builds(Measured, st.floats(-1e3, 1e3, allow_nan=False), st.floats(1e-3, 1e3, allow_nan=False))
+
+
+@given(st.lists(measurements, min_size=1, max_size=4))
+def test_fused_measurements_lie_between_and_are_surer_than_each(several):
+    both = fused(*several, None)
+    assert both is not None
+    assert min(m.value for m in several) - 1e-6 <= both.value <= max(m.value for m in several) + 1e-6
+    assert both.half_width <= min(m.half_width for m in several) * (1 + 1e-12)
+
+
+def test_nothing_measured_is_nothing():
+    assert fused(None, None) is None
+    with pytest.raises(ValueError, match="no uncertainty"):
+        fused(Measured(1.0, 0.0), Measured(1.0, 1.0))
+
+
+def empty(n=3, **changed):
+    content = {
+        "kind": "raw", "sides": ("right",), "t_s": np.arange(float(n)), "channels": np.zeros((n, 1, 896)),
+        "torque_t_s": np.array([0.5, 1.5]), "torque_nm": np.array([0.0, 1.0]), "diameter_mm": np.full(n, np.nan),
+    }  # fmt: skip
+    return FrameSeries(**content | changed)
+
+
+def test_torque_at_frames_is_interpolated_and_never_extrapolated():
+    np.testing.assert_array_equal(empty().torque_at_frames(), [np.nan, 0.5, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"channels": np.zeros((3, 2, 896))}, "need channels of shape"),
+        ({"torque_nm": np.zeros(3)}, "do not go with"),
+        ({"t_s": np.array([0.0, 2.0, 1.0])}, "must not fall"),
+    ],
+)
+def test_what_does_not_belong_together_is_refused(changed, message):
+    with pytest.raises(CalibrationError, match=message):
+        empty(**changed)
+
+
+def test_a_missing_side_is_named():
+    with pytest.raises(CalibrationError, match="not left"):
+        empty().of_sides(("left",))
+
+
+def test_values_that_are_not_finite_are_not_usable():
+    channels = np.zeros((1, 896))
+    channels[0, 5] = np.nan
+    frame = TactileFrame.of(0.0, channels)
+    assert not frame.usable[0, 5]
+    assert frame.usable.sum() == 895
+    assert np.isfinite(frame.channels).all()

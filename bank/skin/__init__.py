@@ -1,0 +1,1 @@
+"""The resistive shear skin: measurement model, membrane, two-dimensional reference, calibration and statistics."""

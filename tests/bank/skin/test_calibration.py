@@ -1,0 +1,233 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from bank.errors import CalibrationError
+from bank.skin.calibration import CalibrationTable, SkinCalibration
+from bank.skin.calibration_file import load_calibration, read_table, save_calibration
+from bank.skin.calibration_fit import fit_calibration
+from bank.skin.membrane import UNSTRETCHED, Direction, Membrane, paper_membrane
+from bank.skin.synthetic import loading, loop
+
+MEMBRANE = paper_membrane()
+R1, R2 = 24.6, 25.3
+
+
+def upturn(tension_n: float) -> float:
+    """A response that is straight to 1.2 N and rises faster beyond, as the paper's does."""
+    beyond = max(abs(tension_n) - 1.2, 0.0)
+    return float(np.sign(tension_n) * 0.088 * (abs(tension_n) + 0.15 * beyond**2))
+
+
+def true_response(membrane: Membrane, path: list[float], normal_n: float) -> list[float]:
+    state, found = UNSTRETCHED, []
+    for shear_n in path:
+        state = membrane.step(state, shear_n, normal_n)
+        found.append(upturn(state.gauge_tension_1_n - state.gauge_tension_2_n))
+    return found
+
+
+def record(
+    paths: list[tuple[float, NDArray[np.float64]]],
+    noise: float = 0.0,
+    membrane: Membrane = MEMBRANE,
+    drift_ohm: float = 0.0,
+) -> CalibrationTable:
+    """Play a skin whose gauges differ and drift between loadings; each loading begins with two rows at rest."""
+    rng, rows = np.random.default_rng(4), []
+    for number, (normal_n, path) in enumerate(paths):
+        r1, r2 = R1 + number * drift_ohm, R2 - number * drift_ohm
+        rows += [(r1, r2, 0.0, 0.0)] * 2
+        for shear_n, response in zip(path, true_response(membrane, path.tolist(), normal_n), strict=True):
+            seen = response + rng.normal(0, noise)
+            stretched = (r1 * (1 + max(seen, 0.0)), r2 * (1 + max(-seen, 0.0)))
+            rows.append((*stretched, float(shear_n), normal_n))
+    return CalibrationTable(*np.array(rows).T)
+
+
+FULL = [(normal_n, loop(5.0)) for normal_n in (0.5, 1.0, 2.0)]
+
+
+@pytest.fixture(scope="module")
+def calibration() -> SkinCalibration:
+    return fit_calibration(record(FULL, noise=2e-4, drift_ohm=0.2))
+
+
+def test_friction_slope_and_scatter_are_found(calibration: SkinCalibration) -> None:
+    assert calibration.friction == pytest.approx(0.04, abs=0.002)
+    assert calibration.slope_per_n == pytest.approx(0.088, rel=0.01)
+    # 1.96 · 2e-4 and what straight pieces leave of a parabola.
+    assert 3.9e-4 < calibration.response_half_width < 5e-3
+    assert calibration.rows == sum(len(path) for _, path in FULL)
+    assert calibration.rows_beyond == 0
+
+
+def test_below_1_2_newton_it_is_one_straight_line_and_beyond_it_rises_to_5(calibration: SkinCalibration) -> None:
+    tension, response = np.array(calibration.tension_n), np.array(calibration.response)
+    assert 1.2 in tension
+    assert -1.2 in tension
+    assert not ((abs(tension) < 1.2).any())
+    slopes = np.diff(response) / np.diff(tension)
+    middle = int(np.flatnonzero(tension == -1.2)[0])
+    assert (slopes > 0).all()
+    assert (np.diff(slopes[middle:]) > 0).all(), "the upturn"
+    assert len(tension) == 2 * 7
+    for shear_n in (0.3, 1.0, 2.5, 4.6):
+        for sign in (1, -1):
+            path = (sign * np.linspace(0, shear_n, 20)).tolist()
+            found = calibration.shear_from_response(true_response(MEMBRANE, path, 1.0)[-1], 1.0, Direction.LOADING)
+            assert found.shear_n == pytest.approx(sign * shear_n, abs=0.01 if shear_n < 1.2 else 0.05)
+            assert found.low_n < sign * shear_n < found.high_n
+
+
+@given(st.lists(st.floats(-4, 4), min_size=1, max_size=8), st.floats(0, 2))
+def test_without_direction_the_interval_is_wider_and_holds_the_force(path: list[float], normal_n: float) -> None:
+    exact = exact_calibration()
+    tension = replace(MEMBRANE, axial_stiffness_n=1.0, gauge_factor=1.0)
+    state = UNSTRETCHED
+    for shear_n in path:
+        state = tension.step(state, shear_n, normal_n)
+        response = float(np.interp(tension.response(state), exact.tension_n, exact.response))
+        unknown = exact.shear_from_response(response, normal_n)
+        assert unknown.low_n <= shear_n <= unknown.high_n
+        for direction in (Direction.LOADING, Direction.UNLOADING):
+            known = exact.shear_from_response(response, normal_n, direction)
+            assert unknown.low_n <= known.low_n <= known.high_n <= unknown.high_n
+
+
+def exact_calibration() -> SkinCalibration:
+    knots = (-5.0, -1.2, 1.2, 5.0)
+    angle = float(np.degrees(MEMBRANE.gauge_angle_rad))
+    return SkinCalibration(0.04, angle, 1.2, knots, tuple(map(upturn, knots)), 1e-4, 100, 0, (R1, R2))
+
+
+def test_the_deadband_is_taken_out_only_where_the_direction_is_known(calibration: SkinCalibration) -> None:
+    response = true_response(MEMBRANE, [0.2, 0.5], 2.0)[-1]
+    loading_n = calibration.shear_from_response(response, 2.0, Direction.LOADING)
+    unknown = calibration.shear_from_response(response, 2.0)
+    assert loading_n.shear_n == pytest.approx(0.5, abs=0.01)
+    assert loading_n.high_n - loading_n.low_n < 0.15
+    assert unknown.high_n - unknown.low_n > loading_n.high_n - loading_n.low_n + 1.9 * 0.08
+    assert calibration.shear_from_response(0.0, 2.0, Direction.LOADING).in_deadband
+
+
+def test_beyond_the_curve_the_interval_has_no_end(calibration: SkinCalibration) -> None:
+    beyond = calibration.response[-1] * 1.1
+    assert calibration.shear_from_response(beyond, 1.0).high_n == np.inf
+    assert calibration.shear_from_response(-beyond, 1.0).low_n == -np.inf
+    assert np.isfinite(calibration.shear_from_response(beyond, 1.0).low_n)
+
+
+@pytest.mark.parametrize("direction", list(Direction))
+def test_the_interval_of_a_new_recording_holds_95_percent(calibration: SkinCalibration, direction: Direction) -> None:
+    rng, held, tried = np.random.default_rng(9), 0, 0
+    for _ in range(300):
+        shear_n, normal_n = rng.uniform(0.1, 1.2), rng.uniform(0.2, 2.0)
+        path = [2.5, shear_n] if direction is Direction.UNLOADING else [shear_n]
+        seen = true_response(MEMBRANE, path, normal_n)[-1] + rng.normal(0, 2e-4)
+        found = calibration.shear_from_response(seen, normal_n, direction)
+        held += found.low_n <= shear_n <= found.high_n
+        tried += 1
+    assert held / tried > 0.93
+
+
+def test_a_light_loading_needs_no_curve_and_drops_no_row_silently() -> None:
+    path = np.concatenate([loop(1.1), loading(1.5)])
+    found = fit_calibration(record([(1.0, path), (2.0, path)], noise=1e-4))
+    assert len(found.tension_n) == 2
+    assert found.rows_beyond == 5, "tension beyond 1.2 N: from 1.3 N of shear under 1 N, from 1.4 N under 2 N"
+    assert found.friction == pytest.approx(0.04, abs=0.003)
+
+
+def test_a_table_without_friction_in_it_is_refused_unless_friction_is_given() -> None:
+    light = record([(0.0, loading(1.0)), (0.0, -loading(1.0))], noise=1e-4)
+    with pytest.raises(CalibrationError, match="--friction"):
+        fit_calibration(light)
+    given_friction = fit_calibration(light, friction=0.04)
+    assert given_friction.slope_per_n == pytest.approx(0.088, rel=0.01)
+
+
+def test_swapped_gauges_few_rows_and_no_rest_are_refused_with_their_cure() -> None:
+    table = record(FULL)
+    with pytest.raises(CalibrationError, match="R1 is the gauge stretched by a positive shear force"):
+        fit_calibration(CalibrationTable(table.r2_ohm, table.r1_ohm, table.shear_n, table.normal_n), friction=0.04)
+    with pytest.raises(CalibrationError, match="record more"):
+        fit_calibration(record([(1.0, loading(0.3))]), friction=0.04)
+    with pytest.raises(CalibrationError, match="begin with a row without load"):
+        fit_calibration(CalibrationTable(*(column[2:] for column in columns(table))))
+
+
+def columns(table: CalibrationTable) -> list[NDArray[np.float64]]:
+    return [table.r1_ohm, table.r2_ohm, table.shear_n, table.normal_n]
+
+
+def test_a_calibration_comes_back_from_its_file(calibration: SkinCalibration, tmp_path: Path) -> None:
+    path = tmp_path / "skin.yaml"
+    save_calibration(calibration, path)
+    assert load_calibration(path) == calibration
+    assert [p.name for p in tmp_path.iterdir()] == ["skin.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "named"),
+    [
+        ("friction: 0.04", "friction: four", "friction"),
+        ("friction: 0.04", "friction: 4.0", "friction"),
+        ("friction: 0.04", "friction: .nan", "friction"),
+        ("rows_beyond: 0", "rows_beyond: 0\ncolour: red", "colour"),
+        ("linear_to_n: 1.2\n", "", "linear_to_n"),
+        ("calibration 1", "calibration 2", "format"),
+        ("- -1.2", "- 1.3", "tension_n must rise"),
+        ("rows: 100", "rows: [", "cannot be read"),
+    ],
+)
+def test_a_file_with_a_mistake_is_refused_by_name(old: str, new: str, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "skin.yaml"
+    save_calibration(exact_calibration(), path)
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(CalibrationError, match=named) as refused:
+        load_calibration(path)
+    assert "skin.yaml" in str(refused.value)
+
+
+def test_a_missing_file_and_an_unwritable_place_are_sentences(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        load_calibration(tmp_path / "none.yaml")
+    with pytest.raises(CalibrationError, match="cannot be written"):
+        save_calibration(exact_calibration(), tmp_path / "none" / "skin.yaml")
+
+
+def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text("shear_n,normal_n,r1_ohm,r2_ohm\n0,0,25,26\n0.5,1,26,26\n")
+    table = read_table(path)
+    np.testing.assert_array_equal(np.array(columns(table)), [[25, 26], [26, 26], [0, 0.5], [0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("r1_ohm,r2_ohm,shear_n\n1,2,3\n", "columns must be"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n,time\n1,2,3,4,5\n", "columns must be"),
+        ("", "columns must be"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n", "no rows"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0\n25,x,0,0\n", "line 3: r2_ohm is 'x'"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0\n", "line 2: normal_n is None"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0,0\n", "line 2: there are more values"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n25,inf,0,0\n", "r2_ohm is 'inf'"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n0,25,0,0\n", "r1_ohm is '0'"),
+    ],
+)
+def test_a_table_with_a_mistake_is_refused_by_line_and_column(text: str, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    with pytest.raises(CalibrationError, match=named) as refused:
+        read_table(path)
+    assert "table.csv" in str(refused.value)

@@ -1,0 +1,173 @@
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bank.errors import CalibrationError
+from bank.skin.membrane import (
+    UNSTRETCHED,
+    Direction,
+    Membrane,
+    MembraneState,
+    direction_of,
+    paper_membrane,
+    section_membrane,
+)
+from bank.skin.statistics import origin_slope
+from bank.skin.synthetic import loading, responses
+
+MEMBRANE = paper_membrane()
+CAPSTAN = math.exp(-MEMBRANE.friction * MEMBRANE.gauge_angle_rad)
+forces = st.lists(st.tuples(st.floats(-5, 5), st.floats(0, 3)), min_size=1, max_size=12)
+
+
+def walk(path: list[tuple[float, float]], membrane: Membrane = MEMBRANE) -> list[MembraneState]:
+    states = [UNSTRETCHED]
+    for shear_n, normal_n in path:
+        states.append(membrane.step(states[-1], shear_n, normal_n))
+    return states[1:]
+
+
+def test_without_friction_it_is_the_paper_s_0_088_per_newton() -> None:
+    slippery = Membrane(MEMBRANE.axial_stiffness_n, 0.0, MEMBRANE.gauge_angle_rad)
+    assert slippery.response(slippery.step(UNSTRETCHED, 1.0, 2.0)) == pytest.approx(0.088)
+
+
+@pytest.mark.parametrize("normal_n", [0.5, 1.0, 1.5, 2.0])
+def test_the_deadband_is_friction_times_normal_force_exactly(normal_n: float) -> None:
+    edge = MEMBRANE.friction * normal_n
+    for sign in (1, -1):
+        inside = MEMBRANE.step(UNSTRETCHED, sign * edge, normal_n)
+        assert MEMBRANE.response(inside) == 0
+        beyond = MEMBRANE.response(MEMBRANE.step(UNSTRETCHED, sign * (edge + 1e-9), normal_n))
+        assert beyond * sign == pytest.approx(0.088 * CAPSTAN * 1e-9, rel=1e-6)
+
+
+@pytest.mark.parametrize("normal_n", [0.5, 1.0, 1.5, 2.0])
+def test_a_fit_through_the_origin_of_loading_from_zero_gives_the_paper_s_0_078(normal_n: float) -> None:
+    """The rule: least squares through the origin over the paper's loading, 0.1 N steps up to the normal force."""
+    shear_n = loading(normal_n)
+    assert shear_n[0] == pytest.approx(0.1)
+    assert shear_n[-1] == pytest.approx(normal_n)
+    assert origin_slope(shear_n, responses(MEMBRANE, shear_n, normal_n)) == pytest.approx(0.078, rel=0.03)
+
+
+@given(forces)
+def test_one_side_alone_is_stretched_and_none_compressed(path: list[tuple[float, float]]) -> None:
+    for state in walk(path):
+        assert min(state.strain_1, state.strain_2) == 0
+        assert max(state.strain_1, state.strain_2) >= 0
+
+
+@given(forces)
+def test_left_and_right_are_alike(path: list[tuple[float, float]]) -> None:
+    for state, mirrored in zip(walk(path), walk([(-s, n) for s, n in path]), strict=True):
+        assert (state.strain_1, state.strain_2) == (mirrored.strain_2, mirrored.strain_1)
+
+
+@given(forces, st.integers(2, 7))
+def test_a_step_taken_in_parts_ends_where_the_whole_one_does(path: list[tuple[float, float]], parts: int) -> None:
+    normal_n = path[0][1]
+    whole = walk([(shear_n, normal_n) for shear_n, _ in path])
+    turns = [0.0, *(shear_n for shear_n, _ in path)]
+    pieces = [np.linspace(a, b, parts + 1)[1:] for a, b in itertools.pairwise(turns)]
+    in_parts = walk([(float(s), normal_n) for piece in pieces for s in piece])[parts - 1 :: parts]
+    for one, other in zip(whole, in_parts, strict=True):
+        assert one.strain_1 == pytest.approx(other.strain_1, abs=1e-12)
+        assert one.strain_2 == pytest.approx(other.strain_2, abs=1e-12)
+
+
+def belt_of_sliders(
+    friction: float, angle_rad: float, pulls: list[float], sliders: int = 16
+) -> list[tuple[float, float]]:
+    """Tension at the load and at the clamp of a chain of springs over sliders, pulled through the given movements.
+
+    Slow and with no notion of a play: each slider moves until friction, μ Δφ times the mean tension beside it,
+    holds the difference, and so on round the chain until nothing moves.
+    """
+    hold = friction * angle_rad / sliders / 2
+    x, found = [0.0] * (sliders + 2), []
+    for pull in pulls:
+        x[0] = pull
+        moved = 1.0
+        while moved > 1e-13:
+            moved = 0.0
+            for i in range(1, sliders + 1):
+                ahead, behind = max(x[i - 1] - x[i], 0.0), max(x[i] - x[i + 1], 0.0)
+                excess = abs(ahead - behind) - hold * (ahead + behind)
+                if excess > 0:
+                    move = math.copysign(excess / 2 / (1 + hold), ahead - behind)
+                    x[i] += move
+                    moved = max(moved, abs(move))
+        found.append((max(x[0] - x[1], 0.0), max(x[-2] - x[-1], 0.0)))
+    return found
+
+
+def test_tension_at_the_gauge_is_that_of_a_slow_chain_of_springs_and_sliders() -> None:
+    friction, angle = 0.3, 1.0
+    pulls = [0.5, 1.0, 0.9, 0.7, 0.75, 1.1, 0.6, 0.3, 0.35, 0.8, 0.0]
+    membrane, state = Membrane(1.0, friction, angle, 1.0), UNSTRETCHED
+    stuck = 0
+    for at_load, at_clamp in belt_of_sliders(friction, angle, pulls):
+        before = state.gauge_tension_1_n
+        state = membrane.step(state, at_load, 0.0)
+        assert state.gauge_tension_1_n == pytest.approx(at_clamp, rel=1e-3, abs=1e-9)
+        stuck += state.gauge_tension_1_n == before
+    assert stuck >= 3, "the path must show the gauge standing still while the force turns round"
+
+
+def test_the_inverse_is_exact_while_the_force_rises_and_while_it_falls_past_the_play() -> None:
+    normal_n = 1.0
+    up = walk([(s, normal_n) for s in (0.3, 0.9, 1.5)])
+    for state, shear_n in zip(up, (0.3, 0.9, 1.5), strict=True):
+        found = MEMBRANE.shear_from_response(MEMBRANE.response(state), normal_n, Direction.LOADING)
+        assert found == pytest.approx((shear_n, shear_n, shear_n))
+    for shear_n in (1.2, 0.5, 0.2):
+        state = MEMBRANE.step(up[-1], shear_n, normal_n)
+        found = MEMBRANE.shear_from_response(MEMBRANE.response(state), normal_n, Direction.UNLOADING)
+        assert found == pytest.approx((shear_n, shear_n, shear_n))
+
+
+@given(forces)
+def test_the_interval_holds_the_force_whatever_came_before(path: list[tuple[float, float]]) -> None:
+    for state, (shear_n, normal_n) in zip(walk(path), path, strict=True):
+        found = MEMBRANE.shear_from_response(MEMBRANE.response(state), normal_n)
+        assert found.low_n - 1e-9 <= shear_n <= found.high_n + 1e-9
+        assert found.low_n <= found.shear_n <= found.high_n
+
+
+@given(forces)
+def test_a_change_of_response_tells_the_direction_and_with_it_the_force(path: list[tuple[float, float]]) -> None:
+    before = 0.0
+    for state, (shear_n, normal_n) in zip(walk(path), path, strict=True):
+        now = MEMBRANE.response(state)
+        direction = direction_of(before, now, 1e-9)
+        if direction is not Direction.UNKNOWN and now != 0:
+            found = MEMBRANE.shear_from_response(now, normal_n, direction)
+            assert found.shear_n == pytest.approx(shear_n, abs=1e-6)
+        before = now
+
+
+def test_without_response_the_force_is_anything_within_the_deadband() -> None:
+    for direction in Direction:
+        found = MEMBRANE.shear_from_response(0.0, 1.0, direction)
+        assert found == pytest.approx((0.0, -0.04, 0.04))
+        assert found.in_deadband
+    assert not MEMBRANE.shear_from_response(0.05, 1.0).in_deadband
+
+
+def test_an_unknown_direction_costs_the_deadband_on_both_sides_and_the_capstan() -> None:
+    response = 0.0462
+    found = MEMBRANE.shear_from_response(response, 1.0)
+    tension = response / 0.088
+    assert found.low_n == pytest.approx(tension * CAPSTAN - 0.04)
+    assert found.high_n == pytest.approx(tension / CAPSTAN + 0.04)
+
+
+def test_a_belt_that_cannot_be_is_refused() -> None:
+    with pytest.raises(CalibrationError, match="stiffness must be positive"):
+        Membrane(0.0, 0.04, 1.0)
+    assert section_membrane().axial_stiffness_n == pytest.approx(MEMBRANE.axial_stiffness_n, rel=0.1)

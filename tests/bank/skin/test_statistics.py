@@ -1,0 +1,113 @@
+"""Every estimator on data whose answer is known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from bank.errors import CalibrationError
+from bank.skin import statistics
+from bank.skin.membrane import paper_membrane
+from bank.skin.synthetic import Figures, loading, loop, recover, responses
+
+RNG_SEED = 20
+
+
+def test_the_noise_floor_is_the_noise_put_in_and_not_the_wandering_between_windows() -> None:
+    rng = np.random.default_rng(RNG_SEED)
+    time_s = np.arange(0, 600, 0.1)
+    wandering = 0.05 * np.floor(time_s) / 600
+    still = wandering + rng.normal(0, 2e-4, len(time_s))
+    assert statistics.noise_floor_n(time_s, still, 0.08) == pytest.approx(2e-4 / 0.08, rel=0.03)
+    assert np.std(still) > 50 * 2e-4
+    with pytest.raises(CalibrationError, match="at least two responses within"):
+        statistics.noise_floor_n(np.arange(0, 100, 5.0), np.zeros(20), 0.08)
+
+
+def test_a_noise_floor_by_hand() -> None:
+    time_s = np.array([0.0, 0.5, 1.0, 1.5])
+    response = np.array([1.0, 3.0, 10.0, 10.0])
+    # Variances 2 and 0, pooled 1.
+    assert statistics.noise_floor_n(time_s, response, 0.5) == pytest.approx(2.0)
+
+
+def test_the_paper_s_range_and_noise_floor_are_more_than_10_bits() -> None:
+    assert statistics.dynamic_range_bits(1024.0, 1.0) == 10
+    assert statistics.dynamic_range_bits(5.0, 0.0016) == pytest.approx(math.log2(3125))
+
+
+def test_the_prediction_interval_holds_95_percent_of_new_forces() -> None:
+    rng = np.random.default_rng(RNG_SEED)
+    shear_n, held, tried = np.linspace(-1, 1, 21), 0, 0
+    for _ in range(400):
+        line = statistics.fit_line(shear_n, 0.02 + 0.08 * shear_n + rng.normal(0, 0.003, 21))
+        force = rng.uniform(-1, 1)
+        found = (0.02 + 0.08 * force + rng.normal(0, 0.003) - line.offset) / line.slope_per_n
+        held += abs(found - force) <= line.prediction_half_width_n(force)
+        tried += 1
+    assert held / tried == pytest.approx(0.95, abs=0.025)
+
+
+def test_a_line_by_hand() -> None:
+    line = statistics.fit_line(np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 1.0, 3.0, 3.0]))
+    assert (line.slope_per_n, line.offset) == pytest.approx((0.8, 0.8))
+    assert line.scatter == pytest.approx(math.sqrt(0.8 / 2))
+    # t(0.975, 2) = 4.3027
+    assert line.prediction_half_width_n(1.5) == pytest.approx(4.3027 * math.sqrt(0.4) / 0.8 * math.sqrt(1.25), rel=1e-4)
+    for shear_n in ([1.0, 2.0], [1.0, 1.0, 1.0]):
+        with pytest.raises(CalibrationError, match="at least three"):
+            statistics.fit_line(np.array(shear_n), np.array(shear_n))
+
+
+def test_drift_and_crosstalk_by_hand() -> None:
+    time_s = np.arange(0, 3601, 900.0)
+    found = statistics.drift(time_s, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * 1e-4, 0.1)
+    assert found.std == pytest.approx(math.sqrt(2.5) * 1e-4)
+    assert found.std_n == pytest.approx(found.std / 0.1)
+    assert found.trend_n_per_h == pytest.approx(4e-3)
+    pressed = statistics.crosstalk(np.array([1.0, 2.0]), np.array([-1e-4, -2e-4]), 0.1)
+    assert (pressed.largest, pressed.largest_n, pressed.slope_n_per_n) == pytest.approx((2e-4, 2e-3, -1e-3))
+    with pytest.raises(CalibrationError, match="at least three"):
+        statistics.drift(time_s[:2], np.zeros(2), 0.1)
+    with pytest.raises(CalibrationError, match="other than zero"):
+        statistics.crosstalk(np.zeros(2), np.zeros(2), 0.1)
+
+
+def test_temperature_sensitivity_is_the_change_of_slope_and_not_of_offset() -> None:
+    shear_n = np.linspace(-1, 1, 9)
+    cold, hot = (shear_n, 0.08 * shear_n), (shear_n, 0.03 + 0.08 * 1.02 * shear_n)
+    assert statistics.temperature_sensitivity_per_k(cold, hot, 25.0, 40.0) == pytest.approx(0.02 / 15)
+    with pytest.raises(CalibrationError, match="different temperatures"):
+        statistics.temperature_sensitivity_per_k(cold, hot, 25.0, 25.0)
+
+
+@pytest.mark.parametrize("put_in", [Figures(), Figures(0.004, 0.05, 4e-4, 3e-4, -0.003)])
+def test_what_is_put_into_a_synthetic_skin_is_found_again(put_in: Figures) -> None:
+    found = [recover(paper_membrane(), put_in, np.random.default_rng(seed)) for seed in range(20)]
+    noise = put_in.noise_floor_n * 0.088
+    for name, spread in {
+        "noise_floor_n": 0.01,
+        "prediction_half_width_n": 0.04,
+        # 36 readings tell a standard deviation within 12 % each.
+        "drift_std": 0.06,
+        "crosstalk": noise / math.sqrt(600) / put_in.crosstalk,
+        "sensitivity_per_k": 0.1,
+    }.items():
+        mean = np.mean([getattr(one, name) for one in found])
+        assert mean == pytest.approx(getattr(put_in, name), rel=spread), name
+
+
+def test_friction_alone_makes_a_prediction_interval_of_the_paper_s_size() -> None:
+    """Loading alone it is narrower than the paper's ± 0.0802 N, over a whole loop wider."""
+    membrane = paper_membrane()
+    up = loading(1.0)
+    rising = responses(membrane, up, 1.0)
+    there = statistics.fit_line(np.concatenate([-up, up]), np.concatenate([-rising, rising]))
+    path = loop(1.0)
+    round_trip = statistics.fit_line(path, responses(membrane, path, 1.0))
+    assert there.prediction_half_width_n(0.0) < 0.0802 < round_trip.prediction_half_width_n(0.0)
+
+
+def test_the_paths_of_the_paper() -> None:
+    np.testing.assert_allclose(loading(0.5), [0.1, 0.2, 0.3, 0.4, 0.5])
+    np.testing.assert_allclose(loop(0.2), [0.1, 0.2, 0.1, 0.0, -0.1, -0.2, -0.1, 0.0, 0.1, 0.2], atol=1e-15)

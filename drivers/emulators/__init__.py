@@ -1,0 +1,1 @@
+"""The devices of `drivers`, played byte for byte over real pseudo-terminals and sockets."""

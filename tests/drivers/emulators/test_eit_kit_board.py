@@ -1,0 +1,94 @@
+import asyncio
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from bank.channels import ZERO_SLOTS
+from drivers.eit_format import Refusal, read_line
+from drivers.emulators.eit_kit import EitKitBoard, Fault, FaultKind, format_line, read_fault
+from drivers.serial_port import SerialPort
+
+
+async def two_lines(port: SerialPort) -> bytes:
+    data = b""
+    while data.count(b"\n") < 2:
+        received = await port.read(20)
+        assert received is not None
+        data += received.data
+    return data
+
+
+def test_a_line_is_what_the_board_sends_byte_for_byte() -> None:
+    values = np.zeros(1024)
+    values[[1, 2, 1023]] = [0.0021484375, 0.55, 1.0162109375]
+    line = format_line(values)
+    assert line.startswith(b"0.0000, 0.0021, 0.5500, 0.0000, ")
+    assert line.endswith(b", 0.0000, 1.0162, \n")
+    assert len(line) == 1024 * 8 + 1
+
+
+@given(st.integers(0, 2**32))
+def test_what_it_sends_is_what_the_driver_reads(seed: int) -> None:
+    values = np.where(ZERO_SLOTS, 0, np.random.default_rng(seed).integers(1, 22_000, 1024) / 10_000)
+    read = read_line(format_line(values).removesuffix(b"\n"), ZERO_SLOTS)
+    assert not isinstance(read, Refusal)
+    np.testing.assert_array_equal(read, values)
+
+
+def test_faults_are_read_from_their_names() -> None:
+    assert read_fault("cut-line") == Fault(FaultKind.CUT_LINE)
+    assert read_fault(" silence 3\n") == Fault(FaultKind.SILENCE, 3.0)
+    assert read_fault("unplug:0.5") == Fault(FaultKind.UNPLUG, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("explode", "no fault 'explode'; there are cut-line, "),
+        ("cut-line 3", "cut-line has no duration"),
+        ("silence soon", "'soon' is no duration in seconds"),
+        ("unplug -1", "'-1' is no duration"),
+        ("unplug nan", "'nan' is no duration"),
+    ],
+)
+def test_what_is_no_fault_is_said_to_be_none(text: str, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        read_fault(text)
+
+
+async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last_frame() -> None:
+    line = np.where(ZERO_SLOTS, 0, 0.25)
+    ports: list[str] = []
+    board = EitKitBoard([line, line], period_s=0.001, on_port=ports.append)
+    running = asyncio.create_task(board.run())
+    await asyncio.sleep(0)
+    with SerialPort(board.path) as port:
+        assert await port.read(0.05) is None
+        await port.write(b"n")
+        assert await port.read(0.05) is None
+        await port.write(b"y")
+        assert await two_lines(port) == 2 * format_line(line)
+        async with asyncio.timeout(20):
+            await board.finished.wait()
+        assert await port.read(0.05) is None
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert ports == [board.path]
+    assert board.sent == 2
+
+
+async def test_faults_can_be_switched_on_while_it_runs() -> None:
+    line = np.where(ZERO_SLOTS, 0, 0.25)
+    board = EitKitBoard([line, line], period_s=0.001)
+    board.inject(Fault(FaultKind.NAN))
+    running = asyncio.create_task(board.run())
+    await asyncio.sleep(0)
+    with SerialPort(board.path) as port:
+        await port.write(b"y")
+        broken, sound = (await two_lines(port)).splitlines(keepends=True)
+    running.cancel()
+    await asyncio.gather(running, return_exceptions=True)
+    assert broken.count(b"nan") == 1
+    assert sound == format_line(line)

@@ -1,0 +1,188 @@
+import asyncio
+from collections.abc import AsyncIterator, Iterable
+from contextlib import aclosing, asynccontextmanager
+from itertools import cycle, pairwise
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bank.channels import LINE_SLOTS, ZERO_SLOTS, line_of_channels
+from drivers import eit_kit
+from drivers.eit_format import ADC_STEP_V, RefusalKind
+from drivers.eit_kit import EitKit, Frame
+from drivers.emulators.eit_kit import EitKitBoard, Fault, FaultKind, format_line
+from drivers.serial_port import LinkEvent
+
+PERIOD_S = 0.003
+# Guards against a test that hangs; none of them waits for so long.
+DEADLINE_S = 30
+
+
+def some_lines(n: int) -> list[NDArray[np.float64]]:
+    steps = np.random.default_rng(1).integers(1, 300, (n, len(LINE_SLOTS)))
+    return [np.round(line_of_channels(row * ADC_STEP_V), 4) for row in steps]
+
+
+@asynccontextmanager
+async def running(board: EitKitBoard) -> AsyncIterator[EitKitBoard]:
+    task = asyncio.create_task(board.run())
+    await asyncio.sleep(0)
+    try:
+        yield board
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def take(kit: EitKit, n_frames: int) -> list[Frame]:
+    frames: list[Frame] = []
+    async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
+        async for frame in arriving:
+            frames.append(frame)
+            if len(frames) == n_frames:
+                break
+    return frames
+
+
+async def play(
+    lines: Iterable[NDArray[np.float64]], n_frames: int, tmp_path: Path, faults: dict[int, Fault] | None = None
+) -> tuple[EitKit, list[Frame], list[LinkEvent]]:
+    link = tmp_path / "eit"
+    events: list[LinkEvent] = []
+    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, faults=faults)):
+        kit = EitKit(zero_slots=ZERO_SLOTS, path=link, frame_period_s=PERIOD_S, on_event=events.append)
+        frames = await take(kit, n_frames)
+    return kit, frames, events
+
+
+def assert_same(frames: list[Frame], lines: Iterable[NDArray[np.float64]]) -> None:
+    np.testing.assert_array_equal([frame.raw for frame in frames], list(lines))
+
+
+async def test_every_frame_arrives_once_and_in_order(tmp_path: Path) -> None:
+    lines = some_lines(60)
+    kit, frames, events = await play(lines, 60, tmp_path)
+    assert_same(frames, lines)
+    assert [frame.line + b"\n" for frame in frames] == [format_line(line) for line in lines]
+    assert [frame.seq for frame in frames] == list(range(60))
+    assert [event.up for event in events] == [True]
+    facts = kit.facts()
+    assert (facts["frames"], facts["errors"], facts["connected"]) == (60, {}, False)
+    assert facts["measured_hz"] is not None
+
+
+async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> None:
+    lines = some_lines(40)
+    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")) as board:
+        kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
+        frames = []
+        async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
+            async for frame in arriving:
+                frames.append(frame)
+                if len(frames) == 5:
+                    # The pseudo-terminal is full long before ten further periods have passed.
+                    await asyncio.sleep(10 * PERIOD_S)
+                    assert board.sent < 10
+                if len(frames) == 40:
+                    break
+    assert_same(frames, lines)
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "lost"),
+    [
+        (FaultKind.CUT_LINE, RefusalKind.WRONG_COUNT, True),
+        (FaultKind.WRONG_COUNT, RefusalKind.WRONG_COUNT, True),
+        (FaultKind.NOT_A_NUMBER, RefusalKind.NOT_A_NUMBER, True),
+        (FaultKind.NAN, RefusalKind.NAN, True),
+        (FaultKind.NEGATIVE, RefusalKind.NEGATIVE, True),
+        (FaultKind.ZERO, RefusalKind.ZERO_CHANNEL, True),
+        (FaultKind.GARBAGE, RefusalKind.WRONG_COUNT, False),
+        (FaultKind.FLOOD, RefusalKind.TOO_LONG, False),
+    ],
+)
+async def test_a_fault_costs_its_own_frame_at_most_and_is_counted(
+    fault: FaultKind, kind: RefusalKind, lost: bool, tmp_path: Path
+) -> None:
+    lines = some_lines(6)
+    kit, frames, _ = await play(lines, 6 - lost, tmp_path, {3: Fault(fault)})
+    assert_same(frames, lines[:3] + lines[3 + lost :])
+    facts = kit.facts()
+    assert facts["errors"] == {kind.name.lower(): 1}
+    assert kind.value in str(facts["last_refusal"])
+
+
+async def test_a_repeated_line_is_handed_over_as_such(tmp_path: Path) -> None:
+    _, frames, _ = await play(some_lines(4), 5, tmp_path, {1: Fault(FaultKind.REPEAT)})
+    assert [frame.repeated for frame in frames] == [False, False, True, False, False]
+
+
+async def test_a_board_that_fell_silent_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(eit_kit, "SHORTEST_SILENCE_S", 0.05)
+    lines = some_lines(8)
+    kit, frames, events = await play(lines, 8, tmp_path, {4: Fault(FaultKind.SILENCE)})
+    assert_same(frames, lines)
+    assert cast("int", kit.facts()["silences"]) >= 1  # more when the machine is slow
+    assert kit.facts()["openings"] == 1
+    assert len(events) == 1
+
+
+async def test_a_board_that_stays_silent_is_opened_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(eit_kit, "SHORTEST_SILENCE_S", 0.02)
+    monkeypatch.setattr(eit_kit, "STARTS_BEFORE_REOPENING", 2)
+    lines = some_lines(5)
+    kit, frames, events = await play(cycle(lines), 10, tmp_path, {2: Fault(FaultKind.SILENCE, 0.5)})
+    # What the board sends while nobody has its port open is lost, as with a real one.
+    places = [[line.tolist() for line in lines].index(frame.raw.tolist()) for frame in frames]
+    assert places[:2] == [0, 1]
+    assert places[2:] == [(places[2] + n) % 5 for n in range(8)]
+    assert cast("int", kit.facts()["openings"]) >= 2
+    assert any("open but silent" in event.sentence for event in events)
+
+
+async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path: Path) -> None:
+    lines = some_lines(12)
+    kit, frames, events = await play(lines, 11, tmp_path, {6: Fault(FaultKind.UNPLUG, 0.05)})
+    assert_same(frames, [*lines[:6], *lines[7:]])
+    facts = kit.facts()
+    assert facts["openings"] == 2
+    assert facts["errors"] == {}
+    assert facts["unfinished"] == 1, "half a line had come when it was unplugged"
+    assert [event.up for event in events if not event.repeated] == [True, False, True]
+    assert all(a.t_mid_ns < b.t_mid_ns for a, b in pairwise(frames))
+
+
+async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next_line(tmp_path: Path) -> None:
+    lines = some_lines(30)
+    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")):
+        first = await take(EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit"), 10)
+        kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit")
+        second = await take(kit, 10)
+    assert_same(first, lines[:10])
+    sent = [line.tolist() for line in lines]
+    places = [sent.index(frame.raw.tolist()) for frame in second]
+    assert places == list(range(places[0], places[0] + 10))
+    assert places[0] >= 10
+    assert kit.facts()["errors"] == {}
+
+
+async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path: Path) -> None:
+    events: list[LinkEvent] = []
+    missed_twice = asyncio.Event()
+
+    def note(event: LinkEvent) -> None:
+        events.append(event)
+        if len(events) == 2:
+            missed_twice.set()
+
+    kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", on_event=note)
+    taking = asyncio.create_task(take(kit, 1))
+    await missed_twice.wait()
+    async with running(EitKitBoard(some_lines(1), period_s=PERIOD_S, link=tmp_path / "eit")):
+        (frame,) = await taking
+    assert frame.seq == 0
+    assert [event.repeated for event in events if not event.up][:2] == [False, True]
+    assert "There is no serial port" in events[0].sentence

@@ -1,0 +1,275 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from bank.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
+from drivers.eit_format import (
+    ADC_STEP_V,
+    FULL_SCALE_SINE_RMS_V,
+    LINE_BYTES,
+    LONGEST_LINE_BYTES,
+    Refusal,
+    RefusalKind,
+    read_line,
+)
+from drivers.eit_line import NOMINAL_PERIOD_NS, TRANSFER_NS, Frame, LineParser
+from drivers.emulators.eit_kit import format_line
+
+PERIOD_NS = NOMINAL_PERIOD_NS
+
+
+def some_line(seed: int) -> bytes:
+    steps = np.random.default_rng(seed).integers(1, 300, len(LINE_SLOTS))
+    return format_line(line_of_channels(steps * ADC_STEP_V))
+
+
+LINES = [some_line(seed) for seed in range(4)]
+GOOD = LINES[0]
+
+
+def slices(data: bytes, cuts: list[int]) -> list[bytes]:
+    edges = [0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]
+    return [data[a:b] for a, b in pairwise(edges)]
+
+
+def feed_all(parser: LineParser, parts: list[bytes]) -> list[Frame]:
+    return [frame for n, part in enumerate(parts) for frame in parser.feed(part, n)]
+
+
+def with_value(position: int, value: bytes, line: bytes = GOOD) -> bytes:
+    values = line.split(b", ")
+    values[position] = value
+    return b", ".join(values)
+
+
+# Each kind of refusal, and a way to earn it.
+CHANNEL, SLOT = int(LINE_SLOTS[500]), int(np.flatnonzero(ZERO_SLOTS)[60])
+BROKEN = [
+    (RefusalKind.TOO_LONG, b"0.1234, " * 5000 + b"\n"),
+    (RefusalKind.WRONG_COUNT, GOOD[:4321] + b"\n"),
+    (RefusalKind.WRONG_COUNT, GOOD[8:]),
+    (RefusalKind.WRONG_COUNT, b"0.1234, " + GOOD),
+    (RefusalKind.WRONG_COUNT, GOOD[:-3] + b"\n"),
+    (RefusalKind.WRONG_COUNT, b"Board Initialized\n"),
+    (RefusalKind.WRONG_COUNT, b"\n"),
+    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"0.1x34")),
+    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"1_0.00")),
+    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b" 0.123")),
+    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"0.12")),
+    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"1.2e-1")),
+    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"inf")),
+    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, "0.١٢٣٤".encode())),
+    (RefusalKind.NAN, with_value(CHANNEL, b"nan")),
+    (RefusalKind.NAN, with_value(CHANNEL, b"-NaN")),
+    (RefusalKind.NEGATIVE, with_value(CHANNEL, b"-0.1234")),
+    (RefusalKind.NEGATIVE, with_value(SLOT, b"-0.0000")),
+    (RefusalKind.OUT_OF_RANGE, with_value(CHANNEL, b"9.1234")),
+    (RefusalKind.OUT_OF_RANGE, with_value(CHANNEL, b"10.1234")),
+    (RefusalKind.ZERO_CHANNEL, with_value(CHANNEL, b"0.0000")),
+    (RefusalKind.NONZERO_SLOT, with_value(SLOT, b"0.0021")),
+]
+
+
+def test_a_line_is_read_to_the_last_digit() -> None:
+    frame, other = LineParser(ZERO_SLOTS).feed(GOOD + LINES[1], 5_000_000_000)
+    expected = [float(value) for value in GOOD.decode().split(", ")[:-1]]
+    assert frame.raw.tolist() == expected, "the same doubles that float() reads"
+    np.testing.assert_array_equal(frame.channels, channels_of_line(frame.raw))
+    assert frame.line + b"\n" == GOOD
+    assert (frame.seq, other.seq) == (0, 1)
+    assert frame.t_arrival_ns == 5_000_000_000
+    assert frame.t_mid_ns == 5_000_000_000 - TRANSFER_NS - PERIOD_NS // 2
+    assert not frame.saturated.any()
+    assert not frame.dead.any()
+    with pytest.raises(ValueError, match="read-only"):
+        frame.channels[0] = 1.0
+
+
+@given(st.lists(st.integers(0, 4 * LINE_BYTES + 4), max_size=40))
+def test_any_slicing_gives_the_same_frames(cuts: list[int]) -> None:
+    parser = LineParser(ZERO_SLOTS)
+    frames = feed_all(parser, slices(b"".join(LINES), cuts))
+    assert [frame.line + b"\n" for frame in frames] == LINES
+    assert not parser.refused
+    assert parser.first_partials == 0
+
+
+def test_one_byte_at_a_time_gives_the_same_frames() -> None:
+    stream = b"".join(LINES[:2])
+    frames = feed_all(LineParser(ZERO_SLOTS), [stream[n : n + 1] for n in range(len(stream))])
+    assert [frame.line + b"\n" for frame in frames] == LINES[:2]
+
+
+def test_carriage_returns_are_taken_as_part_of_the_line_end() -> None:
+    frames = LineParser(ZERO_SLOTS).feed(GOOD.replace(b"\n", b"\r\n") * 2, 0)
+    assert [frame.line + b"\n" for frame in frames] == [GOOD, GOOD]
+
+
+def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffected() -> None:
+    assert {kind for kind, _ in BROKEN} == set(RefusalKind)
+    for kind, broken in BROKEN:
+        parser = LineParser(ZERO_SLOTS)
+        frames = parser.feed(GOOD + broken + LINES[1], 0)
+        assert dict(parser.refused) == {kind: 1}, broken[:20]
+        assert [frame.line + b"\n" for frame in frames] == [GOOD, LINES[1]]
+        assert kind.value in str(parser.last_refusal)
+        assert len(str(parser.last_refusal)) < 600
+
+
+def test_a_refusal_says_which_value_it_was() -> None:
+    refusal = read_line(with_value(CHANNEL, b"-0.1234").rstrip(b"\n"), ZERO_SLOTS)
+    assert isinstance(refusal, Refusal)
+    assert refusal.position == CHANNEL
+    assert f"read '-0.1234' at value {CHANNEL + 1}" in str(refusal)
+
+
+@given(st.data())
+def test_a_line_with_any_one_byte_changed_is_refused_or_reads_as_another_number(data: st.DataObject) -> None:
+    position = data.draw(st.integers(0, len(GOOD) - 2))
+    byte = data.draw(st.integers(0, 255).filter(lambda byte: byte != GOOD[position] and byte != ord("\n")))
+    changed = GOOD[:position] + bytes([byte]) + GOOD[position + 1 :]
+    parser = LineParser(ZERO_SLOTS)
+    frames = parser.feed(LINES[1] + changed + LINES[2], 0)
+    is_digit = chr(byte).isdigit() and byte < 128 and chr(GOOD[position]).isdigit()
+    assert len(frames) + parser.refused.total() == 3
+    assert [frames[0].line + b"\n", frames[-1].line + b"\n"] == LINES[1:3]
+    assert is_digit or parser.refused.total() == 1
+
+
+@given(st.lists(st.one_of(st.sampled_from(LINES), st.sampled_from([b for _, b in BROKEN])), max_size=12), st.data())
+def test_every_good_line_among_broken_ones_arrives_and_every_broken_one_is_counted(
+    lines: list[bytes], data: st.DataObject
+) -> None:
+    stream = GOOD + b"".join(lines)
+    cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=10))
+    parser = LineParser(ZERO_SLOTS)
+    frames = feed_all(parser, slices(stream, cuts))
+    assert [frame.line + b"\n" for frame in frames] == [GOOD, *[line for line in lines if line in LINES]]
+    assert parser.refused.total() == len(lines) + 1 - len(frames)
+
+
+@given(st.binary(max_size=3000), st.integers(1, 300))
+def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage: bytes, times: int) -> None:
+    parser = LineParser(ZERO_SLOTS)
+    for _ in range(times):
+        assert parser.feed(garbage, 0) == []
+        assert len(parser._begun) <= LONGEST_LINE_BYTES
+    parser.feed(b"\n", 0)
+    assert [frame.line + b"\n" for frame in parser.feed(GOOD, 0)] == [GOOD]
+
+
+def test_a_flood_without_newline_is_told_when_it_happens_and_only_once() -> None:
+    parser = LineParser(ZERO_SLOTS)
+    for _ in range(100):
+        parser.feed(b"7" * 10_000, 0)
+    assert dict(parser.refused) == {RefusalKind.TOO_LONG: 1}
+    assert len(parser.feed(b"777\n" + GOOD, 0)) == 1
+    assert parser.refused.total() == 1
+
+
+@given(st.integers(1, LINE_BYTES))
+def test_the_rest_of_a_line_that_was_under_way_is_no_error(start: int) -> None:
+    parser = LineParser(ZERO_SLOTS)
+    assert len(parser.feed(GOOD[start:] + LINES[1], 0)) == 1
+    assert not parser.refused
+    assert parser.first_partials == 1
+
+
+def test_a_whole_line_that_is_broken_is_refused_even_as_the_first() -> None:
+    parser = LineParser(ZERO_SLOTS)
+    parser.feed(with_value(CHANNEL, b"nan"), 0)
+    assert dict(parser.refused) == {RefusalKind.NAN: 1}
+    assert parser.first_partials == 0
+
+
+def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> None:
+    parser = LineParser(ZERO_SLOTS)
+    parser.feed(GOOD + LINES[1][:3000], 0)
+    parser.port_opened()
+    frames = parser.feed(LINES[2], 0)
+    assert [(frame.line + b"\n", frame.seq) for frame in frames] == [(LINES[2], 1)]
+    assert parser.unfinished == 1
+    assert not parser.refused
+
+
+@given(st.integers(0, LINE_BYTES), st.booleans())
+def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun: int, anew: bool) -> None:
+    parser = LineParser(ZERO_SLOTS)
+    parser.feed(GOOD + LINES[1][:begun], 0)
+    parser.board_started()
+    frames = parser.feed((LINES[2] if anew else LINES[1][begun:]) + LINES[3], 0)
+    assert [frame.line + b"\n" for frame in frames] == [LINES[2] if anew else LINES[1], LINES[3]]
+    assert parser.unfinished == (anew and begun > 0)
+    assert not parser.refused
+
+
+def test_frames_that_waited_together_are_stamped_a_period_apart() -> None:
+    parser = LineParser(ZERO_SLOTS)
+    for number in range(30):
+        parser.feed(LINES[number % 2], number * PERIOD_NS)
+    # The reader was away from frame 30 to shortly after frame 34.
+    late = parser.feed(b"".join(LINES) + LINES[0], 34 * PERIOD_NS + 1_000_000)
+    assert {frame.t_arrival_ns for frame in late} == {34 * PERIOD_NS + 1_000_000}
+    middles = [(frame.t_mid_ns + TRANSFER_NS) / PERIOD_NS for frame in late]
+    assert middles == pytest.approx([29.5, 30.5, 31.5, 32.5, 33.5], abs=0.01)
+
+
+@given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3 * PERIOD_NS)), max_size=25))
+def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts: list[tuple[int, int]]) -> None:
+    parser, now_ns, middles = LineParser(ZERO_SLOTS), 0, []
+    for number, pause_ns in bursts:
+        now_ns += pause_ns
+        frames = parser.feed(GOOD * number, now_ns)
+        assert all(frame.t_mid_ns < frame.t_arrival_ns for frame in frames)
+        middles += [frame.t_mid_ns for frame in frames]
+    assert all(a < b for a, b in pairwise(middles))
+
+
+def flagged(lines: list[NDArray[np.float64]], **settings: int) -> list[Frame]:
+    parser = LineParser(ZERO_SLOTS, **settings)
+    return [frame for n, line in enumerate(lines) for frame in parser.feed(format_line(line), n * PERIOD_NS)]
+
+
+def noisy(n: int) -> list[NDArray[np.float64]]:
+    steps = np.random.default_rng(0).integers(1, 300, (n, len(LINE_SLOTS)))
+    return [line_of_channels(row * ADC_STEP_V) for row in steps]
+
+
+def test_a_channel_above_the_largest_sine_the_adc_follows_is_saturated() -> None:
+    line = noisy(1)[0]
+    line[LINE_SLOTS[[3, 7]]] = [FULL_SCALE_SINE_RMS_V + ADC_STEP_V, FULL_SCALE_SINE_RMS_V - ADC_STEP_V]
+    (frame,) = flagged([line])
+    assert np.flatnonzero(frame.saturated).tolist() == [3]
+
+
+def test_a_channel_that_has_not_changed_for_n_frames_is_dead_until_it_changes() -> None:
+    lines = noisy(8)
+    for line in lines[:6]:
+        line[LINE_SLOTS[10]] = 0.5
+    dead = [frame.dead[10] for frame in flagged(lines, dead_after=4)]
+    assert dead == [False, False, False, True, True, True, False, False]
+
+
+def test_a_repeated_line_is_flagged_and_makes_no_channel_dead() -> None:
+    first, second = noisy(2)
+    frames = flagged([first, first, first, first, second], dead_after=3)
+    assert [frame.repeated for frame in frames] == [False, True, True, True, False]
+    assert not any(frame.dead.any() for frame in frames)
+
+
+def test_the_recorded_frames_pass_and_show_what_the_flags_are_for(shared) -> None:
+    from scipy.io import loadmat
+
+    folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
+    right = loadmat(folder / "device1.mat")["Right_Data"][:100, 1:]
+    left = loadmat(folder / "device2.mat")["Left_Data"][:, 1:]
+    for lines, n_saturated in ((right, 0), (left, 4)):
+        frames = flagged(list(lines))
+        np.testing.assert_array_equal([frame.raw for frame in frames], lines)
+        assert not any(frame.repeated or frame.dead.any() for frame in frames)
+        # On the left fingertip both pairs at electrode 4, driven from 4 and from 20, exceed what the ADC can follow.
+        assert {int(frame.saturated.sum()) for frame in frames} == {n_saturated}

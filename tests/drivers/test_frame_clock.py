@@ -1,0 +1,124 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.frame_clock import FrameClock, slope_below
+
+PERIOD_NS = 541_200_000
+
+
+def straightened(arrivals_ns: list[int], nominal_ns: int = PERIOD_NS) -> np.ndarray:
+    clock = FrameClock(nominal_ns)
+    return np.array([clock.arrived(arrival) for arrival in arrivals_ns])
+
+
+def sent(n: int, period_ns: int = PERIOD_NS) -> np.ndarray:
+    return 7_000_000_000 + np.arange(n) * period_ns
+
+
+def delays_ns(n: int, scale_ns: float, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).exponential(scale_ns, n).astype(np.int64)
+
+
+@pytest.mark.parametrize("period_ns", [PERIOD_NS, PERIOD_NS // 100, PERIOD_NS * 4])
+def test_the_jitter_of_a_busy_reader_is_taken_out_at_any_speed(period_ns: int) -> None:
+    truth = sent(400, period_ns)
+    late = delays_ns(400, 0.03 * period_ns)
+    clock = FrameClock(PERIOD_NS)
+    error = np.array([clock.arrived(int(arrival)) for arrival in truth + late]) - truth
+    assert clock.learned
+    assert clock.period_ns == pytest.approx(period_ns, rel=1e-3)
+    settled = error[40:]
+    assert settled.std() < 0.25 * late[40:].std()
+    assert abs(settled).max() < 0.25 * late[40:].max()
+
+
+def test_a_reader_that_was_away_is_late_once_and_then_on_time_again() -> None:
+    truth = sent(60)
+    arrivals = truth.copy()
+    # Frames 40 and 41 wait until shortly after frame 41 was sent, and are then read one after the other.
+    arrivals[40:42] = truth[41] + np.array([1, 2]) * 1_000_000
+    error = straightened(arrivals.tolist()) - truth
+    assert abs(error).max() < 4_000_000
+
+
+def test_a_refused_line_takes_a_period_too() -> None:
+    truth = sent(80)
+    clock = FrameClock(PERIOD_NS)
+    errors = [clock.arrived(int(t), missed=n == 51) - t for n, t in enumerate(truth) if n != 50]
+    assert max(map(abs, errors)) < 1_000_000
+
+
+@pytest.mark.parametrize("pause_periods", [0.3, 0.8, 1.4, 2.1, 7.3])
+def test_a_board_that_paused_is_followed(pause_periods: float) -> None:
+    truth = sent(80)
+    truth[40:] += int(pause_periods * PERIOD_NS)
+    error = straightened(truth.tolist()) - truth
+    assert abs(error[:40]).max() < 1_000_000
+    assert abs(error[53:]).max() < 1_000_000
+
+
+def test_frames_queued_before_the_first_read_do_not_spoil_the_period() -> None:
+    truth = sent(80)
+    arrivals = np.maximum(truth, truth[5] + 50_000_000 * np.arange(80))
+    arrivals[6:] = truth[6:]
+    clock = FrameClock(PERIOD_NS)
+    error = np.array([clock.arrived(int(t)) for t in arrivals]) - truth
+    assert clock.period_ns == pytest.approx(PERIOD_NS, rel=1e-3)
+    assert abs(error[30:]).max() < 4_000_000
+
+
+def test_another_speed_after_a_restart_is_learned() -> None:
+    clock = FrameClock(PERIOD_NS)
+    for t in sent(50):
+        clock.arrived(int(t))
+    clock.restart()
+    fast = 100_000_000_000 + np.arange(60) * 5_412_000
+    error = np.array([clock.arrived(int(t)) for t in fast]) - fast
+    assert clock.period_ns == pytest.approx(5_412_000, rel=1e-3)
+    assert abs(error[30:]).max() < 100_000
+
+
+@given(st.lists(st.integers(0, 5_000_000_000), min_size=1, max_size=120))
+def test_whatever_comes_a_stamp_is_never_after_the_arrival_and_never_before_the_board_could(gaps: list[int]) -> None:
+    clock = FrameClock(PERIOD_NS)
+    for arrival in np.cumsum(gaps).tolist():
+        stamp = clock.arrived(arrival)
+        assert arrival - 3 * max(PERIOD_NS, clock.period_ns) <= stamp <= arrival
+        assert clock.period_ns >= 0
+
+
+@given(st.lists(st.floats(0, 1e9), min_size=2, max_size=60))
+def test_the_slope_is_that_of_the_best_line_below(heights: list[float]) -> None:
+    points = list(enumerate(round(height) for height in heights))
+    n, t = np.array(points, float).T
+    slope = slope_below(points)
+    # The oracle: of all lines through two points and below the rest, the one with the least total distance.
+    best = min(
+        (t - s * n - (t - s * n).min()).sum()
+        for (a, ta) in points
+        for (b, tb) in points[a + 1 :]
+        for s in [(tb - ta) / (b - a)]
+    )
+    assert (t - slope * n - (t - slope * n).min()).sum() == pytest.approx(best, rel=1e-6, abs=1e-2)
+
+
+def test_the_stamps_of_a_recording_are_straightened(shared) -> None:
+    from scipy.io import loadmat
+
+    folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
+    for name, variable in (("device1.mat", "Right_Data"), ("device2.mat", "Left_Data")):
+        days = loadmat(folder / name)[variable][:, 0]
+        arrivals = np.round((days - days[0]) * 86_400e9).astype(np.int64)
+        points = [(n, int(t)) for n, t in enumerate(arrivals)]
+        board = slope_below(points) * np.arange(len(points))
+        stamps = straightened(arrivals.tolist())
+        before = (arrivals - board)[16:] / 1e6
+        after = (stamps - board)[16:] / 1e6
+        assert before.std() > 15, "as recorded: milliseconds off the board's steady pace"
+        assert after.std() < 2.1
+        assert np.ptp(before) > 300
+        assert np.ptp(after) < 12
+        assert np.diff(before).std() > 20
+        assert np.diff(after).std() < 1

@@ -1,0 +1,201 @@
+import asyncio
+import os
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers import serial_port
+from drivers.emulators.pty_port import PtyPort
+from drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
+from drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink, SerialPort, find_port
+
+SECOND_NS = 1_000_000_000
+# Guards against a test that hangs; none of them waits for so long.
+DEADLINE_S = 20
+
+
+class Peer(PtyPort):
+    """The other end of a port, which keeps what it is sent."""
+
+    def __init__(self, link: Path | None = None) -> None:
+        self.received = bytearray()
+        self.heard = asyncio.Event()
+        super().__init__(self._hear, link)
+
+    def _hear(self, data: bytes) -> None:
+        self.received += data
+        self.heard.set()
+
+
+async def read_exactly(port: SerialPort, n_bytes: int) -> bytes:
+    data = b""
+    while len(data) < n_bytes:
+        received = await port.read(DEADLINE_S)
+        assert received is not None
+        data += received.data
+    return data
+
+
+def listed(monkeypatch: pytest.MonkeyPatch, *ports: tuple[str, str | None]) -> None:
+    entries = [SimpleNamespace(device=d, serial_number=n, description="USB Serial") for d, n in ports]
+
+    class Entry(SimpleNamespace):
+        def __lt__(self, other: "Entry") -> bool:
+            return self.device < other.device
+
+    found = [Entry(**vars(entry)) for entry in entries]
+    monkeypatch.setattr(serial_port.list_ports, "comports", lambda: found)
+
+
+def test_a_port_is_found_by_its_usb_serial_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    listed(monkeypatch, ("/dev/ttyS0", None), ("/dev/ttyACM1", "123"), ("/dev/ttyACM0", "456"))
+    assert find_port(serial_number="123") == "/dev/ttyACM1"
+    with pytest.raises(DeviceNotFoundError, match=r"789 is there; there are /dev/ttyACM0 .*456.*, /dev/ttyACM1 .*123"):
+        find_port(serial_number="789")
+
+
+def test_a_serial_number_with_two_ports_is_not_guessed_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    listed(monkeypatch, ("/dev/ttyACM0", "123"), ("/dev/ttyACM1", "123"))
+    with pytest.raises(DeviceNotFoundError, match="/dev/ttyACM0 and /dev/ttyACM1; name one by its path"):
+        find_port(serial_number="123")
+
+
+def test_a_path_without_a_port_is_said_to_be_empty(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    listed(monkeypatch)
+    with pytest.raises(DeviceNotFoundError, match=r"no serial port .*eit; no USB serial port is plugged in"):
+        find_port(path=str(tmp_path / "eit"))
+
+
+def test_a_file_is_no_port(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DeviceUnavailableError, match="cannot be opened as a serial port"):
+        SerialPort(str(tmp_path / "file"))
+
+
+async def test_bytes_pass_unchanged_in_both_directions() -> None:
+    data = bytes(range(256)) * 100
+    with Peer() as peer, SerialPort(peer.path) as port:
+        async with asyncio.timeout(DEADLINE_S):
+            sending = asyncio.create_task(peer.write(data))
+            assert await read_exactly(port, len(data)) == data
+            await sending
+            await port.write(bytes(range(256)))
+            while len(peer.received) < 256:
+                peer.heard.clear()
+                await peer.heard.wait()
+    assert bytes(peer.received) == bytes(range(256))
+
+
+async def test_a_port_is_had_by_one_program_at_a_time() -> None:
+    in_use = pytest.raises(DeviceUnavailableError, match="in use by another program")
+    with Peer() as peer, SerialPort(peer.path), in_use:
+        SerialPort(peer.path)
+
+
+async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing() -> None:
+    with Peer() as peer, SerialPort(peer.path) as port:
+        assert await port.read(0.01) is None
+        reading = asyncio.create_task(port.read(DEADLINE_S))
+        await asyncio.sleep(0)
+        await peer.write(b"kept")
+        # The bytes are read by the loop before the task learns that it is cancelled.
+        asyncio.get_running_loop().call_later(0.01, reading.cancel)
+        received = await asyncio.gather(reading, return_exceptions=True)
+        rest = received[0] if isinstance(received[0], serial_port.Received) else await port.read(DEADLINE_S)
+        assert rest is not None
+        assert rest.data == b"kept"
+
+
+async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told() -> None:
+    with Peer() as peer, SerialPort(peer.path) as port:
+        reading = asyncio.create_task(port.read(DEADLINE_S))
+        await asyncio.sleep(0)
+        peer.unplug()
+        with pytest.raises(DeviceLostError, match="has gone"):
+            await reading
+        with pytest.raises(DeviceLostError, match="has gone"):
+            await port.write(b"y")
+
+
+async def test_a_write_that_nobody_takes_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_port, "WRITE_TIMEOUT_S", 0.05)
+    with Peer() as peer, SerialPort(peer.path) as port:
+        assert peer._master is not None
+        asyncio.get_running_loop().remove_reader(peer._master)
+
+        async def write_for_ever() -> None:
+            while True:
+                await port.write(b"y" * 4096)
+
+        with pytest.raises(DeviceLostError, match="takes no bytes"):
+            await write_for_ever()
+        with pytest.raises(ValueError, match="at most 4096"):
+            await port.write(b"y" * 4097)
+
+
+async def test_a_link_opens_a_device_that_comes_late_and_again_after_it_went(tmp_path: Path) -> None:
+    events: list[LinkEvent] = []
+    policy = ReconnectPolicy(first_s=0.01, longest_s=0.02)
+    path = tmp_path / "port"
+    missing = asyncio.Event()
+
+    def note(event: LinkEvent) -> None:
+        events.append(event)
+        if not event.up:
+            missing.set()
+
+    with Peer(path) as peer, SerialLink(path=str(path), policy=policy, on_event=note) as link:
+        peer.unplug()
+        opening = asyncio.create_task(link.open())
+        async with asyncio.timeout(DEADLINE_S):
+            await missing.wait()
+            peer.plug()
+            port = await opening
+            peer.unplug()
+            with pytest.raises(DeviceLostError) as lost:
+                await port.read(DEADLINE_S)
+            await link.lost(lost.value)
+            assert link.port is None
+            peer.plug()
+            port = await link.open()
+            await port.write(b"again")
+            while peer.received != b"again":
+                peer.heard.clear()
+                await peer.heard.wait()
+    assert link.openings == 2
+    assert "has gone" in link.last_error or "no serial port" in link.last_error
+    assert [event.up for event in events if event.up or not event.repeated][-1]
+    assert not path.is_symlink()
+    assert link.port is None
+
+
+async def test_a_link_that_leads_elsewhere_by_now_is_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "port"
+    with Peer(path), Peer(path) as second:
+        assert os.readlink(path) == second._terminal
+    assert not path.is_symlink()
+
+
+def test_waits_grow_and_only_the_first_failure_is_news() -> None:
+    policy = ReconnectPolicy(first_s=0.2, longest_s=5.0)
+    retries = [policy.failed(0) for _ in range(8)]
+    assert [retry.wait_s for retry in retries] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0, 5.0]
+    assert [retry.repeated for retry in retries] == [False] + 7 * [True]
+    policy.connected(100 * SECOND_NS)
+    assert policy.failed(105 * SECOND_NS).wait_s == 0.2, "it held, so it is a new loss"
+    policy.connected(106 * SECOND_NS)
+    assert policy.failed(107 * SECOND_NS).wait_s == 0.4, "it did not hold"
+
+
+@given(st.lists(st.tuples(st.booleans(), st.integers(0, 20 * SECOND_NS)), max_size=200))
+def test_waits_stay_within_their_bounds(steps: list[tuple[bool, int]]) -> None:
+    policy, now_ns = ReconnectPolicy(), 0
+    for connected, later_ns in steps:
+        now_ns += later_ns
+        if connected:
+            policy.connected(now_ns)
+        else:
+            assert 0.2 <= policy.failed(now_ns).wait_s <= 5.0

@@ -1,0 +1,78 @@
+"""An emulated device in a process of its own, as a driver meets it: at the other end of a socket or a terminal."""
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+import time
+from typing import Any
+
+Event = dict[str, Any]
+
+
+class EmulatorProcess:
+    """`shearloop emulate DEVICE`, which prints JSON lines and takes commands; `ready` is in the line that it is up.
+
+    The ports of a robot are fixed by its client: two test runs at once need two addresses, and so do two modules of
+    one run, by their `network` (64, 128, 192).
+    """
+
+    def __init__(self, device: str, *options: str, network: int, ready: str) -> None:
+        self.host = f"127.{os.getpid() >> 14 & 63 | network}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
+        self.events: list[Event] = []
+        self._unread = b""
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "daemon", "emulate", device, "--host", self.host, *options],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )
+        assert self.process.stdin is not None
+        assert self.process.stdout is not None
+        self._stdin, self._stdout = self.process.stdin, self.process.stdout
+        self.greeting = self._stdout.readline().decode()
+        assert ready in self.greeting
+        os.set_blocking(self._stdout.fileno(), False)
+
+    async def ask(self, line: str, answer: str) -> Event:
+        """Write a line, and return the event with which it is answered."""
+        asked_ns = time.monotonic_ns()
+        self._stdin.write(line.encode() + b"\n")
+        self._stdin.flush()
+        return await self.event(answer, asked_ns)
+
+    async def fault(self, line: str) -> int:
+        """Ask for a fault, wait for it, and return when it was asked for, in ns."""
+        asked_ns = time.monotonic_ns()
+        assert (await self.ask(line, "obeyed"))["detail"] == line
+        return asked_ns
+
+    async def event(self, name: str, since_ns: int, *, within_s: float = 10.0) -> Event:
+        """Return the first event of a name since a moment, waiting for it."""
+        async with asyncio.timeout(within_s):
+            while True:
+                for event in self.events:
+                    if event["event"] == name and event["t_mono_ns"] >= since_ns:
+                        return event
+                await self._more()
+
+    def happened(self, name: str, since_ns: int) -> list[Event]:
+        """Return the events of a name since a moment, of those that were read so far."""
+        return [event for event in self.events if event["event"] == name and event["t_mono_ns"] >= since_ns]
+
+    def close(self) -> int:
+        """End it as its user does, by the end of its input, and return its exit status."""
+        self._stdin.close()
+        status = self.process.wait(10)
+        self._stdout.close()
+        return status
+
+    async def _more(self) -> None:
+        loop, ready = asyncio.get_running_loop(), asyncio.Event()
+        loop.add_reader(self._stdout, ready.set)
+        try:
+            await ready.wait()
+        finally:
+            loop.remove_reader(self._stdout)
+        *lines, self._unread = (self._unread + (self._stdout.read() or b"")).split(b"\n")
+        self.events += [json.loads(line) for line in lines]

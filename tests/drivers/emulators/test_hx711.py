@@ -1,0 +1,173 @@
+"""The driver against the played board, over a real pseudo-terminal: torque comes through, and every fault is met."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from itertools import repeat
+from pathlib import Path
+
+import pytest
+
+from drivers.emulators.hx711 import PAPER_SKETCH, Fault, FaultKind, Hx711Board, Sketch, read_fault
+from drivers.hx711 import LoadCalibration, LoadSample
+from drivers.load_cell import LoadCell
+from drivers.serial_port import LinkEvent, ReconnectPolicy
+
+SKETCH = Sketch()
+CALIBRATION = LoadCalibration(tare_counts=SKETCH.tare_counts, scale_n_per_count=1 / (0.035 * SKETCH.counts_per_nm))
+
+
+@dataclass
+class Rig:
+    board: Hx711Board
+    cell: LoadCell = field(init=False)
+    samples: list[LoadSample] = field(default_factory=list)
+    events: list[LinkEvent] = field(default_factory=list)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def on_sample(self, sample: LoadSample) -> None:
+        self.samples.append(sample)
+        self.changed.set()
+
+    def on_event(self, event: LinkEvent) -> None:
+        self.events.append(event)
+        self.changed.set()
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        async with asyncio.timeout(20):
+            while not condition():
+                self.changed.clear()
+                await self.changed.wait()
+
+
+@contextlib.asynccontextmanager
+async def a_rig(
+    tmp_path: Path,
+    torque_nm: Callable[[], float] = lambda: 0.03,
+    sketch: Sketch = SKETCH,
+    calibration: LoadCalibration = CALIBRATION,
+) -> AsyncIterator[Rig]:
+    link = tmp_path / "load"
+    plugged = asyncio.Event()
+    board = Hx711Board(torque_nm, sketch, period_s=0.002, link=link, on_port=lambda _: plugged.set())
+    rig = Rig(board)
+    cell = rig.cell = LoadCell(calibration, path=link, policy=ReconnectPolicy(0.001, 0.002), on_event=rig.on_event)
+
+    async def listen() -> None:
+        async with contextlib.aclosing(cell.samples()) as samples:
+            async for sample in samples:
+                rig.on_sample(sample)
+
+    tasks = [asyncio.create_task(board.run())]
+    await plugged.wait()
+    tasks.append(asyncio.create_task(listen()))
+    try:
+        yield rig
+    finally:
+        for task in tasks:
+            task.cancel()
+        done, _ = await asyncio.wait(tasks)
+        for task in done:
+            with contextlib.suppress(asyncio.CancelledError):
+                task.result()
+
+
+@pytest.mark.parametrize(
+    ("sketch", "calibration", "noise_nm"),
+    [(SKETCH, CALIBRATION, 120 / SKETCH.counts_per_nm), (PAPER_SKETCH, LoadCalibration.of_torque_lines(), 2e-5)],
+)
+async def test_torque_comes_through_from_either_sketch(
+    tmp_path: Path, sketch: Sketch, calibration: LoadCalibration, noise_nm: float
+) -> None:
+    torques = iter([0.0, *(0.001 * n for n in range(60))])
+    async with a_rig(tmp_path, torques.__next__, sketch, calibration) as rig:
+        await rig.until(lambda: rig.samples and rig.samples[-1].torque_nm > 0.0585)
+        sent = {round(0.001 * n, 3) for n in range(60)}
+        for sample in rig.samples[1:]:
+            assert sample.trusted
+            assert min(abs(sample.torque_nm - torque_nm) for torque_nm in sent) < 6 * noise_nm
+        assert rig.samples[-1].torque_nm == pytest.approx(0.059, abs=6 * noise_nm)
+        assert rig.cell.facts()["errors"] == {}
+        assert rig.cell.facts()["flagged"] == 1  # the first line, whose beginning may be missing
+
+
+async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_path: Path) -> None:
+    async with a_rig(tmp_path) as rig:
+        await rig.until(lambda: len(rig.samples) > 5)
+        rig.board.inject(Fault(FaultKind.SPIKE))
+        rig.board.inject(Fault(FaultKind.GARBAGE))
+        await rig.until(lambda: rig.cell.facts()["errors"])
+        await rig.until(lambda: [sample for sample in rig.samples if sample.spike])
+        n = len(rig.samples)
+        await rig.until(lambda: len(rig.samples) > n + 5)
+        assert [sample.raw for sample in rig.samples if sample.spike] == [38399996]
+        assert rig.cell.facts()["errors"] == {"not_decimal": 1}
+        assert "no decimal number" in str(rig.cell.facts()["refusals"])
+        assert all(sample.trusted for sample in rig.samples[n:])
+
+
+async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp_path: Path) -> None:
+    async with a_rig(tmp_path) as rig:
+        rig.board.inject(Fault(FaultKind.SATURATION, 0.01))
+        await rig.until(lambda: [sample for sample in rig.samples if sample.saturated])
+        await rig.until(lambda: rig.samples[-1].trusted)
+        rig.board.inject(Fault(FaultKind.STUCK))
+        await rig.until(lambda: [sample for sample in rig.samples if sample.stuck])
+        rig.board.inject(Fault(FaultKind.STUCK, 0.0))
+        await rig.until(lambda: rig.samples[-1].trusted)
+
+
+async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path: Path) -> None:
+    async with a_rig(tmp_path) as rig:
+        await rig.until(lambda: len(rig.samples) > 3)
+        before = len(rig.samples)
+        rig.board.inject(Fault(FaultKind.JUMP, 1.6))
+        await rig.until(lambda: rig.samples[-1].trusted and rig.samples[-1].torque_nm > 1.5)
+        jumped = [sample for sample in rig.samples[before:] if sample.torque_nm > 1.5]
+        # Several lines may have come in one piece.
+        assert [sample.spike for sample in jumped] == [True, True, *([False] * (len(jumped) - 2))]
+        assert jumped[-1].torque_nm == pytest.approx(1.63, abs=0.01)
+
+
+async def test_an_unplugged_board_is_lost_and_found_again(tmp_path: Path) -> None:
+    async with a_rig(tmp_path) as rig:
+        await rig.until(lambda: len(rig.samples) > 3)
+        rig.board.inject(Fault(FaultKind.UNPLUG, 0.05))
+        await rig.until(lambda: [event for event in rig.events if not event.up])
+        n = len(rig.samples)
+        await rig.until(lambda: len(rig.samples) > n + 3)
+        assert rig.samples[n].partial
+        assert rig.samples[n].seq == rig.samples[n - 1].seq + 1
+        assert rig.cell.facts()["openings"] == 2
+        assert "gone" in next(event.sentence for event in rig.events if not event.up)
+
+
+async def test_silence_is_reported_as_a_loss(tmp_path: Path) -> None:
+    async with a_rig(tmp_path) as rig:
+        await rig.until(lambda: len(rig.samples) > 3)
+        rig.board.inject(Fault(FaultKind.SILENCE))
+        await rig.until(lambda: [event for event in rig.events if not event.up])
+        assert "sent nothing for 0.7 s" in next(event.sentence for event in rig.events if not event.up)
+
+
+async def test_a_tare_takes_effect_with_the_next_sample(tmp_path: Path) -> None:
+    async with a_rig(tmp_path, repeat(0.03).__next__) as rig:
+        await rig.until(lambda: len(rig.samples) > 3)
+        rig.cell.calibration = rig.cell.calibration.tared(rig.samples[-1].raw)
+        n = len(rig.samples)
+        await rig.until(lambda: len(rig.samples) > n + 1)
+        assert rig.samples[-1].torque_nm == pytest.approx(0.0, abs=0.001)
+        assert rig.samples[-1].trusted
+
+
+@pytest.mark.parametrize("text", ["spark", "spike:3", "jump", "jump:high", "silence:-1", "unplug:nan", "stuck:inf"])
+def test_a_fault_that_does_not_exist_is_explained(text: str) -> None:
+    with pytest.raises(ValueError, match=r"write|there are"):
+        read_fault(text)
+
+
+def test_faults_are_read_as_they_are_typed() -> None:
+    assert read_fault("silence:3") == read_fault(" silence 3 ") == Fault(FaultKind.SILENCE, 3.0)
+    assert read_fault("jump:-0.05") == Fault(FaultKind.JUMP, -0.05)
+    assert read_fault("spike") == Fault(FaultKind.SPIKE)

@@ -1,0 +1,205 @@
+"""The load cell's parser: any bytes in any slices, flags instead of silence, and the paper's real corrupted values."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.calibration_file import CalibrationError, load_calibration, save_calibration
+from drivers.hx711 import (
+    COUNTS_MAX,
+    COUNTS_MIN,
+    MAX_LINE_BYTES,
+    PERIOD_NS,
+    STUCK_AFTER,
+    Despiker,
+    LoadCalibration,
+    LoadLimits,
+    LoadParser,
+    LoadSample,
+    refusals,
+)
+
+TORQUE_LINES = LoadCalibration.of_torque_lines()
+STREAMS = {
+    "glitch_20241202_173837/load.mat": "plotthis3",
+    "20241202_153632/load.mat": "plotthis3",
+    "2024-12-03_16-09/device3.mat": "Load_Data",
+    **{f"cylinders/{mm}mm_1_truth.mat": "plotthis_truth" for mm in (10, 20, 30, 40)},
+}
+
+
+def feed_lines(parser: LoadParser, lines: list[str]) -> list[LoadSample]:
+    samples = []
+    for n, line in enumerate(lines):
+        samples += parser.feed(f"{line}\r\n".encode(), n * PERIOD_NS)
+    return samples
+
+
+def recorded(shared: Path, name: str) -> list[tuple[int, float]]:
+    from scipy.io import loadmat
+
+    rows = loadmat(shared / "recordings/streams" / name)[STREAMS[name]]
+    return [(round((datenum - rows[0, 0]) * 86400e9), value) for datenum, value in rows.tolist()]
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_the_two_real_corrupted_values_are_flagged_and_nothing_else(shared: Path, name: str) -> None:
+    parser = LoadParser(TORQUE_LINES)
+    rows = recorded(shared, name)
+    samples = [sample for t_ns, value in rows for sample in parser.feed(f"{value:.12f}\r\n".encode(), t_ns)]
+    assert len(samples) == len(rows)
+    assert not parser.refused
+    spikes = [sample.raw for sample in samples if sample.spike]
+    assert spikes == ([996.0, 38399996.0] if name.startswith("glitch") else [])
+    assert [sample.seq for sample in samples if not sample.trusted] == sorted({0, *(s.seq for s in samples if s.spike)})
+
+
+def test_torque_lines_keep_their_values_and_counts_become_torque() -> None:
+    (_, sample) = feed_lines(LoadParser(TORQUE_LINES), ["0.000000", "0.059796800613"])
+    assert sample.torque_nm == pytest.approx(0.059796800613, rel=1e-12)
+    counts = LoadCalibration(tare_counts=8000, scale_n_per_count=1e-5, lever_arm_m=0.035, sign=-1)
+    (_, sample) = feed_lines(LoadParser(counts), ["8000", "108000"])
+    assert sample.torque_nm == pytest.approx(-1.0 * 0.035)
+    assert counts.raw(sample.torque_nm) == pytest.approx(108000)
+
+
+@given(
+    st.lists(st.one_of(st.binary(max_size=60), st.decimals(-9e6, 9e6, places=3).map(lambda d: f"{d}\r\n".encode()))),
+    st.lists(st.integers(1, 40), min_size=1),
+)
+def test_the_slices_in_which_bytes_come_change_nothing(pieces: list[bytes], widths: list[int]) -> None:
+    data = b"".join(pieces)
+    whole, sliced = LoadParser(TORQUE_LINES), LoadParser(TORQUE_LINES)
+    expected = whole.feed(data, 0)
+    got, position, n = [], 0, 0
+    while position < len(data):
+        width = widths[n % len(widths)]
+        got += sliced.feed(data[position : position + width], 0)
+        position, n = position + width, n + 1
+    assert [(s.raw, s.seq, s.saturated, s.partial) for s in got] == [
+        (s.raw, s.seq, s.saturated, s.partial) for s in expected
+    ]
+    assert sliced.refused == whole.refused
+    # Every line is either a sample or a counted refusal; only an unfinished one is neither.
+    unfinished_but_refused = len(data) - data.rfind(b"\n") - 1 > MAX_LINE_BYTES
+    assert len(expected) + whole.refused.total() == data.count(b"\n") + unfinished_but_refused
+
+
+NOT_DECIMAL = ("nan", "inf", "ovf", "1e5", "0x10", "1 2", "1.", ".5", "--1", "٣", "9" * 20)
+
+
+@pytest.mark.parametrize(
+    ("line", "kind"), [("", "empty"), ("9" * 40, "too_long"), *((line, "not_decimal") for line in NOT_DECIMAL)]
+)
+def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line: str, kind: str) -> None:
+    parser = LoadParser(TORQUE_LINES)
+    assert feed_lines(parser, [line]) == []
+    assert dict(parser.refused) == {kind: 1}
+    (sentence,) = refusals(parser)
+    assert "(1 times)" in sentence
+
+
+def test_memory_stays_bounded_when_no_line_ever_ends() -> None:
+    parser = LoadParser(TORQUE_LINES)
+    for _ in range(1000):
+        assert parser.feed(b"7" * 1000, 0) == []
+        assert len(parser._pending) <= MAX_LINE_BYTES
+    assert dict(parser.refused) == {"too_long": 1}
+    samples = parser.feed(b"7\n0.5\n", 0)
+    assert [(s.raw, s.partial) for s in samples] == [(0.5, False)]
+
+
+def test_the_ends_of_the_converters_range_are_flagged_and_their_neighbours_are_not() -> None:
+    parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-6))
+    samples = feed_lines(
+        parser, [str(n) for n in (COUNTS_MAX - 1, COUNTS_MAX - 1, COUNTS_MAX, COUNTS_MIN, COUNTS_MIN + 1)]
+    )
+    assert [s.saturated for s in samples] == [False, False, True, True, False]
+
+
+def test_a_converter_that_repeats_itself_is_flagged_until_it_moves() -> None:
+    samples = feed_lines(LoadParser(TORQUE_LINES), ["0.01"] * (STUCK_AFTER + 2) + ["0.010001"])
+    assert [s.stuck for s in samples] == [False] * (STUCK_AFTER - 1) + [True] * 3 + [False]
+
+
+def test_lines_that_arrive_together_are_spread_and_time_never_goes_back() -> None:
+    parser = LoadParser(TORQUE_LINES)
+    samples = parser.feed(b"0.1\n0.1\n0.1\n", 10 * PERIOD_NS) + parser.feed(b"0.1\n", 10 * PERIOD_NS + 1)
+    assert [s.t_arrival_ns for s in samples[:3]] == [8 * PERIOD_NS, 9 * PERIOD_NS, 10 * PERIOD_NS]
+    assert all(a.t_mid_ns < b.t_mid_ns for a, b in pairwise(samples))
+    # The value is the mean of the period before its arrival, and four bytes took 0.35 ms to come.
+    assert samples[0].t_arrival_ns - samples[0].t_mid_ns == pytest.approx(PERIOD_NS / 2 + 0.35e6, abs=0.02e6)
+
+
+torques = st.floats(-1.7, 1.7)
+
+
+@given(torques, torques, st.integers(3, 10))
+def test_a_real_step_is_believed_after_three_agreeing_values(before: float, after: float, n: int) -> None:
+    despiker = Despiker(LoadLimits())
+    assert not any(despiker.is_spike(before, k * PERIOD_NS) for k in range(5))
+    flags = [despiker.is_spike(after, (5 + k) * PERIOD_NS) for k in range(n)]
+    assert flags[0] == (abs(after - before) > 2.0 * PERIOD_NS * 1e-9)
+    assert not any(flags[2:])
+
+
+@given(st.lists(st.floats(-0.15, 0.15), min_size=3, max_size=60), st.data())
+def test_one_corrupted_value_in_a_moving_signal_is_flagged_alone(steps: list[float], data: st.DataObject) -> None:
+    level, values = 0.0, []
+    for step in steps:
+        level = min(max(level + step, -1.0), 1.0)
+        values.append(level)
+    where = data.draw(st.integers(1, len(values) - 1))
+    values[where] = values[where - 1] + data.draw(st.sampled_from([-1, 1])) * data.draw(st.floats(0.2, 1e9))
+    despiker = Despiker(LoadLimits())
+    assert [k for k, v in enumerate(values) if despiker.is_spike(v, k * PERIOD_NS)] == [where]
+
+
+def test_after_a_gap_the_rig_may_have_moved_further() -> None:
+    despiker = Despiker(LoadLimits())
+    assert not despiker.is_spike(0.0, 0)
+    assert not despiker.is_spike(1.5, 10**9)
+
+
+def test_a_tare_forgets_the_level_that_spikes_are_judged_by() -> None:
+    parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-4))
+    assert not feed_lines(parser, ["200000", "200000"])[-1].spike
+    parser.calibration = parser.calibration.tared(200000)
+    assert (sample := feed_lines(parser, ["200000"])[0]).trusted
+    assert sample.torque_nm == 0
+
+
+def test_a_calibration_survives_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "load.yaml"
+    calibration = LoadCalibration(tare_counts=-81234.5, scale_n_per_count=-2.3e-5, lever_arm_m=0.035, sign=-1)
+    save_calibration(path, calibration)
+    assert load_calibration(path, LoadCalibration) == calibration
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tare_counts: 1\nscale_n_per_count: 2e-5\nlever_arm: 0.035\n", "lever_arm"),
+        ("tare_counts: .nan\nscale_n_per_count: 2.0e-5\n", "tare_counts"),
+        ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nsign: 0\n", "sign"),
+        ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nlever_arm_m: -0.035\n", "lever_arm_m"),
+        ("[1, 2", "is not YAML"),
+        ("", "the file"),
+    ],
+)
+def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path: Path, text: str, said: str) -> None:
+    path = tmp_path / "load.yaml"
+    path.write_text(text)
+    with pytest.raises(CalibrationError, match=said) as refused:
+        load_calibration(path, LoadCalibration)
+    assert str(path) in str(refused.value)
+
+
+def test_a_missing_calibration_file_says_how_to_make_one(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match="shearloop calibrate"):
+        load_calibration(tmp_path / "none.yaml", LoadCalibration)
+    with pytest.raises(CalibrationError, match="cannot be written"):
+        save_calibration(tmp_path / "no/such/folder.yaml", TORQUE_LINES)

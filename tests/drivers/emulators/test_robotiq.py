@@ -1,0 +1,217 @@
+"""The played gripper by itself: its timing, its faults, its bytes."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
+from drivers.emulators.robotiq.modbus_face import ModbusFace, crc16
+from drivers.emulators.robotiq.urcap_face import UrcapFace
+
+READ_STATUS = bytes.fromhex("09 03 07D0 0003")
+
+
+def steps(gripper: Gripper, seconds: float, dt_s: float = 0.004) -> None:
+    for _ in range(round(seconds / dt_s)):
+        gripper.step(dt_s)
+
+
+def active_gripper() -> Gripper:
+    gripper = Gripper()
+    gripper.command.act = True
+    steps(gripper, 5.0)
+    assert gripper.sta == 3
+    return gripper
+
+
+def go(gripper: Gripper, position: int, speed: int = 255, force: int = 0) -> None:
+    command = gripper.command
+    command.gto, command.pos, command.spe, command.force = True, position, speed, force
+
+
+def framed(request: bytes) -> bytes:
+    return request + crc16(request)
+
+
+def test_activation_opens_closes_and_opens_and_takes_as_long_as_that() -> None:
+    gripper = Gripper()
+    gripper.command.act = True
+    travelled, extremes, t_s = 0.0, set(), 0.0
+    before = gripper.width_mm
+    while gripper.sta != 3:
+        gripper.step(0.004)
+        t_s += 0.004
+        assert gripper.flt == (0 if gripper.sta == 3 else 5)
+        travelled += abs(gripper.width_mm - before)
+        before = gripper.width_mm
+        extremes.add(round(before, 6))
+    assert (min(extremes), max(extremes)) == (0.0, 140.0)
+    assert t_s == pytest.approx(travelled / 150.0, abs=0.02)
+
+
+@pytest.mark.parametrize(("speed", "mm_s"), [(0, 30.0), (255, 250.0), (51, 74.0)])
+def test_the_fingers_move_at_the_speed_that_is_asked_for(speed: int, mm_s: float) -> None:
+    gripper = active_gripper()
+    go(gripper, 230, speed)
+    steps(gripper, 0.2)
+    assert 140.0 - gripper.width_mm == pytest.approx(0.2 * mm_s, rel=1e-6)
+    assert gripper.obj == 0
+
+
+@given(st.floats(1, 139), st.integers(0, 255), st.floats(0.001, 0.2))
+def test_an_object_is_never_passed_through_however_coarse_the_steps(width: float, force: int, dt_s: float) -> None:
+    gripper = active_gripper()
+    gripper.between = lambda force_n: width - 0.002 * force_n
+    go(gripper, 255, force=force)
+    for _ in range(int(2.0 / dt_s) + 2):
+        gripper.step(dt_s)
+        assert gripper.width_mm >= width - 0.25 - 1e-9
+    assert gripper.obj == 2
+    # A stronger grip presses a soft object further.
+    assert gripper.width_mm == pytest.approx(width - 0.002 * (10 + 115 * force / 255))
+    assert gripper.grip_force_n == pytest.approx(10 + 115 * force / 255)
+
+
+def test_closing_on_air_ends_at_the_fingers_own_stop_without_an_object() -> None:
+    gripper = active_gripper()
+    go(gripper, 255)
+    steps(gripper, 1.0)
+    assert (gripper.obj, gripper.pos, gripper.pre) == (3, 230, 255)
+    assert gripper.grip_force_n == 0
+
+
+def test_opening_inside_something_is_a_contact_of_its_own() -> None:
+    gripper = active_gripper()
+    go(gripper, 230)
+    steps(gripper, 1.0)
+    gripper.around = lambda _: 55.0
+    go(gripper, 0)
+    steps(gripper, 1.0)
+    assert (gripper.obj, round(gripper.width_mm)) == (1, 55)
+
+
+def test_moving_before_activation_is_fault_7_and_a_major_fault_waits_for_an_edge() -> None:
+    gripper = Gripper()
+    go(gripper, 100)
+    steps(gripper, 0.1)
+    assert gripper.flt == 7
+    gripper = active_gripper()
+    gripper.fail(12)
+    go(gripper, 230)
+    steps(gripper, 1.0)
+    assert (gripper.flt, gripper.pos) == (12, 3)
+    gripper.clear_minor()
+    assert gripper.flt == 12
+    gripper.command.act = False
+    steps(gripper, 0.1)
+    gripper.command.act = True
+    steps(gripper, 5.0)
+    assert (gripper.flt, gripper.sta) == (0, 3)
+
+
+def test_an_automatic_release_opens_slowly_and_leaves_its_fault() -> None:
+    gripper = active_gripper()
+    go(gripper, 230)
+    steps(gripper, 1.0)
+    gripper.command.atr = gripper.command.ard = True
+    steps(gripper, 1.0)
+    assert (gripper.flt, round(gripper.width_mm)) == (11, 30)
+    steps(gripper, 5.0)
+    assert (gripper.flt, round(gripper.width_mm)) == (15, 140)
+
+
+def test_frames_are_the_manuals_byte_for_byte() -> None:
+    # Instruction manual, "Modbus RTU example": requests and replies with their checks.
+    assert framed(bytes.fromhex("0910 03E8 0003 06 0000 0000 0000")) == bytes.fromhex("091003E800030600000000000073 30")
+    assert framed(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF"))[-2:] == bytes.fromhex("4229")
+    assert framed(bytes.fromhex("0904 07D0 0003"))[-2:] == bytes.fromhex("B1CE")
+    assert framed(bytes.fromhex("0903 06 B900 00FF BD00"))[-2:] == bytes.fromhex("1D7C")
+    gripper = active_gripper()
+    face = ModbusFace(gripper)
+    assert face.feed(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF 4229"), 0.0) == framed(
+        bytes.fromhex("0910 03E8 0003")
+    )
+    gripper.between = lambda _: gripper.mechanics.width_mm(189)
+    steps(gripper, 1.0)
+    reply = face.feed(framed(READ_STATUS), 0.0)
+    assert reply[:7] == bytes.fromhex("0903 06 B900 00FF")
+    assert reply[7] == 189
+    assert crc16(reply[:-2]) == reply[-2:]
+
+
+@given(st.lists(st.integers(1, 12), min_size=1))
+def test_modbus_requests_come_in_any_slices(widths: list[int]) -> None:
+    requests = [
+        framed(READ_STATUS),
+        framed(bytes.fromhex("0906 03E9 0064")),
+        framed(bytes.fromhex("0910 03E8 0003 06 0900 0064 FF32")),
+        framed(bytes.fromhex("0917 07D0 0003 03E8 0001 02 0900")),
+        framed(bytes.fromhex("0103 07D0 0003")),
+        framed(bytes.fromhex("0904 07D1 0001")),
+    ]
+    whole, sliced = ModbusFace(active_gripper()), ModbusFace(active_gripper())
+    expected = b"".join(whole.feed(request, 0.0) for request in requests)
+    data, got, n = b"".join(requests), b"", 0
+    while data:
+        width = widths[n % len(widths)]
+        got += sliced.feed(data[:width], 0.0)
+        data, n = data[width:], n + 1
+    assert got == expected
+    assert whole.damaged == 0
+
+
+@pytest.mark.parametrize(
+    ("request_hex", "reply_hex"),
+    [
+        ("0905 03E8 FF00", "0985 01"),
+        ("0903 07D0 0004", "0983 02"),
+        ("0903 03E8 0001", "0983 02"),
+        ("0906 07D0 0001", "0986 02"),
+        ("0903 07D0 0000", "0983 02"),
+    ],
+)
+def test_what_the_gripper_does_not_have_is_refused_in_its_words(request_hex: str, reply_hex: str) -> None:
+    assert ModbusFace(Gripper()).feed(framed(bytes.fromhex(request_hex)), 0.0) == framed(bytes.fromhex(reply_hex))
+
+
+@given(st.binary(max_size=600), st.integers(1, 50))
+def test_noise_on_the_line_is_survived_and_bounded(noise: bytes, width: int) -> None:
+    face = ModbusFace(Gripper())
+    for start in range(0, len(noise), width):
+        face.feed(noise[start : start + width], 0.0)
+    # After a pause the next frame is understood.
+    assert face.feed(framed(READ_STATUS), 1.0)[:3] == bytes.fromhex("090306")
+
+
+def test_the_socket_answers_as_the_urcap_does() -> None:
+    gripper = active_gripper()
+    face = UrcapFace(gripper)
+    assert face.feed(b"SET POS 100 SPE 255 FOR 50 GTO 1\n") == b"ack"
+    steps(gripper, 1.0)
+    assert face.feed(b"GET POS\nGET OBJ\nGET P") == b"POS 100\nOBJ 3\n"
+    assert face.feed(b"RE\nGET FLT\nGET SID\n") == b"PRE 100\nFLT 00\nSID 9\n"
+    gripper.fail(14)
+    assert face.feed(b"GET FLT\n") == b"FLT 14\n"
+    face.no_data = True
+    assert face.feed(b"GET POS\n") == b"POS ?\n"
+
+
+@given(st.binary(max_size=2000), st.integers(1, 100))
+def test_a_client_that_talks_nonsense_gets_nothing_and_moves_nothing(noise: bytes, width: int) -> None:
+    gripper = active_gripper()
+    face = UrcapFace(gripper)
+    for start in range(0, len(noise), width):
+        face.feed(noise[start : start + width])
+    assert (gripper.command.pos, gripper.command.gto) == (0, False)
+    assert face.feed(b"\nGET STA\n").endswith(b"STA 3\n")
+
+
+@pytest.mark.parametrize("line", [b"SET POS 256\n", b"SET POS -1\n", b"SET POS\n", b"SET XYZ 1\n", b"SET\n", b"\n"])
+def test_a_wrong_set_is_not_acknowledged(line: bytes) -> None:
+    assert UrcapFace(active_gripper()).feed(line) == b""
+
+
+def test_positions_and_widths_are_each_others_inverse() -> None:
+    mechanics = GripperMechanics()
+    assert mechanics.width_mm(mechanics.counts(42.0)) == pytest.approx(42.0)
+    assert (mechanics.width_mm(3), mechanics.width_mm(230)) == (140.0, 0.0)

@@ -1,0 +1,173 @@
+"""The gripper's two languages and its widths: the manual's examples, any slices, odd answers."""
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.calibration_file import CalibrationError
+from drivers.errors import DeviceLostError, ProtocolError
+from drivers.robotiq import registers
+from drivers.robotiq.faults import fault_of
+from drivers.robotiq.messages import Activate, ActivationStatus, GoTo, Halt, ObjectStatus, Readout, Reset
+from drivers.robotiq.urcap import READ_ORDER, ReplyParser, readout_of, set_lines, value_of
+from drivers.robotiq.width import WidthCalibration
+
+byte = st.integers(0, 255)
+
+
+def test_requests_are_the_manuals_registers() -> None:
+    # Instruction manual, "Modbus RTU": reset 0000 0000 0000, close at full speed and force 0900 00FF FFFF.
+    last = GoTo(0, 0, 0)
+    assert registers.command_registers(Reset(), last) == [0, 0, 0]
+    assert registers.command_registers(Activate(), last) == [0x0100, 0, 0]
+    assert registers.command_registers(GoTo(255, 255, 255), last) == [0x0900, 0x00FF, 0xFFFF]
+    assert registers.command_registers(Halt(), GoTo(255, 255, 128)) == [0x0100, 0x00FF, 0xFF80]
+
+
+def test_replies_are_read_as_the_manual_explains_them() -> None:
+    # The manual's three examples: closing under way, object gripped, opened completely.
+    moving = registers.readout_of([0x3900, 0x0000, 0xBB10])
+    assert moving == Readout(True, True, ActivationStatus.ACTIVE, ObjectStatus.MOVING, 0, 0, 187, 16)
+    gripped = registers.readout_of([0xB900, 0x00FF, 0xBD00])
+    assert (gripped.obj, gripped.pre, gripped.pos) == (ObjectStatus.CONTACT_CLOSING, 255, 189)
+    opened = registers.readout_of([0xF900, 0x0000, 0x0D00])
+    assert (opened.obj, opened.pos) == (ObjectStatus.AT_TARGET, 13)
+    with pytest.raises(ProtocolError, match="2 registers"):
+        registers.readout_of([0, 0])
+
+
+@given(st.binary(min_size=6, max_size=6))
+def test_every_status_is_either_read_whole_or_refused(content: bytes) -> None:
+    readout = registers.readout_of([int.from_bytes(content[n : n + 2], "big") for n in (0, 2, 4)])
+    status = readout.act | readout.gto << 3 | readout.sta << 4 | readout.obj << 6
+    assert status == content[0] & 0b11111001
+    assert (readout.flt, readout.pre, readout.pos, readout.current) == (content[2] & 15, *content[3:6])
+
+
+def test_socket_lines_are_those_that_the_urcap_takes() -> None:
+    assert set_lines(GoTo(100, 255, 50)) == [b"SET POS 100 SPE 255 FOR 50 GTO 1\n"]
+    assert set_lines(Reset()) == [b"SET ACT 0\n", b"SET ATR 0\n"]
+    assert set_lines(Activate()) == [b"SET ACT 1\n"]
+    assert set_lines(Halt()) == [b"SET GTO 0\n"]
+
+
+@given(st.lists(st.one_of(st.just("ack"), st.tuples(st.sampled_from(READ_ORDER), byte)), max_size=8), st.data())
+def test_socket_replies_come_in_any_slices(replies: list[str | tuple[str, int]], data: st.DataObject) -> None:
+    parser = ReplyParser()
+    for reply in replies:
+        parser.expect_nothing()
+        sent = b"ack" if isinstance(reply, str) else b"%s %d\n" % (reply[0].encode(), reply[1])
+        cut = data.draw(st.integers(0, len(sent) - 1))
+        parser.feed(sent[:cut])
+        if isinstance(reply, str):
+            assert not parser.take_ack()
+            parser.feed(sent[cut:])
+            assert parser.take_ack()
+        else:
+            assert parser.take_value(reply[0]) is None
+            parser.feed(sent[cut:])
+            text = parser.take_value(reply[0])
+            assert text is not None
+            assert value_of(reply[0], text) == reply[1]
+
+
+def test_a_line_end_after_an_acknowledgement_is_forgiven() -> None:
+    parser = ReplyParser()
+    parser.feed(b"ack\n")
+    assert parser.take_ack()
+    parser.expect_nothing()
+    parser.feed(b"POS 12\n")
+    assert parser.take_value("POS") == "12"
+
+
+@given(st.binary(min_size=1, max_size=80))
+def test_whatever_a_stranger_answers_is_refused_or_waited_for(answer: bytes) -> None:
+    for take in (ReplyParser.take_ack, lambda parser: parser.take_value("POS")):
+        parser = ReplyParser()
+        try:
+            parser.feed(answer)
+            taken = take(parser)
+        except ProtocolError:
+            continue
+        assert taken in (False, None) or answer.lstrip().startswith((b"ack", b"POS "))
+
+
+def test_answers_to_another_question_are_refused() -> None:
+    parser = ReplyParser()
+    parser.feed(b"OBJ 3\n")
+    with pytest.raises(ProtocolError, match="asked for POS"):
+        parser.take_value("POS")
+    parser.feed(b"POS 3\n")
+    with pytest.raises(ProtocolError, match="without being asked"):
+        parser.expect_nothing()
+
+
+@pytest.mark.parametrize("text", ["256", "-1", "1.5", "", "²", "0x10"])
+def test_a_value_that_is_no_byte_is_refused(text: str) -> None:
+    with pytest.raises(ProtocolError, match="POS"):
+        value_of("POS", text)
+
+
+def test_missing_values_are_a_lost_gripper_except_for_the_current() -> None:
+    assert value_of("COU", "?") is None
+    with pytest.raises(DeviceLostError, match="no data of the gripper"):
+        value_of("POS", "?")
+    values: dict[str, int | None] = {"ACT": 1, "STA": 3, "GTO": 1, "PRE": 9, "OBJ": 2, "POS": 7, "FLT": 0, "COU": None}
+    assert readout_of(values).current is None
+    with pytest.raises(ProtocolError, match="not in its manual"):
+        readout_of(values | {"OBJ": 7})
+
+
+def test_every_fault_code_has_a_name_a_sentence_and_its_cure() -> None:
+    for code in range(1, 16):
+        fault = fault_of(code)
+        assert fault.code == code
+        assert fault.name
+        assert fault.sentence.endswith(".")
+        assert fault.needs_activation == (code >= 10)
+        assert not fault.needs_activation or "activate" in fault.sentence
+    assert fault_of(14).name == "overcurrent"
+    assert fault_of(3).name == "unknown fault 3"
+    assert fault_of(0).sentence == ""
+
+
+@given(st.floats(0, 20), st.floats(200, 255), st.floats(-20, 140))
+def test_a_width_becomes_counts_and_comes_back_within_half_a_count(opened: float, closed: float, width: float) -> None:
+    calibration = WidthCalibration(open_counts=opened, open_mm=140.0, closed_counts=closed, std_mm=0.5)
+    counts = calibration.counts(width)
+    step = abs(calibration.mm_per_count)
+    if 0 < counts < 255:
+        assert calibration.width_mm(counts) == pytest.approx(width, abs=step / 2 * (1 + 1e-9))
+    assert calibration.width_mm(opened) == pytest.approx(140)
+    assert calibration.width_mm(closed) == pytest.approx(0, abs=1e-9)
+    # A uniform error of one step has its standard deviation at step / √12.
+    assert calibration.width_std_mm**2 == pytest.approx(0.25 + step**2 / 12)
+
+
+def test_gauges_give_the_line_they_were_measured_on_and_its_scatter() -> None:
+    truth = WidthCalibration(open_counts=5.0, open_mm=140.0, closed_counts=225.0, std_mm=1.0)
+    gauges = [(truth.closed_counts + width / truth.mm_per_count, width) for width in (10.0, 20.0, 30.0, 40.0)]
+    found = WidthCalibration.of_gauges(gauges)
+    assert [found.width_mm(counts) for counts in (0, 100, 255)] == pytest.approx(
+        [truth.width_mm(counts) for counts in (0, 100, 255)]
+    )
+    assert found.std_mm == pytest.approx(140 / 220)
+    off = WidthCalibration.of_gauges([(counts + (2 if width == 20 else 0), width) for counts, width in gauges])
+    # A bump of 2 counts in the second of four even points leaves 2² (1 − 1/4 − 1/20), over two degrees of freedom, and
+    # tilts the line by 2 · (−5 mm) / 500 mm².
+    assert off.std_mm == pytest.approx(2 * (0.7 / 2) ** 0.5 / (220 / 140 + 0.02))
+
+
+@pytest.mark.parametrize(
+    ("gauges", "said"),
+    [
+        ([(100.0, 20.0)], "two different"),
+        ([(100.0, 20.0), (101.0, 20.0)], "two different"),
+        ([(100.0, 20.0), (150.0, 40.0)], "smaller objects"),
+        ([(100.0, 20.0), (100.0, 40.0)], "smaller objects"),
+        ([(100.0, 80.0), (190.0, 20.0), (160.0, 25.0)], "scatter"),
+    ],
+)
+def test_gauges_that_make_no_line_are_refused(gauges: list[tuple[float, float]], said: str) -> None:
+    with pytest.raises(CalibrationError, match=said):
+        WidthCalibration.of_gauges(gauges)

@@ -1,0 +1,163 @@
+"""ur-rtde behind a port of our own. The only module that imports it, and only the child process imports this module.
+
+The client is not thread-safe and blocks for up to 301 s, its constructors hold the interpreter lock and some never
+return, and it crashes its process when RTDE is lost: hence a process for it alone, with an alarm set before each call.
+"""
+
+import time
+
+import dashboard_client
+import rtde_control
+import rtde_receive
+
+from drivers.errors import DriverError
+from drivers.ur.messages import MoveLinear, Reading, WristSpeed
+from drivers.ur.settings import Six, UrSettings
+
+_VARIABLES = [
+    "timestamp",
+    "actual_q",
+    "actual_qd",
+    "actual_TCP_pose",
+    "actual_TCP_force",
+    "robot_mode",
+    "safety_mode",
+    "runtime_state",
+    "speed_scaling",
+]
+# A sample may arrive while it is being read; then it is read again.
+_READ_AGAIN = 3
+
+
+class DashboardRefusedError(DriverError):
+    """The dashboard server did not do what it was asked."""
+
+
+class Arm:
+    """One connection to a controller for reading, one for control; the dashboard when needed."""
+
+    def __init__(self, settings: UrSettings) -> None:
+        """Connect without starting a program, so that a robot in a protective stop can be connected to as well.
+
+        Raises:
+            RuntimeError: whatever ur-rtde says.
+        """
+        self._settings = settings
+        self._receive = rtde_receive.RTDEReceiveInterface(settings.host, settings.rate_hz, _VARIABLES)
+        kind = rtde_control.RTDEControlInterface
+        self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
+        self._timestamp_s = -1.0
+        self._changed_ns = time.monotonic_ns()
+
+    def read(self) -> Reading:
+        """Return the controller's latest sample and its age."""
+        receive = self._receive
+        for _ in range(_READ_AGAIN):
+            timestamp_s = receive.getTimestamp()
+            sample = (
+                _six(receive.getActualQ()),
+                _six(receive.getActualQd()),
+                _six(receive.getActualTCPPose()),
+                _six(receive.getActualTCPForce()),
+                receive.getRobotMode(),
+                receive.getSafetyMode(),
+                receive.getRuntimeState(),
+                receive.getSpeedScaling(),
+            )
+            if receive.getTimestamp() == timestamp_s:
+                break
+        now_ns = time.monotonic_ns()
+        if timestamp_s != self._timestamp_s:
+            self._timestamp_s, self._changed_ns = timestamp_s, now_ns
+        return Reading(
+            now_ns,
+            timestamp_s,
+            now_ns - self._changed_ns,
+            receive.isConnected() and self._control.isConnected(),
+            *sample,
+            self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
+        )
+
+    def wrist(self, command: WristSpeed) -> bool:
+        """Turn wrist 3, the other joints held."""
+        speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
+        return bool(self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0))
+
+    def end_speed(self, deceleration_rad_per_s2: float) -> bool:
+        """End the script's speed thread; blocks until the arm rests, so only for an arm that does."""
+        return bool(self._control.speedStop(deceleration_rad_per_s2))
+
+    def move(self, command: MoveLinear) -> bool:
+        """Begin a linear move; `Reading.moving_linearly` tells its end."""
+        return bool(
+            self._control.moveL(
+                [*command.pose], command.speed_m_per_s, command.acceleration_m_per_s2, asynchronous=True
+            )
+        )
+
+    def stop_move(self, deceleration_rad_per_s2: float) -> None:
+        """Begin to end a linear move."""
+        self._control.stopJ(deceleration_rad_per_s2, asynchronous=True)
+
+    def kick(self) -> bool:
+        """Tell the robot's watchdog that we live."""
+        return bool(self._control.kickWatchdog())
+
+    def clear_command(self) -> None:
+        """Clear the register that holds the last command, while no program runs.
+
+        The client has no call for it, but clears the register before it says that it cannot send: so let it refuse.
+        """
+        self._control.kickWatchdog()
+
+    def zero_wrench(self) -> bool:
+        """Take the present wrench as zero."""
+        return bool(self._control.zeroFtSensor())
+
+    def upload(self) -> bool:
+        """Send the control script; the program then starts by itself."""
+        return bool(self._control.reuploadScript())
+
+    def arm_watchdog(self) -> bool:
+        """Have the robot end its program when it hears nothing; to be done after every upload."""
+        return bool(self._control.setWatchdog(self._settings.watchdog_hz))
+
+    def end_program(self) -> None:
+        """End the control script."""
+        self._control.stopScript()
+
+    def unlock(self) -> None:
+        """Unlock a protective stop; `DashboardRefusedError` in its first 5 s."""
+        self._ask("unlockProtectiveStop")
+
+    def close_popups(self) -> None:
+        """Close what the pendant shows."""
+        self._ask("closeSafetyPopup", "closePopup")
+
+    def power_on(self) -> None:
+        """Begin to switch the arm's power on."""
+        self._ask("powerOn")
+
+    def release_brakes(self) -> None:
+        """Begin to release the brakes."""
+        self._ask("brakeRelease")
+
+    def stop_program(self) -> None:
+        """Stop whatever program runs or is paused."""
+        self._ask("stop")
+
+    def _ask(self, *requests: str) -> None:
+        dashboard = dashboard_client.DashboardClient(self._settings.host)
+        try:
+            dashboard.connect()
+            for request in requests:
+                getattr(dashboard, request)()
+        except RuntimeError as error:
+            raise DashboardRefusedError(str(error)) from error
+        finally:
+            dashboard.disconnect()
+
+
+def _six(values: list[float]) -> Six:
+    a, b, c, d, e, f = values
+    return (a, b, c, d, e, f)

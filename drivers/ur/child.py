@@ -1,0 +1,222 @@
+"""The robot's own process, `python -m drivers.ur.child`: commands on stdin, states and replies on stdout, 125 times a
+second.
+
+It may hang or crash in ur-rtde at any time and holds nothing worth saving. Before every stretch that may hang it sets
+an alarm that the kernel answers by ending it, whatever holds the interpreter lock; the robot's watchdog then ends the
+motion. When stdin ends the daemon is gone: it stops the arm and goes too.
+"""
+
+import contextlib
+import os
+import select
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NoReturn
+
+from drivers.ur import sentences
+from drivers.ur.messages import (
+    RECOVERY_HANG_S,
+    Command,
+    Configure,
+    Decoder,
+    Disconnect,
+    Failed,
+    FailureKind,
+    Heartbeat,
+    Message,
+    MoveLinear,
+    Phase,
+    Reply,
+    Stop,
+    WristSpeed,
+    encode,
+)
+from drivers.ur.pilot import Pilot
+from drivers.ur.probe import ProbeError, probe
+from drivers.ur.settings import UrSettings
+
+if TYPE_CHECKING:
+    from drivers.ur.arm import Arm
+
+EXIT_DONE, EXIT_FAILED = 0, 3
+COMMANDS = Command.__args__
+# Motion that the daemon leaves behind is braked in this time; the robot's watchdog ends what is not.
+FAREWELL_S = 1.0
+# States that a slow daemon does not fetch are dropped, as the latest counts; replies wait, within this bound.
+MOST_UNSENT = 1 << 16
+
+
+class Pipe:
+    """The two ends to the daemon, neither of which ever blocks."""
+
+    def __init__(self, stdin: int, stdout: int) -> None:
+        """Take over both descriptors."""
+        self._in, self._out = stdin, stdout
+        self._decoder = Decoder()
+        self._unsent = bytearray()
+        self.open = True
+        os.set_blocking(stdin, False)
+        os.set_blocking(stdout, False)
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait for input."""
+        select.select([self._in], [], [], timeout_s)
+
+    def receive(self) -> Iterator[tuple[int, Message]]:
+        """Yield the messages that have arrived; `open` is False once the daemon is gone."""
+        try:
+            data = os.read(self._in, 1 << 16)
+        except BlockingIOError:
+            return
+        self.open = self.open and bool(data)
+        yield from self._decoder.feed(data)
+
+    def send(self, message: Message, number: int = 0) -> None:
+        """Send a message that must arrive."""
+        self._unsent += encode(message, number)
+        if len(self._unsent) > MOST_UNSENT:
+            self.open = False
+        self._flush()
+
+    def send_latest(self, message: Message) -> None:
+        """Send a message unless others are still waiting."""
+        self._flush()
+        if not self._unsent:
+            self.send(message)
+
+    def _flush(self) -> None:
+        try:
+            while self._unsent:
+                del self._unsent[: os.write(self._out, self._unsent)]
+        except BlockingIOError:
+            return
+        except BrokenPipeError:
+            self._unsent.clear()
+            self.open = False
+
+
+def main() -> NoReturn:
+    """Run until told to go, until the daemon is gone, or until the controller is."""
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    # Ctrl-C at the terminal reaches the daemon, which then says when to stop.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # What the client prints must not get between the messages.
+    stdout = os.dup(1)
+    os.dup2(2, 1)
+    pipe = Pipe(0, stdout)
+    settings = _configuration(pipe)
+    if settings is None:
+        _leave(EXIT_DONE)
+    arm = _connect(pipe, settings)
+    _fly(pipe, settings, arm)
+
+
+def _configuration(pipe: Pipe) -> UrSettings | None:
+    while pipe.open:
+        pipe.wait(60.0)
+        for _, message in pipe.receive():
+            if isinstance(message, Configure):
+                return message.settings
+    return None
+
+
+def _connect(pipe: Pipe, settings: UrSettings) -> "Arm":
+    _alarm(settings.connect_timeout_s)
+    pipe.send(Phase("loading ur-rtde"))
+    try:
+        from drivers.ur.arm import Arm
+    except ImportError:
+        _fail(pipe, "not-installed", sentences.NOT_INSTALLED)
+    pipe.send(Phase("greeting the controller"))
+    try:
+        probe(settings.host, settings.connect_timeout_s / 3)
+    except ProbeError as error:
+        _fail(pipe, error.kind, str(error))
+    pipe.send(Phase("connecting"))
+    try:
+        return Arm(settings)
+    except RuntimeError as error:
+        _fail(pipe, *_explain(settings.host, str(error)))
+
+
+def _explain(host: str, text: str) -> tuple[FailureKind, str]:
+    if "already in use" in text:
+        return "registers-in-use", sentences.registers_in_use(host)
+    if "remote control" in text:
+        return "local-control", sentences.local_control(host)
+    return "unreachable", sentences.refused_by_client(host, text)
+
+
+def _fly(pipe: Pipe, settings: UrSettings, arm: "Arm") -> NoReturn:
+    pilot = Pilot(settings, arm, time.monotonic_ns())
+    period_s = 1.0 / settings.rate_hz
+    leaving_s = 0.0
+    due_s = time.monotonic()
+    while True:
+        _alarm(settings.hang_timeout_s)
+        reading = arm.read()
+        if not reading.connected or reading.age_ns > 3 * settings.state_timeout_s * 1e9:
+            _fail(pipe, "lost", sentences.unfit(reading, settings.host, settings.state_timeout_s))
+        for number, command in _newest(pipe, pilot):
+            reply = pilot.request(number, command, reading, time.monotonic_ns())
+            if reply is not None:
+                pipe.send(reply, number)
+            if isinstance(command, Disconnect):
+                leaving_s = time.monotonic() + FAREWELL_S
+        if not pipe.open and not leaving_s:
+            pilot.request(0, Disconnect(), reading, time.monotonic_ns())
+            leaving_s = time.monotonic() + FAREWELL_S
+        if pilot.recovering:
+            # The daemon learns beforehand that this cycle may take long.
+            pipe.send_latest(pilot.state(reading))
+            _alarm(RECOVERY_HANG_S)
+        decided = pilot.tick(reading, time.monotonic_ns())
+        if decided is not None:
+            pipe.send(decided[1], decided[0])
+        pipe.send_latest(pilot.state(reading))
+        if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
+            if reading.program_running:
+                arm.end_program()
+            _leave(EXIT_DONE)
+        # A late cycle is not caught up with: two commands at once are no use to anyone.
+        due_s = max(due_s + period_s, time.monotonic())
+        time.sleep(max(0.0, due_s - time.monotonic()))
+
+
+def _newest(pipe: Pipe, pilot: Pilot) -> list[tuple[int, Command]]:
+    """Return the commands to carry out in this cycle: of motions only the latest, the others answered as overtaken."""
+    commands: list[tuple[int, Command]] = []
+    for number, message in pipe.receive():
+        pilot.heard(time.monotonic_ns())
+        if isinstance(message, COMMANDS):
+            commands.append((number, message))
+        elif not isinstance(message, Heartbeat):
+            raise TypeError(f"the daemon sent a {type(message).__name__}, which is no command")
+    motions = [n for n, (_, command) in enumerate(commands) if isinstance(command, WristSpeed | MoveLinear | Stop)]
+    # A stop is never overtaken: what comes after it finds the arm stopping.
+    overtaken = [n for n in motions[:-1] if not isinstance(commands[n][1], Stop)]
+    for index in overtaken:
+        pipe.send(Reply(refused="A newer command came before this one could be sent."), commands[index][0])
+    return [entry for index, entry in enumerate(commands) if index not in overtaken]
+
+
+def _alarm(seconds: float) -> None:
+    signal.setitimer(signal.ITIMER_REAL, seconds)
+
+
+def _fail(pipe: Pipe, kind: FailureKind, sentence: str) -> NoReturn:
+    pipe.send(Failed(kind, sentence))
+    _leave(EXIT_FAILED)
+
+
+def _leave(status: int) -> NoReturn:
+    # Not through the interpreter's end: the client's destructors hang and abort, and the kernel closes sockets as well.
+    with contextlib.suppress(OSError):
+        sys.stderr.flush()
+    os._exit(status)
+
+
+if __name__ == "__main__":
+    main()

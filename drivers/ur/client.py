@@ -1,0 +1,302 @@
+"""The daemon's end of the robot: one process that may die at any time, and one object that outlives it.
+
+`UrRobot.run` belongs in the daemon's task group. It starts the process, keeps the latest state, ends a process that
+hangs, and starts the next one with growing pauses. A new process has motion disabled: no command is ever sent twice,
+and nothing moves until someone says `Enable` (or `Unlock`) anew.
+"""
+
+import asyncio
+import contextlib
+import importlib.util
+import signal
+import sys
+import time
+from collections import Counter, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from drivers.errors import DeviceLostError, DriverError, ProtocolError
+from drivers.ur import sentences
+from drivers.ur.messages import (
+    RECOVERY_HANG_S,
+    Command,
+    Configure,
+    Decoder,
+    Disconnect,
+    Failed,
+    FailureKind,
+    Heartbeat,
+    Message,
+    Phase,
+    Reply,
+    RobotState,
+    encode,
+)
+from drivers.ur.settings import UrSettings
+
+LinkStatus = Literal["starting", "up", "down"]
+LossKind = FailureKind | Literal["crashed", "hung", "garbled"]
+
+PAUSES_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
+# After so long without a loss the next one is a first one again.
+STEADY_S = 30.0
+# A process being told to go stops the arm (1 s) and ends the program; then it is ended.
+FAREWELL_S = 3.0
+# Beyond its own alarms a process gets so long: they end it at a known place, and first.
+GRACE_S = 1.0
+# What a stuck process leaves unread; some hundred commands.
+MOST_UNSENT = 1 << 15
+
+
+@dataclass(frozen=True, slots=True)
+class LinkEvent:
+    """The link to the robot came up or went down; `sentence` is for the operator."""
+
+    t_mono_ns: int
+    status: LinkStatus
+    sentence: str
+    kind: LossKind | None = None
+    losses: int = 0
+
+
+class UrRobot:
+    """A UR arm: `run` in a task, `send` commands, look at `state`."""
+
+    def __init__(self, settings: UrSettings, on_link: Callable[[LinkEvent], None] | None = None) -> None:
+        """Take the settings; `on_link` hears of every loss and every return."""
+        self.settings = settings
+        self.link = LinkEvent(time.monotonic_ns(), "starting", "The robot's process has not been started.")
+        self.losses: Counter[str] = Counter()
+        self.pid: int | None = None
+        self._on_link = on_link or (lambda _event: None)
+        self._state: RobotState | None = None
+        self._stdin: asyncio.StreamWriter | None = None
+        self._waiting: dict[int, asyncio.Future[Reply]] = {}
+        self._number = 0
+        self._fresh = asyncio.Condition()
+
+    @property
+    def state(self) -> RobotState | None:
+        """The latest state, or None while there is no connection: an old state is no state."""
+        return self._state
+
+    async def next_state(self) -> RobotState:
+        """Return the next state that arrives; waits through losses of the connection."""
+        async with self._fresh:
+            await self._fresh.wait()
+            while self._state is None:
+                await self._fresh.wait()
+            return self._state
+
+    async def send(self, command: Command) -> Reply:
+        """Return the one reply to a command: what is sent after clipping, or why nothing is.
+
+        A command whose process dies before it replied is answered as refused, and is not sent again.
+        """
+        if self._stdin is None or self._state is None:
+            return Reply(refused=f"The robot is not connected. {self.link.sentence}")
+        self._number += 1
+        number = self._number
+        future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        self._waiting[number] = future
+        self._stdin.write(encode(command, number))
+        try:
+            return await future
+        finally:
+            self._waiting.pop(number, None)
+
+    async def run(self) -> None:
+        """Keep the robot connected until cancelled; then stop it and let it go.
+
+        Raises:
+            DriverError: ur-rtde is not installed, which no attempt would change.
+        """
+        if importlib.util.find_spec("rtde_control") is None:
+            raise DriverError(sentences.NOT_INSTALLED)
+        attempts = 0
+        while True:
+            started_s = time.monotonic()
+            try:
+                await self._one_process()
+            except _LostError as loss:
+                if loss.kind == "not-installed":
+                    raise DriverError(str(loss)) from loss
+                attempts = 1 if time.monotonic() - started_s > STEADY_S else attempts + 1
+                self.losses[loss.kind] += 1
+                self._tell("down", str(loss), loss.kind)
+            await asyncio.sleep(PAUSES_S[min(attempts, len(PAUSES_S)) - 1])
+
+    # ---- one process ----------------------------------------------------------------------------------------------
+
+    async def _one_process(self) -> None:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "drivers.ur.child",
+            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+        )  # fmt: skip
+        self.pid = process.pid
+        conversation = _Conversation(self, process)
+        loss: BaseException | None = None
+        try:
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(conversation.keep_alive())
+                tasks.create_task(conversation.collect_stderr())
+                await conversation.listen()
+        except* _LostError as group:
+            loss = group.exceptions[0]
+        finally:
+            self._disconnected()
+            # Cancelled: let it stop the arm. Lost: there is nothing to wait for.
+            await asyncio.shield(conversation.end())
+            self.pid = None
+        if loss is not None:
+            raise loss
+
+    def connected(self, stdin: asyncio.StreamWriter) -> None:
+        """Send commands there from now on."""
+        self._stdin = stdin
+
+    def _disconnected(self) -> None:
+        self._stdin = None
+        self._state = None
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_result(Reply(refused="The robot's process ended before it answered; nothing is sent again."))
+        self._waiting.clear()
+
+    async def take(self, number: int, message: Message) -> None:
+        """Act on a message of the process."""
+        match message:
+            case RobotState():
+                first = self._state is None
+                self._state = message
+                if first:
+                    self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
+                async with self._fresh:
+                    self._fresh.notify_all()
+            case Reply():
+                future = self._waiting.get(number)
+                if future is not None and not future.done():
+                    future.set_result(message)
+            case Failed():
+                raise _LostError(message.kind, message.sentence)
+
+    def _tell(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
+        self.link = LinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
+        self._on_link(self.link)
+
+
+class _LostError(DeviceLostError):
+    """The process is of no more use."""
+
+    def __init__(self, kind: LossKind, sentence: str) -> None:
+        super().__init__(sentence)
+        self.kind: LossKind = kind
+
+
+class _Conversation:
+    """The pipe to one process."""
+
+    def __init__(self, robot: UrRobot, process: asyncio.subprocess.Process) -> None:
+        if process.stdin is None or process.stdout is None or process.stderr is None:
+            raise DriverError("The robot's process was started without pipes.")
+        self._robot = robot
+        self._settings = robot.settings
+        self._process = process
+        self._stdin, self._stdout, self._stderr = process.stdin, process.stdout, process.stderr
+        self._said: deque[str] = deque(maxlen=8)
+        self._doing = "starting"
+        self._stdin.write(encode(Configure(robot.settings)))
+
+    async def listen(self) -> None:
+        """Take messages until the process has no more; a silent process is ended."""
+        decoder = Decoder()
+        while True:
+            patience_s = self._patience_s()
+            try:
+                async with asyncio.timeout(patience_s):
+                    data = await self._stdout.read(1 << 16)
+            except TimeoutError:
+                self._kill()
+                raise _LostError("hung", self._hung(patience_s)) from None
+            if not data:
+                raise await self._died()
+            try:
+                for number, message in decoder.feed(data):
+                    if isinstance(message, Phase):
+                        self._doing = message.doing
+                    elif isinstance(message, RobotState):
+                        self._doing = "controlling"
+                        self._robot.connected(self._stdin)
+                    await self._robot.take(number, message)
+            except ProtocolError as error:
+                self._kill()
+                raise _LostError("garbled", str(error)) from error
+
+    async def keep_alive(self) -> None:
+        """Give signs of life four times in the time after which motion would be stopped."""
+        beat = encode(Heartbeat())
+        while True:
+            await asyncio.sleep(self._settings.silence_timeout_s / 4)
+            if self._stdin.transport.get_write_buffer_size() > MOST_UNSENT:
+                self._kill()
+                raise _LostError("hung", self._hung(self._settings.silence_timeout_s))
+            self._stdin.write(beat)
+
+    async def collect_stderr(self) -> None:
+        """Keep the last lines that the process printed: after a crash they are all there is."""
+        while line := await self._stderr.readline():
+            self._said.append(line.decode("utf-8", "replace").strip())
+
+    async def end(self) -> None:
+        """End the process: in good order while it listens, and in any case within `FAREWELL_S`."""
+        if self._process.returncode is None:
+            with contextlib.suppress(ConnectionError):
+                self._stdin.write(encode(Disconnect()))
+            # The end of its input is its second word to go.
+            self._stdin.close()
+            try:
+                async with asyncio.timeout(FAREWELL_S), asyncio.TaskGroup() as tasks:
+                    tasks.create_task(_drain(self._stdout))
+                    tasks.create_task(_drain(self._stderr))
+                    tasks.create_task(self._process.wait())
+            except TimeoutError:
+                self._kill()
+        await self._process.communicate()
+
+    def _kill(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
+
+    def _patience_s(self) -> float:
+        state = self._robot.state
+        if state is None:
+            return self._settings.connect_timeout_s + GRACE_S
+        return (RECOVERY_HANG_S if state.recovering else self._settings.hang_timeout_s) + GRACE_S
+
+    async def _died(self) -> "_LostError":
+        status = await self._process.wait()
+        if status == -signal.SIGALRM:
+            return _LostError("hung", self._hung(self._settings.hang_timeout_s))
+        died_of = f"died of {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+        # What ur-rtde does when it loses the controller.
+        why = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
+        said = f" Its last words: {' / '.join(self._said)}." if self._said else ""
+        return _LostError(
+            "crashed",
+            f"The robot's process {died_of} while {self._doing}{why}. The robot's watchdog ends the motion; the "
+            f"process is started again with motion disabled.{said}",
+        )
+
+    def _hung(self, seconds: float) -> str:
+        if self._robot.state is None:
+            return sentences.silent(self._settings.host, self._settings.connect_timeout_s, self._doing)
+        return (
+            f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "
+            "motion; the process is started again with motion disabled."
+        )
+
+
+async def _drain(stream: asyncio.StreamReader) -> None:
+    while await stream.read(1 << 16):
+        pass

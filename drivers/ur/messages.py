@@ -1,0 +1,258 @@
+"""What crosses the pipe between the daemon and the robot's own process: typed, length-prefixed, strictly decoded.
+
+A message is a header (length of the body, number, kind) and its fields as JSON, written and checked by pydantic in one
+pass; its strict mode for JSON takes neither a missing field nor an unknown one nor a value of another type.
+"""
+
+import struct
+from dataclasses import dataclass
+from typing import ClassVar, Final, Literal
+
+from pydantic import TypeAdapter, ValidationError
+
+from drivers.errors import ProtocolError
+from drivers.ur.settings import Six, UrSettings
+
+MotionKind = Literal["idle", "wrist", "linear", "stopping"]
+FailureKind = Literal["not-installed", "unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
+
+_FINITE: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
+# What the controller reports is passed on even where it is no number; `limits.violation` then says so.
+_STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "ser_json_inf_nan": "constants"}
+
+
+@dataclass(frozen=True, slots=True)
+class WristSpeed:
+    """Turn the tool about its axis; holds for `command_timeout_s`, then has to be commanded again."""
+
+    __pydantic_config__: ClassVar = _FINITE
+
+    rad_per_s: float
+    acceleration_rad_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class MoveLinear:
+    """Move the tool on a straight line to a pose: x, y, z in m and the rotation vector in rad, in the base frame."""
+
+    __pydantic_config__: ClassVar = _FINITE
+
+    pose: Six
+    speed_m_per_s: float
+    acceleration_m_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Slow every joint down to rest, whatever moves."""
+
+    __pydantic_config__: ClassVar = _FINITE
+
+    deceleration_rad_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroForceTorque:
+    """Take the present wrench as zero; only at rest."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+
+@dataclass(frozen=True, slots=True)
+class Enable:
+    """Allow motion: after every start of the robot's process, and after everything that stopped the arm."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+
+@dataclass(frozen=True, slots=True)
+class Unlock:
+    """The operator's word after a protective or emergency stop: unlock, power, start the control program, enable."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+
+@dataclass(frozen=True, slots=True)
+class Disconnect:
+    """Stop, end the control program, go."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+
+Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | Disconnect
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """The one answer to a command: what is sent to the robot after clipping, or why nothing is."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+    refused: str = ""
+    sent: WristSpeed | MoveLinear | Stop | None = None
+    clipped: tuple[str, ...] = ()
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the command is carried out."""
+        return not self.refused
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One reading of the controller: SI units, base frame, joints from base to wrist 3."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+    t_mono_ns: int
+    timestamp_s: float
+    # How long ago the controller's timestamp last changed; a connection can be open and the data old.
+    age_ns: int
+    connected: bool
+    q_rad: Six
+    qd_rad_per_s: Six
+    tcp_pose: Six
+    wrench: Six
+    robot_mode: int
+    safety_mode: int
+    runtime_state: int
+    speed_scaling: float
+    moving_linearly: bool
+
+    @property
+    def program_running(self) -> bool:
+        """Whether the control program plays."""
+        return self.runtime_state == RUNTIME_PLAYING
+
+    @property
+    def wrist_rad(self) -> float:
+        """The angle of wrist 3, about which the tool twists."""
+        return self.q_rad[5]
+
+
+@dataclass(frozen=True, slots=True)
+class RobotState(Reading):
+    """A reading and what the driver makes of it; published as `robot.state`."""
+
+    # Torque about the tool's own axis, from wrench and pose.
+    wrist_torque_nm: float
+    protective_stop: bool
+    emergency_stop: bool
+    # Why motion is refused at present; empty when it is enabled.
+    blocked: str
+    # Whether the robot is being unlocked, powered or started.
+    recovering: bool
+    motion: MotionKind
+    # Number of the command that the motion belongs to, and why its motion ended ("arrived" when as asked).
+    motion_id: int
+    ended: str
+    # What was last sent to the robot, after clipping, and every reason for clipping it.
+    sent: WristSpeed | MoveLinear | Stop | None
+    clipped: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Configure:
+    """The first message to the process."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+    settings: UrSettings
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """The daemon is alive."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """What the process is about to do, said before doing it: it may hang or crash there."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+    doing: str
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """Why the process ends."""
+
+    __pydantic_config__: ClassVar = _STRICT
+
+    kind: FailureKind
+    sentence: str
+
+
+Message = Command | Reply | RobotState | Configure | Heartbeat | Phase | Failed
+
+# How long a cycle may take while recovering: the dashboard's client waits 2.5 s for an answer, the control client 3 s
+# for a ready program.
+RECOVERY_HANG_S: Final = 6.0
+
+ROBOT_MODE_POWER_OFF: Final = 3
+ROBOT_MODE_IDLE: Final = 5
+ROBOT_MODE_RUNNING: Final = 7
+RUNTIME_STOPPED: Final = 1
+RUNTIME_PLAYING: Final = 2
+SAFETY_NORMAL: Final = 1
+SAFETY_REDUCED: Final = 2
+SAFETY_PROTECTIVE_STOP: Final = 3
+SAFETY_EMERGENCY_STOPS: Final = (6, 7)
+
+_KINDS: Final[tuple[type[Message], ...]] = (
+    WristSpeed, MoveLinear, Stop, ZeroForceTorque, Enable, Unlock, Disconnect,
+    Reply, RobotState, Configure, Heartbeat, Phase, Failed,
+)  # fmt: skip
+_ADAPTERS: Final[tuple[TypeAdapter[Message], ...]] = tuple(TypeAdapter(kind) for kind in _KINDS)
+_CODES: Final = {kind: code for code, kind in enumerate(_KINDS)}
+_HEADER = struct.Struct("<IIB")
+# The largest message, a state with every reason for clipping, has some 2 kB; more is not ours.
+LARGEST_BODY = 1 << 16
+
+
+def encode(message: Message, number: int = 0) -> bytes:
+    """Return a message with its header; `number` pairs a command with its reply."""
+    code = _CODES[type(message)]
+    body = _ADAPTERS[code].dump_json(message)
+    return _HEADER.pack(len(body), number, code) + body
+
+
+class Decoder:
+    """Cuts a byte stream into messages."""
+
+    def __init__(self) -> None:
+        """Start empty."""
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> list[tuple[int, Message]]:
+        """Return the (number, message) pairs that are complete now.
+
+        Raises:
+            ProtocolError: the stream is not one of ours, or a message does not have its type's fields and values.
+        """
+        self._buffer += data
+        messages = []
+        while len(self._buffer) >= _HEADER.size:
+            length, number, code = _HEADER.unpack_from(self._buffer)
+            if length > LARGEST_BODY or code >= len(_KINDS):
+                raise ProtocolError(f"The robot's pipe carries no message of ours: kind {code}, {length} bytes.")
+            end = _HEADER.size + length
+            if len(self._buffer) < end:
+                break
+            messages.append((number, _decode(code, bytes(self._buffer[_HEADER.size : end]))))
+            del self._buffer[:end]
+        return messages
+
+
+def _decode(code: int, body: bytes) -> Message:
+    try:
+        return _ADAPTERS[code].validate_json(body)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise ProtocolError(
+            f"The robot's pipe carries a bad {_KINDS[code].__name__}: {where} {first['msg']}."
+        ) from error

@@ -1,0 +1,354 @@
+"""What is sent to the robot and what is refused: commands, readings and the time in; calls on the arm and replies out.
+
+No clock, no pipe, no ur-rtde: the arm is a port and the time an argument, so that every rule here is tested without a
+robot. One cycle is `tick`; commands come between cycles through `request`. Whatever ends a motion, nothing begins one
+but a command given after it.
+"""
+
+import dataclasses
+import math
+from typing import Protocol
+
+from drivers.ur import sentences
+from drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation, violation
+from drivers.ur.messages import (
+    SAFETY_EMERGENCY_STOPS,
+    SAFETY_PROTECTIVE_STOP,
+    Command,
+    Disconnect,
+    Enable,
+    MotionKind,
+    MoveLinear,
+    Reading,
+    Reply,
+    RobotState,
+    Stop,
+    Unlock,
+    WristSpeed,
+    ZeroForceTorque,
+)
+from drivers.ur.recovery import CureArm, Outcome, Recovery
+from drivers.ur.settings import UrSettings
+
+# Slower than this, a joint rests: below it lies the noise of a real arm's speed signal.
+REST_RAD_PER_S = 2e-3
+# How long a linear move may take beyond its nominal time before it is stopped.
+LINEAR_SLACK, LINEAR_SLACK_S = 1.5, 2.0
+
+
+class PilotArm(CureArm, Protocol):
+    """What flying needs of the robot."""
+
+    def wrist(self, command: WristSpeed) -> bool:
+        """Turn wrist 3."""
+
+    def end_speed(self, deceleration_rad_per_s2: float) -> bool:
+        """End the speed thread of an arm at rest."""
+
+    def move(self, command: MoveLinear) -> bool:
+        """Begin a linear move."""
+
+    def stop_move(self, deceleration_rad_per_s2: float) -> None:
+        """Begin to end a linear move."""
+
+    def kick(self) -> bool:
+        """Tell the robot's watchdog that we live."""
+
+    def zero_wrench(self) -> bool:
+        """Take the present wrench as zero."""
+
+
+class Pilot:
+    """Applies the latest command, within the limits, while everything is well."""
+
+    def __init__(self, settings: UrSettings, arm: PilotArm, now_ns: int) -> None:
+        """Begin with motion not enabled, and with starting the control program where the robot lets us."""
+        self._settings = settings
+        self._limits = settings.limits
+        self._arm = arm
+        self._held = sentences.NOT_ENABLED
+        self._motion: MotionKind = "idle"
+        self._motion_id = 0
+        self._ended = ""
+        self._asked: WristSpeed | Stop = Stop(0.0)
+        self._speed_thread = False
+        self._asked_ns = self._heard_ns = now_ns
+        self._deadline_ns = 0
+        self._move_seen = False
+        self._sent: WristSpeed | MoveLinear | Stop | None = None
+        self._clipped: tuple[str, ...] = ()
+        self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s, operator_asked=False)
+        self._unlock_number: int | None = None
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether no motion is under way."""
+        return self._motion == "idle"
+
+    @property
+    def recovering(self) -> bool:
+        """Whether calls may take seconds: the dashboard's, and the first one to a new program."""
+        return self._recovery is not None
+
+    def heard(self, now_ns: int) -> None:
+        """Note a sign of life of the daemon."""
+        self._heard_ns = now_ns
+
+    def request(self, number: int, command: Command, reading: Reading, now_ns: int) -> Reply | None:
+        """Return the reply to a command; None when it comes later, from `tick` (`Unlock`)."""
+        match command:
+            case Stop():
+                return self._stop_on_command(number, command, reading)
+            case Enable():
+                return self._enable(reading)
+            case Unlock():
+                return self._unlock(number, reading, now_ns)
+            case ZeroForceTorque():
+                return self._zero_wrench(reading)
+            case WristSpeed():
+                return self._turn(number, command, reading, now_ns)
+            case MoveLinear():
+                return self._move(number, command, reading, now_ns)
+            case Disconnect():
+                self._stop(reading, "the daemon disconnects")
+                return Reply()
+
+    def tick(self, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
+        """Let one cycle pass: judge the reading, send what is due; return the reply to an `Unlock` that is decided."""
+        if self._recovery is not None:
+            return self._recover(self._recovery, reading, now_ns)
+        trouble = self._unfit(reading)
+        if trouble:
+            # Nothing can be sent. The arm stops by itself, or by its watchdog, which is no longer kicked.
+            self._held = trouble
+            self._end(trouble)
+            self._speed_thread = False
+            return None
+        beyond = violation(reading, self._limits)
+        if beyond:
+            self._held = beyond
+            self._stop(reading, beyond)
+        elif now_ns - self._heard_ns > self._settings.silence_timeout_s * 1e9:
+            self._stop(reading, f"the daemon was silent for {self._settings.silence_timeout_s:g} s")
+        match self._motion:
+            case "wrist":
+                self._keep_turning(reading, now_ns)
+            case "linear":
+                self._watch_move(reading, now_ns)
+            case "stopping":
+                self._keep_stopping(reading)
+            case "idle":
+                self._arm.kick()
+        return None
+
+    def state(self, reading: Reading) -> RobotState:
+        """Return the reading with everything that this pilot adds to it."""
+        values = {field.name: getattr(reading, field.name) for field in dataclasses.fields(reading)}
+        return RobotState(
+            **values,
+            wrist_torque_nm=tool_axis_torque(reading),
+            protective_stop=reading.safety_mode == SAFETY_PROTECTIVE_STOP,
+            emergency_stop=reading.safety_mode in SAFETY_EMERGENCY_STOPS,
+            blocked=self._blocked(reading),
+            recovering=self.recovering,
+            motion=self._motion,
+            motion_id=self._motion_id,
+            ended=self._ended,
+            sent=self._sent,
+            clipped=self._clipped,
+        )
+
+    # ---- commands -------------------------------------------------------------------------------------------------
+
+    def _turn(self, number: int, asked: WristSpeed, reading: Reading, now_ns: int) -> Reply:
+        why = self._blocked(reading)
+        if not why and asked.acceleration_rad_per_s2 <= 0:
+            why = f"An acceleration of {asked.acceleration_rad_per_s2:g} rad/s² is not above 0."
+        if not why and self._motion not in ("idle", "wrist"):
+            why = "The arm is still stopping." if self._motion == "stopping" else "A linear move is under way: stop it."
+        if why:
+            return Reply(refused=why)
+        self._begin("wrist", number)
+        self._asked, self._asked_ns = asked, now_ns
+        if not self._send_wrist(reading):
+            return self._not_taken(reading, "wrist speed")
+        return Reply(sent=self._sent, clipped=self._clipped)
+
+    def _move(self, number: int, asked: MoveLinear, reading: Reading, now_ns: int) -> Reply:
+        why = self._blocked(reading)
+        if not why and min(asked.speed_m_per_s, asked.acceleration_m_per_s2) <= 0:
+            why = "A linear move needs a speed and an acceleration above 0."
+        if not why and not (self._motion in ("idle", "wrist") and _rests(reading)):
+            why = "The arm moves: stop it before a linear move."
+        if why:
+            return Reply(refused=why)
+        self._end_speed_thread()
+        sent, clipped = clip_linear(asked, self._limits)
+        self._begin("linear", number)
+        self._sent, self._clipped = sent, clipped
+        self._deadline_ns = now_ns + int(1e9 * _longest_s(sent, reading))
+        self._move_seen = False
+        if not self._arm.move(sent):
+            return self._not_taken(reading, "linear move")
+        return Reply(sent=sent, clipped=clipped)
+
+    def _stop_on_command(self, number: int, asked: Stop, reading: Reading) -> Reply:
+        if asked.deceleration_rad_per_s2 <= 0:
+            return Reply(refused=f"A deceleration of {asked.deceleration_rad_per_s2:g} rad/s² is not above 0.")
+        trouble = self._unfit(reading)
+        if trouble:
+            return Reply(refused=f"Nothing can be sent, and the arm stops by itself. {trouble}")
+        sent = clip_stop(asked, reading, self._limits, self._settings.reaction_s)
+        self._motion_id = number
+        self._stop(reading, "stopped on command", sent)
+        self._sent, self._clipped = sent, ()
+        return Reply(sent=sent)
+
+    def _enable(self, reading: Reading) -> Reply:
+        why = self._unfit(reading) or violation(reading, self._limits)
+        if self._recovery is not None:
+            why = sentences.BEING_MADE_READY
+        if not why:
+            self._held = ""
+        return Reply(refused=why)
+
+    def _unlock(self, number: int, reading: Reading, now_ns: int) -> Reply | None:
+        if self._unlock_number is not None:
+            return Reply(refused="Unlocking is under way.")
+        if not self._unfit(reading):
+            return self._enable(reading)
+        self._end(self._unfit(reading))
+        self._speed_thread = False
+        self._unlock_number = number
+        self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
+        return None
+
+    def _zero_wrench(self, reading: Reading) -> Reply:
+        why = self._unfit(reading)
+        if not why and not (self._motion == "idle" and _rests(reading)):
+            why = "The wrench is zeroed only at rest: stop the arm first."
+        if not why and not self._arm.zero_wrench():
+            why = "The robot did not zero its force-torque sensor."
+        return Reply(refused=why)
+
+    # ---- motion under way -----------------------------------------------------------------------------------------
+
+    def _keep_turning(self, reading: Reading, now_ns: int) -> None:
+        if now_ns - self._asked_ns > self._settings.command_timeout_s * 1e9:
+            late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
+            self._stop(reading, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
+            self._keep_stopping(reading)
+        else:
+            self._send_wrist(reading)
+
+    def _send_wrist(self, reading: Reading) -> bool:
+        if not isinstance(self._asked, WristSpeed):
+            return False
+        self._sent, self._clipped = clip_wrist(self._asked, reading, self._limits, self._settings.reaction_s)
+        self._speed_thread = True
+        return self._arm.wrist(self._sent)
+
+    def _watch_move(self, reading: Reading, now_ns: int) -> None:
+        self._move_seen = self._move_seen or reading.moving_linearly
+        why = line_violation(reading, self._limits)
+        if now_ns > self._deadline_ns:
+            why = "the linear move did not end within its time"
+        if self._move_seen and not reading.moving_linearly:
+            self._end("arrived")
+        elif why:
+            self._stop(reading, why)
+            return
+        self._arm.kick()
+
+    def _keep_stopping(self, reading: Reading) -> None:
+        if isinstance(self._asked, Stop) and self._speed_thread:
+            deceleration = clip_stop(self._asked, reading, self._limits, self._settings.reaction_s)
+            self._arm.wrist(WristSpeed(0.0, deceleration.deceleration_rad_per_s2))
+            if _rests(reading):
+                self._end_speed_thread()
+                self._motion = "idle"
+            return
+        self._arm.kick()
+        if not reading.moving_linearly and _rests(reading):
+            self._motion = "idle"
+
+    def _stop(self, reading: Reading, why: str, stop: Stop | None = None) -> None:
+        """Begin to stop, as hard as may be unless told how; a stop under way goes on unless another is asked for."""
+        if self._motion == "idle" or (self._motion == "stopping" and stop is None):
+            return
+        if self._motion != "stopping":
+            self._ended = why
+        self._motion = "stopping"
+        self._asked = stop or Stop(self._limits.wrist_acceleration_rad_per_s2.hard)
+        if not self._speed_thread and not self._unfit(reading):
+            self._arm.stop_move(self._asked.deceleration_rad_per_s2)
+
+    def _begin(self, motion: MotionKind, number: int) -> None:
+        self._motion, self._motion_id, self._ended = motion, number, ""
+
+    def _end(self, why: str) -> None:
+        if self._motion != "idle":
+            if self._motion != "stopping":
+                self._ended = why
+            self._motion = "idle"
+
+    def _end_speed_thread(self) -> None:
+        if self._speed_thread:
+            self._arm.end_speed(self._limits.wrist_acceleration_rad_per_s2.inner)
+            self._speed_thread = False
+
+    def _not_taken(self, reading: Reading, what: str) -> Reply:
+        # An earlier speed may still hold: whatever the arm does now, it is to stop.
+        why = f"The robot did not take the {what}: its control program does not answer."
+        self._stop(reading, why)
+        return Reply(refused=why)
+
+    # ---- judging --------------------------------------------------------------------------------------------------
+
+    def _unfit(self, reading: Reading) -> str:
+        return sentences.unfit(reading, self._settings.host, self._settings.state_timeout_s)
+
+    def _blocked(self, reading: Reading) -> str:
+        if self._recovery is not None:
+            return sentences.BEING_MADE_READY
+        return self._unfit(reading) or violation(reading, self._limits) or self._held
+
+    def _recover(self, recovery: Recovery, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
+        if not reading.connected or reading.age_ns > self._settings.state_timeout_s * 1e9:
+            return None
+        outcome = recovery.advance(reading, now_ns)
+        if outcome is Outcome.UNDER_WAY:
+            return None
+        self._recovery = None
+        number, self._unlock_number = self._unlock_number, None
+        if number is None:
+            self._held = recovery.why or self._held
+            return None
+        if outcome is Outcome.DONE:
+            self._held = ""
+        return number, Reply(refused=recovery.why)
+
+
+def _rests(reading: Reading) -> bool:
+    return all(abs(speed) < REST_RAD_PER_S for speed in reading.qd_rad_per_s)
+
+
+def _longest_s(move: MoveLinear, reading: Reading) -> float:
+    """Return how long a linear move may take: distance or turn at its speed, the pendant's speed slider, and slack."""
+    distance_m = math.dist(move.pose[:3], reading.tcp_pose[:3])
+    # At most half a turn; a move that only turns takes its speed as rad/s.
+    way = max(distance_m, math.pi if distance_m < 1e-3 else 0.0)
+    nominal_s = way / move.speed_m_per_s + move.speed_m_per_s / move.acceleration_m_per_s2
+    return LINEAR_SLACK * nominal_s / max(reading.speed_scaling, 0.05) + LINEAR_SLACK_S
+
+
+def tool_axis_torque(reading: Reading) -> float:
+    """Return the torque about the tool's z axis: the third column of the pose's rotation, times the torque."""
+    x, y, z = reading.tcp_pose[3:]
+    angle = math.sqrt(x * x + y * y + z * z)
+    if angle < 1e-12:
+        return reading.wrench[5]
+    x, y, z = x / angle, y / angle, z / angle
+    sine, versine = math.sin(angle), 1 - math.cos(angle)
+    axis = (x * z * versine + y * sine, y * z * versine - x * sine, 1 - (x * x + y * y) * versine)
+    return sum(a * t for a, t in zip(axis, reading.wrench[3:], strict=True))

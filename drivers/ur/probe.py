@@ -1,0 +1,66 @@
+"""A first look at a controller, with deadlines of our own: is it there, does it answer, does it speak our RTDE?
+
+ur-rtde does not look at the answer to its protocol request, and waits for ever for a peer that stays silent.
+"""
+
+import socket
+import struct
+
+from drivers.errors import DriverError
+from drivers.ur import sentences
+from drivers.ur.messages import FailureKind
+
+RTDE_PORT = 30004
+_PROTOCOL, _CONTROLLER_VERSION = ord("V"), ord("v")
+_HEADER = struct.Struct(">HB")
+_OTHER_PACKAGES = 20
+
+
+class ProbeError(DriverError):
+    """A controller that cannot be worked with; `kind` says why."""
+
+    def __init__(self, kind: FailureKind, sentence: str) -> None:
+        """Keep the kind beside the sentence."""
+        super().__init__(sentence)
+        self.kind: FailureKind = kind
+
+
+def probe(host: str, timeout_s: float) -> str:
+    """Return the controller's version, as 5.17.3.0, after agreeing on protocol 2.
+
+    Raises:
+        ProbeError: it is not there, stays silent, or refuses the protocol.
+    """
+    try:
+        with socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection:
+            connection.sendall(_HEADER.pack(3, _CONTROLLER_VERSION))
+            answer = _receive(connection, _CONTROLLER_VERSION)
+            version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
+            connection.sendall(_HEADER.pack(5, _PROTOCOL) + b"\x00\x02")
+            accepted = _receive(connection, _PROTOCOL)[:1] == b"\x01"
+    except TimeoutError as error:
+        raise ProbeError("silent", sentences.silent(host, timeout_s, "greeting it")) from error
+    except (OSError, struct.error) as error:
+        raise ProbeError("unreachable", sentences.unreachable(host, str(error) or type(error).__name__)) from error
+    if not accepted:
+        raise ProbeError("version", sentences.version_refused(host, version))
+    return version
+
+
+def _receive(connection: socket.socket, kind: int) -> bytes:
+    for _ in range(_OTHER_PACKAGES):
+        size, got = _HEADER.unpack(_exactly(connection, _HEADER.size))
+        payload = _exactly(connection, size - _HEADER.size)
+        if got == kind:
+            return payload
+    raise OSError("something else than RTDE listens on its port")
+
+
+def _exactly(connection: socket.socket, size: int) -> bytes:
+    data = b""
+    while len(data) < size:
+        part = connection.recv(size - len(data))
+        if not part:
+            raise OSError("the connection was closed")
+        data += part
+    return data

@@ -1,0 +1,146 @@
+"""What the robot may do and how long things may take: read from YAML, checked before anything is connected.
+
+A `hard` limit is one that the arm must never pass: a *measured* value beyond it stops the motion. `inner` is where
+commands are clipped to, so that the hard limit is never reached by a command. All limits are magnitudes.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from drivers.errors import DriverError
+
+Six = tuple[float, float, float, float, float, float]
+Three = tuple[float, float, float]
+
+_CHECKED: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
+
+
+@dataclass(frozen=True, slots=True)
+class Bound:
+    """A magnitude that commands keep at or below `inner`, and measured values below `hard`."""
+
+    __pydantic_config__: ClassVar = _CHECKED
+
+    inner: float
+    hard: float
+
+    def __post_init__(self) -> None:
+        """Refuse a margin that is none."""
+        if not 0 < self.inner < self.hard:
+            raise ValueError(f"inner ({self.inner:g}) must be above 0 and below hard ({self.hard:g})")
+
+
+@dataclass(frozen=True, slots=True)
+class JointRange:
+    """How far each joint may turn: hard ends in rad, and the margin within them that commands keep."""
+
+    __pydantic_config__: ClassVar = _CHECKED
+
+    lower_rad: Six
+    upper_rad: Six
+    margin_rad: float
+
+    def __post_init__(self) -> None:
+        """Refuse ranges without room between the margins."""
+        _check_range(self.lower_rad, self.upper_rad, self.margin_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class Workspace:
+    """The box for the tool centre point, in m in the robot's base frame, and the margin that commands keep."""
+
+    __pydantic_config__: ClassVar = _CHECKED
+
+    lower_m: Three
+    upper_m: Three
+    margin_m: float
+
+    def __post_init__(self) -> None:
+        """Refuse a box without room between the margins."""
+        _check_range(self.lower_m, self.upper_m, self.margin_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Everything that a command or a measured state is held against."""
+
+    __pydantic_config__: ClassVar = _CHECKED
+
+    joints: JointRange
+    workspace: Workspace
+    wrist_speed_rad_per_s: Bound
+    wrist_acceleration_rad_per_s2: Bound
+    linear_speed_m_per_s: Bound
+    linear_acceleration_m_per_s2: Bound
+    force_n: Bound
+    torque_nm: Bound
+
+
+@dataclass(frozen=True, slots=True)
+class UrSettings:
+    """The robot's address, its limits, and the deadlines of the driver."""
+
+    __pydantic_config__: ClassVar = _CHECKED
+
+    host: str
+    limits: Limits
+    rate_hz: float = 125.0
+    # The robot ends its program when it hears nothing for 1/watchdog_hz.
+    watchdog_hz: float = 10.0
+    # A wrist speed holds for so long; then it has to be commanded again.
+    command_timeout_s: float = 0.3
+    # Motion stops when nothing at all was heard from the daemon for so long.
+    silence_timeout_s: float = 0.3
+    # A controller's timestamp older than this is not believed; twice as old again, and the connection is given up.
+    state_timeout_s: float = 0.25
+    connect_timeout_s: float = 10.0
+    # A cycle that takes longer is a hang (blocking calls of the client last up to 301 s), and its process is ended.
+    hang_timeout_s: float = 1.5
+    recover_timeout_s: float = 30.0
+    # How late a commanded speed may take effect; distances to the joint limits allow for it.
+    reaction_s: float = 0.04
+
+    def __post_init__(self) -> None:
+        """Refuse deadlines that contradict each other."""
+        for name in self.__dataclass_fields__:
+            value = getattr(self, name)
+            if isinstance(value, float | int) and not 0 < value < math.inf:
+                raise ValueError(f"{name} must be above 0, not {value:g}")
+        if self.rate_hz < 3 * self.watchdog_hz:
+            raise ValueError(
+                f"rate_hz ({self.rate_hz:g}) must be at least three times watchdog_hz ({self.watchdog_hz:g}), "
+                "or one late cycle ends the robot's program"
+            )
+
+
+def _check_range(lower: tuple[float, ...], upper: tuple[float, ...], margin: float) -> None:
+    if margin <= 0:
+        raise ValueError(f"the margin must be above 0, not {margin:g}")
+    for number, (low, high) in enumerate(zip(lower, upper, strict=True), start=1):
+        if low + 2 * margin >= high:
+            raise ValueError(f"entry {number}: no room between {low:g} and {high:g} with a margin of {margin:g}")
+
+
+def read_settings(path: Path) -> UrSettings:
+    """Return the robot's settings from a YAML file.
+
+    Raises:
+        DriverError: the file cannot be read, or settings are wrong; all mistakes are named together.
+    """
+    import yaml
+    from pydantic import TypeAdapter, ValidationError
+
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise DriverError(f"The robot's settings cannot be read from {path}: {error}.") from error
+    try:
+        return TypeAdapter(UrSettings).validate_python(content)
+    except ValidationError as error:
+        mistakes = "; ".join(
+            f"{'.'.join(str(part) for part in mistake['loc']) or 'the file'}: {mistake['msg']}"
+            for mistake in error.errors()
+        )
+        raise DriverError(f"{path}: {mistakes}.") from error

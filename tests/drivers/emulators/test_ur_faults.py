@@ -1,0 +1,29 @@
+"""Faults by lines of text: each known one is carried out, and what is not known is told."""
+
+import pytest
+
+from drivers.emulators.ur.faults import obey
+from drivers.emulators.ur.robot import Robot
+from drivers.emulators.ur.server import Controller
+
+
+def test_faults_are_carried_out_and_ended() -> None:
+    controller = Controller(Robot())
+    robot = controller.robot
+    for line in ("registers-in-use", "local-control", "refuse-protocol on", "protective-stop", "emergency-stop"):
+        obey(controller, line)
+    assert (robot.registers_taken, robot.remote_control, controller.protocol_refused) == (True, False, True)
+    assert robot.safety_mode == 7
+    obey(controller, "registers-in-use off")
+    assert not robot.registers_taken
+    obey(controller, "normal")
+    assert (robot.remote_control, controller.protocol_refused, robot.safety_mode) == (True, False, 1)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [("fire", "there are protective-stop, emergency-stop"), ("silence long", "long"), ("silence", "nothing")],
+)
+def test_what_is_no_fault_is_told(line: str, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        obey(Controller(Robot()), line)

@@ -1,0 +1,50 @@
+"""Kinematics against UR's zero pose, scipy's rotations and finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from drivers.emulators.ur.kinematics import jacobian, link_frames, pose_of, rotation_matrix, rotation_vector
+
+angles = st.floats(-math.pi, math.pi)
+joints = st.tuples(*[angles] * 6).map(np.array)
+
+
+def test_stretched_arm_is_where_the_dimensions_put_it() -> None:
+    x, y, z = pose_of(link_frames(np.zeros(6), 0.0)[-1])[:3]
+    assert x == pytest.approx(-0.425 - 0.3922)
+    assert y == pytest.approx(-0.1333 - 0.0996)
+    assert z == pytest.approx(0.1625 - 0.0997)
+
+
+@given(joints, angles)
+def test_wrist_3_turns_the_tool_about_its_own_axis(q: np.ndarray, turn: float) -> None:
+    turned = q + np.array([0, 0, 0, 0, 0, turn])
+    before, after = link_frames(q, 0.2)[-1], link_frames(turned, 0.2)[-1]
+    assert after[:3, 3] == pytest.approx(before[:3, 3], abs=1e-12)
+    about_z = Rotation.from_rotvec([0, 0, turn]).as_matrix()
+    assert after[:3, :3] == pytest.approx(before[:3, :3] @ about_z, abs=1e-12)
+
+
+@given(joints)
+def test_jacobian_is_the_derivative_of_the_pose(q: np.ndarray) -> None:
+    step = 1e-6
+    frames = link_frames(q, 0.1)
+    for joint, column in enumerate(jacobian(frames).T):
+        moved = link_frames(q + step * np.eye(6)[joint], 0.1)[-1]
+        linear = (moved[:3, 3] - frames[-1][:3, 3]) / step
+        angular = Rotation.from_matrix(moved[:3, :3] @ frames[-1][:3, :3].T).as_rotvec() / step
+        assert column == pytest.approx(np.concatenate([linear, angular]), abs=1e-5)
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: math.hypot(*v) > 1e-3), st.floats(0, math.pi))
+def test_rotation_vectors_agree_with_scipy(direction: tuple[float, ...], angle: float) -> None:
+    vector = np.array(direction) / math.hypot(*direction) * angle
+    matrix = rotation_matrix(vector)
+    assert matrix == pytest.approx(Rotation.from_rotvec(vector).as_matrix(), abs=1e-12)
+    # A half turn has two vectors; both are the same rotation.
+    assert Rotation.from_rotvec(rotation_vector(matrix)).as_matrix() == pytest.approx(matrix, abs=1e-9)

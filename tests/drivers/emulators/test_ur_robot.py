@@ -1,0 +1,267 @@
+"""The emulated controller without I/O: what its registers, watchdog and safety do, at its own time."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from drivers.emulators.ur.make import Make
+from drivers.emulators.ur.robot import MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, Robot
+from drivers.emulators.ur.script import (
+    IS_STEADY,
+    MOVE_J,
+    MOVE_L,
+    PROTECTIVE_STOP,
+    SET_WATCHDOG,
+    SPEED_J,
+    SPEED_STOP,
+    STOP_J,
+    ZERO_FT,
+)
+
+DT_S = 0.002
+
+
+def wait(robot: Robot, seconds: float) -> None:
+    for _ in range(round(seconds / DT_S)):
+        robot.step(DT_S)
+
+
+def send(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> None:
+    for index, number in enumerate(numbers):
+        robot.write(f"input_double_register_{index}", number)
+    robot.write("input_int_register_1", int(asynchronous))
+    robot.write("input_int_register_0", command)
+
+
+def do(robot: Robot, command: int, *numbers: float, asynchronous: bool = False) -> float:
+    """Carry a command out as the client does, and return how long it took."""
+    send(robot, command, *numbers, asynchronous=asynchronous)
+    begun_s = robot.time_s
+    while robot.number("output_int_register_0") != 2:
+        robot.step(DT_S)
+        assert robot.program_running, robot.events[-1]
+        assert robot.time_s < begun_s + 20
+    took_s = robot.time_s - begun_s
+    robot.write("input_int_register_0", 0)
+    wait(robot, DT_S)
+    assert robot.number("output_int_register_0") == 1
+    return took_s
+
+
+def turn(robot: Robot, speed: float, acceleration: float = 2.0) -> None:
+    send(robot, SPEED_J, 0, 0, 0, 0, 0, speed, acceleration, 0)
+
+
+def started(**make: float) -> Robot:
+    robot = Robot(Make(**make))  # type: ignore[arg-type]  # numbers only in these tests
+    robot.upload()
+    wait(robot, DT_S)
+    return robot
+
+
+def happened(robot: Robot, name: str) -> list[float]:
+    return [event.time_s for event in robot.events if event.name == name]
+
+
+def moving_asynchronously(robot: Robot) -> bool:
+    return bool(int(robot.number("output_int_register_2")) & 1 << 15)
+
+
+def test_speed_is_reached_with_the_acceleration_and_held() -> None:
+    robot = started()
+    turn(robot, 0.4)
+    wait(robot, 0.1)
+    assert robot.qd_rad_per_s[5] == pytest.approx(0.2)
+    wait(robot, 0.9)
+    # 0.4²/2·2 to get up to speed, then 0.8 s at 0.4 rad/s.
+    assert robot.q_rad[5] == pytest.approx(0.04 + 0.8 * 0.4)
+    assert not robot.qd_rad_per_s[:5].any()
+
+
+def test_without_a_watchdog_the_speed_outlives_its_client() -> None:
+    robot = started()
+    turn(robot, 0.4)
+    wait(robot, 3.0)
+    assert robot.qd_rad_per_s[5] == pytest.approx(0.4)
+
+
+def test_watchdog_ends_the_motion_of_a_client_that_died() -> None:
+    robot = started()
+    do(robot, SET_WATCHDOG, 10.0)
+    turn(robot, 0.4)
+    wait(robot, 0.05)
+    turn(robot, 0.4)
+    died_s = robot.time_s
+    wait(robot, 0.5)
+    (stopped_s,) = happened(robot, "motion-stopped")
+    assert 0.1 < stopped_s - died_s < 0.15
+    assert robot.runtime_state == STOPPED
+    assert not robot.program_running
+
+
+def test_watchdog_does_not_outlive_the_program_it_was_armed_in() -> None:
+    robot = started()
+    do(robot, SET_WATCHDOG, 10.0)
+    robot.upload()
+    wait(robot, 1.0)
+    assert robot.program_running
+
+
+def test_watchdog_ends_the_program_under_a_blocking_move() -> None:
+    robot = started()
+    do(robot, SET_WATCHDOG, 10.0)
+    send(robot, MOVE_J, 1, -1.5, 1.5, -1.5, -1.5, 0, 0.5, 1.0)
+    wait(robot, 0.2)
+    assert not robot.program_running
+
+
+def test_registers_outlive_the_program_and_a_new_one_obeys_them() -> None:
+    robot = started()
+    turn(robot, 0.4)
+    wait(robot, 0.1)
+    robot.end_program("test")
+    wait(robot, 0.2)
+    assert not robot.qd_rad_per_s.any()
+    robot.upload()
+    wait(robot, 0.1)
+    assert robot.qd_rad_per_s[5] > 0, "the hazard that a driver has to know of"
+
+
+def test_linear_move_arrives_at_the_pose_on_a_straight_line() -> None:
+    robot = started(tool_length_m=0.2)
+    begin = robot.pose()
+    target = begin.copy()
+    target[:3] += (0.05, -0.03, -0.1)
+    target[3:] = (Rotation.from_rotvec(begin[3:]) * Rotation.from_rotvec([0.2, 0, 0.3])).as_rotvec()
+    do(robot, MOVE_L, *target, 0.1, 0.5, asynchronous=True)
+    assert moving_asynchronously(robot)
+    way = target[:3] - begin[:3]
+    while moving_asynchronously(robot):
+        wait(robot, 0.02)
+        off = np.cross(robot.pose()[:3] - begin[:3], way / np.linalg.norm(way))
+        assert np.linalg.norm(off) < 1e-5
+    assert robot.pose()[:3] == pytest.approx(target[:3], abs=1e-6)
+    error = Rotation.from_rotvec(robot.pose()[3:]).inv() * Rotation.from_rotvec(target[3:])
+    assert error.magnitude() < 1e-5
+    # A trapezoid: the way at 0.1 m/s and once its ramp of 0.2 s.
+    assert happened(robot, "motion-stopped")[0] == pytest.approx(np.linalg.norm(way) / 0.1 + 0.2, abs=0.03)
+
+
+def test_linear_move_out_of_reach_ends_in_a_protective_stop() -> None:
+    robot = started()
+    send(robot, MOVE_L, 2.0, 0.0, 0.5, 0, math.pi, 0, 1.0, 1.0, asynchronous=True)
+    wait(robot, 4.0)
+    assert happened(robot, "protective-stop")
+    assert not robot.qd_rad_per_s.any()
+
+
+def test_asynchronous_move_is_stopped_on_command() -> None:
+    robot = started()
+    do(robot, MOVE_J, 1, -1.5, 1.5, -1.5, -1.5, 0, 0.5, 1.0, asynchronous=True)
+    wait(robot, 0.3)
+    do(robot, STOP_J, 2.0, asynchronous=True)
+    assert moving_asynchronously(robot)
+    wait(robot, 0.3)
+    assert not moving_asynchronously(robot)
+    assert not robot.qd_rad_per_s.any()
+    assert robot.q_rad[0] < 0.5
+    do(robot, IS_STEADY)
+    assert robot.number("output_int_register_1") == 1
+
+
+def test_two_threads_may_not_move_the_arm() -> None:
+    robot = started()
+    turn(robot, 0.4)
+    wait(robot, 0.1)
+    send(robot, MOVE_J, 1, -1.5, 1.5, -1.5, -1.5, 0, 0.5, 1.0, asynchronous=True)
+    wait(robot, 0.1)
+    assert not robot.program_running
+    assert "another thread" in robot.events[-1].detail or "another thread" in robot.events[-2].detail
+
+
+def test_after_speed_stop_a_move_is_possible() -> None:
+    robot = started()
+    turn(robot, 0.4)
+    wait(robot, 0.3)
+    assert do(robot, SPEED_STOP, 2.0) == pytest.approx(0.2, abs=0.01)
+    do(robot, MOVE_J, 1, -1.5, 1.5, -1.5, -1.5, 0, 0.5, 1.0, asynchronous=True)
+    wait(robot, 0.1)
+    assert robot.program_running
+
+
+def test_protective_stop_pauses_and_is_not_unlocked_at_once() -> None:
+    robot = started()
+    turn(robot, 0.4)
+    wait(robot, 0.3)
+    send(robot, PROTECTIVE_STOP)
+    wait(robot, 0.1)
+    assert robot.runtime_state == PAUSED
+    assert robot.variable("safety_mode") == 3
+    assert not robot.qd_rad_per_s.any()
+    wait(robot, 4.8)
+    assert not robot.unlock()
+    wait(robot, 0.2)
+    assert robot.unlock()
+    wait(robot, 1.0)
+    assert not robot.qd_rad_per_s.any(), "unlocking must not resume"
+
+
+def test_emergency_stop_takes_power_which_comes_back_in_two_steps() -> None:
+    robot = started(power_on_s=0.5)
+    robot.emergency_stop()
+    robot.power_on()
+    wait(robot, 1.0)
+    assert robot.robot_mode == MODE_POWER_OFF, "the button is still pressed"
+    robot.release()
+    robot.power_on()
+    wait(robot, 0.6)
+    robot.upload()
+    assert not robot.program_running, "the brakes are on"
+    robot.brake_release()
+    wait(robot, 0.6)
+    assert robot.robot_mode == MODE_RUNNING
+    robot.upload()
+    assert robot.program_running
+
+
+def test_what_the_tool_feels_is_the_plants_torque_about_its_axis() -> None:
+    stiffness_nm_per_rad, damping = 2.0, 0.1
+    robot = Robot(plant=lambda angle, speed, _dt_s: -stiffness_nm_per_rad * angle - damping * speed)
+    robot.upload()
+    turn(robot, 0.5, 10.0)
+    wait(robot, 1.0)
+    expected = -stiffness_nm_per_rad * robot.q_rad[5] - damping * 0.5
+    # The tool points down: its axis is -z of the base.
+    assert robot.wrench() == pytest.approx([0, 0, 0, 0, 0, -expected], abs=1e-9)
+    robot.write("input_int_register_0", 0)
+    do(robot, SPEED_STOP, 10.0)
+    do(robot, ZERO_FT)
+    assert robot.wrench() == pytest.approx(np.zeros(6), abs=1e-9)
+
+
+def test_an_arm_in_fast_motion_leaves_the_controllers_time_alone() -> None:
+    seen: list[float] = []
+    robots = [Robot(plant=lambda angle, _speed, dt_s: seen.append(dt_s) or angle, pace=pace) for pace in (1.0, 20.0)]
+    for robot in robots:
+        seen.clear()
+        robot.upload()
+        turn(robot, 0.1, 4.0)
+        wait(robot, 0.5)
+        assert robot.qd_rad_per_s[5] == pytest.approx(0.1), "in its own time it turns as it is told"
+        assert sum(seen) == pytest.approx(robot.time_s), "the plant's time is the controller's"
+    slow, fast = robots
+    assert slow.time_s == fast.time_s == pytest.approx(0.5, abs=2 * DT_S)
+    lost_rad = 0.5 * 0.1**2 / 4.0  # while getting up to speed
+    assert slow.q_rad[5] == pytest.approx(0.1 * 0.5 - lost_rad, abs=0.1 * 2 * DT_S)
+    assert fast.q_rad[5] == pytest.approx(0.1 * 10.0 - lost_rad, abs=0.1 * 40 * DT_S)
+    assert fast.program_running
+
+
+def test_command_that_is_not_played_ends_the_program_loudly() -> None:
+    robot = started()
+    send(robot, 45)
+    wait(robot, DT_S)
+    assert not robot.program_running
+    assert "45" in robot.events[-1].detail

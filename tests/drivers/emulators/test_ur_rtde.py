@@ -1,0 +1,124 @@
+"""RTDE bytes in and out of the emulated controller."""
+
+import struct
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.emulators.ur.make import Make
+from drivers.emulators.ur.registers import pack, unpack
+from drivers.emulators.ur.robot import Robot
+from drivers.emulators.ur.rtde import NotRtdeError, RtdeSession, package
+
+GREETING = package(ord("V"), b"\x00\x02") + package(ord("v"), b"")
+COMMAND = b"input_int_register_0,input_double_register_0,"
+CONVERSATION = (
+    GREETING
+    + package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,actual_q,safety_mode,")
+    + package(ord("I"), COMMAND)
+    + package(ord("S"), b"")
+    + package(ord("U"), struct.pack(">Bid", 1, 9, 0.25))
+)
+
+
+def session(**make: object) -> RtdeSession:
+    return RtdeSession(Robot(Make(**make)), 500.0)  # type: ignore[arg-type]
+
+
+def replies(data: bytes) -> list[tuple[int, bytes]]:
+    found = []
+    while data:
+        size, kind = struct.unpack_from(">HB", data)
+        found.append((kind, data[3:size]))
+        data = data[size:]
+    return found
+
+
+def test_conversation_of_a_client() -> None:
+    rtde = session(version=(5, 17, 3, 0))
+    assert replies(rtde.receive(CONVERSATION)) == [
+        (ord("V"), b"\x01"),
+        (ord("v"), struct.pack(">4I", 5, 17, 3, 0)),
+        (ord("O"), b"\x01DOUBLE,VECTOR6D,INT32"),
+        (ord("I"), b"\x01INT32,DOUBLE"),
+        (ord("S"), b"\x01"),
+    ]
+    assert rtde.robot.number("input_int_register_0") == 9
+    assert rtde.robot.number("input_double_register_0") == 0.25
+    ((kind, data),) = replies(rtde.data())
+    assert kind == ord("U")
+    assert data[:1] == b"\x01"
+    timestamp_s, *_q, safety_mode = struct.unpack(">d6di", data[1:])
+    assert (timestamp_s, safety_mode) == (0.0, 1)
+
+
+@given(st.lists(st.integers(0, len(CONVERSATION)), max_size=20))
+def test_bytes_may_arrive_in_any_pieces(cuts: list[int]) -> None:
+    whole, pieces = session(), session()
+    answer = whole.receive(CONVERSATION)
+    edges = [0, *sorted(cuts), len(CONVERSATION)]
+    got = b"".join(pieces.receive(CONVERSATION[a:b]) for a, b in pairwise(edges))
+    assert got == answer
+    assert pieces.robot.number("input_double_register_0") == 0.25
+
+
+any_packages = st.tuples(st.sampled_from(b"VvOISPUM"), st.binary(max_size=60)).map(lambda parts: package(*parts))
+
+
+@given(st.binary(max_size=200) | st.lists(any_packages).map(b"".join))
+def test_foreign_bytes_are_answered_or_refused_but_never_crash(data: bytes) -> None:
+    rtde = session()
+    rtde.receive(CONVERSATION)
+    try:
+        rtde.receive(data)
+    except NotRtdeError:
+        return
+    assert len(rtde._buffer) <= 4096
+
+
+def test_data_comes_at_the_rate_asked_for_and_not_before_the_start() -> None:
+    rtde = session()
+    rtde.receive(GREETING + package(ord("O"), struct.pack(">d", 125.0) + b"timestamp"))
+    packages = 0
+    for _ in range(100):
+        rtde.robot.step(0.002)
+        packages += bool(rtde.data())
+    assert packages == 0
+    rtde.receive(package(ord("S"), b""))
+    for _ in range(500):
+        rtde.robot.step(0.002)
+        packages += bool(rtde.data())
+    # One at once, then one every 8 ms.
+    assert packages == 126
+
+
+def test_registers_in_use_and_unknown_variables_are_refused_by_name() -> None:
+    rtde = session(version=(5, 5, 1, 0))
+    rtde.robot.registers_taken = True
+    ((_, answer),) = replies(rtde.receive(package(ord("I"), COMMAND)))
+    assert answer == b"\x00IN_USE,IN_USE"
+    ((_, answer),) = replies(rtde.receive(package(ord("O"), struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench")))
+    assert answer == b"\x00DOUBLE,NOT_FOUND"
+
+
+def test_short_vector_is_dropped() -> None:
+    rtde = session()
+    rtde.receive(CONVERSATION)
+    rtde.receive(package(ord("U"), struct.pack(">Bi", 1, 11)))
+    assert rtde.robot.number("input_int_register_0") == 9
+
+
+@given(st.lists(st.floats(allow_nan=False), min_size=7, max_size=7), st.integers(-(2**31), 2**31 - 1))
+def test_values_survive_the_wire(numbers: list[float], integer: int) -> None:
+    kinds = ["VECTOR6D", "INT32", "DOUBLE"]
+    data = pack(kinds, [numbers[:6], integer, numbers[6]])
+    assert unpack(kinds, data) == [*numbers[:6], integer, numbers[6]]
+    assert unpack(kinds, data[:-1]) is None
+
+
+@pytest.mark.parametrize("size", [0, 2, 5000])
+def test_impossible_lengths_end_the_connection(size: int) -> None:
+    with pytest.raises(NotRtdeError, match="bytes"):
+        session().receive(struct.pack(">HB", size, ord("V")))

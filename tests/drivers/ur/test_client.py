@@ -1,0 +1,351 @@
+"""The whole driver over real TCP: the real ur-rtde in its process, an emulated controller in another."""
+
+import asyncio
+import contextlib
+import dataclasses
+import os
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.ur.client import LinkEvent, UrRobot
+from drivers.ur.messages import (
+    Enable,
+    MoveLinear,
+    RobotState,
+    Stop,
+    Unlock,
+    WristSpeed,
+    ZeroForceTorque,
+)
+from drivers.ur.settings import UrSettings, read_settings
+from tests.emulator_process import EmulatorProcess as ControllerProcess
+
+pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
+
+ROOT = Path(__file__).parents[3]
+# What the issue asks of a twist whose client dies: the robot has stopped.
+STOPPED_WITHIN_S = 0.2
+
+
+class Link:
+    """A robot's link events, to be waited for."""
+
+    def __init__(self) -> None:
+        self.events: list[LinkEvent] = []
+        self._changed = asyncio.Event()
+
+    def __call__(self, event: LinkEvent) -> None:
+        self.events.append(event)
+        self._changed.set()
+
+    async def down(self, number: int = 1, within_s: float = 15.0) -> LinkEvent:
+        """Return the loss of this number."""
+        async with asyncio.timeout(within_s):
+            while len(losses := [event for event in self.events if event.status == "down"]) < number:
+                self._changed.clear()
+                await self._changed.wait()
+        return losses[number - 1]
+
+
+def settings_for(host: str, **changes: object) -> UrSettings:
+    delivered = read_settings(ROOT / "config" / "ur.yaml")
+    return dataclasses.replace(delivered, host=host, **changes)  # type: ignore[arg-type]
+
+
+@contextlib.asynccontextmanager
+async def running(settings: UrSettings, link: Link | None = None) -> AsyncIterator[UrRobot]:
+    robot = UrRobot(settings, link)
+    task = asyncio.create_task(robot.run())
+    try:
+        yield robot
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def until(robot: UrRobot, condition: Callable[[RobotState], bool], within_s: float = 15.0) -> RobotState:
+    state = robot.state
+    try:
+        async with asyncio.timeout(within_s):
+            while not (state and condition(state)):
+                state = await robot.next_state()
+    except TimeoutError:
+        raise AssertionError(f"never came about; link {robot.link}, state {state}") from None
+    return state
+
+
+async def enable(robot: UrRobot) -> None:
+    await until(robot, lambda state: state.program_running and not state.recovering)
+    assert (await robot.send(Enable())).accepted
+
+
+async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5) -> None:
+    """Turn the wrist, and return when it is up to speed."""
+    since_ns = time.monotonic_ns()
+    reply = await robot.send(WristSpeed(speed, 4.0))
+    assert reply.accepted, reply.refused
+    await controller.event("motion-started", since_ns)
+    await until(robot, lambda state: abs(state.qd_rad_per_s[5]) > 0.9 * abs(speed))
+
+
+def stopped_after_s(event: dict[str, int], since_ns: int) -> float:
+    return (event["t_mono_ns"] - since_ns) / 1e9
+
+
+async def test_states_arrive_and_commands_are_answered_with_what_is_sent(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        assert "not connected" in (await robot.send(Enable())).refused
+        await until(robot, lambda state: state.program_running and not state.recovering)
+        assert "not been enabled" in (await robot.send(WristSpeed(0.1, 1.0))).refused
+        await enable(robot)
+
+        reply = await robot.send(WristSpeed(3.0, 9.0))
+        assert reply.sent == WristSpeed(0.5, 4.0)
+        assert reply.clipped == ("acceleration is limited to 4", "wrist speed is limited to 0.5 rad/s")
+        state = await until(robot, lambda state: state.qd_rad_per_s[5] > 0.49)
+        assert state.sent == reply.sent
+        assert not state.blocked
+        assert state.age_ns < 100_000_000
+        assert 0 <= time.monotonic_ns() - state.t_mono_ns < 500_000_000
+
+        assert (await robot.send(Stop(4.0))).sent == Stop(4.0)
+        state = await until(robot, lambda state: state.motion == "idle")
+        assert state.ended == "stopped on command"
+        assert (await robot.send(ZeroForceTorque())).accepted
+
+        x, y, z, *turned = state.tcp_pose
+        target = (x, y, z - 0.02, turned[0], turned[1], turned[2])
+        reply = await robot.send(MoveLinear(target, 0.1, 0.5))
+        assert reply.sent == MoveLinear(target, 0.1, 0.5)
+        number = (await until(robot, lambda state: state.motion == "linear")).motion_id
+        state = await until(robot, lambda state: state.motion == "idle")
+        assert (state.motion_id, state.ended) == (number, "arrived")
+        assert state.tcp_pose[2] == pytest.approx(z - 0.02, abs=1e-5)
+
+
+async def test_state_comes_125_times_a_second_with_the_controllers_own_time(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        first = await until(robot, lambda state: not state.recovering)
+        states = [await robot.next_state() for _ in range(100)]
+        own_s = states[-1].timestamp_s - first.timestamp_s
+        ours_s = (states[-1].t_mono_ns - first.t_mono_ns) / 1e9
+        # Both clocks tell the same, but for cycles that a busy machine made late.
+        assert own_s == pytest.approx(ours_s, abs=0.3)
+        assert sorted(states, key=lambda state: state.timestamp_s) == states
+
+
+async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess) -> None:
+    link = Link()
+    async with running(settings_for(controller.host), link) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        assert robot.pid is not None
+        killed_ns = time.monotonic_ns()
+        os.kill(robot.pid, signal.SIGKILL)
+        stopped = await controller.event("motion-stopped", killed_ns)
+        assert stopped_after_s(stopped, killed_ns) <= STOPPED_WITHIN_S
+        loss = await link.down()
+        assert loss.kind == "crashed"
+        assert "SIGKILL" in loss.sentence
+
+        state = await until(robot, lambda state: state.program_running and not state.recovering)
+        assert "not been enabled" in state.blocked
+        assert "not been enabled" in (await robot.send(WristSpeed(0.1, 1.0))).refused
+        await controller.event("watchdog-armed", stopped["t_mono_ns"])
+        assert not controller.happened("motion-started", killed_ns), "a second motion"
+        await enable(robot)
+        await turn(robot, controller)
+
+
+async def test_protective_stop_is_told_and_unlocked_in_the_same_process(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        pid = robot.pid
+        asked_ns = await controller.fault("protective-stop")
+        state = await until(robot, lambda state: state.protective_stop)
+        assert "Protective stop" in state.blocked
+        assert "Protective stop" in (await robot.send(WristSpeed(0.1, 1.0))).refused
+        assert "Cannot unlock" in (await robot.send(Unlock())).refused
+        # The controller's own second has to pass.
+        await until(robot, lambda later: later.timestamp_s > state.timestamp_s + 1.0)
+        assert (await robot.send(Unlock())).accepted
+        await controller.event("watchdog-armed", asked_ns)
+        assert not controller.happened("motion-started", asked_ns), "the speed from before the stop was taken up again"
+        await turn(robot, controller, -0.5)
+        assert robot.pid == pid
+
+
+async def test_emergency_stop_is_told_and_recovered_from(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        asked_ns = await controller.fault("emergency-stop")
+        state = await until(robot, lambda state: state.emergency_stop)
+        assert "Emergency stop" in state.blocked
+        assert "still pressed" in (await robot.send(Unlock())).refused
+        await controller.fault("release")
+        await until(robot, lambda state: not state.emergency_stop)
+        assert (await robot.send(Unlock())).accepted
+        assert not controller.happened("motion-started", asked_ns)
+        await turn(robot, controller)
+
+
+async def test_lost_rtde_ends_the_process_and_the_next_one_moves_nothing(controller: ControllerProcess) -> None:
+    link = Link()
+    async with running(settings_for(controller.host), link) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        dropped_ns = await controller.fault("drop-rtde")
+        stopped = await controller.event("motion-stopped", dropped_ns)
+        assert stopped_after_s(stopped, dropped_ns) <= STOPPED_WITHIN_S
+        # Which of the two comes first is up to the client: our look at its connection, or its crash in reconnecting.
+        assert (await link.down()).kind in ("lost", "crashed")
+        await until(robot, lambda state: state.program_running and not state.recovering)
+        assert "not been enabled" in (await robot.send(WristSpeed(0.5, 4.0))).refused
+        await enable(robot)
+        assert not controller.happened("motion-started", dropped_ns)
+
+
+async def test_crash_of_the_client_is_named(controller: ControllerProcess) -> None:
+    link = Link()
+    async with running(settings_for(controller.host), link) as robot:
+        await enable(robot)
+        assert robot.pid is not None
+        os.kill(robot.pid, signal.SIGSEGV)
+        loss = await link.down()
+        assert "SIGSEGV" in loss.sentence
+        assert "motion disabled" in loss.sentence
+
+
+async def test_process_that_hangs_is_ended_and_started_again(controller: ControllerProcess) -> None:
+    link = Link()
+    async with running(settings_for(controller.host, hang_timeout_s=0.3), link) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        assert robot.pid is not None
+        hung_ns = time.monotonic_ns()
+        os.kill(robot.pid, signal.SIGSTOP)
+        stopped = await controller.event("motion-stopped", hung_ns)
+        assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
+        unanswered = asyncio.create_task(robot.send(Stop(1.0)))
+        assert (await link.down()).kind == "hung"
+        assert "ended before it answered" in (await unanswered).refused
+        await enable(robot)
+        assert not controller.happened("motion-started", hung_ns)
+
+
+async def test_controller_that_falls_silent_is_told_and_the_robot_stops(controller: ControllerProcess) -> None:
+    link = Link()
+    async with running(settings_for(controller.host, connect_timeout_s=1.5), link) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        silent_ns = await controller.fault("silence 3600")
+        stopped = await controller.event("motion-stopped", silent_ns)
+        # Data is believed for state_timeout_s, then the watchdog is no longer kicked.
+        assert stopped_after_s(stopped, silent_ns) <= robot.settings.state_timeout_s + STOPPED_WITHIN_S
+        assert "nothing new" in (await link.down(1)).sentence
+        loss = await link.down(2)
+        assert loss.kind == "silent"
+        assert f"The UR controller at {controller.host} said nothing" in loss.sentence
+        await controller.fault("normal")
+        await enable(robot)
+        assert not controller.happened("motion-started", silent_ns)
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "said"),
+    [
+        ("registers-in-use", "registers-in-use", "EtherNet/IP or PROFINET"),
+        ("local-control", "local-control", "switch it to remote control"),
+        ("refuse-protocol", "version", "PolyScope 3.10 or 5.4"),
+    ],
+)
+async def test_connection_that_is_refused_is_explained(
+    controller: ControllerProcess, fault: str, kind: str, said: str
+) -> None:
+    await controller.fault(fault)
+    link = Link()
+    async with running(settings_for(controller.host), link) as robot:
+        loss = await link.down()
+        assert (loss.kind, robot.losses[kind]) == (kind, 1)
+        assert said in loss.sentence
+        assert said in (await robot.send(Enable())).refused
+
+
+async def test_absent_controller_is_explained() -> None:
+    link = Link()
+    async with running(settings_for("127.0.0.254"), link):
+        loss = await link.down()
+        assert loss.kind == "unreachable"
+        assert "No UR controller at 127.0.0.254" in loss.sentence
+        assert "refused" in loss.sentence
+
+
+async def test_leaving_stops_the_arm_and_ends_the_program(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        left_ns = time.monotonic_ns()
+    stopped = await controller.event("motion-stopped", left_ns)
+    ended = await controller.event("program-ended", left_ns)
+    assert ended["t_mono_ns"] >= stopped["t_mono_ns"]
+    assert ended["detail"] == "the client ended it"
+
+
+DAEMON = """
+import asyncio, sys
+from drivers.ur.client import UrRobot
+from drivers.ur.messages import Enable, WristSpeed
+from tests.drivers.ur.test_client import settings_for, until
+
+async def main():
+    robot = UrRobot(settings_for(sys.argv[1]))
+    task = asyncio.create_task(robot.run())
+    await until(robot, lambda state: state.program_running and not state.recovering)
+    await robot.send(Enable())
+    while True:
+        await robot.send(WristSpeed(0.5, 4.0))
+        state = await robot.next_state()
+        if state.qd_rad_per_s[5] > 0.49:
+            print(robot.pid, flush=True)
+
+asyncio.run(main())
+"""
+
+
+async def test_daemon_killed_in_the_middle_of_a_twist_leaves_a_robot_at_rest_and_no_process(
+    controller: ControllerProcess,
+) -> None:
+    daemon = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", DAEMON, controller.host, stdout=asyncio.subprocess.PIPE, cwd=ROOT
+    )
+    assert daemon.stdout is not None
+    child = os.pidfd_open(int(await daemon.stdout.readline()))
+    killed_ns = time.monotonic_ns()
+    daemon.kill()
+    try:
+        stopped = await controller.event("motion-stopped", killed_ns)
+        assert stopped_after_s(stopped, killed_ns) <= STOPPED_WITHIN_S
+        ended = asyncio.Event()
+        asyncio.get_running_loop().add_reader(child, ended.set)
+        async with asyncio.timeout(5):
+            await ended.wait()
+    finally:
+        asyncio.get_running_loop().remove_reader(child)
+        os.close(child)
+    assert (await controller.event("program-ended", killed_ns))["detail"] == "the client ended it"
+    await daemon.communicate()
+
+
+async def test_without_ur_rtde_the_user_is_told_which_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    with pytest.raises(DriverError, match=r"none for 3\.13"):
+        await UrRobot(settings_for("127.0.0.254")).run()

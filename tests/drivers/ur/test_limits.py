@@ -1,0 +1,154 @@
+"""Limits: whatever is asked, what is sent stays within, and an arm that follows it stays within its range."""
+
+import dataclasses
+import math
+
+import numpy as np
+from hypothesis import example, given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation, violation
+from drivers.ur.messages import MoveLinear, Reading, Stop, WristSpeed
+from drivers.ur.pilot import tool_axis_torque
+from drivers.ur.settings import Bound, JointRange, Limits, Workspace
+
+CYCLE_S, REACTION_S = 0.008, 0.04
+LIMITS = Limits(
+    joints=JointRange((-6.0, -6.0, -3.0, -6.0, -6.0, -2.0), (6.0, 6.0, 3.0, 6.0, 6.0, 2.0), 0.1),
+    workspace=Workspace((-0.8, -0.8, 0.0), (0.8, 0.8, 0.9), 0.02),
+    wrist_speed_rad_per_s=Bound(0.8, 1.0),
+    wrist_acceleration_rad_per_s2=Bound(4.0, 8.0),
+    linear_speed_m_per_s=Bound(0.1, 0.15),
+    linear_acceleration_m_per_s2=Bound(0.5, 1.0),
+    force_n=Bound(40.0, 60.0),
+    torque_nm=Bound(4.0, 6.0),
+)
+AT_REST = Reading(
+    t_mono_ns=0,
+    timestamp_s=0.0,
+    age_ns=0,
+    connected=True,
+    q_rad=(0.0, -1.5, 1.5, -1.5, -1.5, 0.0),
+    qd_rad_per_s=(0.0,) * 6,
+    tcp_pose=(-0.5, -0.1, 0.5, 0.0, math.pi, 0.0),
+    wrench=(0.0,) * 6,
+    robot_mode=7,
+    safety_mode=1,
+    runtime_state=2,
+    speed_scaling=1.0,
+    moving_linearly=False,
+)
+
+
+def reading(wrist_rad: float = 0.0, speed: float = 0.0, force_n: float = 0.0, torque_nm: float = 0.0) -> Reading:
+    return dataclasses.replace(
+        AT_REST,
+        q_rad=(*AT_REST.q_rad[:5], wrist_rad),
+        qd_rad_per_s=(0.0, 0.0, 0.0, 0.0, 0.0, speed),
+        wrench=(force_n, 0.0, 0.0, 0.0, torque_nm, 0.0),
+    )
+
+
+anything = st.floats(-1e9, 1e9)
+above_0 = st.floats(1e-6, 1e9)
+commands = st.builds(WristSpeed, anything | st.floats(-2, 2), above_0 | st.floats(0.01, 8))
+readings = st.builds(reading, st.floats(-2.5, 2.5), st.floats(-1.5, 1.5), st.floats(0, 100), st.floats(0, 10))
+
+
+@given(commands, readings)
+def test_wrist_command_is_within_the_limits_and_tells_what_was_clipped(asked: WristSpeed, now: Reading) -> None:
+    sent, reasons = clip_wrist(asked, now, LIMITS, REACTION_S)
+    assert abs(sent.rad_per_s) <= min(LIMITS.wrist_speed_rad_per_s.inner, abs(asked.rad_per_s))
+    assert sent.rad_per_s * asked.rad_per_s >= 0
+    assert 0 < sent.acceleration_rad_per_s2 <= LIMITS.wrist_acceleration_rad_per_s2.inner
+    assert bool(reasons) == (sent != asked)
+    inner_end = 2.0 - 0.1
+    if abs(now.wrist_rad) >= inner_end:
+        assert sent.rad_per_s * now.wrist_rad <= 1e-12, "only back inside"
+    if math.hypot(*now.wrench[:3]) >= LIMITS.force_n.hard or math.hypot(*now.wrench[3:]) >= LIMITS.torque_nm.hard:
+        assert sent.rad_per_s == 0
+
+
+@given(
+    st.lists(st.tuples(commands, st.integers(1, 60)), min_size=1, max_size=12),
+    st.floats(-1.9, 1.9),
+    st.integers(0, 3),
+)
+@example([(WristSpeed(1e9, 0.01), 400), (WristSpeed(-0.01, 1e-6), 60)], 1.0, 3)
+@example([(WristSpeed(0.8, 4.0), 60), (WristSpeed(0.79, 1e-6), 60), (WristSpeed(0.0, 1e-6), 60)], 1.7, 3)
+def test_arm_that_follows_stays_within_its_inner_range(
+    asked: list[tuple[WristSpeed, int]], begin_rad: float, cycles_late: int
+) -> None:
+    """The arm as speedJ moves it: towards the speed with the acceleration, commands taking hold some cycles late."""
+    wrist_rad, speed = begin_rad, 0.0
+    under_way = [WristSpeed(0.0, 4.0)] * cycles_late
+    for command, cycles in asked:
+        for _ in range(cycles):
+            sent, _ = clip_wrist(command, reading(wrist_rad, speed), LIMITS, REACTION_S)
+            under_way.append(sent)
+            now = under_way.pop(0)
+            step = now.acceleration_rad_per_s2 * CYCLE_S
+            before, speed = speed, speed + min(max(now.rad_per_s - speed, -step), step)
+            wrist_rad += 0.5 * (before + speed) * CYCLE_S
+            assert abs(wrist_rad) <= 1.9 + 1e-9
+            assert abs(speed) <= 0.8 + 1e-12
+
+
+@given(above_0, st.floats(-1.9, 1.9), st.floats(-0.8, 0.8))
+def test_stop_brakes_within_the_range_however_gently_it_was_asked(asked: float, wrist_rad: float, speed: float) -> None:
+    room = 1.9 - abs(wrist_rad) if wrist_rad * speed > 0 else 1.9 + abs(wrist_rad)
+    sent = clip_stop(Stop(asked), reading(wrist_rad, speed), LIMITS, REACTION_S).deceleration_rad_per_s2
+    assert 0 < sent <= LIMITS.wrist_acceleration_rad_per_s2.hard
+    if speed * speed / 2 / LIMITS.wrist_acceleration_rad_per_s2.inner + abs(speed) * REACTION_S < room:
+        assert speed * speed / 2 / sent + abs(speed) * REACTION_S <= room + 1e-9
+
+
+poses = st.tuples(*[anything] * 3, *[st.floats(-math.pi, math.pi)] * 3)
+
+
+@given(st.builds(MoveLinear, poses, above_0, above_0))
+def test_linear_move_ends_within_the_workspace_and_tells_what_was_clipped(asked: MoveLinear) -> None:
+    sent, reasons = clip_linear(asked, LIMITS)
+    box = LIMITS.workspace
+    for value, low, high in zip(sent.pose[:3], box.lower_m, box.upper_m, strict=True):
+        assert low + box.margin_m <= value <= high - box.margin_m
+    assert sent.pose[3:] == asked.pose[3:]
+    assert sent.speed_m_per_s <= LIMITS.linear_speed_m_per_s.inner
+    assert sent.acceleration_m_per_s2 <= LIMITS.linear_acceleration_m_per_s2.inner
+    before = (*asked.pose, asked.speed_m_per_s, asked.acceleration_m_per_s2)
+    after = (*sent.pose, sent.speed_m_per_s, sent.acceleration_m_per_s2)
+    changes = sum(a != b for a, b in zip(before, after, strict=True))
+    assert len(reasons) == changes
+
+
+def test_every_hard_limit_is_named() -> None:
+    assert violation(AT_REST, LIMITS) == ""
+    assert "Joint 3" in violation(dataclasses.replace(AT_REST, q_rad=(0.0, 0.0, 3.01, 0.0, 0.0, 0.0)), LIMITS)
+    assert "z = -0.010 m" in violation(dataclasses.replace(AT_REST, tcp_pose=(0.0, 0.0, -0.01, 0.0, 0.0, 0.0)), LIMITS)
+    assert "Wrist speed" in violation(reading(speed=-1.01), LIMITS)
+    assert "Force is 60.10 N" in violation(reading(force_n=60.1), LIMITS)
+    assert "Torque" in violation(reading(torque_nm=6.1), LIMITS)
+    assert "no numbers" in violation(reading(force_n=math.nan), LIMITS)
+
+
+def test_linear_move_is_watched_at_the_inner_limits() -> None:
+    assert line_violation(AT_REST, LIMITS) == ""
+    assert "force" in line_violation(reading(force_n=41.0), LIMITS)
+    towards = dataclasses.replace(
+        AT_REST, q_rad=(0.0, 0.0, 2.85, 0.0, 0.0, 0.0), qd_rad_per_s=(0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+    )
+    assert "joint 3" in line_violation(towards, LIMITS)
+    away = dataclasses.replace(towards, qd_rad_per_s=(0.0, 0.0, -1.0, 0.0, 0.0, 0.0))
+    assert line_violation(away, LIMITS) == ""
+
+
+@given(st.tuples(*[st.floats(-1, 1)] * 3), st.floats(0, math.pi), st.tuples(*[st.floats(-9, 9)] * 3))
+def test_torque_about_the_tool_axis_agrees_with_scipy(
+    direction: tuple[float, float, float], angle: float, torque: tuple[float, float, float]
+) -> None:
+    length = math.hypot(*direction) or 1.0
+    vector = np.array(direction) / length * angle
+    now = dataclasses.replace(AT_REST, tcp_pose=(0.0, 0.0, 0.0, *vector.tolist()), wrench=(0.0, 0.0, 0.0, *torque))
+    axis = Rotation.from_rotvec(vector).as_matrix()[:, 2]
+    assert math.isclose(tool_axis_torque(now), float(axis @ np.array(torque)), abs_tol=1e-9)

@@ -1,0 +1,101 @@
+"""The pipe: everything arrives as it was sent, in any pieces, and nothing else is taken."""
+
+import contextlib
+import math
+import struct
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import ProtocolError
+from drivers.ur.messages import (
+    Configure,
+    Decoder,
+    Disconnect,
+    Enable,
+    Failed,
+    Heartbeat,
+    Message,
+    MoveLinear,
+    Phase,
+    Reply,
+    RobotState,
+    Stop,
+    Unlock,
+    WristSpeed,
+    ZeroForceTorque,
+    encode,
+)
+from drivers.ur.settings import UrSettings
+from tests.drivers.ur.test_limits import LIMITS
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+six = st.tuples(*[finite] * 6)
+wrist, line, stop = (
+    st.builds(WristSpeed, finite, finite),
+    st.builds(MoveLinear, six, finite, finite),
+    st.builds(Stop, finite),
+)
+sent = st.none() | wrist | line | stop
+reasons = st.lists(st.text(max_size=20), max_size=3).map(tuple)
+states = st.builds(
+    RobotState,
+    q_rad=six, qd_rad_per_s=six, tcp_pose=six, wrench=six, sent=sent, clipped=reasons,
+    timestamp_s=finite, speed_scaling=finite, wrist_torque_nm=finite,
+    motion=st.sampled_from(["idle", "wrist", "linear", "stopping"]),
+)  # fmt: skip
+messages = st.one_of(
+    wrist, line, stop, st.just(Enable()), st.just(Unlock()), st.just(ZeroForceTorque()), st.just(Disconnect()),
+    st.just(Heartbeat()), st.builds(Reply, st.text(), sent, reasons), st.builds(Phase, st.text()),
+    st.builds(Failed, st.sampled_from(["lost", "silent"]), st.text()), states,
+    st.just(Configure(UrSettings(host="10.0.0.1", limits=LIMITS))),
+)  # fmt: skip
+numbered = st.lists(st.tuples(st.integers(0, 2**32 - 1), messages), max_size=5)
+
+
+@given(numbered, st.lists(st.integers(0, 10_000), max_size=8))
+def test_messages_arrive_as_sent_in_any_pieces(entries: list[tuple[int, Message]], cuts: list[int]) -> None:
+    stream = b"".join(encode(message, number) for number, message in entries)
+    decoder = Decoder()
+    edges = sorted({0, len(stream), *(cut for cut in cuts if cut < len(stream))})
+    assert [entry for a, b in pairwise(edges) for entry in decoder.feed(stream[a:b])] == entries
+
+
+@given(st.binary(max_size=200))
+def test_foreign_bytes_are_refused_or_waited_on(data: bytes) -> None:
+    decoder = Decoder()
+    with contextlib.suppress(ProtocolError):
+        for _, message in decoder.feed(data):
+            assert Decoder().feed(encode(message)) == [(0, message)]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b'{"rad_per_s":0.1}',
+        b'{"rad_per_s":"0.1","acceleration_rad_per_s2":1.0}',
+        b'{"rad_per_s":true,"acceleration_rad_per_s2":1.0}',
+        b'{"rad_per_s":NaN,"acceleration_rad_per_s2":1.0}',
+        b'{"rad_per_s":1e999,"acceleration_rad_per_s2":1.0}',
+        b'{"rad_per_s":0.1,"acceleration_rad_per_s2":1.0,"time_s":1.0}',
+        b"[0.1,1.0]",
+        b"{",
+    ],
+)
+def test_command_with_anything_missing_wrong_or_more_is_refused(body: bytes) -> None:
+    code = encode(WristSpeed(0.1, 1.0))[8]
+    with pytest.raises(ProtocolError, match="WristSpeed"):
+        Decoder().feed(struct.pack("<IIB", len(body), 1, code) + body)
+
+
+def test_states_carry_what_is_no_number() -> None:
+    state = RobotState(
+        0, 0.0, 0, True, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0, False,
+        0.0, False, False, "", False, "idle", 0, "", None, (),
+    )  # fmt: skip
+    ((_, got),) = Decoder().feed(encode(state))
+    assert isinstance(got, RobotState)
+    assert got.wrench == state.wrench
+    assert all(map(math.isnan, got.q_rad))

@@ -1,0 +1,63 @@
+"""The robot's YAML: the one that is delivered is right, and mistakes are told together, with path and range."""
+
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.ur.settings import read_settings
+
+DELIVERED = Path(__file__).parents[3] / "config" / "ur.yaml"
+
+
+def changed(folder: Path, *changes: tuple[str, str]) -> Path:
+    text = DELIVERED.read_text(encoding="utf-8")
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "ur.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_delivered_settings_are_complete() -> None:
+    settings = read_settings(DELIVERED)
+    assert settings.limits.torque_nm.inner < settings.limits.torque_nm.hard
+    assert len(settings.limits.joints.lower_rad) == 6
+
+
+def test_all_mistakes_are_told_together(tmp_path: Path) -> None:
+    path = changed(
+        tmp_path,
+        ("torque_nm: {inner: 4.0, hard: 6.0}", "torque_nm: {inner: 7.0, hard: 6.0}"),
+        ("margin_m: 0.02", "margin_m: 0.02\n    colour: red"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: -1"),
+        ("upper_m: [0.8, 0.8, 0.9]", "upper_m: [0.8, .inf, 0.9]"),
+    )
+    with pytest.raises(DriverError) as caught:
+        read_settings(path)
+    message = str(caught.value)
+    for part in (str(path), "limits.torque_nm", "inner (7) must be above 0 and below hard (6)",
+                 "limits.workspace.colour", "limits.workspace.upper_m.1"):  # fmt: skip
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: 60", "three times"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nhang_timeout_s: 0", "above 0"),
+        ("margin_rad: 0.1", "margin_rad: 3.2", "no room"),
+        ("margin_m: 0.02", "margin_m: 0", "above 0"),
+        ("host: 192.168.1.10\n", "", "host: Field required"),
+        ("limits:", "limits", "cannot be read"),
+    ],
+)
+def test_a_mistake_is_told(tmp_path: Path, old: str, new: str, said: str) -> None:
+    with pytest.raises(DriverError, match=said):
+        read_settings(changed(tmp_path, (old, new)))
+
+
+def test_missing_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DriverError, match="nowhere"):
+        read_settings(tmp_path / "nowhere.yaml")

@@ -1,0 +1,281 @@
+"""The whole rig, played by one process: arm, gripper, load cell, two EIT boards and a shear skin, tied by one physics.
+
+Arm → wrist's angle → twin ← force of the fingers; twin → wrench, load cell, EIT frames and the skin's gauges. The
+controller's cycle is what makes time pass, so that all devices see the same moment.
+"""
+
+import asyncio
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from drivers.emulators import eit_kit, hx711
+from drivers.emulators.eit_kit import FRAME_PERIOD_S, EitKitBoard
+from drivers.emulators.hx711 import Hx711Board, Sketch
+from drivers.emulators.robotiq.gripper import Gripper
+from drivers.emulators.robotiq.modbus_face import ModbusServer
+from drivers.emulators.robotiq.player import GripperPlayer
+from drivers.emulators.robotiq.urcap_face import PORT, UrcapServer
+from drivers.emulators.scene import FloatArray, Scene, Truth
+from drivers.emulators.skin.circuit import Gauges
+from drivers.emulators.skin.instruments import SkinInstruments
+from drivers.emulators.twin import Joint, TwinSettings
+from drivers.emulators.ur.faults import FAULTS, obey
+from drivers.emulators.ur.make import Make
+from drivers.emulators.ur.robot import Event, Robot
+from drivers.emulators.ur.server import Controller
+
+# A frame (1024,) in volts, from what its injections saw, (32,) each: grip 0…1 and shear torque in N·m; and the tool's
+# diameter in mm.
+FrameOf = Callable[[FloatArray, FloatArray, float], FloatArray]
+
+NOISE_NM = 0.0005
+TRUTH_PERIOD_S = 0.1
+# The pads face each other: what shears one way on the right shears the other way on the left.
+SIDES = {"right": 1.0, "left": -1.0}
+# An outage without an end of its own.
+A_DAY = "86400"
+COMMANDS = (
+    "kick NM, slip [NM], joint KIND, object MM|none, silence DEVICE [SECONDS], unplug DEVICE [SECONDS], replug DEVICE, "
+    "right|left|load|skin FAULT, gripper drop|fault CODE|…, a fault of the robot, or normal"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RigSkin:
+    """A shear skin on one finger: hears the tool's torque in N·m and whether it is gripped, and has two gauges."""
+
+    follow: Callable[[float, bool], None]
+    gauges: Gauges
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigSettings:
+    """What is played, where, and how fast.
+
+    `speed` is times their own pace for gel, fingers and boards, `arm_speed` for the arm. The controller's and the
+    gripper's answers, its samples and its watchdog stay in real time, as their clients are.
+    """
+
+    run_dir: Path
+    host: str = "127.0.0.1"
+    gripper: Literal["socket", "modbus"] = "socket"
+    gripper_port: int = PORT
+    twin: TwinSettings = field(default_factory=TwinSettings)
+    diameter_mm: float | None = 20.0
+    speed: float = 1.0
+    arm_speed: float = 1.0
+    rate_hz: float = 500.0
+    # Whether a finger wears a shear skin.
+    skin: bool = False
+    make: Make = field(default_factory=Make)
+    sketch: Sketch = field(default_factory=lambda: Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm))
+    seed: int = 0
+
+    @property
+    def ports(self) -> dict[str, Path]:
+        """Where the devices on serial lines are to be found."""
+        names = {"right": "eit-right", "left": "eit-left", "load": "load-cell"}
+        if self.gripper == "modbus":
+            names["gripper"] = "gripper"
+        if self.skin:
+            names |= {"skin-source": "skin-source", "skin-daq": "skin-daq"}
+        return {device: self.run_dir / name for device, name in names.items()}
+
+
+class Rig:
+    """All devices. `run` plays them, `command` lets something befall them, `scene` is what is really so.
+
+    `on_event` hears what happens to the robot, `on_truth` the truth ten times a second of the scene's time, and
+    `on_ready` that every port is there.
+    """
+
+    def __init__(
+        self,
+        settings: RigSettings,
+        frame_of: FrameOf,
+        *,
+        skin: RigSkin | None = None,
+        on_event: Callable[[Event], None] | None = None,
+        on_truth: Callable[[Truth], None] | None = None,
+        on_ready: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._settings = settings
+        self._frame_of = frame_of
+        self._on_truth = on_truth
+        self._on_ready = on_ready
+        self._awaited = {*SIDES, "load", "gripper"}
+        gripper = Gripper()
+        self.scene = Scene(gripper, settings.twin, settings.speed)
+        self.player = GripperPlayer(gripper, self._gripper_server(gripper))
+        if settings.diameter_mm is not None:
+            self.player.command(f"object {settings.diameter_mm}")
+        self._follow_skin = skin.follow if skin is not None else None
+        robot = Robot(settings.make, lambda wrist_rad, _, dt_s: self._step(dt_s, wrist_rad), settings.arm_speed)
+        self.controller = Controller(robot, host=settings.host, rate_hz=settings.rate_hz, on_event=on_event)
+        self.eit = {side: self._eit_board(side, number) for number, side in enumerate(SIDES)}
+        self.load = Hx711Board(
+            lambda: self.scene.conversion_nm(hx711.PERIOD_S),
+            settings.sketch,
+            period_s=hx711.PERIOD_S / settings.speed,
+            link=settings.ports["load"],
+            on_port=lambda _: self._appeared("load"),
+            seed=settings.seed,
+        )
+        self._devices: dict[str, Callable[[str], None]] = {
+            "load": lambda text: self.load.inject(hx711.read_fault(text)),
+            "gripper": self._befall_gripper,
+            "robot": lambda text: obey(self.controller, text),
+            **{side: self._befall_board(board) for side, board in self.eit.items()},
+        }
+        self._cures: dict[str, Callable[[], None]] = {
+            "load": self.load.recover,
+            "gripper": self.player.recover,
+            "robot": lambda: obey(self.controller, "normal"),
+            **{side: board.recover for side, board in self.eit.items()},
+        }
+        self.skin = self._skin_instruments(skin.gauges) if skin is not None else None
+
+    async def run(self) -> None:
+        """Play until cancelled; OSError, alone or in a group, when an address or a port is not to be had."""
+        async with self.controller, asyncio.TaskGroup() as group:
+            group.create_task(self.controller.run())
+            group.create_task(self.player.serve())
+            group.create_task(self.load.run())
+            for board in self.eit.values():
+                group.create_task(board.run())
+            if self.skin is not None:
+                group.create_task(self.skin.run())
+            if self._on_truth is not None:
+                group.create_task(self._tell_truth(self._on_truth))
+
+    def command(self, text: str) -> None:
+        """Do what a line says; ValueError, with a sentence, for one that says nothing known."""
+        match text.split():
+            case ["kick", jump_nm]:
+                self.scene.kick(_torque(jump_nm))
+            case ["slip"]:
+                self.scene.slip()
+            case ["slip", left_nm]:
+                self.scene.slip(_torque(left_nm))
+            case ["joint", name]:
+                self.scene.put_on(joint_of(name))
+            case ["object", *_]:
+                self.player.command(text)
+            case ["normal"]:
+                for cure in self._cures.values():
+                    cure()
+            case ["replug", device]:
+                _named(self._cures, device)()
+            case ["silence", device, *seconds]:
+                _named(self._devices, device)(" ".join(["silence", *seconds]))
+            case ["unplug", device, *seconds]:
+                _named(self._devices, device)(" ".join(["unplug", *(seconds or [A_DAY])]))
+            case [device, *words] if device in self._devices and words:
+                self._devices[device](" ".join(words))
+            case [name, *_] if name in FAULTS:
+                obey(self.controller, text)
+            case _:
+                raise ValueError(f"{text!r} is no command; there are {COMMANDS}")
+
+    def _step(self, dt_s: float, wrist_rad: float) -> float:
+        torque_nm = self.scene.step(dt_s, wrist_rad)
+        if self._follow_skin is not None:
+            state = self.scene.twin.state
+            self._follow_skin(state.torque_nm, state.gripped)
+        return torque_nm
+
+    def _skin_instruments(self, gauges: Gauges) -> SkinInstruments:
+        settings = self._settings
+        skin = SkinInstruments(
+            gauges,
+            settings.ports["skin-source"],
+            settings.ports["skin-daq"],
+            on_port=lambda device, _: self._appeared(f"skin-{device}"),
+            speed=settings.speed,
+            seed=settings.seed,
+        )
+        self._awaited |= {"skin-source", "skin-daq"}
+        self._devices["skin"] = lambda text: self._befall_skin(skin, text)
+        self._cures["skin"] = lambda: skin.command("normal")
+        return skin
+
+    @staticmethod
+    def _befall_skin(skin: SkinInstruments, text: str) -> None:
+        # Without its voltages nothing is measured; what befalls the source alone is named so.
+        skin.command(f"daq {text}" if text.split(maxsplit=1)[0] in ("silence", "unplug") else text)
+
+    def _befall_gripper(self, text: str) -> None:
+        match text.split():
+            case ["drop"]:
+                self.player.command("object none")
+            case ["unplug", *seconds]:
+                self.player.command(" ".join(["lose", *seconds]))
+            case _:
+                self.player.command(text)
+
+    @staticmethod
+    def _befall_board(board: EitKitBoard) -> Callable[[str], None]:
+        return lambda text: board.inject(eit_kit.read_fault(text))
+
+    def _gripper_server(self, gripper: Gripper) -> UrcapServer | ModbusServer:
+        settings = self._settings
+        if settings.gripper == "modbus":
+            return ModbusServer(gripper, settings.ports["gripper"], lambda _: self._appeared("gripper"))
+        return UrcapServer(gripper, settings.host, settings.gripper_port, lambda _: self._appeared("gripper"))
+
+    def _eit_board(self, side: str, number: int) -> EitKitBoard:
+        settings = self._settings
+        return EitKitBoard(
+            self._frames(SIDES[side]),
+            period_s=FRAME_PERIOD_S / settings.speed,
+            link=settings.ports[side],
+            on_port=lambda _: self._appeared(side),
+            seed=settings.seed + number,
+        )
+
+    def _frames(self, sign: float) -> Iterator[FloatArray]:
+        for _ in itertools.count():
+            seen = self.scene.frame(FRAME_PERIOD_S)
+            yield self._frame_of(seen.grip, sign * seen.shear_torque_nm, seen.diameter_mm)
+
+    def _appeared(self, device: str) -> None:
+        if device in self._awaited:
+            self._awaited.discard(device)
+            if not self._awaited:
+                self._on_ready()
+
+    async def _tell_truth(self, tell: Callable[[Truth], None]) -> None:
+        loop = asyncio.get_running_loop()
+        period_s = TRUTH_PERIOD_S / self._settings.speed
+        due_s = loop.time()
+        while True:
+            tell(self.scene.truth())
+            due_s = max(due_s + period_s, loop.time())
+            await asyncio.sleep(due_s - loop.time())
+
+
+def joint_of(name: str) -> Joint:
+    """Return the joint of a name; ValueError, with a sentence, when there is none."""
+    try:
+        return Joint(name)
+    except ValueError:
+        raise ValueError(f"there is no joint {name!r}; there are {', '.join(joint.value for joint in Joint)}") from None
+
+
+def _torque(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not abs(value) <= 5.0:
+        raise ValueError(f"{text!r} is no torque in N·m of at most 5; write for instance 0.05")
+    return value
+
+
+def _named(table: dict[str, Callable[..., None]], device: str) -> Callable[..., None]:
+    if device not in table:
+        raise ValueError(f"there is no device {device!r}; there are {', '.join(table)}")
+    return table[device]

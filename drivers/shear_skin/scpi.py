@@ -1,0 +1,149 @@
+"""Talking SCPI to a bench instrument: one question at a time, over a serial port or a socket."""
+
+import re
+from collections import Counter
+from dataclasses import dataclass
+from time import monotonic_ns
+
+from drivers.errors import DeviceLostError, ProtocolError
+from drivers.serial_port import Link, Port
+
+# A reading of five elements is 70 characters long; what is longer without an end is no reply.
+LONGEST_REPLY = 512
+# Replies to questions asked before the port was opened, read past before the answer to *IDN? comes.
+MOST_STALE_REPLIES = 8
+# A reading takes some tenths of a second at the most.
+REPLY_DEADLINE_S = 2.0
+# What stands for an overload, and for a quantity that is not measured (SCPI-1999, 7.2.1.4 and 7.2.1.5).
+OVERLOAD, NOT_A_NUMBER = 9.9e37, 9.91e37
+_NUMBER = re.compile(r" *[+-]?[0-9]{1,12}(\.[0-9]{0,12})?([Ee][+-]?[0-9]{1,2})? *")
+
+
+class ReplyLines:
+    """Cuts bytes, in whatever slices they come, into replies: instruments end them with CR, LF or both. No I/O."""
+
+    def __init__(self) -> None:
+        self.refused: Counter[str] = Counter()
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what was half received."""
+        self._begun = b""
+        self._flooded = False
+
+    def feed(self, data: bytes) -> list[str]:
+        """Return the replies that `data` completes, without their ends; empty lines are none."""
+        *lines, rest = (self._begun + data).replace(b"\r", b"\n").split(b"\n")
+        replies = []
+        for line in lines:
+            if self._flooded or len(line) > LONGEST_REPLY:
+                self._refuse_flood()
+                self._flooded = False
+            elif not line.isascii():
+                self.refused["not ASCII"] += 1
+            elif text := line.decode().strip():
+                replies.append(text)
+        if len(rest) > LONGEST_REPLY:
+            self._refuse_flood()
+            self._flooded, rest = True, b""
+        self._begun = rest
+        return replies
+
+    def _refuse_flood(self) -> None:
+        if not self._flooded:
+            self.refused["too long"] += 1
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What an instrument answered, when it was asked and when the answer was there (monotonic, ns)."""
+
+    text: str
+    t_asked_ns: int
+    t_arrival_ns: int
+
+
+def numbers(text: str, count: int, what: str) -> list[float]:
+    """Return the comma-separated numbers of a reply; ProtocolError when it has not exactly so many."""
+    parts = text.split(",")
+    if len(parts) != count or not all(map(_NUMBER.fullmatch, parts)):
+        raise ProtocolError(f"{what} sent {text[:60]!r}, which is not {count} numbers; check the baud rate.")
+    return [float(part) for part in parts]
+
+
+class ScpiSession:
+    """Questions and commands over a link that may break; after a failure the link is to be closed by `lost`."""
+
+    def __init__(self, link: Link, what: str, deadline_s: float = REPLY_DEADLINE_S) -> None:
+        """Take the link, and what the instrument is called in sentences."""
+        self._link = link
+        self._what = what
+        self._deadline_s = deadline_s
+        self.lines = ReplyLines()
+        self._waiting: list[tuple[str, int]] = []
+
+    async def identified(self, *models: str) -> str:
+        """Return the reply to *IDN?, read past what was said before; ProtocolError unless it names one of the models.
+
+        Without `models` every instrument will do.
+        """
+        self.lines.restart()
+        self._waiting.clear()
+        name = (await self.ask("*IDN?")).text
+        for _ in range(MOST_STALE_REPLIES):
+            # A name has four fields, of which the first is no number.
+            if name.count(",") >= 3 and not name.lstrip("+-")[:1].isdigit():
+                break
+            name = (await self._next(0, "*IDN?")).text
+        if models and not any(model in name for model in models):
+            raise ProtocolError(
+                f"{self._what} says it is {name!r}, and not {' or '.join(models)}; see which instrument is there."
+            )
+        return name
+
+    async def tell(self, *commands: str) -> None:
+        """Send commands; what an instrument thinks of them is told by `check`."""
+        for command in commands:
+            await self._port.write(f"{command}\n".encode())
+
+    async def ask(self, query: str) -> Reply:
+        """Return the answer to a query; DeviceLostError when none comes."""
+        # What comes without having been asked for must not be taken for the answer.
+        self.lines.refused["unasked"] += len(self._waiting)
+        self._waiting.clear()
+        asked_ns = monotonic_ns()
+        await self.tell(query)
+        return await self._next(asked_ns, query)
+
+    async def check(self) -> None:
+        """Raise ProtocolError when the instrument refused something that it was told."""
+        reply = (await self.ask(":SYST:ERR?")).text
+        code = reply.split(",")[0]
+        try:
+            refused = int(code) != 0
+        except ValueError:
+            refused = True
+        if refused:
+            raise ProtocolError(
+                f"{self._what} refused its settings: {reply}; see whether it is the model that is meant."
+            )
+
+    @property
+    def _port(self) -> Port:
+        if self._link.port is None:
+            raise DeviceLostError(f"There is no connection to {self._what} at present.")
+        return self._link.port
+
+    async def _next(self, asked_ns: int, query: str) -> Reply:
+        deadline_ns = monotonic_ns() + int(self._deadline_s * 1e9)
+        while not self._waiting:
+            left_s = (deadline_ns - monotonic_ns()) / 1e9
+            received = await self._port.read(left_s) if left_s > 0 else None
+            if received is None:
+                raise DeviceLostError(
+                    f"{self._what} at {self._port.path} has not answered {query!r} within {self._deadline_s:g} s; "
+                    "see that it is on, and that baud rate and line end are as configured."
+                )
+            self._waiting += [(text, received.t_arrival_ns) for text in self.lines.feed(received.data)]
+        text, arrival_ns = self._waiting.pop(0)
+        return Reply(text, asked_ns, arrival_ns)

@@ -1,0 +1,126 @@
+"""What two voltages and a source say of two gauges; every fault by its own name."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.shear_skin.daq import Voltages
+from drivers.shear_skin.judge import Fault, Judge, SkinSample
+from drivers.shear_skin.source import SourceReading
+
+CURRENT_A, SOURCE_S, DAQ_S = 5e-3, 0.5, 0.1
+GOOD = SourceReading(0, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
+
+
+def judge() -> Judge:
+    return Judge(CURRENT_A, SOURCE_S, DAQ_S)
+
+
+def voltages(v1_v: float, v2_v: float, number: int = 0, *, over_1: bool = False, over_2: bool = False) -> Voltages:
+    t_ns = number * 100_000_000
+    return Voltages(v1_v, v2_v, t_ns, t_ns, over_1=over_1, over_2=over_2)
+
+
+def said(v1_v: float, v2_v: float, source: SourceReading | None = GOOD, **more: bool) -> SkinSample:
+    return judge().sample(voltages(v1_v, v2_v, **more), source)
+
+
+def test_two_sound_voltages_are_two_resistances() -> None:
+    sample = said(0.123, 0.1265)
+    assert (sample.r1_ohm, sample.r2_ohm) == pytest.approx((24.6, 25.3))
+    assert sample.trusted
+    assert sample.why == ""
+
+
+STUCK_OPEN = SourceReading(0, output_on=True, voltage_v=1.0, current_a=1e-9, compliance=True)
+
+
+@pytest.mark.parametrize(
+    ("v1_v", "v2_v", "source", "faults"),
+    [
+        (0.123, 0.126, None, [Fault.SOURCE_LOST]),
+        (0.0, 0.0, SourceReading(0, output_on=False), [Fault.SOURCE_OFF]),
+        (1.0, 0.0, STUCK_OPEN, [Fault.COMPLIANCE, Fault.OPEN_1]),
+        (0.0, 1.0, STUCK_OPEN, [Fault.COMPLIANCE, Fault.OPEN_2]),
+        (0.0, 0.0, STUCK_OPEN, [Fault.COMPLIANCE]),
+        # Half a second before the source says so, the voltages do.
+        (1.0, 0.0, GOOD, [Fault.OPEN_1]),
+        (0.126, 0.0001, GOOD, [Fault.SHORT_2]),
+        (-0.123, 0.126, GOOD, [Fault.REVERSED_1]),
+        (0.123, -0.126, GOOD, [Fault.REVERSED_2]),
+        (0.123, 0.3, GOOD, [Fault.IMPLAUSIBLE_2]),
+        (0.123, 0.180, GOOD, [Fault.SUM]),
+        (0.123, 0.126, SourceReading(0, True, 0.252, 4.8e-3), [Fault.CURRENT]),
+    ],
+)
+def test_each_fault_has_its_name_and_leaves_no_resistance(
+    v1_v: float, v2_v: float, source: SourceReading | None, faults: list[Fault]
+) -> None:
+    sample = said(v1_v, v2_v, source)
+    assert list(sample.faults) == faults
+    assert sample.r1_ohm is None
+    assert sample.r2_ohm is None
+    assert all(str(fault) in sample.why for fault in faults)
+
+
+def test_beyond_the_range_is_open_only_where_nothing_is_across_the_other_gauge() -> None:
+    assert list(said(9.9e37, 0.126, over_1=True).faults) == [Fault.OVERRANGE_1]
+    assert list(said(0.512, 0.0, STUCK_OPEN, over_1=True).faults) == [Fault.COMPLIANCE, Fault.OPEN_1]
+
+
+def test_a_source_that_falls_silent_is_lost_after_two_seconds() -> None:
+    one = judge()
+    assert one.sample(voltages(0.123, 0.126, 20), GOOD).trusted
+    assert list(one.sample(voltages(0.124, 0.126, 21), GOOD).faults) == [Fault.SOURCE_LOST]
+    assert one.faults == {"source_lost": 1}
+
+
+def test_missing_readings_are_counted_where_they_are_missing() -> None:
+    one = judge()
+    missed = [one.sample(voltages(0.123 + 1e-6 * n, 0.126, n), GOOD).missed for n in (0, 1, 2, 5, 6)]
+    assert missed == [0, 0, 0, 2, 0]
+    assert one.missed == 2
+
+
+def test_a_jump_is_a_disturbance_until_it_stays() -> None:
+    one = judge()
+    path = [0.123, 0.123, 0.19, 0.1231, 0.17, 0.17, 0.17, 0.17]
+    trusted = []
+    for number, v1_v in enumerate(path):
+        source = SourceReading(0, True, v1_v + 0.126, CURRENT_A)
+        trusted.append(one.sample(voltages(v1_v, 0.126, number), source).trusted)
+    assert trusted == [True, True, False, True, False, False, True, True]
+
+
+def test_a_converter_that_stands_still_is_told_by_gauge() -> None:
+    one = judge()
+    source = SourceReading(60 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
+    samples = [one.sample(voltages(0.123, 0.126 + 1e-6 * (n % 2), n), source) for n in range(60)]
+    assert samples[40].trusted
+    assert list(samples[59].faults) == [Fault.STUCK_1]
+
+
+ANY = st.floats(-2, 2) | st.just(9.9e37)
+
+
+@given(
+    st.lists(st.tuples(ANY, ANY, st.integers(1, 4)), max_size=30),
+    st.sampled_from([None, GOOD, STUCK_OPEN, SourceReading(0, output_on=False)]),
+)
+def test_whatever_comes_a_trusted_sample_has_two_resistances_that_a_gauge_can_have(
+    story: list[tuple[float, float, int]], source: SourceReading | None
+) -> None:
+    one, number = judge(), 0
+    for v1_v, v2_v, step in story:
+        number += step
+        reading = None if source is None else SourceReading(number * 10**8, *_rest(source))
+        sample = one.sample(voltages(v1_v, v2_v, number, over_1=v1_v > 1, over_2=v2_v > 1), reading)
+        assert sample.trusted == (sample.r1_ohm is not None) == (sample.r2_ohm is not None)
+        for ohm in (sample.r1_ohm, sample.r2_ohm):
+            assert ohm is None or (ohm * 1.01 >= 15 and ohm <= 50.5 and math.isfinite(ohm))
+
+
+def _rest(source: SourceReading) -> tuple[bool, float, float, bool]:
+    return source.output_on, source.voltage_v, source.current_a, source.compliance

@@ -1,0 +1,127 @@
+"""What the skin's instruments may send: sound replies come through, anything else is refused by kind, in any slices."""
+
+import re
+from contextlib import suppress
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import ProtocolError
+from drivers.shear_skin.adc_board import MAX_LINE_BYTES, NS_PER_BYTE, PairParser
+from drivers.shear_skin.scanner import read_scan
+from drivers.shear_skin.scpi import LONGEST_REPLY, Reply, ReplyLines, numbers
+from drivers.shear_skin.source import read_elements
+
+PERIOD_NS = 100_000_000
+VOLTS = st.floats(-0.6, 0.6).map(lambda volts: round(volts, 6))
+
+
+def slices(data: bytes, cuts: list[int]) -> list[bytes]:
+    ends = sorted({min(cut, len(data)) for cut in cuts} | {0, len(data)})
+    return [data[begin:end] for begin, end in pairwise(ends)]
+
+
+CUTS = st.lists(st.integers(0, 400), max_size=8)
+
+
+@given(st.lists(st.tuples(VOLTS, VOLTS), min_size=1, max_size=8), CUTS)
+def test_every_line_of_the_board_comes_through_in_any_slices(pairs: list[tuple[float, float]], cuts: list[int]) -> None:
+    parser = PairParser()
+    data = b"2,0.123\r\n" + b"".join(f"{v1:.6f},{v2:.6f}\r\n".encode() for v1, v2 in pairs)
+    found = [voltages for part in slices(data, cuts) for voltages in parser.feed(part, 10**9)]
+    assert [(one.v1_v, one.v2_v) for one in found] == pairs
+    assert [(one.over_1, one.over_2) for one in found] == [(abs(a) >= 0.51174, abs(b) >= 0.51174) for a, b in pairs]
+    assert parser.first_partials == 1
+    assert not parser.refused
+
+
+@given(st.binary(max_size=600), CUTS)
+def test_no_bytes_break_the_board_s_parser_and_a_sound_line_comes_through_after_them(
+    noise: bytes, cuts: list[int]
+) -> None:
+    parser = PairParser()
+    for part in slices(noise, cuts):
+        parser.feed(part, 1)
+    parser.feed(b"\n", 2)
+    (found,) = parser.feed(b"0.125000,-0.124000\n", 3 * PERIOD_NS)
+    assert (found.v1_v, found.v2_v) == (0.125, -0.124)
+    assert len(parser._pending) <= MAX_LINE_BYTES
+
+
+def test_refused_lines_are_counted_by_kind() -> None:
+    parser = PairParser()
+    parser.feed(b"cut\n0.1,0.2,0.3\n0.1\n0,1\nnan,0.1\n\r\n" + b"1" * 50 + b"\n0.100000,0.200000\n", 0)
+    assert parser.refused == {"not two decimals": 4, "empty": 1, "too long": 1}
+
+
+def test_lines_that_arrive_together_are_a_period_apart() -> None:
+    parser = PairParser()
+    parser.feed(b"\n", 0)
+    first, second = parser.feed(b"0.125000,0.126000\r\n" * 2, 10**9)
+    assert second.t_mid_ns == 10**9 - 19 * NS_PER_BYTE - PERIOD_NS // 2
+    assert second.t_mid_ns - first.t_mid_ns == PERIOD_NS
+    assert first.t_arrival_ns == second.t_arrival_ns == 10**9
+
+
+@given(st.lists(st.from_regex(r"[ -~]{1,40}", fullmatch=True).filter(str.strip), max_size=6), CUTS)
+def test_replies_come_through_whatever_ends_their_lines(replies: list[str], cuts: list[int]) -> None:
+    for end in (b"\n", b"\r", b"\r\n", b"\n\r"):
+        lines = ReplyLines()
+        data = b"".join(reply.encode() + end for reply in replies)
+        assert [text for part in slices(data, cuts) for text in lines.feed(part)] == [r.strip() for r in replies]
+        assert not lines.refused
+
+
+@given(st.binary(max_size=2 * LONGEST_REPLY), CUTS)
+def test_no_bytes_break_the_reply_lines(noise: bytes, cuts: list[int]) -> None:
+    lines = ReplyLines()
+    for part in slices(noise, cuts):
+        lines.feed(part)
+    lines.feed(b"\n")
+    assert lines.feed(b"1\n") == ["1"]
+
+
+def test_a_flood_without_an_end_is_counted_once_and_forgotten() -> None:
+    lines = ReplyLines()
+    for _ in range(10):
+        assert lines.feed(b"7" * 300) == []
+    assert lines.feed(b"\n\xff\n0\n") == ["0"]
+    assert lines.refused == {"too long": 1, "not ASCII": 1}
+
+
+@given(st.text(max_size=80))
+def test_what_is_no_reading_is_refused_by_name(text: str) -> None:
+    for read in (lambda: read_elements(text, 0), lambda: read_scan(Reply(text, 0, 2))):
+        if re.fullmatch(r"[0-9Ee.,+ -]+", text):
+            with suppress(ProtocolError):
+                read()
+        else:
+            with pytest.raises(ProtocolError, match=r"^The (current source|scanner) sent"):
+                read()
+
+
+def test_the_manual_s_own_example_is_read() -> None:
+    # Figure 17-1 of the 6430's manual, without the resistance and the time; 10 kΩ at 100 µA.
+    reading = read_elements("+1.000206E+00, +1.000000E-04, +4.813200E+04", 5)
+    assert (reading.voltage_v, reading.current_a, reading.t_ns) == (1.000206, 1e-4, 5)
+    assert reading.output_on
+    assert not reading.compliance
+
+
+@pytest.mark.parametrize("bit", [0, 3, 4, 16])
+def test_every_way_of_not_keeping_its_current_is_compliance(bit: int) -> None:
+    assert read_elements(f"+1.0E+00,+1.0E-09,{38916 | 1 << bit:+.6E}", 0).compliance
+
+
+@pytest.mark.parametrize("text", ["+9.91E37,+5.0E-03,+3.8E+04", "1,2", "1,2,-1", "1,2,3E+08", "inf,nan,1", "1_0,2,3"])
+def test_a_reading_that_was_not_made_is_refused(text: str) -> None:
+    with pytest.raises(ProtocolError):
+        read_elements(text, 0)
+
+
+def test_an_overload_of_the_scanner_is_told_by_channel() -> None:
+    voltages = read_scan(Reply("+9.90000000E+37,-1.25000000E-01", 100, 300))
+    assert (voltages.over_1, voltages.over_2, voltages.t_mid_ns) == (True, False, 200)
+    assert numbers("-1,2.5E3", 2, "It") == [-1.0, 2500.0]

@@ -1,0 +1,265 @@
+"""The skin's driver against the played instruments, over real sockets and pseudo-terminals."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from drivers.emulators.skin import daq as played_daq
+from drivers.emulators.skin.circuit import Circuit, befall
+from drivers.emulators.skin.keithley import Keithley6430 as PlayedSource
+from drivers.emulators.skin.servers import Outages, ScpiSerial, ScpiSocket
+from drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
+from drivers.shear_skin.adc_board import AdcBoard
+from drivers.shear_skin.daq import Daq
+from drivers.shear_skin.judge import Fault, SkinSample
+from drivers.shear_skin.scanner import ScpiScanner
+from drivers.shear_skin.skin import ShearSkin
+from drivers.shear_skin.source import BAUD_RATE, Keithley6430
+from drivers.tcp_port import TcpLink
+
+R1, R2 = 24.6, 25.3
+RATE_HZ = 500.0
+# Guards against a test that hangs; none waits for so long.
+DEADLINE_S = 30
+
+
+@dataclass
+class Bench:
+    circuit: Circuit
+    played: PlayedSource
+    source: Outages
+    reader: Callable[[str], None]
+    skin: ShearSkin
+    samples: list[SkinSample] = field(default_factory=list)
+    events: list[LinkEvent] = field(default_factory=list)
+    changed: asyncio.Event = field(default_factory=asyncio.Event)
+
+    async def until(self, condition: Callable[[], object]) -> None:
+        async with asyncio.timeout(DEADLINE_S):
+            while not condition():
+                self.changed.clear()
+                await self.changed.wait()
+
+    async def next_says(self, *faults: Fault) -> None:
+        """Wait for a sample with exactly these faults that was taken from here on."""
+        begin = len(self.samples)
+        try:
+            await self.until(lambda: any(set(sample.faults) == set(faults) for sample in self.samples[begin:]))
+        except TimeoutError:
+            pytest.fail(f"no sample says {faults}; the last one: {self.samples[-1:]}")
+
+
+@contextlib.asynccontextmanager
+async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: float = 2.0) -> AsyncIterator[Bench]:
+    circuit = Circuit(lambda: (R1, R2))
+    policy, events = ReconnectPolicy(0.001, 0.005), []
+    changed, ready = asyncio.Event(), asyncio.Semaphore(0)
+
+    def on_event(event: LinkEvent) -> None:
+        events.append(event)
+        changed.set()
+
+    played = PlayedSource(circuit, time.monotonic)
+    way_in: ScpiSerial | ScpiSocket
+    if serial_source:
+        way_in = ScpiSerial(played.feed, folder / "source", lambda _: ready.release(), answer_s=0.0)
+    else:
+        way_in = ScpiSocket(played.feed, on_port=lambda _: ready.release(), answer_s=0.0)
+    outages = Outages(way_in)
+    players = [outages.run]
+    scanner = ScpiSocket(
+        played_daq.Scanner(circuit, time.monotonic).feed, on_port=lambda _: ready.release(), answer_s=0.0
+    )
+    scanner_outages = Outages(scanner)
+    board = played_daq.AdcBoard(
+        circuit, time.monotonic, period_s=1 / RATE_HZ, link=folder / "adc", on_port=lambda _: ready.release()
+    )
+    players.append(board.run if adc else scanner_outages.run)
+    tasks = [asyncio.create_task(play()) for play in players]
+    for _ in players:
+        await ready.acquire()
+
+    source_link = (
+        SerialLink(path=str(folder / "source"), baud=BAUD_RATE, policy=policy, on_event=on_event)
+        if isinstance(way_in, ScpiSerial)
+        else TcpLink("127.0.0.1", way_in.port, policy=policy, on_event=on_event)
+    )
+    source = Keithley6430(source_link, period_s=0.01, reply_deadline_s=deadline_s)
+    daq: Daq
+    if adc:
+        daq = AdcBoard(SerialLink(path=str(folder / "adc"), policy=policy, on_event=on_event), RATE_HZ)
+    else:
+        link = TcpLink("127.0.0.1", scanner.port, policy=policy, on_event=on_event)
+        daq = ScpiScanner(link, rate_hz=RATE_HZ, reply_deadline_s=deadline_s)
+    skin = ShearSkin(source, daq)
+    bench = Bench(
+        circuit,
+        played,
+        outages,
+        board.command if adc else scanner_outages.command,
+        skin,
+        events=events,
+        changed=changed,
+    )
+
+    async def listen() -> None:
+        async with contextlib.aclosing(skin.samples()) as samples:
+            async for sample in samples:
+                bench.samples.append(sample)
+                changed.set()
+
+    drivers = [asyncio.create_task(skin.watch_source()), asyncio.create_task(listen())]
+    try:
+        yield bench
+    finally:
+        for group in (drivers, tasks):
+            for task in group:
+                task.cancel()
+            done, _ = await asyncio.wait(group)
+            for task in done:
+                with contextlib.suppress(asyncio.CancelledError):
+                    task.result()
+
+
+@pytest.mark.parametrize(("serial_source", "adc"), [(True, True), (True, False), (False, True), (False, False)])
+async def test_resistances_come_through_over_every_way_in(tmp_path: Path, serial_source: bool, adc: bool) -> None:
+    async with a_bench(tmp_path, serial_source=serial_source, adc=adc) as bench:
+        await bench.until(lambda: sum(sample.trusted for sample in bench.samples) >= 50)
+        good = [sample for sample in bench.samples if sample.trusted]
+        for name, true_ohm in (("r1_ohm", R1), ("r2_ohm", R2)):
+            values = [getattr(sample, name) for sample in good]
+            assert sum(values) / len(values) == pytest.approx(true_ohm, rel=2e-4)
+        assert all(sample.faults == (Fault.SOURCE_LOST,) for sample in bench.samples if not sample.trusted)
+        assert [sample.seq for sample in bench.samples] == list(range(len(bench.samples)))
+        times = [sample.t_mid_ns for sample in bench.samples]
+        assert all(a < b for a, b in pairwise(times))
+        assert bench.circuit.output_on
+        assert (bench.circuit.level_a, bench.circuit.compliance_v) == (5e-3, 1.0)
+        assert "MODEL 6430" in str(bench.skin.source_facts()["instrument"])
+        facts = bench.skin.facts()
+        assert facts["connected"]
+        assert facts["samples"] == len(bench.samples)
+    assert not bench.circuit.output_on, "whoever stops measuring switches the current off"
+
+
+FAULTS = [
+    ("open 1", {Fault.COMPLIANCE, Fault.OPEN_1}),
+    ("open 2", {Fault.COMPLIANCE, Fault.OPEN_2}),
+    ("short 1", {Fault.SHORT_1}),
+    ("short 2", {Fault.SHORT_2}),
+    ("reversed 1", {Fault.REVERSED_1}),
+    ("reversed 2", {Fault.REVERSED_2}),
+    ("leads 400", {Fault.COMPLIANCE}),
+    ("leads 40", {Fault.SUM}),
+]
+
+
+@pytest.mark.parametrize("adc", [True, False])
+async def test_each_fault_of_the_circuit_is_named_and_goes_away_with_its_cause(tmp_path: Path, adc: bool) -> None:
+    async with a_bench(tmp_path, serial_source=False, adc=adc) as bench:
+        await bench.next_says()
+        for text, faults in FAULTS:
+            befall(bench.circuit, text, time.monotonic())
+            await bench.next_says(*faults)
+            befall(bench.circuit, "mend", time.monotonic())
+            await bench.next_says()
+        errors = bench.skin.facts()["errors"]
+        assert isinstance(errors, dict)
+        assert {"compliance", "open_1", "open_2", "short_1", "reversed_2", "sum"} <= set(errors)
+
+
+@pytest.mark.parametrize("serial_source", [True, False])
+async def test_a_source_that_is_silent_or_gone_is_named_and_set_up_again_without_a_reset(
+    tmp_path: Path, serial_source: bool
+) -> None:
+    async with a_bench(tmp_path, serial_source=serial_source, adc=True, deadline_s=0.1) as bench:
+        await bench.next_says()
+        for outage in ("silence", "unplug"):
+            bench.source.command(outage)
+            await bench.next_says(Fault.SOURCE_LOST)
+            assert bench.circuit.output_on, "the current flows on while the cable is out"
+            bench.source.command("normal")
+            await bench.next_says()
+        openings = bench.skin.source_facts()["openings"]
+        assert isinstance(openings, int)
+        assert openings >= 3
+
+
+async def test_a_source_that_is_switched_off_by_hand_stays_off_and_says_so(tmp_path: Path) -> None:
+    async with a_bench(tmp_path, serial_source=False, adc=False) as bench:
+        await bench.next_says()
+        bench.circuit.output_on = False
+        await bench.next_says(Fault.SOURCE_OFF)
+        assert not bench.circuit.output_on
+        bench.circuit.output_on = True
+        await bench.next_says()
+
+
+async def test_a_source_that_says_nonsense_is_not_believed(tmp_path: Path) -> None:
+    async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=0.1) as bench:
+        await bench.next_says()
+        sound = bench.played.face.feed
+        bench.played.face.feed = lambda data: sound(data) and b"%%%\n"  # type: ignore[method-assign]  # a bad cable
+        await bench.next_says(Fault.SOURCE_LOST)
+        bench.played.face.feed = sound  # type: ignore[method-assign]
+        await bench.next_says()
+        errors = bench.skin.source_facts()["errors"]
+        assert isinstance(errors, dict)
+        assert errors["not understood"] >= 3
+
+
+@pytest.mark.parametrize("adc", [True, False])
+async def test_voltages_that_stop_coming_are_awaited(tmp_path: Path, adc: bool) -> None:
+    async with a_bench(tmp_path, serial_source=False, adc=adc, deadline_s=0.1) as bench:
+        for outage in ("unplug", "silence"):
+            await bench.next_says()
+            losses = sum(not event.up for event in bench.events)
+            bench.reader(outage)
+            await bench.until(lambda n=losses: sum(not event.up for event in bench.events) > n)
+            bench.reader("normal")
+        await bench.next_says()
+        assert any(sample.missed for sample in bench.samples), "the gap is counted"
+
+
+async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(tmp_path: Path) -> None:
+    async with a_bench(tmp_path, serial_source=False, adc=True) as bench:
+        await bench.next_says()
+        for fault in ("garbage", "missing", "torn", "missing"):
+            bench.reader(fault)
+        count = len(bench.samples)
+        await bench.until(lambda: len(bench.samples) > count + 10)
+        facts = bench.skin.facts()
+        assert isinstance(facts["errors"], dict)
+        assert facts["errors"]["not two decimals"] == 2
+        bench.reader("stuck 5")
+        await bench.next_says(Fault.STUCK_1, Fault.STUCK_2)
+
+
+async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
+    scanner = ScpiSocket(played_daq.Scanner(Circuit(lambda: (R1, R2)), time.monotonic).feed, answer_s=0.0)
+    sentences: asyncio.Queue[str] = asyncio.Queue()
+
+    def on_event(event: LinkEvent) -> None:
+        if not event.up:
+            sentences.put_nowait(event.sentence)
+
+    async with asyncio.timeout(DEADLINE_S):
+        await scanner.bring_back()
+        source = Keithley6430(TcpLink("127.0.0.1", scanner.port, on_event=on_event))
+
+        async def watch() -> None:
+            async with contextlib.aclosing(source.readings()) as readings:
+                async for _ in readings:
+                    pass
+
+        task = asyncio.create_task(watch())
+        assert "says it is 'Agilent Technologies,34972A" in await sentences.get()
+        task.cancel()
+        await asyncio.wait([task])
+        await scanner.lose()

@@ -1,0 +1,337 @@
+"""The twist controller: torque measurements, late and noisy, become a wrist speed, 125 times a second.
+
+The tool in the grip is a torsion spring on a wrist whose angle is known at all times: torque = K·(θ − θ₀) + d, where
+the offset d takes in all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d has to be
+learnt from the torque sensor; the rest is known without delay.
+
+- A measurement y that belongs to the time t_mid (an EIT frame: the middle of its acquisition) is compared with what
+  was to be expected *there and then*: ν = y − K·(mean of θ over that acquisition − θ₀) − d. This is the delay
+  compensator. It is the internal-model form of Smith's predictor (Smith 1957; Garcia & Morari, "Internal Model
+  Control. 1", Ind. Eng. Chem. Process Des. Dev. 21, 1982), with the *measured* angle in place of a simulated one. So
+  the delay of each measurement is its own, a dropped frame changes nothing but the time of the next correction, and
+  neither a clipped command nor a slow wrist is a modelling error.
+- A PI controller in incremental form takes ν up into d: i ← i + ki·ν, d ← d + kp·ν + i. (An α-β filter, the steady
+  Kalman filter of an offset that drifts: Kalata 1984.) i is the drift of the torque at a fixed angle.
+- The wrist is driven to the angle at which the expected torque is the wanted one: speed = bandwidth·(r − torque)/K,
+  with feed-forward of the ramp, ṙ/K.
+
+Wind-up: the expectation is made from the angle that the wrist really has, so there is nothing to wind up in d while
+a command is clipped (the observer form of anti-windup: Åström & Wittenmark, Computer-Controlled Systems).
+What could run ahead are the ramp and i: the ramp goes no faster than the wrist was really told to turn, and i stands
+still while less was sent than was wanted.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from daemon.control.history import AngleHistory
+from daemon.control.settings import ControllerSettings
+from daemon.errors import UserError
+
+# A ramp does not catch up on a loop that was late for longer than this.
+_LONGEST_STEP_NS = 50_000_000
+# A rest ends at the deadband, a motion at this share of it: otherwise noise would toggle the two.
+_SETTLED_SHARE = 0.1
+# A jump is what a cumulative sum says (Page 1954): innovations, in standard deviations and less the first number, that
+# add up to the second. A lasting 2.5 sigma does that within four measurements, noise alone once in some 20 000.
+_JUMP_SLACK, _JUMP_SUM = 1.0, 4.5
+# After it the offset counts as no better known than from so many measurements: the gain starts again at 1/4.
+_KNOWN_AFTER_JUMP = 3.0
+# A drift is carried on over so many dropped measurements at most.
+_MOST_MISSED = 4
+
+
+class Reason(StrEnum):
+    """Why the wrist does not do what the torque asks for; the text is for the operator."""
+
+    NOT_STARTED = "the controller has not been started"
+    HELD = "the wrist is held on command"
+    NO_SET_POINT = "no torque set point has been given"
+    NOT_MEASURED = "no torque has been measured since the start"
+    STALE = "the torque is stale: no valid measurement has come for too long"
+    NO_ANGLE = "the robot's wrist angle is missing or not a number"
+    NOT_FOLLOWING = "the torque no longer follows the wrist: the grip slips, or the screw broke loose or stripped"
+    TRAVEL = "the wrist has reached the limit of its travel"
+    SPEED = "the wrist turns at its speed limit"
+
+
+class Refusal(StrEnum):
+    """Why a measurement was not used."""
+
+    NOT_A_NUMBER = "not a number"
+    NOT_STARTED = "before the start"
+    OUT_OF_ORDER = "not later than the one before it"
+    FROM_THE_FUTURE = "stamped in the future"
+    LATE = "too old when it arrived"
+    NO_ANGLE = "from a time at which the wrist angle is not known"
+
+
+_CLIPPED = frozenset({Reason.TRAVEL, Reason.SPEED})
+
+
+@dataclass(frozen=True, slots=True)
+class WristCommand:
+    """The wrist speed that is wanted now, and every reason why it is not the one that the torque asks for."""
+
+    speed_rad_per_s: float
+    reasons: tuple[Reason, ...] = ()
+
+    @property
+    def holds(self) -> bool:
+        """Return whether the wrist is held, rather than driven with a clipped speed."""
+        return any(reason not in _CLIPPED for reason in self.reasons)
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerState:
+    """What the controller believes; torques in N·m. None before the start."""
+
+    set_point_nm: float | None
+    ramp_nm: float | None
+    torque_nm: float | None
+    offset_nm: float | None
+    creep_nm_per_s: float
+    innovation_nm: float | None
+
+
+class TwistController:
+    """Drives the wrist so that the tool's torque takes and keeps a set point. Times are CLOCK_MONOTONIC ns."""
+
+    def __init__(self, settings: ControllerSettings) -> None:
+        self.settings = settings
+        self._refused: Counter[Refusal] = Counter()
+        span_s = settings.age_limit_s + settings.window_s + abs(settings.lag_s)
+        self._history = AngleHistory(int(1e9 * (span_s + 1.0)))
+        self._started = self._held = self._measured = self._moving = self._lost = False
+        self._set_point_nm: float | None = None
+        self._ramp_nm: float | None = None
+        self._innovation_nm: float | None = None
+        self._origin_rad = self._angle_rad = 0.0
+        self._offset_nm = self._first_offset_nm = self._creep_nm = 0.0  # the last one per measurement
+        self._known = self._sum_up = self._sum_down = 0.0
+        self._t_mid_ns = self._fresh_ns = self._t_ns = 0
+        self._wanted = self._sent = 0.0
+
+    @property
+    def refused(self) -> Mapping[Refusal, int]:
+        """Return how many measurements were refused, by kind."""
+        return self._refused
+
+    @property
+    def state(self) -> ControllerState:
+        """Return what the controller believes now."""
+        return ControllerState(
+            set_point_nm=self._set_point_nm,
+            ramp_nm=self._ramp_nm,
+            torque_nm=self._expected_nm(self._angle_rad) if self._started else None,
+            offset_nm=self._offset_nm if self._started else None,
+            creep_nm_per_s=self._creep_nm / self.settings.sample_period_s,
+            innovation_nm=self._innovation_nm,
+        )
+
+    def start(self, t_ns: int, angle_rad: float, torque_nm: float, known_measurements: float = 0.0) -> None:
+        """Begin at a wrist angle and the torque there, known as well as the mean of so many measurements knows it.
+
+        The first measurements are averaged with it (gain 1/(n+1)) until kp is the greater gain. What was learnt
+        before is forgotten; there is no set point afterwards. Raises UserError for values that are not numbers.
+        """
+        if not (math.isfinite(angle_rad) and math.isfinite(torque_nm) and known_measurements >= 0.0):
+            raise UserError("controller: it cannot start without a wrist angle and a torque that are numbers")
+        self._history = AngleHistory(self._history.span_ns)
+        self._history.add(t_ns, angle_rad)
+        self._started, self._held, self._measured = True, False, False
+        self._moving = self._lost = False
+        self._set_point_nm = self._ramp_nm = self._innovation_nm = None
+        self._origin_rad = self._angle_rad = angle_rad
+        self._offset_nm = self._first_offset_nm = torque_nm
+        self._creep_nm = self._sum_up = self._sum_down = 0.0
+        self._known = known_measurements
+        self._t_mid_ns = self._fresh_ns = self._t_ns = t_ns
+        self._wanted = self._sent = 0.0
+
+    def set_point(self, torque_nm: float) -> None:
+        """Ask for a torque; the ramp sets out from where it stands, or from the present torque.
+
+        Raises UserError where the torque is not a number within the torque limit, or before the start.
+        """
+        limit = self.settings.torque_limit_nm
+        if not self._started:
+            raise UserError("controller: a set point can only be given after the start")
+        if not abs(torque_nm) <= limit:
+            raise UserError(f"controller: a set point of {torque_nm:g} N·m is not within the limit of {limit:g} N·m")
+        self._set_point_nm = torque_nm
+        if self._ramp_nm is None:
+            self._ramp_nm = self._expected_nm(self._angle_rad)
+
+    def hold(self) -> None:
+        """Keep the wrist where it is until `resume`; measurements are still followed."""
+        self._held = True
+
+    def resume(self) -> None:
+        """Go on after `hold`, or after the torque did not follow: the ramp sets out anew from the present torque.
+
+        The offset is accepted as it now is, so a grip that has slipped may slip as far again before it is held.
+        """
+        self._held = self._lost = False
+        self._first_offset_nm = self._offset_nm
+        self._rest()
+
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> Refusal | None:
+        """Take in a torque that belongs to t_mid_ns and became known at t_ns; return why it was refused, or None."""
+        refusal = self._use(torque_nm, t_mid_ns, t_ns)
+        if refusal is not None:
+            self._refused[refusal] += 1
+        return refusal
+
+    def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
+        """Return the wrist speed for now, from the wrist angle as the robot reports it now (NaN where it does not).
+
+        The speed is 0 where anything speaks against motion, and never exceeds the speed limit. Reported as sent
+        until `sent` says otherwise.
+        """
+        elapsed_ns = min(max(t_ns - self._t_ns, 0), _LONGEST_STEP_NS)
+        self._t_ns = max(t_ns, self._t_ns)
+        reasons = self._against_motion(t_ns, wrist_angle_rad)
+        if reasons or self._set_point_nm is None:
+            self._rest()
+            return WristCommand(0.0, reasons)
+        return self._drive(self._set_point_nm, elapsed_ns / 1e9)
+
+    def sent(self, speed_rad_per_s: float) -> None:
+        """Tell what was really sent for the last command, after all clipping by driver and safety gate."""
+        self._sent = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
+
+    def _use(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> Refusal | None:
+        own = self.settings
+        if torque_nm is None or not math.isfinite(torque_nm):
+            return Refusal.NOT_A_NUMBER
+        if not self._started:
+            return Refusal.NOT_STARTED
+        if t_mid_ns > t_ns:
+            return Refusal.FROM_THE_FUTURE
+        if t_mid_ns <= self._t_mid_ns:
+            return Refusal.OUT_OF_ORDER
+        if t_ns - t_mid_ns > own.age_limit_s * 1e9:
+            return Refusal.LATE
+        middle_ns, half_ns = t_mid_ns - int(own.lag_s * 1e9), int(own.window_s * 0.5e9)
+        angle = self._history.mean(middle_ns - half_ns, middle_ns + half_ns)
+        if angle is None:
+            return Refusal.NO_ANGLE
+        missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / own.sample_period_s) - 1, _MOST_MISSED)
+        if self._measured and missed > 0:
+            self._offset_nm += self._creep_nm * missed
+        self._correct(torque_nm - self._expected_nm(angle))
+        self._t_mid_ns, self._fresh_ns, self._measured = t_mid_ns, t_ns, True
+        return None
+
+    def _correct(self, innovation_nm: float) -> None:
+        own = self.settings
+        self._innovation_nm = innovation_nm
+        bounded = max(-own.innovation_limit_nm, min(own.innovation_limit_nm, innovation_nm))
+        if own.noise_nm and self._has_jumped(bounded / own.noise_nm):
+            self._known = min(self._known, _KNOWN_AFTER_JUMP)
+        self._known += 1.0
+        gain = max(own.kp, 1.0 / self._known)
+        if gain == own.kp and not self._is_clipped():
+            most = own.creep_limit_nm_per_s * own.sample_period_s
+            self._creep_nm = max(-most, min(most, self._creep_nm + own.ki * bounded))
+        self._offset_nm += gain * bounded + self._creep_nm
+        self._lost |= abs(self._offset_nm - self._first_offset_nm) > own.offset_limit_nm
+
+    def _has_jumped(self, innovation_sigmas: float) -> bool:
+        """Add an innovation to the two sums; return whether one of them is full, and empty them then."""
+        self._sum_up = max(self._sum_up + innovation_sigmas - _JUMP_SLACK, 0.0)
+        self._sum_down = max(self._sum_down - innovation_sigmas - _JUMP_SLACK, 0.0)
+        jumped = max(self._sum_up, self._sum_down) > _JUMP_SUM
+        if jumped:
+            self._sum_up = self._sum_down = 0.0
+        return jumped
+
+    def _against_motion(self, t_ns: int, wrist_angle_rad: float) -> tuple[Reason, ...]:
+        """Take the angle in, and return everything that forbids motion at present."""
+        if not self._started:
+            return (Reason.NOT_STARTED,)
+        stale_ns = self.settings.stale_periods * self.settings.sample_period_s * 1e9
+        reasons = []
+        if math.isfinite(wrist_angle_rad):
+            self._angle_rad = wrist_angle_rad
+            self._history.add(t_ns, wrist_angle_rad)
+        else:
+            reasons.append(Reason.NO_ANGLE)
+        if self._held:
+            reasons.append(Reason.HELD)
+        if self._set_point_nm is None:
+            reasons.append(Reason.NO_SET_POINT)
+        if not self._measured:
+            reasons.append(Reason.NOT_MEASURED)
+        elif t_ns - self._fresh_ns > stale_ns:
+            reasons.append(Reason.STALE)
+        if self._lost:
+            reasons.append(Reason.NOT_FOLLOWING)
+        return tuple(reasons)
+
+    def _rest(self) -> None:
+        """Stand still; whatever comes next sets out from the torque that there is."""
+        self._moving = False
+        self._wanted = self._sent = 0.0
+        if self._set_point_nm is not None:
+            self._ramp_nm = self._expected_nm(self._angle_rad)
+
+    def _drive(self, set_point_nm: float, elapsed_s: float) -> WristCommand:
+        own = self.settings
+        torque_nm = self._expected_nm(self._angle_rad)
+        ramp_nm = torque_nm if self._ramp_nm is None else self._ramp_nm
+        self._ramp_nm, slope = self._advance_ramp(ramp_nm, set_point_nm, elapsed_s)
+        missing_nm = self._ramp_nm - torque_nm
+        if self._rests(missing_nm, slope):
+            wanted = 0.0
+        else:
+            wanted = (own.wrist_bandwidth_per_s * missing_nm + slope) / own.stiffness_nm_per_rad
+        speed, reasons = self._clip(wanted, elapsed_s)
+        self._wanted, self._sent = wanted, speed
+        return WristCommand(speed, reasons)
+
+    def _advance_ramp(self, ramp_nm: float, set_point_nm: float, elapsed_s: float) -> tuple[float, float]:
+        """Return the ramp moved on by no more than the wrist was really told to turn, and its slope in N·m/s."""
+        own = self.settings
+        blocked = self._sent == 0.0 and self._wanted != 0.0
+        if blocked or elapsed_s <= 0.0:
+            return ramp_nm, 0.0
+        towards = math.copysign(1.0, set_point_nm - ramp_nm)
+        turning = max(self._sent * towards, 0.0) + own.acceleration_limit_rad_per_s2 * elapsed_s
+        slope = min(own.ramp_nm_per_s, own.stiffness_nm_per_rad * turning, abs(set_point_nm - ramp_nm) / elapsed_s)
+        return ramp_nm + towards * slope * elapsed_s, towards * slope
+
+    def _rests(self, missing_nm: float, slope_nm_per_s: float) -> bool:
+        own = self.settings
+        bound = own.deadband_nm * (_SETTLED_SHARE if self._moving else 1.0)
+        self._moving = slope_nm_per_s != 0.0 or abs(missing_nm) > bound
+        return not self._moving
+
+    def _clip(self, wanted: float, elapsed_s: float) -> tuple[float, tuple[Reason, ...]]:
+        own = self.settings
+        reasons = []
+        speed = max(-own.speed_limit_rad_per_s, min(own.speed_limit_rad_per_s, wanted))
+        if speed != wanted:
+            reasons.append(Reason.SPEED)
+        # Only speeding up is limited: the robot brakes as it can, and a stop is never softened.
+        turning = abs(self._sent) if speed * self._sent > 0.0 else 0.0
+        fastest = turning + own.acceleration_limit_rad_per_s2 * elapsed_s
+        speed = math.copysign(min(abs(speed), fastest), speed)
+        travel = self._angle_rad - self._origin_rad
+        # Slower and slower towards the limit, so that it is not run over within one period.
+        room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
+        if abs(speed) > own.wrist_bandwidth_per_s * room:
+            speed = math.copysign(own.wrist_bandwidth_per_s * room, speed)
+            reasons.append(Reason.TRAVEL)
+        return speed, tuple(reasons)
+
+    def _is_clipped(self) -> bool:
+        """Return whether less was sent than was wanted: then nothing may be integrated."""
+        return abs(self._sent - self._wanted) > 1e-9 and abs(self._sent) < abs(self._wanted)
+
+    def _expected_nm(self, angle_rad: float) -> float:
+        return self.settings.stiffness_nm_per_rad * (angle_rad - self._origin_rad) + self._offset_nm

@@ -1,0 +1,76 @@
+"""The loop around the emulated skin, in virtual time: what the bench measures, held to what it has to be."""
+
+from pathlib import Path
+
+import pytest
+
+from bank.skin.calibration import SkinCalibration
+from bank.skin.calibration_file import load_calibration
+from bench.skin_loop import CALIBRATION, Case, SkinLoop, judge
+from daemon.config import load_daemon_config
+from daemon.config_file import load_yaml_model
+from daemon.experiment.machine import Phase
+from daemon.experiment.steps import ExperimentFile, HoldTorque
+
+CONFIG = Path(__file__).parents[2] / "config"
+
+
+@pytest.fixture(scope="module")
+def calibration() -> SkinCalibration:
+    return load_calibration(CALIBRATION)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        Case(name="Fn = 1 N", hold_s=6.0),
+        Case(name="Fn = 2 N", normal_n=2.0, deadband_nm=0.0, kp=0.15, hold_s=6.0),
+    ],
+)
+def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(
+    case: Case, calibration: SkinCalibration
+) -> None:
+    held, _ = judge(case, calibration)
+    assert held.phase == "done"
+    assert held.bound_n == pytest.approx(2 * 0.04 * case.normal_n)
+    assert held.width_n <= held.bound_n / 4
+    assert held.offset_n <= 0.02
+
+
+def test_the_band_is_what_does_it(calibration: SkinCalibration) -> None:
+    held, _ = judge(Case(name="not told the band", band=False, seed=5, kp=0.15, hold_s=12.0), calibration)
+    assert held.width_n > held.bound_n
+
+
+def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_push(
+    calibration: SkinCalibration,
+) -> None:
+    loop = SkinLoop(Case(name="drift"), calibration)
+    begin = []
+    measured = loop.skin.resistances_ohm
+
+    def drifting() -> tuple[float, float]:
+        r1, r2 = measured()
+        controller = loop.brain.controller
+        if controller is not None and not begin:
+            begin.append(loop.t_ns)
+        seconds = (loop.t_ns - begin[0]) / 1e9 - 8.0 if begin else 0.0
+        return r1 * (1 - 0.01 * max(seconds, 0.0)), r2
+
+    loop.skin.resistances_ohm = drifting  # type: ignore[method-assign]
+    said = loop.run(60.0)
+    assert said.startswith(Phase.STOPPED.value)
+    assert max(loop.truth_n) < 2.0, "half of what the drift would have had it push by then"
+
+
+def test_the_demo_holds_the_force_that_it_says() -> None:
+    config = load_daemon_config(CONFIG / "skin_demo.yaml")
+    assert config.skin is not None
+    assert config.experiment is not None
+    assert config.skin.tool_radius_mm is not None
+    file = load_yaml_model(config.experiment, ExperimentFile)
+    (hold,) = [step for step in file.steps if isinstance(step, HoldTorque)]
+    assert file.drive == "skin"
+    assert hold.torque_nm / config.skin.tool_radius_mm * 1e3 == pytest.approx(1.0)
+    assert [step.do for step in file.steps] == ["tare", "identify", "hold_torque"]
+    assert all(step.timeout_s for step in file.steps), "none may last for ever"

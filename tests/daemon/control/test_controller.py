@@ -1,0 +1,328 @@
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.control.controller import Reason, Refusal, TwistController
+from daemon.control.settings import ControllerSettings
+from daemon.errors import UserError
+
+from .conftest import DEFAULTS, Bench
+
+
+def running(**changes: Any) -> Bench:
+    bench = Bench(**changes)
+    bench.measured_for(1.5)
+    bench.controller.set_point(0.1)
+    return bench
+
+
+def test_a_known_spring_is_brought_to_its_torque_and_rests_there() -> None:
+    bench = running()
+    speeds = bench.measured_for(6.0)
+    assert 0.25 * (bench.angle - 0.3) == pytest.approx(0.1, abs=0.0011)
+    assert max(speeds) < 0.05 / 0.25 * 1.05  # the ramp's speed, and no lunge
+    assert speeds[-1] == 0.0
+
+
+def test_the_ramp_is_followed_by_feed_forward_without_any_measurement_of_its_end() -> None:
+    bench = running(deadband_nm=0.0)
+    bench.measured_for(0.5)
+    start = bench.controller.state.ramp_nm
+    bench.advance(1.0)
+    ramp = bench.controller.state.ramp_nm
+    assert start is not None
+    assert ramp is not None
+    assert ramp - start == pytest.approx(0.05, rel=0.02)
+    assert 0.25 * (bench.angle - 0.3) == pytest.approx(ramp, abs=0.001)
+
+
+@pytest.mark.parametrize("believed", [0.125, 0.25, 0.5])
+def test_a_wrong_stiffness_ends_at_the_set_point_all_the_same(believed: float) -> None:
+    bench = running(stiffness_nm_per_rad=believed, offset_limit_nm=math.inf)
+    bench.measured_for(40.0)
+    assert 0.25 * (bench.angle - 0.3) == pytest.approx(0.1, abs=0.002)
+
+
+# --- what may not move the wrist
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.one_of(st.none(), st.floats(allow_nan=True, allow_infinity=True)),
+            st.integers(-(10**11), 10**11),
+            st.integers(-(10**11), 10**11),
+        ),
+        max_size=30,
+    )
+)
+def test_refused_measurements_change_nothing(batch: list[tuple[float | None, int, int]]) -> None:
+    poked, left_alone = running(), running()
+    for bench in (poked, left_alone):
+        bench.measured_for(1.0)
+    for torque, mid_offset, offset in batch:
+        t_mid, now = poked.t_ns + mid_offset, poked.t_ns + offset
+        finite = torque is not None and math.isfinite(torque)
+        unusable = not finite or mid_offset > offset or mid_offset < -800_000_000 or offset - mid_offset > 2 * 10**9
+        if unusable:
+            assert poked.controller.measure(torque, t_mid, now) is not None
+    assert poked.advance(0.4) == left_alone.advance(0.4)
+
+
+def test_every_refusal_is_counted_by_kind(bench: Bench) -> None:
+    bench.advance(1.0)
+    fresh = TwistController(bench.settings)
+    assert fresh.measure(0.1, 0, 1) is Refusal.NOT_STARTED
+    assert bench.measure(None) is Refusal.NOT_A_NUMBER
+    assert bench.measure(math.nan) is Refusal.NOT_A_NUMBER
+    assert bench.measure(0.0, -0.1) is Refusal.FROM_THE_FUTURE
+    assert bench.measure(0.0, 0.1) is Refusal.NO_ANGLE  # its window has not ended
+    assert bench.measure(0.0, 0.3) is None
+    assert bench.measure(0.0, 0.3) is Refusal.OUT_OF_ORDER
+    assert bench.measure(0.0, 0.5) is Refusal.OUT_OF_ORDER
+    bench.advance(3.0)
+    assert bench.measure(0.0, 2.5) is Refusal.LATE
+    assert sum(bench.controller.refused.values()) == 7
+    assert bench.controller.refused[Refusal.OUT_OF_ORDER] == 2
+
+
+def test_one_wild_value_moves_the_wrist_by_no_more_than_its_bounded_share() -> None:
+    bench = running(noise_nm=0.0, deadband_nm=0.0)
+    bench.measured_for(8.0)
+    before = bench.angle
+    bench.measure(1e300)
+    bench.advance(1.0)
+    share = (0.1 + 0.001) * 0.036 / 0.25
+    assert abs(bench.angle - before) <= share * 1.05
+
+
+# --- holding
+
+
+def test_hold_is_zero_speed_at_once_and_resume_does_not_lunge() -> None:
+    bench = running()
+    bench.measured_for(1.0)
+    assert bench.speed > 0.1
+    bench.controller.hold()
+    command = bench.controller.command(bench.t_ns + 8_000_000, bench.angle)
+    assert command.speed_rad_per_s == 0.0
+    assert command.reasons == (Reason.HELD,)
+    assert command.holds
+    bench.speed = 0.0
+    bench.measured_for(2.0)
+    assert bench.speed == 0.0
+    bench.controller.resume()
+    speeds = bench.advance(0.2)
+    assert all(abs(after - before) <= 2.0 * 0.008 + 1e-9 for before, after in zip([0.0, *speeds], speeds, strict=False))
+    assert max(speeds) <= 0.05 / 0.25 * 1.05
+
+
+def test_a_stale_torque_holds_and_a_fresh_one_lets_go() -> None:
+    bench = running()
+    bench.controller.set_point(0.2)
+    bench.measured_for(1.0)
+    bench.advance(1.24)
+    assert bench.speed > 0.0
+    bench.advance(0.05)
+    command = bench.controller.command(bench.t_ns + 1, bench.angle)
+    assert (command.speed_rad_per_s, command.reasons) == (0.0, (Reason.STALE,))
+    bench.speed = 0.0
+    bench.measured_for(0.5)
+    bench.advance(0.1)
+    assert bench.speed > 0.0
+
+
+def test_without_angle_measurement_set_point_or_start_the_wrist_stays() -> None:
+    bench = Bench()
+    assert TwistController(bench.settings).command(0, 0.0).reasons == (Reason.NOT_STARTED,)
+    assert set(bench.controller.command(bench.t_ns + 1, math.nan).reasons) == {
+        Reason.NO_ANGLE,
+        Reason.NO_SET_POINT,
+        Reason.NOT_MEASURED,
+    }
+
+
+@given(st.floats(0.04, 0.09))
+@settings(max_examples=20, deadline=None)
+def test_a_slipping_grip_is_bounded_and_then_held(slip_nm: float) -> None:
+    bench = Bench()
+    bench.measured_for(1.5)
+    bench.controller.set_point(0.16)
+    for _ in range(120):
+        bench.advance(0.5)
+        bench.measure(min(0.25 * (bench.angle - 0.3), slip_nm))
+    command = bench.controller.command(bench.t_ns + 1, bench.angle)
+    assert Reason.NOT_FOLLOWING in command.reasons
+    assert command.speed_rad_per_s == 0.0
+    # The way to the set point, and what the offset limit allows beyond it, and one measurement's share.
+    assert bench.angle - 0.3 <= (0.16 + 0.06 + 0.036 * 0.3) / 0.25
+    bench.controller.resume()
+    assert Reason.NOT_FOLLOWING not in bench.controller.command(bench.t_ns + 2, bench.angle).reasons
+
+
+# --- limits
+
+
+@st.composite
+def events(draw: st.DrawFn) -> list[tuple[str, float]]:
+    kinds = st.sampled_from(["advance", "measure", "wild", "angle", "sent", "set", "hold", "resume", "late", "none"])
+    return draw(st.lists(st.tuples(kinds, st.floats(-1.0, 1.0)), min_size=1, max_size=60))
+
+
+@given(events())
+@settings(max_examples=150, deadline=None)
+def test_no_command_is_ever_beyond_a_limit(script: list[tuple[str, float]]) -> None:
+    bench = Bench()
+    controller, own = bench.controller, bench.settings
+    bench.measured_for(1.0)
+    for kind, value in script:
+        match kind:
+            case "advance":
+                for speed in bench.advance(abs(value)):
+                    assert abs(speed) <= own.speed_limit_rad_per_s
+            case "measure":
+                bench.measure(0.3 * value)
+            case "wild":
+                bench.measure(1e30 * value)
+            case "none":
+                bench.measure(None)
+            case "angle":
+                bench.angle += 0.01 * value
+            case "sent":
+                controller.sent(value)
+            case "set":
+                controller.set_point(0.2 * value)
+            case "hold":
+                controller.hold()
+            case "resume":
+                controller.resume()
+            case "late":
+                bench.t_ns += int(abs(value) * 3e9)
+        last = bench.speed
+        bench.t_ns += bench.period_ns
+        bench.angle += last * bench.period_ns / 1e9
+        command = controller.command(bench.t_ns, bench.angle)
+        bench.speed = command.speed_rad_per_s
+        assert math.isfinite(bench.speed)
+        assert abs(bench.speed) <= own.speed_limit_rad_per_s
+        assert not (command.holds and bench.speed)
+        travel = bench.angle - 0.3
+        assert not (abs(travel) >= own.travel_limit_rad and travel * bench.speed > 0.0)
+        if kind not in ("sent", "late"):  # speeding up is limited from what was really sent
+            assert abs(bench.speed) <= abs(last) + own.acceleration_limit_rad_per_s2 * 0.05 + 1e-9
+
+
+def test_the_wrist_comes_to_rest_at_the_limit_of_its_travel() -> None:
+    bench = running(travel_limit_rad=0.2)
+    bench.measured_for(8.0)
+    assert bench.angle - 0.3 == pytest.approx(0.2, abs=0.002)
+    assert bench.angle - 0.3 <= 0.2
+    assert Reason.TRAVEL in bench.controller.command(bench.t_ns + 8_000_000, bench.angle).reasons
+
+
+# --- wind-up
+
+
+def test_nothing_winds_up_while_the_robot_does_not_move() -> None:
+    """The gate sends 0 for 20 s with measurements going on; afterwards the wrist starts no faster than at first."""
+    blocked, free = running(), running()
+    for _ in range(40):
+        for _ in range(62):
+            blocked.t_ns += blocked.period_ns
+            blocked.controller.command(blocked.t_ns, blocked.angle)
+            blocked.controller.sent(0.0)
+        blocked.measure(0.0)
+    state = blocked.controller.state
+    assert state.offset_nm == pytest.approx(0.0, abs=1e-9)
+    assert state.ramp_nm == pytest.approx(0.0, abs=0.001)
+    after = blocked.measured_for(6.0)
+    assert max(after) <= max(free.measured_for(6.0)) * 1.02
+    assert 0.25 * (blocked.angle - 0.3) == pytest.approx(0.1, abs=0.0011)
+
+
+def test_the_ramp_goes_no_faster_than_what_was_really_sent() -> None:
+    bench = running()
+    for _ in range(250):  # 2 s, in which the gate lets 0.05 rad/s through
+        bench.t_ns += bench.period_ns
+        bench.angle += bench.speed * 0.008
+        bench.speed = min(bench.controller.command(bench.t_ns, bench.angle).speed_rad_per_s, 0.05)
+        bench.controller.sent(bench.speed)
+        if bench.t_ns % 500_000_000 < 8_000_000:
+            bench.measure(0.25 * (bench.angle - 0.3))
+    state = bench.controller.state
+    assert state.ramp_nm is not None
+    assert state.torque_nm is not None
+    # Without looking at what was sent, the ramp would be at 0.1 by now, and the wrist at a quarter of that.
+    assert state.ramp_nm - state.torque_nm < 0.02
+
+
+def test_a_drift_is_learnt_by_the_integral_and_bounded() -> None:
+    bench = running(deadband_nm=0.0, creep_limit_nm_per_s=0.0005, ki=0.005)
+    for number in range(80):
+        bench.advance(0.5)
+        middle = bench.controller._history.mean(bench.t_ns - 550_000_000, bench.t_ns - 50_000_000)
+        assert middle is not None
+        bench.measure(0.25 * (middle - 0.3) - 0.0003 * 0.5 * number)
+    assert bench.controller.state.creep_nm_per_s == pytest.approx(-0.0003, rel=0.05)
+    for number in range(80, 100):
+        bench.advance(0.5)
+        bench.measure(0.25 * (bench.angle - 0.3) - 0.002 * 0.5 * number)
+    assert bench.controller.state.creep_nm_per_s >= -0.0005 - 1e-12
+
+
+def test_a_jump_is_caught_up_with_faster_than_the_gain_alone_would() -> None:
+    offsets = {}
+    for noise in (0.0, 0.012):
+        bench = running(noise_nm=noise, offset_limit_nm=math.inf)
+        bench.measured_for(8.0)
+        for _ in range(10):
+            bench.advance(0.5)
+            middle = bench.controller._history.mean(bench.t_ns - 550_000_000, bench.t_ns - 50_000_000)
+            assert middle is not None
+            bench.measure(0.25 * (middle - 0.3) - 0.03)
+        offsets[noise] = bench.controller.state.offset_nm
+    assert offsets[0.0] == pytest.approx(-0.03 * (1 - 0.9**10), abs=0.002)
+    assert offsets[0.012] is not None
+    assert offsets[0.012] < -0.0235
+
+
+def test_noise_alone_hardly_ever_passes_for_a_jump(bench: Bench) -> None:
+    noise = np.random.default_rng(5).normal(size=100_000).clip(-3.0, 3.0)
+    assert 1 <= sum(bench.controller._has_jumped(float(value)) for value in noise) <= 12
+
+
+# --- what is refused beforehand
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("stiffness_nm_per_rad", 0.0),
+        ("stiffness_nm_per_rad", math.nan),
+        ("kp", 5.0),
+        ("ki", 0.2),
+        ("window_s", -0.1),
+        ("speed_limit_rad_per_s", math.inf),
+        ("stale_periods", 0.5),
+        ("lag_s", -0.1),
+    ],
+)
+def test_settings_out_of_range_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(UserError, match=name):
+        ControllerSettings(**(DEFAULTS | {name: value}))
+
+
+def test_a_set_point_beyond_the_limit_or_before_the_start_is_refused(bench: Bench) -> None:
+    with pytest.raises(UserError, match=r"0\.3 N·m is not within the limit of 0\.2"):
+        bench.controller.set_point(0.3)
+    with pytest.raises(UserError, match="not within"):
+        bench.controller.set_point(math.nan)
+    with pytest.raises(UserError, match="after the start"):
+        TwistController(replace(bench.settings, kp=0.2)).set_point(0.1)
+    with pytest.raises(UserError, match="numbers"):
+        bench.controller.start(0, math.nan, 0.0)

@@ -1,0 +1,145 @@
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.control.margins import (
+    LoopModel,
+    characteristic_polynomial,
+    gain_limit,
+    is_stable,
+    margins,
+    pulse_response,
+    with_gain,
+    wrist_response,
+)
+
+# A wrist that arrives within one command period, seen at one instant: an integrator with whole delays.
+INTEGRATOR = partial(
+    LoopModel, sample_period_s=1.0, window_s=0.0, actuation_s=0.0, wrist_bandwidth_per_s=125.0, compensated=False
+)
+EIT = LoopModel(
+    sample_period_s=0.5412,
+    window_s=0.5412,
+    age_s=0.34,
+    actuation_s=0.02,
+    wrist_bandwidth_per_s=4.0,
+    kp=0.06,
+    ki=0.00036,
+)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3, 5, 8])
+def test_an_integrator_with_a_delay_has_the_textbook_limit(delay: int) -> None:
+    """1/(z − 1)·z^−(d−1): on the unit circle z^(d−1)·(z − 1) = −k where k = 2·sin(π/(2(2d − 1)))."""
+    model = INTEGRATOR(age_s=delay - 0.5, kp=0.1)
+    expected = 2.0 * math.sin(math.pi / (2.0 * (2.0 * delay - 1.0)))
+    assert gain_limit(model) == pytest.approx(expected, rel=2e-4)
+    has = margins(model)
+    assert has.gain == pytest.approx(expected / 0.1, rel=1e-3)
+    # |k/(z−1)| = 1 where 2·sin(ω/2) = k; the phase there is −π/2 − ω/2 of the integrator, and −(d−1)·ω of the delay.
+    omega = 2.0 * math.asin(0.05)
+    assert has.phase_deg == pytest.approx(math.degrees(math.pi / 2 - omega * (delay - 0.5)), abs=0.05)
+
+
+def test_the_delay_margin_is_where_the_next_whole_delay_becomes_unstable() -> None:
+    """With gain 0.7 the limit is passed between two and three delays, where the correction falls on the frame."""
+    has = margins(INTEGRATOR(age_s=0.5, kp=0.7))
+    # Half a period of age is used; the third whole delay begins 1.5 periods later (less half a command period).
+    assert has.delay_s == pytest.approx(1.5 - 0.004, abs=0.002)
+
+
+@pytest.mark.parametrize("age_s", [0.34, 1.0, 2.7])
+def test_with_an_exact_model_the_compensated_loop_does_not_depend_on_the_delay(age_s: float) -> None:
+    model = replace(EIT, age_s=age_s, ki=0.0)
+    assert gain_limit(model) == pytest.approx(2.0, rel=1e-3)
+    np.testing.assert_allclose(characteristic_polynomial(model), [1.0, model.kp - 1.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("age_s", [0.34, 1.0, 2.7])
+@pytest.mark.parametrize("ratio", [0.5, 1.9])
+def test_up_to_twice_the_stiffness_no_delay_makes_a_gain_below_one_unstable(age_s: float, ratio: float) -> None:
+    """|1 − ρ|·|F| < 1 with |F| ≤ 1 for kp ≤ 1, the small-gain theorem: what the internal-model form is for."""
+    assert gain_limit(replace(EIT, age_s=age_s, ki=0.0, stiffness_ratio=ratio)) >= 1.0
+
+
+def test_the_wrist_closes_in_as_the_exponential_that_its_bandwidth_names() -> None:
+    model = replace(EIT, actuation_s=0.0, command_period_s=1e-4)
+    times = np.arange(wrist_response(model).size) * 1e-4
+    np.testing.assert_allclose(wrist_response(model), 1.0 - np.exp(-4.0 * times), atol=2e-4)
+
+
+def test_an_actuation_delay_shifts_the_wrist_by_whole_and_broken_periods() -> None:
+    prompt = replace(EIT, wrist_bandwidth_per_s=0.05, actuation_s=0.0)
+    for delay_s in (0.008, 0.02, 0.0293):
+        late = wrist_response(replace(prompt, actuation_s=delay_s))
+        times = np.arange(5, 30) * 0.008
+        # So slow a wrist turns at a constant speed at first.
+        np.testing.assert_allclose(late[5:30], 0.05 * (times - delay_s), rtol=1e-2)
+
+
+def test_a_wrist_that_cannot_settle_is_refused() -> None:
+    with pytest.raises(ValueError, match="does not settle"):
+        wrist_response(replace(EIT, wrist_bandwidth_per_s=20.0, actuation_s=0.2))
+    with pytest.raises(ValueError, match="cannot be the mean"):
+        pulse_response(replace(EIT, age_s=0.1))
+
+
+def test_what_the_windows_see_adds_up_to_the_whole_correction() -> None:
+    seen = pulse_response(EIT)
+    assert seen[0] == 0.0
+    assert seen.sum() == pytest.approx(1.0, abs=1e-8)
+    # By hand, for a wrist that jumps: the window 0.27 s either way of 0.5412 s, from 0.34 + 0.004 s on.
+    jump = pulse_response(replace(EIT, wrist_bandwidth_per_s=125.0, actuation_s=0.0))
+    assert jump[1] == pytest.approx((1.5 * 0.5412 - 0.34 - 0.004 - 0.004) / 0.5412, abs=1e-3)
+
+
+@given(
+    age=st.floats(0.28, 2.0),
+    ratio=st.floats(0.4, 2.5),
+    lag=st.floats(0.0, 0.5),
+    kp=st.floats(0.02, 0.4),
+    compensated=st.booleans(),
+)
+@settings(max_examples=25, deadline=None)
+def test_at_the_gain_and_delay_margins_the_loop_is_just_stable(
+    age: float, ratio: float, lag: float, kp: float, compensated: bool
+) -> None:
+    """The margins come from frequency response and search, the stability from the roots: they must agree."""
+    model = replace(
+        EIT, age_s=age, stiffness_ratio=ratio, lag_error_s=lag, kp=kp, ki=0.1 * kp * kp, compensated=compensated
+    )
+    has = margins(model)
+    if not is_stable(model):
+        assert (has.gain, has.phase_deg, has.delay_s) == (0.0, 0.0, 0.0)
+        return
+    if math.isfinite(has.gain):
+        assert is_stable(replace(model, stiffness_ratio=ratio * has.gain * 0.999))
+        assert not is_stable(replace(model, stiffness_ratio=ratio * has.gain * 1.001))
+    if math.isfinite(has.delay_s):
+        assert is_stable(replace(model, lag_error_s=lag + has.delay_s * 0.998))
+        assert not is_stable(replace(model, lag_error_s=lag + has.delay_s * 1.002 + 1e-4))
+    assert is_stable(with_gain(model, 0.5 * kp)) or not is_stable(model)
+
+
+@pytest.mark.parametrize("model", [EIT, replace(EIT, compensated=False, age_s=1.2), replace(EIT, stiffness_ratio=2.2)])
+def test_roots_agree_with_the_loop_iterated_by_hand(model: LoopModel) -> None:
+    """Brute force: the difference equations run for 3000 measurements, a twentieth below and above the boundary."""
+    limit = gain_limit(model)
+    for factor, dies_out in ((0.95, True), (1.05, False)):
+        tried = with_gain(model, limit * factor)
+        seen = pulse_response(tried)
+        offsets, integral = [0.0] * seen.size, 0.0
+        for number in range(3000):
+            mean = -float(seen[1:] @ np.array(offsets[: -seen.size : -1]))
+            torque = tried.stiffness_ratio * mean + (1.0 if number < 2 else 0.0)
+            excess = torque - mean - offsets[-1] if tried.compensated else torque
+            integral += tried.ki * excess
+            offsets.append(offsets[-1] + tried.kp * excess + integral)
+            if abs(offsets[-1]) > 1e6:
+                break
+        assert (max(map(abs, offsets[-50:])) < 1e-3) is dies_out

@@ -1,0 +1,1 @@
+"""Experiments: what is written in YAML, and the state machine that carries it out."""

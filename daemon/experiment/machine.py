@@ -1,0 +1,135 @@
+"""Carries an experiment through its steps: start, pause, hold, resume, stop, done. No I/O; the time is passed in."""
+
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from daemon.experiment.programme import Programme, StepFailedError, expected_s, programme_of
+from daemon.experiment.steps import ExperimentFile, Limits, Step
+from daemon.experiment.wishes import Still, View, Wish
+
+
+class Phase(Enum):
+    """Where an experiment stands."""
+
+    RUNNING = "running"
+    PAUSED = "paused"  # by the operator
+    DONE = "done"
+    STOPPED = "stopped"  # before its end, by the operator, by safety, or by a step that failed
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What an operator is shown."""
+
+    phase: Phase
+    step: int
+    steps: int
+    doing: str
+    share: float
+    remaining_s: float
+    overdue: str = ""
+
+
+class Experiment:
+    """One run of an experiment file."""
+
+    def __init__(self, file: ExperimentFile, t_ns: int) -> None:
+        self.file = file
+        self.phase = Phase.RUNNING
+        self.why = ""
+        self._t_ns = t_ns
+        self._elapsed_s = 0.0
+        self._index = -1
+        self._step_began_s = 0.0
+        self._wish = Wish()
+        self._programme: Programme
+        self._begin_next()
+
+    @property
+    def running(self) -> bool:
+        """Whether it may still move something."""
+        return self.phase in (Phase.RUNNING, Phase.PAUSED)
+
+    @property
+    def step(self) -> Step:
+        """The step that is being carried out, or the last one."""
+        return self.file.steps[min(self._index, len(self.file.steps) - 1)]
+
+    @property
+    def limits(self) -> Limits:
+        """The tighter of the experiment's limits and the step's own."""
+        own, whole = self.step.limits, self.file.limits
+        if own is None:
+            return whole
+        return Limits(torque_nm=min(own.torque_nm, whole.torque_nm), angle_rad=min(own.angle_rad, whole.angle_rad))
+
+    @property
+    def wish(self) -> Wish:
+        """What is wished for, whether or not it is held back at present."""
+        return self._wish
+
+    def update(self, view: View, t_ns: int, *, held: bool = False) -> Wish:
+        """Return what is wished for now; while paused or held the wrist stands and no time passes."""
+        passed_s = max(0, t_ns - self._t_ns) / 1e9
+        self._t_ns = max(t_ns, self._t_ns)
+        if not self.running:
+            return Wish()
+        if self.phase is Phase.PAUSED or held:
+            return replace(self._wish, wrist=Still())
+        self._elapsed_s += passed_s
+        try:
+            self._wish = replace(self._programme.send(view), number=self._index)
+        except StopIteration:
+            self._begin_next()
+        except StepFailedError as failure:
+            self.stop(f"step {self._index + 1} ({self.step.do}) failed: {failure}")
+        return self._wish
+
+    def pause(self) -> None:
+        """Stand still until `resume`."""
+        if self.phase is Phase.RUNNING:
+            self.phase = Phase.PAUSED
+
+    def resume(self) -> None:
+        """Go on where it was paused."""
+        if self.phase is Phase.PAUSED:
+            self.phase = Phase.RUNNING
+
+    def stop(self, why: str) -> None:
+        """End for good; a stopped experiment is started anew, never resumed."""
+        if self.running:
+            self.phase, self.why, self._wish = Phase.STOPPED, why, Wish()
+
+    def progress(self) -> Progress:
+        """Return where it stands."""
+        ahead_s = sum(expected_s(step) for step in self.file.steps[self._index + 1 :])
+        spent_s = self._elapsed_s - self._step_began_s
+        planned_s = sum(expected_s(step) for step in self.file.steps)
+        here_s = max(0.0, expected_s(self.step) - spent_s) if self.running else 0.0
+        remaining_s = here_s + ahead_s if self.running else 0.0
+        overdue = ""
+        longest_s = self.step.timeout_s
+        if self.running and longest_s is not None and spent_s > longest_s:
+            overdue = f"step {self._index + 1} ({self.step.do}) has taken {spent_s:.1f} s of at most {longest_s:g} s"
+        return Progress(
+            phase=self.phase,
+            step=min(self._index + 1, len(self.file.steps)),
+            steps=len(self.file.steps),
+            doing=self._wish.doing if self.running else self.why,
+            share=1.0 if self.phase is Phase.DONE else max(0.0, 1.0 - remaining_s / max(planned_s, 1e-9)),
+            remaining_s=remaining_s,
+            overdue=overdue,
+        )
+
+    def _begin_next(self) -> None:
+        while self._index + 1 < len(self.file.steps):
+            self._index += 1
+            self._step_began_s = self._elapsed_s
+            self._programme = programme_of(self.step, lambda: self._elapsed_s)
+            try:
+                self._wish = replace(next(self._programme), number=self._index)
+            except StopIteration:  # nothing to do, such as a wait of 0 s
+                continue
+            return
+        self._index = len(self.file.steps)
+        self.phase, self._wish = Phase.DONE, Wish()

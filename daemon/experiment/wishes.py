@@ -1,0 +1,107 @@
+"""What an experiment sees at each tick, and what it may wish for. Values only; somebody else carries them out."""
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TypeAlias
+
+
+@dataclass(frozen=True, slots=True)
+class Still:
+    """The wrist stands."""
+
+
+@dataclass(frozen=True, slots=True)
+class GoTo:
+    """The wrist turns to an angle, measured from where the tool was gripped, no faster than this."""
+
+    angle_rad: float
+    speed_rad_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """The wrist turns on at a speed, counterclockwise positive."""
+
+    speed_rad_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """The wrist follows a torque set point in closed loop."""
+
+    torque_nm: float
+    ramp_nm_per_s: float
+
+
+WristWish: TypeAlias = Still | GoTo | Turn | Track
+
+
+@dataclass(frozen=True, slots=True)
+class MoveTo:
+    """Move the tool centre in a straight line."""
+
+    pose_m_rad: tuple[float, ...]
+    speed_m_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class GripTo:
+    """Close or open the gripper."""
+
+    width_mm: float
+    speed_mm_per_s: float
+    force_n: float
+    expect_object: bool
+
+
+@dataclass(frozen=True, slots=True)
+class TakeZero:
+    """Tare every torque sensor, with the wrist standing still."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeasureTool:
+    """Identify stiffness, delay and noise with small twists."""
+
+    amplitude_rad: float
+
+
+Action: TypeAlias = MoveTo | GripTo | TakeZero | MeasureTool
+
+
+class ActionState(Enum):
+    """How far the action that was wished for has come."""
+
+    IDLE = "idle"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What the experiment sees: the wrist from where the tool was gripped, the driving torque, its own action.
+
+    `gripped_at_rad` is the wrist joint's own angle where the tool was gripped; `torque_nm` is None while no valid
+    estimate is fresh.
+    """
+
+    wrist_rad: float
+    torque_nm: float | None
+    gripped_at_rad: float = 0.0
+    action: ActionState = ActionState.IDLE
+    failure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What the experiment wants now.
+
+    An action is begun when it is first wished for; `number`, the step's, tells two equal actions apart. From the next
+    `View` on, `View.action` tells of it.
+    """
+
+    wrist: WristWish = Still()
+    action: Action | None = None
+    doing: str = ""
+    number: int = -1

@@ -1,0 +1,105 @@
+"""The latest of everything that the loop goes by, with the times that say how old it is. Values only."""
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+# Torques kept of each source: more than two periods of the slowest at the rate of the fastest.
+MOST_RECENT = 64
+
+
+@dataclass(frozen=True, slots=True)
+class Torque:
+    """One torque of one source: None where it is not valid; when it was measured and when it became known.
+
+    Where friction hides the torque within a band, `low_nm` and `high_nm` are its ends: anything between is as likely.
+    """
+
+    source: str
+    torque_nm: float | None
+    why: str
+    t_mid_ns: int
+    t_ns: int
+    low_nm: float | None = None
+    high_nm: float | None = None
+
+    def __post_init__(self) -> None:
+        """Take what is not a number for no torque at all."""
+        if self.torque_nm is not None and not math.isfinite(self.torque_nm):
+            object.__setattr__(self, "torque_nm", None)
+
+    def nearest_to(self, expected_nm: float | None) -> float | None:
+        """Return the torque within the band that is nearest to the expected one; what is inside contradicts nothing."""
+        if self.torque_nm is None or self.low_nm is None or self.high_nm is None or expected_nm is None:
+            return self.torque_nm
+        return min(max(expected_nm, self.low_nm), self.high_nm)
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """What the loop needs of the robot's state."""
+
+    wrist_rad: float
+    wrist_torque_nm: float
+    t_ns: int
+    protective_stop: bool = False
+    emergency_stop: bool = False
+    blocked: str = ""
+    moving_linearly: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Hand:
+    """What the loop needs of the gripper's state."""
+
+    t_ns: int
+    width_mm: float
+    holding: bool
+    moving: bool
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """A torque that can drive or supervise: how often it comes, and over what time it averages.
+
+    `sticks` where friction hides it within a band: then it says nothing while the wrist turns through the band.
+    """
+
+    name: str
+    period_s: float
+    window_s: float = 0.0
+    sticks: bool = False
+
+
+@dataclass(slots=True)
+class Senses:
+    """The latest values. `lost` and `died` map a device or task to a sentence while it is gone."""
+
+    torques: dict[str, Torque] = field(default_factory=dict)
+    # The valid torques of the last seconds, to compare two sources at the same time.
+    recent: dict[str, deque[Torque]] = field(default_factory=dict)
+    arm: Arm | None = None
+    hand: Hand | None = None
+    lost: dict[str, str] = field(default_factory=dict)
+    died: dict[str, str] = field(default_factory=dict)
+    recording_failed: str = ""
+    late_s: float = 0.0
+
+    def hear(self, torque: Torque) -> None:
+        """Take in a torque; what is older than what is known already is left out."""
+        known = self.torques.get(torque.source)
+        if known is not None and torque.t_mid_ns <= known.t_mid_ns:
+            return
+        self.torques[torque.source] = torque
+        if torque.torque_nm is not None:
+            self.recent.setdefault(torque.source, deque(maxlen=MOST_RECENT)).append(torque)
+
+    def mean_torque_nm(self, source: str, from_ns: int, to_ns: int) -> float | None:
+        """Return the mean of a source's valid torques that belong to a time, or None where there is none."""
+        found = [
+            torque.torque_nm
+            for torque in self.recent.get(source, ())
+            if from_ns <= torque.t_mid_ns <= to_ns and torque.torque_nm is not None
+        ]
+        return sum(found) / len(found) if found else None

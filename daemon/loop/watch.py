@@ -1,0 +1,150 @@
+"""From what is sensed to what is wrong: the events of the safety table, with the numbers of this moment."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from daemon.experiment.steps import Limits
+from daemon.loop.senses import Senses, Source
+from daemon.safety import Event, Trouble
+from daemon.topics import STALE_AFTER_PERIODS, stale_after_s
+
+# 2.5 periods of their topics. The arm stands still by itself when it hears nothing for 0.3 s.
+ARM_STALE_S = stale_after_s("robot.state")
+HAND_STALE_S = stale_after_s("gripper.state")
+# Later than this and the wrist would turn on an angle that it has left.
+LATEST_LOOP_S = 0.1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WatchSettings:
+    """How far two torques may be apart, and how fast one may change without the wrist's doing."""
+
+    disagreement_nm: float = 0.05
+    jump_nm: float = 0.08
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Watched:
+    """What is watched at present: the sources, the limits, and what the experiment relies on."""
+
+    driving: Source
+    supervising: tuple[Source, ...]
+    limits: Limits
+    # Whether the torque is needed now: while the wrist is driven by it or twists under its limit.
+    torque_needed: bool
+    gripped: bool
+    twisted_rad: float
+    expected_nm: float | None = None
+    overdue: str = ""
+    required: tuple[str, ...] = ()
+
+
+def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
+    """Yield everything that is wrong at t_ns, in the order of the table."""
+    if watched.torque_needed:
+        yield from _torque(senses, watched, settings, t_ns)
+    yield from _limits(senses, watched, t_ns)
+    yield from _arm_and_hand(senses, watched, t_ns)
+    for name, why in senses.lost.items():
+        if name in watched.required:
+            yield Trouble(Event.DEVICE_LOST, f"{name}: {why}")
+    for name, why in senses.died.items():
+        yield Trouble(Event.TASK_DIED, f"{name}: {why}")
+    if senses.late_s > LATEST_LOOP_S:
+        yield Trouble(Event.LOOP_LATE, f"the 8 ms loop was woken {senses.late_s * 1e3:.0f} ms late")
+    if senses.recording_failed:
+        yield Trouble(Event.RECORDING_FAILED, senses.recording_failed)
+    if watched.overdue:
+        yield Trouble(Event.STEP_OVERDUE, watched.overdue)
+
+
+def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
+    source = watched.driving
+    latest = senses.torques.get(source.name)
+    allowed_s = STALE_AFTER_PERIODS * source.period_s
+    if latest is None:
+        yield Trouble(Event.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
+        return
+    age_s = (t_ns - latest.t_ns) / 1e9
+    if age_s > allowed_s:
+        yield Trouble(
+            Event.ESTIMATE_STALE,
+            f"the last torque of {source.name} came {age_s:.1f} s ago, {allowed_s:.1f} s are allowed",
+        )
+        return
+    if latest.torque_nm is None:
+        yield Trouble(Event.ESTIMATE_INVALID, f"{source.name} says: {latest.why or 'nothing'}")
+        return
+    if watched.expected_nm is not None and abs(latest.torque_nm - watched.expected_nm) > settings.jump_nm:
+        yield Trouble(
+            Event.ESTIMATE_JUMPED,
+            f"{source.name} says {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was to be expected",
+        )
+    for other in watched.supervising:
+        yield from _disagreement(senses, source, other, settings.disagreement_nm, t_ns)
+
+
+def _disagreement(senses: Senses, one: Source, other: Source, allowed_nm: float, t_ns: int) -> Iterator[Trouble]:
+    """Compare two torques at the time of the slower one's latest frame, over its own window."""
+    slow, fast = sorted((one, other), key=lambda source: source.period_s, reverse=True)
+    latest = senses.torques.get(slow.name)
+    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > STALE_AFTER_PERIODS * slow.period_s * 1e9:
+        return
+    half_ns = round(max(slow.window_s, fast.period_s) * 0.5e9)
+    beside_nm = senses.mean_torque_nm(fast.name, latest.t_mid_ns - half_ns, latest.t_mid_ns + half_ns)
+    if beside_nm is None:
+        return
+    apart_nm = abs(latest.torque_nm - beside_nm)
+    if apart_nm > allowed_nm:
+        yield Trouble(
+            Event.TORQUES_DISAGREE,
+            f"{slow.name} says {latest.torque_nm:+.3f} N·m and {fast.name} {beside_nm:+.3f} N·m, "
+            f"{apart_nm:.3f} N·m apart where {allowed_nm:g} are allowed",
+        )
+
+
+def _limits(senses: Senses, watched: Watched, t_ns: int) -> Iterator[Trouble]:
+    limit_nm, limit_rad = watched.limits.torque_nm, watched.limits.angle_rad
+    for source in (watched.driving, *watched.supervising):
+        torque = senses.torques.get(source.name)
+        if (
+            torque is None
+            or torque.torque_nm is None
+            or t_ns - torque.t_ns > STALE_AFTER_PERIODS * source.period_s * 1e9
+        ):
+            continue
+        if abs(torque.torque_nm) > limit_nm:
+            yield Trouble(
+                Event.TORQUE_LIMIT, f"{source.name} says {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
+            )
+    if watched.gripped and abs(watched.twisted_rad) > limit_rad:
+        yield Trouble(
+            Event.ANGLE_LIMIT,
+            f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad",
+        )
+
+
+def _arm_and_hand(senses: Senses, watched: Watched, t_ns: int) -> Iterator[Trouble]:
+    arm, hand = senses.arm, senses.hand
+    if arm is None:
+        yield Trouble(Event.DEVICE_LOST, "the robot has not reported its state yet")
+    elif t_ns - arm.t_ns > ARM_STALE_S * 1e9:
+        yield Trouble(Event.STATE_STALE, f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago")
+    elif arm.emergency_stop:
+        yield Trouble(Event.EMERGENCY_STOP, arm.blocked or "the controller reports it")
+    elif arm.protective_stop:
+        yield Trouble(Event.PROTECTIVE_STOP, arm.blocked or "the controller reports it")
+    elif arm.blocked:
+        yield Trouble(Event.DEVICE_LOST, f"the robot does not move: {arm.blocked}")
+    if "gripper" not in watched.required:
+        return
+    if hand is None:
+        yield Trouble(Event.DEVICE_LOST, "the gripper has not reported its state yet")
+        return
+    if t_ns - hand.t_ns > HAND_STALE_S * 1e9:
+        yield Trouble(Event.STATE_STALE, f"the gripper last reported its state {(t_ns - hand.t_ns) / 1e9:.1f} s ago")
+        return
+    if hand.fault:
+        yield Trouble(Event.GRIPPER_FAULT, hand.fault)
+    elif watched.gripped and not hand.holding:
+        yield Trouble(Event.GRIP_LOST, f"its fingers are {hand.width_mm:.1f} mm apart with nothing between them")

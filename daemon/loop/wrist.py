@@ -1,0 +1,175 @@
+"""What the wrist does for each wish: a speed in rad/s, 125 times a second. No I/O; times are passed in."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from daemon.control.controller import TwistController
+from daemon.control.excite import ExciteSettings, IdentifyStep
+from daemon.control.identify import Identified
+from daemon.control.settings import ControllerSettings
+from daemon.control.tuning import RequiredMargins, refusal
+from daemon.experiment.wishes import GoTo, MeasureTool, Still, Track, Turn, WristWish
+from daemon.loop.senses import Source, Torque
+
+# How fast the wrist closes in on an angle, per second and per radian that is missing.
+ANGLE_BANDWIDTH_PER_S = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WristSettings:
+    """Bounds on the wrist's motion, and what the closed loop must have."""
+
+    speed_limit_rad_per_s: float = 0.5
+    acceleration_limit_rad_per_s2: float = 2.0
+    required: RequiredMargins = field(default_factory=RequiredMargins)
+
+
+@dataclass(frozen=True, slots=True)
+class WristTurn:
+    """The speed that is wanted now, and why it is not another."""
+
+    speed_rad_per_s: float = 0.0
+    reasons: tuple[str, ...] = ()
+
+
+class Wrist:
+    """Carries out one wish at a time; a wish that changes is begun anew from where the wrist is."""
+
+    def __init__(
+        self,
+        source: Source,
+        settings: WristSettings,
+        tune: Callable[[Identified, Source, Track, float], ControllerSettings],
+    ) -> None:
+        """Take the driving torque's source, bounds, and what makes controller settings from an identified tool."""
+        self.source = source
+        self.identified: Identified | None = None
+        self.controller: TwistController | None = None
+        self._settings = settings
+        self._tune = tune
+        self._tracked: Track | None = None
+        self._held = False
+        # A torque that is newer than the latest angle waits for the next one: it is compared with the angle it had.
+        self._heard: list[Torque] = []
+        self._measuring: IdentifyStep | None = None
+
+    @property
+    def expected_nm(self) -> float | None:
+        """Return the torque that the controller expects at the wrist's angle, while it drives."""
+        return self.controller.state.torque_nm if self.controller is not None and self._tracked is not None else None
+
+    def hear(self, torque: Torque) -> None:
+        """Pass the driving torque on to whatever listens."""
+        if torque.source != self.source.name:
+            return
+        if self._measuring is not None:
+            self._measuring.measure(torque.torque_nm, torque.t_mid_ns, torque.t_ns)
+        if self.controller is not None:
+            self._heard.append(torque)
+
+    def sent(self, speed_rad_per_s: float) -> None:
+        """Tell what was really sent, after all clipping."""
+        if self.controller is not None:
+            self.controller.sent(speed_rad_per_s)
+        if self._measuring is not None:
+            self._measuring.sent(speed_rad_per_s)
+
+    def turn(self, wish: WristWish, t_ns: int, wrist_rad: float, origin_rad: float) -> WristTurn:
+        """Return the speed for a wish; angles in wishes count from origin_rad."""
+        if not isinstance(wish, Track):
+            # A loop that is not driven sees no angles; the next one starts from what is then measured.
+            self._tracked = self.controller = None
+        elif self._held and self.controller is not None:
+            self.controller.resume()
+        self._held = False
+        match wish:
+            case Still():
+                return WristTurn()
+            case GoTo(angle_rad, speed_rad_per_s):
+                return self._towards(origin_rad + angle_rad - wrist_rad, speed_rad_per_s)
+            case Turn(speed_rad_per_s):
+                return self._bounded(speed_rad_per_s)
+            case Track():
+                return self._follow(wish, t_ns, wrist_rad)
+
+    def refuses(self, wish: Track, torque_limit_nm: float) -> str | None:
+        """Return why a set point cannot be tracked with what is known of the tool, or None."""
+        if self.identified is None:
+            return "the tool has not been identified; put an `identify` step before the first `hold_torque`"
+        settings = self._tune(self.identified, self.source, wish, torque_limit_nm)
+        return refusal(settings, self.identified, self._settings.required)
+
+    def begin_tracking(self, wish: Track, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> None:
+        """Close the loop on a set point; `refuses` has been asked before."""
+        if self.identified is None:
+            raise ValueError("a loop is closed on an identified tool")
+        found = self.identified
+        if self.controller is None:
+            self.controller = TwistController(self._tune(found, self.source, wish, torque_limit_nm))
+            here_nm = found.torque_nm + found.stiffness_nm_per_rad * (wrist_rad - found.angle_rad)
+            self.controller.start(t_ns, wrist_rad, here_nm, found.known_measurements)
+        self.controller.set_point(wish.torque_nm)
+        self._tracked = wish
+
+    @property
+    def tracks(self) -> Track | None:
+        """Return the set point that is being tracked."""
+        return self._tracked
+
+    def begin_measuring(self, action: MeasureTool, torque_limit_nm: float) -> None:
+        """Shake the tool to learn its stiffness."""
+        self.forget()
+        self._measuring = IdentifyStep(
+            ExciteSettings(
+                amplitude_rad=action.amplitude_rad,
+                sample_period_s=self.source.period_s,
+                window_s=self.source.window_s,
+                torque_limit_nm=torque_limit_nm,
+                speed_rad_per_s=self._settings.speed_limit_rad_per_s,
+                acceleration_rad_per_s2=self._settings.acceleration_limit_rad_per_s2,
+            )
+        )
+
+    def measure(self, t_ns: int, wrist_rad: float) -> tuple[WristTurn, str | None]:
+        """Return the speed of the identification, and "" when it has ended well, or why it has ended badly."""
+        step = self._measuring
+        if step is None:
+            return WristTurn(), "it was never begun"
+        turn = self._bounded(step.command(t_ns, wrist_rad))
+        if not step.done:
+            return turn, None
+        self.identified, self._measuring = step.result, None
+        return WristTurn(), step.failure or ""
+
+    def hold(self) -> WristTurn:
+        """Stand still for now; the next `turn` goes on without a jump."""
+        if self.controller is not None and not self._held:
+            self.controller.hold()
+        self._held = True
+        return WristTurn()
+
+    def forget(self) -> None:
+        """Forget the tool: it was let go, or another zero was taken."""
+        self.identified = self.controller = self._tracked = self._measuring = None
+
+    def _follow(self, wish: Track, t_ns: int, wrist_rad: float) -> WristTurn:
+        if self.controller is None or self._tracked != wish:
+            return WristTurn(reasons=("the loop has not been closed",))
+        command = self.controller.command(t_ns, wrist_rad)
+        for torque in self._heard:
+            torque_nm = torque.nearest_to(self.controller.state.torque_nm)
+            self.controller.measure(torque_nm, torque.t_mid_ns, torque.t_ns)
+        self._heard.clear()
+        return WristTurn(self._bounded(command.speed_rad_per_s).speed_rad_per_s, tuple(map(str, command.reasons)))
+
+    def _towards(self, missing_rad: float, speed_rad_per_s: float) -> WristTurn:
+        wanted = ANGLE_BANDWIDTH_PER_S * missing_rad
+        return self._bounded(math.copysign(min(abs(wanted), speed_rad_per_s), missing_rad))
+
+    def _bounded(self, speed_rad_per_s: float) -> WristTurn:
+        limit = self._settings.speed_limit_rad_per_s
+        bounded = max(-limit, min(limit, speed_rad_per_s))
+        if bounded == speed_rad_per_s:
+            return WristTurn(bounded)
+        return WristTurn(bounded, (f"the wrist turns no faster than {limit:g} rad/s",))

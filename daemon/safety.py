@@ -1,0 +1,227 @@
+"""The safety table: what happens when something is not as it should be, and what the operator is told.
+
+Every event has one row. A response is never weaker than the strongest row that applies; whatever is not a row ends
+with the robot still as well, because the task that meets it dies, and `TASK_DIED` is a row.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+
+
+class Response(IntEnum):
+    """What is done, from the mildest to the strongest; the strongest of all active rows is carried out."""
+
+    NOTE = 0  # told and counted, nothing else
+    REFUSE_START = 1  # a running experiment goes on, a new one is not begun
+    HOLD = 2  # the wrist stands still until the cause has gone; the experiment's clock stands too
+    STOP_AND_KEEP_GRIP = 3  # the wrist is stopped, the experiment ends, the tool stays gripped
+    STOP_AND_RELEASE = 4  # the wrist is stopped, the experiment ends, the gripper opens
+
+
+class Event(Enum):
+    """What can be wrong."""
+
+    ESTIMATE_STALE = "estimate stale"
+    ESTIMATE_INVALID = "estimate invalid"
+    ESTIMATE_JUMPED = "estimate jumped"
+    TORQUE_LIMIT = "torque limit"
+    ANGLE_LIMIT = "angle limit"
+    TORQUES_DISAGREE = "torques disagree"
+    PROTECTIVE_STOP = "protective stop"
+    EMERGENCY_STOP = "emergency stop"
+    GRIPPER_FAULT = "gripper fault"
+    GRIP_LOST = "grip lost"
+    STATE_STALE = "state stale"
+    DEVICE_LOST = "device lost"
+    TASK_DIED = "task died"
+    LOOP_LATE = "loop late"
+    RECORDING_FAILED = "recording failed"
+    COMMAND_REFUSED = "command refused"
+    STEP_OVERDUE = "step overdue"
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One row: the response, what the operator reads, and how long a hold may last before it becomes a stop."""
+
+    response: Response
+    sentence: str
+    cure: str
+    hold_at_most_s: float | None = None
+
+
+_KEEP, _RELEASE, _HOLD = Response.STOP_AND_KEEP_GRIP, Response.STOP_AND_RELEASE, Response.HOLD
+
+TABLE: Mapping[Event, Rule] = {
+    Event.ESTIMATE_STALE: Rule(
+        _HOLD,
+        "no new torque has come: {detail}.",
+        "Look at the sensor's cable and at its task in `shearloop listen health`.",
+        hold_at_most_s=5.0,
+    ),
+    Event.ESTIMATE_INVALID: Rule(
+        _HOLD,
+        "the torque estimate is not valid: {detail}.",
+        "Wait for the next valid estimate, or tare with nothing gripped and start again.",
+        hold_at_most_s=5.0,
+    ),
+    Event.ESTIMATE_JUMPED: Rule(
+        _HOLD,
+        "the torque jumped by more than the wrist can have caused: {detail}.",
+        "Look whether the tool slipped or the screw broke loose.",
+        hold_at_most_s=5.0,
+    ),
+    Event.TORQUE_LIMIT: Rule(
+        _RELEASE,
+        "the torque is beyond its limit: {detail}.",
+        "Check what blocks the tool; raise `limits.torque_nm` only when tool and gel bear it.",
+    ),
+    Event.ANGLE_LIMIT: Rule(
+        _KEEP,
+        "the wrist has reached its angle limit: {detail}.",
+        "The tool may be slipping; regrip it, or widen `limits.angle_rad`.",
+    ),
+    Event.TORQUES_DISAGREE: Rule(
+        _HOLD,
+        "two torque measurements disagree: {detail}.",
+        "Tare both with nothing gripped; when they still disagree, calibrate again.",
+        hold_at_most_s=3.0,
+    ),
+    Event.PROTECTIVE_STOP: Rule(
+        _KEEP,
+        "the robot is in a protective stop: {detail}.",
+        "Look what the robot touched, clear it, then `shearloop command unlock`.",
+    ),
+    Event.EMERGENCY_STOP: Rule(
+        _KEEP,
+        "the robot's emergency stop is pressed: {detail}.",
+        "Release the button, power the arm on the pendant, then `shearloop command unlock`.",
+    ),
+    Event.GRIPPER_FAULT: Rule(
+        _KEEP,
+        "the gripper reports a fault: {detail}.",
+        "Clear what it names, then `shearloop command unlock` activates the gripper anew.",
+    ),
+    Event.GRIP_LOST: Rule(
+        _KEEP,
+        "the gripper no longer holds an object: {detail}.",
+        "Put the tool back and start the experiment again.",
+    ),
+    Event.STATE_STALE: Rule(
+        _HOLD,
+        "a device's state is out of date: {detail}.",
+        "It goes on by itself when the state comes again; look at its cable, and whether this computer is overloaded.",
+        hold_at_most_s=2.0,
+    ),
+    Event.DEVICE_LOST: Rule(
+        _KEEP,
+        "a device that the experiment needs is gone: {detail}.",
+        "Plug it in again; it is found by itself, then start the experiment again.",
+    ),
+    Event.TASK_DIED: Rule(
+        _KEEP,
+        "a task of the daemon died and is being started again: {detail}.",
+        "Read the log above this line; report it when it comes back.",
+    ),
+    Event.LOOP_LATE: Rule(
+        _HOLD,
+        "the daemon is too slow for its devices: {detail}.",
+        "End other programs on this computer, or see the service's real-time options.",
+        hold_at_most_s=5.0,
+    ),
+    Event.RECORDING_FAILED: Rule(
+        Response.REFUSE_START,
+        "the recording cannot be written: {detail}.",
+        "Make room on the disk or name another folder; what runs goes on unrecorded.",
+    ),
+    Event.COMMAND_REFUSED: Rule(
+        Response.NOTE,
+        "a command was refused: {detail}.",
+        "Nothing was done; mend the command and send it again.",
+    ),
+    Event.STEP_OVERDUE: Rule(
+        _KEEP,
+        "a step took longer than it may: {detail}.",
+        "Look what kept it waiting; lengthen `timeout_s` of the step when it was too short.",
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """One event with what is particular to this occurrence."""
+
+    event: Event
+    detail: str
+
+    @property
+    def rule(self) -> Rule:
+        """The table's row."""
+        return TABLE[self.event]
+
+    @property
+    def sentence(self) -> str:
+        """What the operator reads: what happened, and what to do."""
+        return f"{self.rule.sentence.format(detail=self.detail)} {self.rule.cure}"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The response to all that is wrong now, and every reason for it."""
+
+    response: Response
+    troubles: tuple[Trouble, ...] = ()
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """One sentence a trouble."""
+        return tuple(trouble.sentence for trouble in self.troubles)
+
+
+class SafetyGate:
+    """Judges what is wrong, lets holds go when their cause has gone, and keeps a stop until it is acknowledged."""
+
+    def __init__(self) -> None:
+        self._since_ns: dict[Event, int] = {}
+        self._stopped: Verdict | None = None
+
+    def judge(self, troubles: Iterable[Trouble], t_ns: int) -> Verdict:
+        """Return the response to the troubles of this moment (t_ns on the monotonic clock)."""
+        now = {trouble.event: trouble for trouble in troubles}
+        self._since_ns = {event: self._since_ns.get(event, t_ns) for event in now}
+        active = tuple(now.values())
+        response = max((self._response(trouble, t_ns) for trouble in active), default=Response.NOTE)
+        verdict = Verdict(response, active)
+        if response >= Response.STOP_AND_KEEP_GRIP and (self._stopped is None or response > self._stopped.response):
+            self._stopped = verdict
+        if self._stopped is None:
+            return verdict
+        # A stop outlives its cause; what has come since is told beside it.
+        first = [trouble for trouble in self._stopped.troubles if trouble.event not in now]
+        return Verdict(self._stopped.response, (*first, *active))
+
+    def look(self, troubles: Iterable[Trouble]) -> Verdict:
+        """Return what is wrong while nothing moves: a stop that waits is kept, but none is begun."""
+        active = tuple(troubles)
+        if self._stopped is None:
+            return Verdict(Response.NOTE, active)
+        events = {trouble.event for trouble in active}
+        return Verdict(self._stopped.response, (*(t for t in self._stopped.troubles if t.event not in events), *active))
+
+    def acknowledge(self) -> None:
+        """Let a stop go, on the operator's word; what is still wrong stops again at the next judgement."""
+        self._stopped = None
+        self._since_ns.clear()
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a stop waits for the operator."""
+        return self._stopped is not None
+
+    def _response(self, trouble: Trouble, t_ns: int) -> Response:
+        rule = trouble.rule
+        held_s = (t_ns - self._since_ns[trouble.event]) / 1e9
+        if rule.hold_at_most_s is not None and held_s > rule.hold_at_most_s:
+            return Response.STOP_AND_KEEP_GRIP
+        return rule.response

@@ -1,0 +1,196 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from daemon.config_file import load_yaml_model
+from daemon.experiment.machine import Experiment, Phase
+from daemon.experiment.steps import ExperimentFile
+from daemon.experiment.wishes import ActionState, GoTo, Still, Track, Turn, View, Wish
+
+TICK_NS = 8_000_000
+STIFFNESS_NM_PER_RAD = 0.2
+
+
+def experiment(*steps: dict[str, Any], **keys: Any) -> Experiment:
+    return Experiment(ExperimentFile.model_validate({"name": "test", "steps": list(steps), **keys}), 0)
+
+
+class Bench:
+    """The simplest thing that can carry wishes out: a wrist that turns at once, a spring, and prompt actions."""
+
+    def __init__(self, machine: Experiment, tick_ns: int = TICK_NS) -> None:
+        self.machine, self.t_ns, self.wrist_rad, self.tick_ns = machine, 0, 0.0, tick_ns
+        self.begun: list[str] = []
+        self.wish = Wish()
+        self.seen: list[Wish] = []
+
+    def view(self) -> View:
+        done = ActionState.DONE if self.wish.action else ActionState.IDLE
+        return View(self.wrist_rad, STIFFNESS_NM_PER_RAD * self.wrist_rad, action=done)
+
+    def tick(self, *, held: bool = False) -> Wish:
+        self.t_ns += self.tick_ns
+        wish = self.machine.update(self.view(), self.t_ns, held=held)
+        if wish.action is not None and wish.number != self.wish.number:
+            self.begun.append(type(wish.action).__name__)
+        step_s = self.tick_ns / 1e9
+        match wish.wrist:
+            case GoTo(angle, speed):
+                reach = speed * step_s
+                self.wrist_rad += max(-reach, min(reach, angle - self.wrist_rad))
+            case Turn(speed):
+                self.wrist_rad += speed * step_s
+            case Track(torque, _):
+                self.wrist_rad += 0.05 * (torque / STIFFNESS_NM_PER_RAD - self.wrist_rad)
+            case Still():
+                pass
+        self.wish = wish
+        self.seen.append(wish)
+        return wish
+
+    def run(self, most: int = 200_000) -> None:
+        while self.machine.running and most:
+            self.tick()
+            most -= 1
+
+
+def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
+    bench = Bench(
+        experiment(
+            {"do": "approach", "pose_m_rad": [0.4, 0, 0.3, 0, 3.1, 0]},
+            {"do": "grip", "width_mm": 20},
+            {"do": "tare"},
+            {"do": "twist", "angles_rad": "0.1:0.3:3", "hold_s": 1.0, "repeats": 2},
+            {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 2},
+            {"do": "release"},
+            {"do": "retreat", "pose_m_rad": [0.4, 0, 0.5, 0, 3.1, 0]},
+        )
+    )
+    bench.run()
+    assert bench.machine.phase is Phase.DONE
+    assert bench.begun == ["MoveTo", "GripTo", "TakeZero", "GripTo", "MoveTo"]
+    assert bench.machine.progress().share == 1.0
+    holds = [wish for wish in bench.seen if wish.doing.startswith("holding 0.200 rad")]
+    assert len(holds) * TICK_NS / 1e9 == pytest.approx(2 * 1.0, abs=0.05)
+    assert {wish.doing.split(": ")[1].split(",")[1] for wish in holds} == {" repeat 1 of 2", " repeat 2 of 2"}
+
+
+def test_absolute_angles_are_the_wrists_own() -> None:
+    machine = experiment({"do": "twist", "angles_rad": [1.5], "absolute": True})
+    machine.update(View(0.0, 0.0, gripped_at_rad=1.4), TICK_NS)
+    wish = machine.update(View(0.0, 0.0, gripped_at_rad=1.4), 2 * TICK_NS)
+    assert isinstance(wish.wrist, GoTo)
+    assert wish.wrist.angle_rad == pytest.approx(0.1)
+
+
+def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first() -> None:
+    for angle_rad, reached_rad in ((3.0, 0.5), (0.25, 0.25)):
+        bench = Bench(experiment({"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": angle_rad}))
+        bench.run()
+        assert bench.machine.phase is Phase.DONE
+        assert bench.wrist_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
+
+
+def test_a_failed_action_stops_the_experiment_with_its_reason() -> None:
+    machine = experiment({"do": "grip"}, {"do": "release"})
+    machine.update(View(0.0, None, action=ActionState.RUNNING), TICK_NS)
+    wish = machine.update(
+        View(0.0, None, action=ActionState.FAILED, failure="nothing was between the fingers"), TICK_NS
+    )
+    assert (machine.phase, wish) == (Phase.STOPPED, Wish())
+    assert machine.why == "step 1 (grip) failed: nothing was between the fingers"
+
+
+def test_while_paused_or_held_the_wrist_stands_and_no_time_passes() -> None:
+    bench = Bench(experiment({"do": "twist", "angles_rad": [0.5], "hold_s": 5.0}))
+    for _ in range(100):
+        bench.tick()
+    left_s, angle_rad = bench.machine.progress().remaining_s, bench.wrist_rad
+    bench.machine.pause()
+    for _ in range(1000):
+        assert bench.tick().wrist == Still()
+    bench.machine.resume()
+    for _ in range(1000):
+        assert bench.tick(held=True).wrist == Still()
+    assert bench.machine.progress().remaining_s == left_s
+    assert bench.wrist_rad == angle_rad
+    bench.run()
+    assert bench.machine.phase is Phase.DONE
+
+
+def test_a_step_that_takes_too_long_is_said_to_be_overdue() -> None:
+    machine = experiment({"do": "grip", "timeout_s": 2.0})
+    view = View(0.0, None, action=ActionState.RUNNING)
+    machine.update(view, 2_000_000_000)
+    assert not machine.progress().overdue
+    machine.update(view, 2_100_000_000)
+    assert machine.progress().overdue == "step 1 (grip) has taken 2.1 s of at most 2 s"
+
+
+def test_a_steps_limits_only_tighten_the_experiments() -> None:
+    step = {"do": "wait", "wait_s": 1, "limits": {"torque_nm": 0.4, "angle_rad": 0.1}}
+    machine = experiment(step, limits={"torque_nm": 0.2, "angle_rad": 1.0})
+    assert (machine.limits.torque_nm, machine.limits.angle_rad) == (0.2, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("step", "part"),
+    [
+        ({"do": "twist", "angles_rad": "1.45:1.65"}, "START:STOP:STEPS"),
+        ({"do": "twist", "angles_rad": "0:1:1"}, "steps from 2 to 1000"),
+        ({"do": "twist", "angles_rad": ["nan"]}, "finite"),
+        ({"do": "fly"}, "'approach', 'retreat'"),
+        ({"do": "grip", "width_mm": 200}, "140"),
+        ({"do": "grip", "widht_mm": 20}, "not permitted"),
+    ],
+)
+def test_a_mistake_in_a_step_is_told_with_the_cure(step: dict[str, Any], part: str) -> None:
+    with pytest.raises(ValidationError, match=part):
+        experiment(step)
+
+
+STEPS = st.one_of(
+    st.just({"do": "grip"}),
+    st.just({"do": "tare"}),
+    st.just({"do": "release"}),
+    st.builds(lambda s: {"do": "wait", "wait_s": s}, st.floats(0, 2)),
+    st.builds(
+        lambda a, r: {"do": "twist", "angles_rad": a, "repeats": r, "hold_s": 0.1, "speed_rad_per_s": 3.0},
+        st.lists(st.floats(-0.5, 0.5), min_size=1, max_size=3),
+        st.integers(1, 2),
+    ),
+    st.builds(lambda t: {"do": "hold_torque", "torque_nm": t, "hold_s": 0.2}, st.floats(-0.2, 0.2)),
+)
+
+
+@given(
+    st.lists(STEPS, min_size=1, max_size=4), st.lists(st.sampled_from(["pause", "resume", "hold", "tick"]), max_size=40)
+)
+def test_any_experiment_ends_whatever_interrupts_it_and_never_moves_after_its_end(
+    steps: list[dict[str, Any]], interruptions: list[str]
+) -> None:
+    bench = Bench(experiment(*steps))
+    for what in interruptions:
+        if what == "pause":
+            bench.machine.pause()
+        elif what == "resume":
+            bench.machine.resume()
+        wish = bench.tick(held=what == "hold")
+        assert what != "hold" or wish.wrist == Still()
+        assert 0.0 <= bench.machine.progress().share <= 1.0
+    bench.machine.resume()
+    bench.run()
+    assert bench.machine.phase is Phase.DONE
+    assert bench.tick() == Wish()
+
+
+@pytest.mark.parametrize("path", sorted(Path("config/experiments").glob("*.yaml")), ids=lambda path: path.stem)
+def test_the_experiments_that_are_shipped_are_in_order_and_end(path: Path) -> None:
+    file = load_yaml_model(path, ExperimentFile)
+    bench = Bench(Experiment(file, 0), tick_ns=100_000_000)
+    bench.run()
+    assert bench.machine.phase is Phase.DONE

@@ -1,0 +1,105 @@
+"""How good a calibration is on recordings: every frame in order through the tracker, against the truth."""
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.bank_file import Bank
+from bank.estimators import Calibration, Estimate, FrameSeries, TactileFrame, Tracker
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Track:
+    """One series with its estimates, one for each frame, and how long each took."""
+
+    series: FrameSeries
+    estimates: tuple[Estimate, ...]
+    latency_ms: FloatArray
+
+
+def follow(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> Track:
+    """Estimate every frame of a series in order, as live; raises CalibrationError for a series of other sides."""
+    chosen = series.of_sides(calibration.sides)
+    tracker = Tracker(calibration, bank)
+    estimates, latency = [], []
+    for t_s, channels in zip(chosen.t_s, chosen.channels, strict=True):
+        begun = time.perf_counter()
+        estimates.append(tracker.estimate(TactileFrame.of(float(t_s), channels)))
+        latency.append(1e3 * (time.perf_counter() - begun))
+    return Track(chosen, tuple(estimates), np.array(latency))
+
+
+def judge(tracks: Sequence[Track]) -> dict[str, float | int | None]:
+    """Return the figures of `shearloop evaluate`: r, rmse_nm, bias_nm, coverage_95, valid_fraction, latency, frames.
+
+    Torque is judged on valid frames with a known truth; a figure is None where there are too few of them. Where
+    diameters are known, diameter_rmse_mm is given, and coverage_95 is theirs if there is no torque to judge.
+    """
+    torque = _compared(tracks, "torque")
+    diameter = _compared(tracks, "diameter")
+    valid = [estimate.valid for track in tracks for estimate in track.estimates]
+    latency = np.concatenate([track.latency_ms for track in tracks])
+    figures: dict[str, float | int | None] = {
+        "r": torque.r,
+        "rmse_nm": torque.rmse,
+        "bias_nm": torque.bias,
+        "coverage_95": torque.coverage if torque.n else diameter.coverage,
+        "valid_fraction": float(np.mean(valid)) if valid else None,
+        "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
+        "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
+        "frames": len(valid),
+    }
+    if any(np.isfinite(track.series.diameter_mm).any() for track in tracks):
+        figures["diameter_rmse_mm"] = diameter.rmse
+        figures["diameter_coverage_95"] = diameter.coverage
+    return figures
+
+
+def reasons(tracks: Sequence[Track]) -> Counter[str]:
+    """Return why frames were not valid, each reason up to its first colon or number, with how often."""
+    found: Counter[str] = Counter()
+    for track in tracks:
+        for estimate in track.estimates:
+            for why in estimate.why:
+                head = why.split(":")[0]
+                found["".join("#" if letter.isdigit() else letter for letter in head)] += 1
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class _Compared:
+    n: int
+    r: float | None
+    rmse: float | None
+    bias: float | None
+    coverage: float | None
+
+
+def _compared(tracks: Sequence[Track], quantity: str) -> _Compared:
+    unit = {"torque": "nm", "diameter": "mm"}[quantity]
+    rows = []
+    for track in tracks:
+        truths = track.series.torque_at_frames() if quantity == "torque" else track.series.diameter_mm
+        for estimate, truth in zip(track.estimates, truths, strict=True):
+            value = getattr(estimate, f"{quantity}_{unit}")
+            if value is not None and np.isfinite(truth):
+                low, high = getattr(estimate, f"{quantity}_low_{unit}"), getattr(estimate, f"{quantity}_high_{unit}")
+                rows.append((value, float(truth), low <= truth <= high))
+    if len(rows) < 2:
+        return _Compared(len(rows), None, None, None, None)
+    value, truth, inside = np.array(rows, dtype=np.float64).T
+    error = value - truth
+    changing = value.std() > 0 and truth.std() > 0
+    return _Compared(
+        len(rows),
+        float(np.corrcoef(value, truth)[0, 1]) if changing else None,
+        float(np.sqrt((error**2).mean())),
+        float(error.mean()),
+        float(inside.mean()),
+    )

@@ -1,0 +1,126 @@
+"""Reads a recording back, and refuses by name what is truncated, foreign, damaged or of another channel table."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from mcap.records import Channel, Message
+from numpy.typing import NDArray
+
+from bank.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
+from daemon.errors import UserError
+from daemon.recording.schema import FORMAT_VERSION, FRAME_TOPIC, LOAD_TOPIC, METADATA
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SideFrames:
+    """One side's frames by rising time: t_mid_ns and arrival_ns (n,) in Unix nanoseconds, lines (n, 1024) in volts."""
+
+    t_mid_ns: IntArray
+    arrival_ns: IntArray
+    lines: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recording:
+    """All of a recording: frames by side, and the torque in N·m at t_ns (p,), Unix nanoseconds, both maybe empty."""
+
+    path: Path
+    source: str
+    notes: dict[str, str]
+    sides: dict[str, SideFrames]
+    torque_t_ns: IntArray
+    torque_nm: FloatArray
+
+
+def read_recording(path: str | Path) -> Recording:
+    """Read a recording whole; raises UserError, naming the file, for one that cannot be used."""
+    path = Path(path)
+    try:
+        with path.open("rb") as file:
+            reader = make_reader(file, validate_crcs=True)
+            summary = reader.get_summary()
+            if summary is None:
+                raise _unusable(path, "it has no index at its end: it is truncated, or is still being written")
+            metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+            _check(path, metadata.get(METADATA))
+            messages = [(channel, message) for _, channel, message in reader.iter_messages()]
+    except OSError as error:
+        raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
+    # The library raises its own errors, and those of its decoders and of struct, on damaged files.
+    except (McapError, ValueError, EOFError, ArithmeticError, LookupError, TypeError, AttributeError) as error:
+        raise _unusable(path, f"it is not an MCAP file, or is truncated or damaged ({error!r})") from error
+    except Exception as error:
+        raise _unusable(path, f"it is damaged ({error!r})") from error
+    return _sorted(path, metadata[METADATA], messages)
+
+
+def _check(path: Path, identities: dict[str, str] | None) -> None:
+    if identities is None:
+        raise _unusable(path, "it is an MCAP file, but not a recording of shearloop")
+    if identities.get("format_version") != FORMAT_VERSION:
+        raise _unusable(path, f"it has format version {identities.get('format_version')}, expected {FORMAT_VERSION}")
+    found = str(identities.get("channel_table_hash"))
+    if found != CHANNEL_TABLE_HASH:
+        raise _unusable(
+            path, f"it was made under the channel table {found[:12]}…, and this is {CHANNEL_TABLE_HASH[:12]}…"
+        )
+
+
+def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel, Message]]) -> Recording:
+    frames: dict[str, list[tuple[int, int, list[float]]]] = {}
+    torques: list[tuple[int, float]] = []
+    for channel, message in messages:
+        content = _content(path, channel, message)
+        try:
+            if channel.topic == LOAD_TOPIC:
+                torques.append((message.log_time, float(content["torque_nm"])))
+            elif channel.topic.startswith(f"{FRAME_TOPIC}."):
+                line = content["line"]
+                if len(line) != N_LINE_VALUES:
+                    raise ValueError(f"a line of {len(line)} values")
+                side = channel.topic.removeprefix(f"{FRAME_TOPIC}.")
+                frames.setdefault(side, []).append((message.log_time, int(content["arrival_unix_ns"]), line))
+        except (KeyError, TypeError, ValueError) as error:
+            raise _unusable(path, f"a message on {channel.topic} is not what its schema says ({error!r})") from error
+    torques.sort(key=lambda pair: pair[0])
+    sides = {}
+    for side, rows in frames.items():
+        rows.sort(key=lambda row: row[0])
+        sides[side] = SideFrames(
+            np.array([row[0] for row in rows], dtype=np.int64),
+            np.array([row[1] for row in rows], dtype=np.int64),
+            np.array([row[2] for row in rows], dtype=np.float64),
+        )
+    notes = {key: value for key, value in identities.items() if key not in ("format_version", "channel_table_hash")}
+    return Recording(
+        path,
+        notes.pop("source", ""),
+        notes,
+        sides,
+        np.array([t for t, _ in torques], dtype=np.int64),
+        np.array([torque for _, torque in torques], dtype=np.float64),
+    )
+
+
+def _content(path: Path, channel: Channel, message: Message) -> dict[str, Any]:
+    try:
+        content = json.loads(message.data)
+    except ValueError as error:
+        raise _unusable(path, f"a message on {channel.topic} is not JSON") from error
+    if not isinstance(content, dict):
+        raise _unusable(path, f"a message on {channel.topic} is not a JSON object")
+    return content
+
+
+def _unusable(path: Path, why: str) -> UserError:
+    return UserError(
+        f"{path}: this recording cannot be used: {why}; record it again, or import it with `shearloop import`"
+    )

@@ -1,0 +1,81 @@
+import json
+
+import numpy as np
+import pytest
+
+from bank.estimators import Estimate, FrameSeries
+from daemon.cli import main
+from daemon.recording.evaluation import Track, judge
+
+KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "valid_fraction", "latency_ms_p50", "latency_ms_p99", "frames"}
+
+
+@pytest.mark.usefixtures("fonts")
+def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_path, capsys):
+    first, second = tmp_path / "a.cal", tmp_path / "b.cal"
+    for out in (first, second):
+        assert main(["calibrate", str(slices_folder), "--part", "0:0.6", "--out", str(out)]) == 0
+    assert first.read_bytes() == second.read_bytes()
+    capsys.readouterr()
+    assert main(["evaluate", str(first), str(slices_folder), "--part", "0.6:1", "--json", "--plot"]) == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert set(figures) == KEYS | {"diameter_rmse_mm", "diameter_coverage_95"}
+    assert figures["r"] > 0.97
+    assert figures["rmse_nm"] < 0.01
+    assert figures["diameter_rmse_mm"] < 3
+    assert figures["frames"] == 20 + 6
+    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["evaluate", str(first), str(slices_folder / "torque_slices")]) == 0
+    text = capsys.readouterr().out
+    assert "rmse_nm" in text
+    assert "diameter" not in text
+
+
+def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, capsys):
+    recording, calibration = tmp_path / "a.mcap", tmp_path / "a.cal"
+    assert main(["import", "mat", str(mat_folder()), "--out", str(recording)]) == 0
+    assert "60 frames of the right side, 60 frames of the left side, 355 torques" in capsys.readouterr().out
+    assert main(["calibrate", str(slices_folder / "torque_slices"), "--out", str(calibration)]) == 0
+    assert main(["evaluate", str(calibration), str(recording)]) == 2
+    assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["calibrate", "{slices}", "--part", "0.5", "--out", "x"], "--part must be two shares"),
+        (["calibrate", "{slices}", "--part", "0.9:0.5", "--out", "x"], "--part must rise"),
+        (["calibrate", "{slices}", "--sides", "middle", "--out", "x"], "--sides must be right or left"),
+        (["calibrate", "{slices}", "--estimator", "bank", "--out", "x"], "needs a bank"),
+        (["calibrate", "nowhere.mcap", "--out", "x"], "nowhere.mcap: the recording cannot be read"),
+        (["evaluate", "nowhere.cal", "{slices}"], "nowhere.cal: the calibration cannot be read"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, capsys):
+    assert main([one.format(slices=slices_folder) for one in arguments]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_the_load_cell_is_still_calibrated_by_its_name(capsys):
+    with pytest.raises(SystemExit):
+        main(["calibrate", "load", "--help"])
+    assert "known masses" in capsys.readouterr().out
+
+
+def test_figures_are_what_their_names_say():
+    truth = np.array([0.0, 0.1, 0.2, 0.3])
+    estimates = [
+        Estimate(True, (), torque_nm=value, torque_low_nm=value - 0.05, torque_high_nm=value + 0.05)
+        for value in (0.02, 0.1, 0.27)
+    ] + [Estimate(False, ("no grip",))]
+    t = np.arange(4.0)
+    series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, truth, np.full(4, np.nan))
+    figures = judge([Track(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
+    error = np.array([0.02, 0.0, 0.07])
+    assert figures["rmse_nm"] == pytest.approx(np.sqrt((error**2).mean()))
+    assert figures["bias_nm"] == pytest.approx(error.mean())
+    assert figures["r"] == pytest.approx(np.corrcoef([0.02, 0.1, 0.27], truth[:3])[0, 1])
+    assert figures["coverage_95"] == pytest.approx(2 / 3)
+    assert figures["valid_fraction"] == 0.75
+    assert (figures["latency_ms_p50"], figures["frames"]) == (2.5, 4)
+    assert "diameter_rmse_mm" not in figures

@@ -1,0 +1,66 @@
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from daemon.errors import UserError
+from daemon.recording.importing import import_mat
+from daemon.recording.reader import read_recording
+from daemon.recording.series import part_of, read_series, series_of
+
+PERIOD_S = 0.5408
+
+
+def test_frames_belong_to_the_middle_of_their_acquisition_however_late_they_were_read(mat_folder, tmp_path):
+    late = [(20, 0.3), (21, 0.12), (40, 1.4), (41, 0.9), (42, 0.35)]
+    import_mat([mat_folder(late=late)], tmp_path / "a.mcap")
+    frames = read_recording(tmp_path / "a.mcap").sides["right"]
+    expected = PERIOD_S * (np.arange(60) + 0.5)
+    found = (frames.t_mid_ns - frames.arrival_ns[0]) / 1e9 + PERIOD_S
+    np.testing.assert_allclose(found, expected, atol=0.01)
+
+
+def test_a_load_that_was_read_once_per_frame_gets_its_own_pace_back(mat_folder, tmp_path):
+    imported = import_mat([mat_folder(one_loop=True)], tmp_path / "a.mcap")
+    assert "read once per frame" in imported.remarks[0]
+    found = read_recording(tmp_path / "a.mcap")
+    np.testing.assert_allclose(np.diff(found.torque_t_ns) / 1e9, 0.0916, atol=1e-6)
+    assert "read once per frame" in found.notes["remarks"]
+
+
+def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path):
+    imported = import_mat([mat_folder(glitches=(0, 8))], tmp_path / "a.mcap")
+    found = read_recording(tmp_path / "a.mcap")
+    assert imported.torques == len(found.torque_nm) == 353
+    assert np.abs(found.torque_nm).max() < 0.06
+    assert "2 load values beyond 20 N·m" in imported.remarks[0]
+
+
+def test_two_sides_are_paired_by_time(mat_folder, tmp_path):
+    import_mat([mat_folder()], tmp_path / "a.mcap")
+    both = series_of(read_recording(tmp_path / "a.mcap"))
+    assert both.sides == ("right", "left")
+    assert both.channels.shape == (60, 2, 896)
+    left = series_of(read_recording(tmp_path / "a.mcap"), ("left",))
+    np.testing.assert_array_equal(left.channels[:, 0], both.channels[:, 1])
+    assert np.isfinite(both.torque_at_frames()[2:55]).all()
+    early, later = part_of(both, 0, 0.25), part_of(both, 0.25, 1)
+    assert (len(early.t_s), len(later.t_s)) == (15, 45)
+
+
+def test_what_cannot_be_imported_is_named(mat_folder, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(UserError, match=r"holds no \.mat files"):
+        import_mat([tmp_path / "empty"], tmp_path / "a.mcap")
+    savemat(tmp_path / "other.mat", {"x": np.zeros((2, 2))})
+    with pytest.raises(UserError, match=r"other\.mat holds x, expected one of Right_Data"):
+        import_mat([tmp_path / "other.mat"], tmp_path / "a.mcap")
+    folder = mat_folder()
+    with pytest.raises(UserError, match="second stream of right"):
+        import_mat([folder, folder / "device0.mat"], tmp_path / "a.mcap")
+    with pytest.raises(UserError, match="no frames"):
+        import_mat([folder / "load.mat"], tmp_path / "a.mcap")
+    import_mat([folder / "device0.mat"], tmp_path / "a.mcap")
+    with pytest.raises(UserError, match="not of left"):
+        read_series(tmp_path / "a.mcap", ("left",))
+    with pytest.raises(UserError, match="without slices"):
+        read_series(tmp_path / "empty")

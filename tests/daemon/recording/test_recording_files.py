@@ -1,0 +1,102 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from bank.channels import line_of_channels
+from daemon.errors import UserError
+from daemon.recording import writer as writer_module
+from daemon.recording.reader import read_recording
+from daemon.recording.writer import RecordingWriter
+
+
+def written(path, n=4):
+    rng = np.random.default_rng(0)
+    frames = line_of_channels(np.round(rng.uniform(0, 1, (n, 896)), 4))
+    with RecordingWriter(path, "a bench", {"tool": "driver"}) as writer:
+        for i, line in enumerate(frames):
+            writer.frame("right", 1_700_000_000_000_000_000 + i * 540_000_000, 1_700_000_000_300_000_000 + i, line)
+            writer.torque(1_700_000_000_100_000_000 + i, 0.01 * i)
+    return frames
+
+
+def test_what_was_written_is_read(tmp_path):
+    frames = written(tmp_path / "a.mcap")
+    found = read_recording(tmp_path / "a.mcap")
+    assert found.source == "a bench"
+    assert found.notes == {"tool": "driver"}
+    np.testing.assert_array_equal(found.sides["right"].lines, frames)
+    np.testing.assert_array_equal(np.diff(found.sides["right"].t_mid_ns), 540_000_000)
+    np.testing.assert_array_equal(found.sides["right"].arrival_ns - 1_700_000_000_300_000_000, np.arange(4))
+    np.testing.assert_allclose(found.torque_nm, 0.01 * np.arange(4))
+    assert list(tmp_path.iterdir()) == [tmp_path / "a.mcap"]
+
+
+def test_messages_out_of_order_are_sorted(tmp_path):
+    with RecordingWriter(tmp_path / "a.mcap", "x") as writer:
+        for t in (3, 1, 2):
+            writer.torque(t, float(t))
+    np.testing.assert_array_equal(read_recording(tmp_path / "a.mcap").torque_nm, [1, 2, 3])
+
+
+def test_what_was_not_closed_is_kept_under_another_name(tmp_path):
+    def interrupted():
+        with RecordingWriter(tmp_path / "a.mcap", "x") as writer:
+            writer.torque(1, 1.0)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.partial"]
+    assert read_recording(tmp_path / "a.mcap.partial").torque_nm.tolist() == [1.0]
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "a.mcap"
+    written(path)
+    return path.read_bytes()
+
+
+@settings(max_examples=50, deadline=None)
+@given(where=st.floats(0, 0.9999), length=st.integers(1, 30), cut=st.booleans())
+def test_damage_is_refused_by_name(content, tmp_path_factory, where, length, cut):
+    at = int(where * len(content))
+    spoilt = bytes(255 - byte for byte in content[at : at + length])
+    path = tmp_path_factory.mktemp("damaged") / "x.mcap"
+    path.write_bytes(content[:at] if cut else content[:at] + spoilt + content[at + length :])
+    try:
+        found = read_recording(path)
+    except UserError as error:
+        told = str(error)
+    else:
+        # A byte that nothing reads, such as the library's name.
+        assert not cut
+        assert len(found.torque_nm) == 4
+        return
+    assert str(path) in told
+
+
+def test_foreign_and_stale_files_are_refused(tmp_path, monkeypatch):
+    (tmp_path / "text.mcap").write_text("hello")
+    with pytest.raises(UserError, match=r"text\.mcap: this recording cannot be used"):
+        read_recording(tmp_path / "text.mcap")
+    with (tmp_path / "other.mcap").open("wb") as file:
+        other = Writer(file)
+        other.start()
+        other.finish()
+    with pytest.raises(UserError, match="not a recording of shearloop"):
+        read_recording(tmp_path / "other.mcap")
+    with pytest.raises(UserError, match="No such file"):
+        read_recording(tmp_path / "none.mcap")
+    monkeypatch.setattr(writer_module, "CHANNEL_TABLE_HASH", "0" * 64)
+    written(tmp_path / "stale.mcap")
+    with pytest.raises(UserError, match="channel table 000000000000…"):
+        read_recording(tmp_path / "stale.mcap")
+    monkeypatch.setattr(writer_module, "FORMAT_VERSION", "99")
+    written(tmp_path / "new.mcap")
+    with pytest.raises(UserError, match="format version 99, expected 1"):
+        read_recording(tmp_path / "new.mcap")
+    with pytest.raises(UserError, match="choose another --out"):
+        RecordingWriter(tmp_path / "no" / "where.mcap", "x")

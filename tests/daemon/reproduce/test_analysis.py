@@ -1,0 +1,139 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bank.bank_file import BankDefinition
+from bank.build import RowSolver
+from bank.grouping import group_means
+from bank.matching import ReferenceMatcher, best_match
+from bank.mesh import Mesh, load_mesh
+from daemon.recordings import DiameterSlices, TorqueSlices, read_torque_slices
+from daemon.reproduce.analysis import (
+    TorqueResult,
+    analyse_diameter,
+    analyse_torque,
+    correlation,
+    score_models,
+    smoothed_along_channels,
+)
+from daemon.reproduce.banks import Grid, cached_bank
+
+
+@pytest.fixture(scope="module")
+def bank(coarse_mesh: Mesh, tmp_path_factory: pytest.TempPathFactory):
+    grid = Grid(np.linspace(2.6, 3.6, 7), np.linspace(1.0, 2.0, 8))
+    return cached_bank("small", grid, coarse_mesh, tmp_path_factory.mktemp("banks"), 1, lambda *_: None)
+
+
+def slices_of(signals: NDArray, columns: list[int], torque: list[float]) -> TorqueSlices:
+    return TorqueSlices(np.abs(signals[3, columns]).astype(float), np.array(torque), np.arange(len(columns)))
+
+
+def analysed(signals: NDArray, bank, columns: list[int], torque: list[float]) -> TorqueResult:
+    return analyse_torque(slices_of(signals, columns, torque), bank, bank, lambda _: None)
+
+
+def test_torque_is_related_to_the_sigma_of_the_best_match(signals: NDArray, bank) -> None:
+    columns = [6, 5, 3, 1, 7, 6, 4, 2, 0, 7, 6, 4, 1, 1]  # three series, the first without its lowest level
+    torque = [0.02, 0.04, 0.06, 0.08, 0.01, 0.021, 0.041, 0.061, 0.081, 0.011, 0.019, 0.039, 0.061, 0.079]
+    found = analysed(signals, bank, columns, torque)
+    sigma = bank.sigma_grid[columns]
+    assert found.focused.sigma.tolist() == sigma.tolist()
+    assert found.r_focused == found.r_wide == pytest.approx(np.corrcoef(sigma, torque)[0, 1], abs=1e-12)
+    assert found.groups.tolist() == [1, 2, 3, 4, 0, 1, 2, 3, 4, 0, 1, 2, 3, 4]
+    means = group_means(sigma, found.groups), group_means(np.array(torque), found.groups)
+    assert found.r_clustered == pytest.approx(np.corrcoef(*means)[0, 1], abs=1e-12)
+    # Leaving out each series in turn, by numpy's own fit.
+    parts = np.array([0] * 4 + [1] * 5 + [2] * 5)
+    errors = [
+        np.polyval(np.polyfit(sigma[parts != part], np.array(torque)[parts != part], 2), sigma[parts == part])
+        - np.array(torque)[parts == part]
+        for part in range(3)
+    ]
+    assert found.rmse_nm == pytest.approx(np.sqrt(np.mean(np.concatenate(errors) ** 2)), rel=1e-9)
+    assert found.grouping == "by place in 3 repeated series"
+    assert found.notes == ()
+
+
+def test_slices_that_are_no_repeats_are_grouped_by_torque(signals: NDArray, bank) -> None:
+    columns = [4, 1, 7, 2, 5, 0, 3, 6, 6, 1]
+    torque = [0.03, 0.06, 0.0, 0.05, 0.02, 0.07, 0.04, 0.01, 0.011, 0.061]
+    found = analysed(signals, bank, columns, torque)
+    assert found.grouping == "by k-means of the torques into 3 (no repeated series found)"
+    assert found.held_out == "one of 5 stretches of time left out at a time"
+    assert found.r_clustered is not None
+    assert found.r_clustered < -0.95
+    assert found.rmse_nm is not None
+    assert found.rmse_nm < 0.005
+
+
+def test_what_the_slices_do_not_determine_is_none_and_said(signals: NDArray, bank) -> None:
+    found = analysed(signals, bank, [4, 4, 4], [0.01, 0.02, 0.03])
+    assert (found.r_focused, found.r_clustered, found.fit, found.rmse_nm) == (None, None, None, None)
+    assert any("too alike for a correlation" in note for note in found.notes)
+    assert any("no fit of torque over sigma" in note for note in found.notes)
+
+
+def test_diameter_is_related_to_the_k_of_the_best_match(signals: NDArray, bank) -> None:
+    rows = [5, 5, 4, 2, 1]
+    slices = DiameterSlices(
+        np.abs(signals[rows, 4]).astype(float), np.array([10.0, 10.0, 20.0, 30.0, 30.0]), np.zeros(5)
+    )
+    found = analyse_diameter(slices, bank, lambda _: None)
+    smooth = smoothed_along_channels(slices.differences)
+    expected = [best_match(heatmap, bank.k_grid, bank.sigma_grid).k for heatmap in found.single.heatmaps]
+    assert found.single.k.tolist() == expected
+    np.testing.assert_allclose(found.single.heatmaps, ReferenceMatcher.from_bank(bank).heatmaps(smooth), atol=1e-14)
+    np.testing.assert_allclose(found.heatmaps[2], found.single.heatmaps[3:].mean(axis=0), atol=1e-14)
+    assert found.r_single is not None
+    assert found.r_single < -0.9
+    assert found.r_accumulated is not None
+    assert found.r_accumulated < -0.9
+
+
+def test_two_diameters_make_no_correlation(signals: NDArray, bank) -> None:
+    slices = DiameterSlices(np.abs(signals[[5, 1], 4]).astype(float), np.array([10.0, 30.0]), np.zeros(2))
+    found = analyse_diameter(slices, bank, lambda _: None)
+    assert (found.r_single, found.r_accumulated, found.fit) == (None, None, None)
+    assert any("2 diameters" in note for note in found.notes)
+
+
+def test_smoothing_keeps_what_is_constant_and_spreads_a_peak_over_nine_channels() -> None:
+    peak = np.zeros((2, 896))
+    peak[0] = 3.0
+    peak[1, 100] = 1.0
+    smooth = smoothed_along_channels(peak)
+    np.testing.assert_allclose(smooth[0], 3.0)
+    assert np.flatnonzero(smooth[1]).tolist() == list(range(96, 105))
+    assert smooth[1].sum() == pytest.approx(1.0)
+    assert smooth[1, 101] / smooth[1, 100] == pytest.approx(np.exp(-0.5 / 1.8**2))
+
+
+def test_a_correlation_needs_three_points_that_differ() -> None:
+    assert correlation(np.arange(3.0), -np.arange(3.0)) == pytest.approx(-1.0)
+    assert correlation(np.arange(2.0), np.arange(2.0)) is None
+    assert correlation(np.ones(5), np.arange(5.0)) is None
+
+
+def test_without_a_raw_frame_models_are_scored_by_the_matching(signals: NDArray, coarse_mesh: Mesh) -> None:
+    slices = slices_of(signals, [4, 5], [0.01, 0.02])
+    scores = score_models(slices, None, coarse_mesh)
+    assert scores.envelope is None
+    assert scores.chosen is scores.matching
+    assert max(scores.matching, key=lambda name: scores.matching[name] or 0) == "gaussian_derivative"
+    silent = score_models(slices, np.zeros(896), coarse_mesh)
+    assert set(silent.chosen.values()) == {None}
+
+
+def test_sigma_falls_with_torque_on_the_shared_slices(shared: Path) -> None:
+    mesh = load_mesh(shared / "reference" / "fingertip_mesh.npz")
+    slices = read_torque_slices(shared / "recordings" / "torque_slices")
+    k, sigma = np.linspace(3.1, 3.4, 6), np.linspace(1.2, 1.9, 15)
+    solver = RowSolver(mesh, BankDefinition(mesh.digest, "gaussian_derivative", k, sigma))
+    rows = [solver.solve(row) for row in range(len(k))]
+    matcher = ReferenceMatcher(np.stack([row.signals for row in rows]), np.stack([row.valid for row in rows]), k, sigma)
+    best = [best_match(heatmap, k, sigma).sigma for heatmap in matcher.heatmaps(slices.differences)]
+    # On the full focused grid of 100 × 100 it is −0.67487; on these 6 × 15 cells it was measured as −0.69073.
+    assert correlation(np.array(best), slices.torque_nm) == pytest.approx(-0.69073, abs=0.002)

@@ -1,0 +1,137 @@
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from scipy.io import savemat
+
+from bank.bank_file import Bank
+from bank.calibration import Calibration
+from daemon.cli import main
+from daemon.reproduce import banks
+from daemon.reproduce.report import PAPER_MODEL_SCORES
+
+pytestmark = pytest.mark.usefixtures("small_grids")
+
+KEYS = [
+    "torque_sigma_r_focused",
+    "torque_sigma_r_wide",
+    "torque_sigma_r_clustered",
+    "diameter_k_r_single",
+    "diameter_k_r_accumulated",
+    "model_scores",
+    "torque_rmse_nm_cross_validated",
+    "bank_valid_cells",
+]
+FIGURES = {"figure_5_models", "figure_7_heatmap", "figure_8_torque", "figure_9_diameter"}
+MakeRecordings = Callable[..., Path]
+
+
+def test_numbers_figures_and_calibrations_are_made(
+    make_recordings: MakeRecordings,
+    coarse_fingertip: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = tmp_path / "out"
+    command = ["reproduce", str(make_recordings()), "--out", str(out), "--mesh", str(coarse_fingertip), "--jobs", "1"]
+    assert main([*command, "--json"]) == 0
+    said = capsys.readouterr()
+    found = json.loads(said.out)
+    assert list(found) == KEYS
+    assert json.loads((out / "reproduce.json").read_text()) == found
+    assert f"mesh: {coarse_fingertip}" in said.err
+    assert found["torque_sigma_r_focused"] < -0.99
+    assert found["torque_sigma_r_clustered"] < -0.99
+    assert found["diameter_k_r_accumulated"] < -0.95
+    assert 0 < found["torque_rmse_nm_cross_validated"] < 0.01
+    assert set(found["model_scores"]) == set(PAPER_MODEL_SCORES)
+    assert found["bank_valid_cells"] == 56
+    for name in FIGURES:
+        assert (out / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert "</svg>" in (out / f"{name}.svg").read_text()
+    (focused,) = (out / "banks").glob("focused-*.bank")
+    identity = Bank.open(focused).identity
+    calibration = Calibration.load(out / "calibration_torque_focused.yaml", bank_identity=identity)
+    assert calibration.torque(1.9).value < calibration.torque(1.2).value
+
+    # A second run finds the banks and says the same as a table; a damaged bank is built anew.
+    before = focused.stat().st_mtime_ns
+    (wide,) = (out / "banks").glob("wide-*.bank")
+    wide.write_bytes(wide.read_bytes()[:-100])
+    monkeypatch.setattr("daemon.reproduce.figures.draw_all", lambda *_: [])  # they take most of the time
+    assert main(command) == 0
+    said = capsys.readouterr()
+    assert focused.stat().st_mtime_ns == before
+    assert "truncated" in said.err
+    assert f"{found['torque_sigma_r_focused']:.5f}" in said.out
+    assert "0.6552" in said.out
+    assert "grouped by place in 3 repeated series" in said.out
+
+
+@pytest.mark.parametrize("present", ["torque", "diameter"])
+def test_one_kind_of_slice_is_enough(
+    make_recordings: MakeRecordings,
+    coarse_fingertip: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    present: str,
+) -> None:
+    recordings = make_recordings(torque=present == "torque", diameter=present == "diameter", raw=False)
+    out = tmp_path / "out"
+    assert main(["reproduce", str(recordings), "--out", str(out), "--mesh", str(coarse_fingertip), "--jobs", "1"]) == 0
+    found = json.loads((out / "reproduce.json").read_text())
+    absent = "diameter" if present == "torque" else "torque"
+    assert found[f"{present}_{'sigma_r_wide' if present == 'torque' else 'k_r_single'}"] < -0.9
+    assert all(value is None for key, value in found.items() if key.startswith(absent))
+    assert (found["model_scores"]["step"] is None) == (present == "diameter")
+    printed = capsys.readouterr().out
+    assert f"nothing about {absent}" in printed
+    assert ("needs TorqueSlice.mat and TorqueSliceHom.mat" in printed) == (present == "torque")
+    drawn = {path.stem for path in out.glob("*.png")}
+    assert drawn == ({"figure_9_diameter"} if present == "diameter" else FIGURES - {"figure_9_diameter"})
+
+
+def test_the_papers_mesh_is_taken_where_it_is_beside_the_recordings(
+    make_recordings: MakeRecordings, tmp_path: Path, shared: Path
+) -> None:
+    recordings = make_recordings(diameter=False)
+    assert banks.choose_mesh(recordings, None, None).origin == f"our own grid for {banks.OWN_FINGERTIP}"
+    beside = recordings.parent / "reference" / "fingertip_mesh.npz"
+    beside.parent.mkdir()
+    shutil.copy(shared / "reference" / "fingertip_mesh.npz", beside)
+    chosen = banks.choose_mesh(recordings, None, None)
+    assert chosen.origin == f"{beside} (the paper's)"
+    assert len(chosen.mesh.triangles) == 4882
+    config = tmp_path / "bank.yaml"
+    grid = "{low: 1, high: 2, count: 2}"
+    config.write_text(f"mesh: {{file: {beside}}}\nmodel: step\nk: {grid}\nsigma: {grid}\n")
+    assert banks.choose_mesh(recordings, None, config).mesh.digest == chosen.mesh.digest
+
+
+def test_mistakes_end_in_one_sentence(
+    make_recordings: MakeRecordings, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(recordings: Path, *options: str) -> str:
+        assert main(["reproduce", str(recordings), "--out", str(tmp_path / "out"), *options]) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        assert len(said.err.strip().splitlines()) == 1
+        return said.err
+
+    assert "has neither a folder torque_slices nor a folder diameter_slices" in refused(tmp_path)
+    recordings = make_recordings(diameter=False)
+    assert "absent.npz" in refused(recordings, "--mesh", str(tmp_path / "absent.npz"))
+    assert "--jobs must be 1 or more, not 0" in refused(recordings, "--jobs", "0")
+    folder = recordings / "torque_slices"
+    for path in sorted(folder.glob("Data_Slice_*.mat"))[2:]:
+        path.unlink()
+    assert f"{folder} has 2 slices; a correlation needs at least 3" in refused(recordings)
+    savemat(folder / "Data_Slice_99.mat", {"data_diff": [[1.0, 2.0]], "torque_value": 1.0})
+    assert "Data_Slice_99.mat: expected 1 × 896 values, found 1 × 2" in refused(recordings)
+    (folder / "Data_Slice_99.mat").write_bytes(b"MATLAB 5.0 cut")
+    assert "Data_Slice_99.mat: the recording is truncated or damaged" in refused(recordings)
+    (tmp_path / "file").write_text("")
+    assert main(["reproduce", str(recordings), "--out", str(tmp_path / "file" / "out")]) == 2

@@ -1,0 +1,201 @@
+import contextlib
+import datetime
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.io import savemat
+
+from daemon.errors import UserError
+from daemon.recordings import (
+    read_diameter_slices,
+    read_line,
+    read_load_stream,
+    read_stream,
+    read_torque_slices,
+)
+
+# 2024-12-03 16:09:38 on MATLAB's count of days.
+DATENUM = 739589 + (16 * 3600 + 9 * 60 + 38) / 86400
+
+
+def stream_table(rows: int, width: int) -> np.ndarray:
+    times = DATENUM + np.arange(rows) * 0.54 / 86400
+    return np.column_stack([times, np.arange(rows * width).reshape(rows, width) / 1000.0])
+
+
+@pytest.mark.parametrize(
+    "name", ["Right_Data", "Left_Data", "plotthis1", "plotthis2", "plotthis_right", "plotthis_left"]
+)
+def test_a_stream_is_read_under_each_of_its_names(tmp_path: Path, name: str) -> None:
+    savemat(tmp_path / "device.mat", {name: stream_table(5, 1024)})
+    stream = read_stream(tmp_path / "device.mat")
+    assert stream.lines.shape == (5, 1024)
+    assert stream.lines[1, 0] == 1.024
+    first = datetime.datetime(2024, 12, 3, 16, 9, 38, tzinfo=datetime.UTC).timestamp()
+    # A datenum of this size has steps of 10 µs.
+    np.testing.assert_allclose(stream.unix_s, first + 0.54 * np.arange(5), atol=2e-5)
+
+
+@pytest.mark.parametrize("name", ["Load_Data", "plotthis3", "plotthis_truth"])
+def test_a_load_stream_is_read_with_its_glitches(tmp_path: Path, name: str) -> None:
+    table = stream_table(4, 1)
+    table[2, 1] = 3.84e7
+    savemat(tmp_path / "load.mat", {name: table})
+    load = read_load_stream(tmp_path / "load.mat")
+    assert load.torque_nm.tolist() == [0.0, 0.001, 3.84e7, 0.003]
+    assert load.unix_s.shape == (4,)
+
+
+def test_of_both_fingertips_in_one_file_one_must_be_chosen(tmp_path: Path) -> None:
+    left, right = stream_table(2, 1024), stream_table(3, 1024)
+    savemat(tmp_path / "both.mat", {"Left_Data": left, "Right_Data": right})
+    assert len(read_stream(tmp_path / "both.mat", side="left").lines) == 2
+    assert len(read_stream(tmp_path / "both.mat", side="right").lines) == 3
+    with pytest.raises(UserError, match=r"both\.mat holds Right_Data and Left_Data; say which"):
+        read_stream(tmp_path / "both.mat")
+
+
+def test_torque_slices_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    for number in (10, 2, 1, 37):
+        savemat(
+            tmp_path / f"Data_Slice_{number}.mat",
+            {"data_diff": np.full((1, 896), number), "torque_value": number / 100},
+        )
+    (tmp_path / "Data_Slice_notes.txt").write_text("not a slice")
+    slices = read_torque_slices(tmp_path)
+    assert slices.numbers.tolist() == [1, 2, 10, 37]
+    assert slices.differences[:, 5].tolist() == [1.0, 2.0, 10.0, 37.0]
+    assert slices.torque_nm.tolist() == [0.01, 0.02, 0.1, 0.37]
+
+
+def test_diameter_slices_come_by_rising_diameter(tmp_path: Path) -> None:
+    for name in ("40mm_Data_1", "9.5mm_Data_2", "9.5mm_Data_1", "100mm_Data_10"):
+        savemat(tmp_path / f"{name}.mat", {"data_diff": np.ones((896, 1)), "mean_torque": [[0.1]]})
+    slices = read_diameter_slices(tmp_path)
+    assert slices.diameter_mm.tolist() == [9.5, 9.5, 40.0, 100.0]
+    assert slices.differences.shape == (4, 896)
+    assert slices.torque_nm.tolist() == [0.1] * 4
+
+
+@pytest.mark.parametrize("name", ["clipped_data", "clipped_data_hom"])
+def test_a_raw_line_is_read(tmp_path: Path, name: str) -> None:
+    savemat(tmp_path / "line.mat", {name: np.arange(1024.0)[None]})
+    assert read_line(tmp_path / "line.mat").tolist() == list(range(1024))
+
+
+Reader = Callable[[Path], object]
+
+
+@pytest.mark.parametrize(
+    ("read", "variables", "says"),
+    [
+        (read_stream, {"other": [[1.0]]}, "holds other, expected Right_Data or plotthis2 or"),
+        (read_stream, {}, "holds no variable, expected"),
+        (read_stream, {"Right_Data": np.ones((4, 1024))}, "one time and 1024 values, found 4 × 1024"),
+        (read_stream, {"Right_Data": np.ones((0, 1025))}, "found 0 × "),
+        (read_stream, {"Right_Data": "text"}, "Right_Data is 1 × 4 text, expected a matrix"),
+        (read_stream, {"Right_Data": {"a": 1.0}}, "Right_Data is 1 × 1 struct, expected a matrix"),
+        (read_stream, {"Right_Data": np.full((2, 1025), np.nan)}, "2050 values of Right_Data are not finite"),
+        (read_stream, {"Right_Data": np.ones((2, 1025)) * 1j}, "is 2 × 1025 complex numbers"),
+        (read_load_stream, {"Load_Data": np.ones((4, 3))}, "one time and 1 value, found 4 × 3"),
+        (read_line, {"clipped_data": np.ones((1, 896))}, "expected 1 × 1024 values, found 1 × 896"),
+    ],
+)
+def test_what_is_no_such_recording_is_refused(
+    tmp_path: Path, read: Reader, variables: dict[str, object], says: str
+) -> None:
+    path = tmp_path / "device.mat"
+    savemat(path, variables)
+    with pytest.raises(UserError, match=says) as refusal:
+        read(path)
+    assert str(path) in str(refusal.value)
+
+
+def test_slices_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"has no torque slices: expected files named Data_Slice_1\.mat"):
+        read_torque_slices(tmp_path)
+    with pytest.raises(UserError, match=r"has no diameter slices: expected files named 10mm_Data_1\.mat"):
+        read_diameter_slices(tmp_path)
+    with pytest.raises(UserError, match="absent: the recordings cannot be listed: No such file"):
+        read_torque_slices(tmp_path / "absent")
+    savemat(tmp_path / "Data_Slice_1.mat", {"data_diff": np.zeros((1, 896)), "torque_value": 0.1})
+    with pytest.raises(UserError, match=r"Data_Slice_1\.mat: data_diff is zero in all channels"):
+        read_torque_slices(tmp_path)
+    savemat(tmp_path / "Data_Slice_1.mat", {"data_diff": np.ones((1, 896))})
+    with pytest.raises(UserError, match=r"Data_Slice_1\.mat holds data_diff, expected torque_value"):
+        read_torque_slices(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "is not a MATLAB file"),
+        (b"#!/bin/sh\n", "is not a MATLAB file"),
+        (b"\x89HDF\r\n\x1a\n" + bytes(600), "version 7.3; save it again with `save -v7`"),
+        (b"MATLAB 7.3 MAT-file" + bytes(600), "version 7.3; save it again with `save -v7`"),
+        (b"MATLAB 5.0 MAT-file", "truncated or damaged"),
+    ],
+)
+def test_foreign_files_are_refused(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "device.mat"
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=says):
+        read_stream(path)
+    with pytest.raises(UserError, match=r"absent\.mat: the recording cannot be read: No such file"):
+        read_stream(tmp_path / "absent.mat")
+    with pytest.raises(UserError, match="cannot be read: Is a directory"):
+        read_stream(tmp_path)
+
+
+@pytest.fixture(scope="module", params=[True, False], ids=["compressed", "plain"])
+def recording(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> bytes:
+    path = tmp_path_factory.mktemp("recording") / "Data_Slice_1.mat"
+    noise = np.random.default_rng(1).integers(0, 5, (1, 896)) * 0.00215
+    savemat(path, {"torque_value": 0.1, "data_diff": noise}, do_compression=request.param)
+    return path.read_bytes()
+
+
+def test_a_recording_cut_off_anywhere_is_refused_in_a_sentence(tmp_path: Path, recording: bytes) -> None:
+    path = tmp_path / "Data_Slice_1.mat"
+    for length in [*range(0, len(recording), 97), len(recording) - 1]:
+        path.write_bytes(recording[:length])
+        with pytest.raises(UserError, match=r"Data_Slice_1\.mat") as refusal:
+            read_torque_slices(tmp_path)
+        assert "\n" not in str(refusal.value)
+
+
+@given(data=st.data())
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_damaged_recording_is_refused_or_still_of_the_right_shape(
+    tmp_path: Path, recording: bytes, data: st.DataObject
+) -> None:
+    damaged = bytearray(recording)
+    # The head is where sizes and types stand; changing values alone would teach nothing.
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, min(len(damaged) - 1, 400)))
+        damaged[at] = data.draw(st.integers(0, 255))
+    path = tmp_path / "Data_Slice_1.mat"
+    path.write_bytes(damaged)
+    with contextlib.suppress(UserError):
+        slices = read_torque_slices(tmp_path)
+        assert slices.differences.shape == (1, 896)
+        assert np.isfinite(slices.differences).all()
+
+
+def test_the_shared_recordings_are_read(shared: Path) -> None:
+    folder = shared / "recordings"
+    torque, diameter = read_torque_slices(folder / "torque_slices"), read_diameter_slices(folder / "diameter_slices")
+    assert torque.numbers.tolist() == list(range(1, 50))
+    assert torque.torque_nm[9] == pytest.approx(0.0085, abs=5e-5)
+    assert diameter.diameter_mm.tolist() == [10.0] * 4 + [20.0] * 3 + [30.0] * 2 + [40.0] * 4
+    assert read_line(folder / "torque_slices" / "TorqueSlice.mat").max() == 0.45
+    streams = folder / "streams"
+    for name in ("2024-12-03_16-09/device1", "20241202_153632/left", "cylinders/10mm_1_right"):
+        stream = read_stream(streams / f"{name}.mat")
+        assert 0.4 < np.diff(stream.unix_s).mean() < 0.7
+        assert np.count_nonzero(stream.lines[0]) == 896
+    assert read_load_stream(streams / "glitch_20241202_173837" / "load.mat").torque_nm.max() == 38399996.0

@@ -1,0 +1,116 @@
+"""`shearloop install` and `uninstall`, on the root of another system."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from daemon.cli import main
+from daemon.service.installation import EXAMPLE, PLACES, REAL_TIME, find_program, install_steps, service_file
+
+PROGRAM = "/usr/bin/true"
+
+
+def files(root: Path) -> set[str]:
+    return {str(path.relative_to(root)) for path in root.rglob("*") if path.is_file()}
+
+
+def place(root: Path, command: str, *options: str) -> int:
+    program = ["--program", PROGRAM] if command == "install" else []
+    return main([command, "--root", str(root), *program, *options])
+
+
+def without_the_users_tables(names: set[str]) -> set[str]:
+    tables = ("etc/passwd", "etc/group", "etc/shadow", "etc/gshadow", "etc/.pwd.lock", "etc/subuid", "etc/subgid")
+    return {name for name in names if not name.startswith(tables)}
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="making a user and folders of his needs root")
+def test_all_is_put_in_place_and_taken_away_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert place(tmp_path, "install") == 0
+    said = capsys.readouterr().out
+    assert without_the_users_tables(files(tmp_path)) == {*PLACES.values(), EXAMPLE}
+    for name in PLACES.values():
+        assert f"write {tmp_path / name}" in said
+    assert "shearloop:x:" in (tmp_path / "etc/passwd").read_text()
+    recordings = (tmp_path / "var/lib/shearloop/recordings").stat()
+    assert recordings.st_mode & 0o777 == 0o750
+    assert f"shearloop:x:{recordings.st_uid}:" in (tmp_path / "etc/passwd").read_text()
+    assert (tmp_path / "etc/shearloop/keys/clients").is_dir()
+
+    assert place(tmp_path, "install") == 0
+    assert capsys.readouterr().out.count("left as it is") == len(PLACES) + 1
+
+    assert place(tmp_path, "uninstall") == 0
+    assert without_the_users_tables(files(tmp_path)) == set()
+    assert not (tmp_path / "etc/shearloop").exists()
+    assert "shearloop" not in (tmp_path / "etc/passwd").read_text()
+    assert (tmp_path / "var/lib/shearloop/banks").is_dir(), "the user's work stays"
+    assert place(tmp_path, "uninstall") == 0, "nothing to do is no failure"
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="making a user and folders of his needs root")
+def test_what_was_edited_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert place(tmp_path, "install", "--real-time") == 0
+    assert (tmp_path / REAL_TIME).read_text() == service_file("realtime.conf")
+    edited = tmp_path / EXAMPLE
+    edited.write_text("fingertips: {}\n")
+    key = tmp_path / "etc/shearloop/keys/server.key_secret"
+    key.write_text("secret")
+    assert place(tmp_path, "install") == 0
+    assert not (tmp_path / REAL_TIME).parent.exists(), "real-time options go when they are not asked for"
+    assert place(tmp_path, "uninstall") == 0
+    assert f"left, having been edited: {edited}" in capsys.readouterr().out
+    assert edited.read_text() == "fingertips: {}\n"
+    assert key.exists()
+
+
+@pytest.mark.parametrize("command", ["install", "uninstall"])
+def test_a_dry_run_says_everything_and_does_nothing(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = tmp_path / PLACES["shearloop.service"]
+    kept.parent.mkdir(parents=True)
+    kept.write_text("something else")
+    assert place(tmp_path, command, "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert f"would {'replace' if command == 'install' else 'remove'} {kept}" in said
+    assert "would run `" in said
+    assert files(tmp_path) == {PLACES["shearloop.service"]}
+    assert kept.read_text() == "something else"
+
+
+def test_a_running_system_is_told(tmp_path: Path) -> None:
+    told = [step.sentence() for step in install_steps(tmp_path, Path(PROGRAM), real_time=False, running=True)]
+    for command in ("udevadm control --reload", "udevadm trigger --subsystem-match=tty", "systemctl daemon-reload"):
+        assert any(f"run `{command}`" in sentence for sentence in told)
+
+
+def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(arguments) == 2
+    return capsys.readouterr().err
+
+
+def test_mistakes_are_sentences(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "is not a file" in mistake(capsys, "install", "--root", str(tmp_path), "--program", "no/such/shearloop")
+    monkeypatch.setenv("PATH", "")
+    said = mistake(capsys, "install", "--root", str(tmp_path), "--program", PROGRAM)
+    assert "there is no program systemd-sysusers on this system" in said
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    assert "run it with sudo" in mistake(capsys, "uninstall")
+
+
+def test_a_program_that_the_service_cannot_see_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.executable", str(tmp_path / "bin/python3"))
+    assert "there is no program" in mistake(capsys, "install", "--dry-run")
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin/shearloop").touch()
+    monkeypatch.setattr("daemon.service.installation._HIDDEN", (str(tmp_path),))
+    said = mistake(capsys, "install", "--dry-run")
+    assert f"lies in {tmp_path}, which the service is not allowed to see" in said
+    monkeypatch.setattr("daemon.service.installation._HIDDEN", ("/nowhere",))
+    assert find_program() == tmp_path / "bin/shearloop"

@@ -1,0 +1,123 @@
+import asyncio
+import ctypes
+import resource
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq
+
+from daemon import health
+from daemon.clock import Clock
+from daemon.errors import UserError
+from daemon.publisher import Publisher
+from daemon.sd_notify import notify
+from daemon.service.locked_memory import lock_memory
+from daemon.supervisor import Supervisor, TaskRecord
+from tests.daemon.conftest import DEADLINE_S, shearloop
+
+
+@pytest.fixture
+def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """What systemd listens with."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
+        listening.bind(str(tmp_path / "notify"))
+        listening.settimeout(DEADLINE_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        yield listening
+
+
+def test_nobody_is_told_where_nobody_listens(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
+    assert not notify("READY=1")
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
+    assert not notify("READY=1")
+
+
+def test_states_arrive_at_a_path_and_at_an_abstract_address(
+    manager: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert notify("READY=1", "STATUS=well")
+    assert manager.recv(4096) == b"READY=1\nSTATUS=well"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as abstract:
+        # The kernel chooses a free abstract name.
+        abstract.bind("")
+        abstract.settimeout(DEADLINE_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", "@" + abstract.getsockname()[1:].decode())
+        assert notify("WATCHDOG=1")
+        assert abstract.recv(4096) == b"WATCHDOG=1"
+
+
+def test_a_manager_that_does_not_read_keeps_nobody_waiting(manager: socket.socket) -> None:
+    # The kernel queues a few datagrams; the daemon must not wait for room.
+    assert not all(notify("WATCHDOG=1") for _ in range(2000))
+    assert manager.recv(4096) == b"WATCHDOG=1"
+
+
+async def test_the_daemon_says_when_it_is_ready_that_it_lives_and_that_it_ends(
+    manager: socket.socket, config: Callable[..., Path]
+) -> None:
+    async with shearloop("run", str(config())) as daemon:
+        assert await asyncio.to_thread(manager.recv, 4096) == b"READY=1"
+        said = await asyncio.to_thread(manager.recv, 4096)
+        assert said.startswith(b"WATCHDOG=1\nSTATUS=4 tasks are alive")
+        daemon.send_signal(signal.SIGTERM)
+        assert await daemon.wait() == 0
+    while said != b"STOPPING=1":
+        said = manager.recv(4096)
+
+
+async def test_the_watchdog_is_fed_only_while_every_task_is_alive(
+    manager: socket.socket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(health, "HEALTH_PERIOD_S", 0.0)
+    supervisor = Supervisor(
+        {"right": TaskRecord("right", alive=True), "experiment": TaskRecord("experiment", done=True)}
+    )
+    with zmq.Context() as context:
+        publisher = Publisher(context, f"ipc://{tmp_path}/publish", Clock())
+        reporter = health.HealthReporter(publisher, supervisor, Clock())
+        running = asyncio.create_task(reporter.run())
+        said = await asyncio.to_thread(manager.recv, 4096)
+        assert said == b"WATCHDOG=1\nSTATUS=2 tasks are alive", "an experiment that has ended is not dead"
+        supervisor.records["right"].alive = False
+        while said.startswith(b"WATCHDOG=1"):
+            said = await asyncio.to_thread(manager.recv, 4096)
+        assert said == b"STATUS=dead, to be started again: right"
+        assert await asyncio.to_thread(manager.recv, 4096) == said, "and it stays hungry"
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        publisher.close()
+
+
+async def test_a_task_that_ends_by_itself_is_not_dead() -> None:
+    supervisor = Supervisor()
+
+    async def ends() -> None:
+        assert supervisor.dead == ()
+
+    await supervisor.keep_running("experiment", ends)
+    assert supervisor.dead == ()
+    supervisor.records["other"] = TaskRecord("other")
+    assert supervisor.dead == ("other",)
+
+
+def test_memory_that_may_not_be_locked_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (8 << 20, 8 << 20))
+    with pytest.raises(UserError, match="needs an unlimited RLIMIT_MEMLOCK, and it is 8192 kB: run `sudo shearloop"):
+        lock_memory()
+
+    class Libc:
+        @staticmethod
+        def mlockall(flags: int) -> int:
+            assert flags == 3
+            ctypes.set_errno(1)
+            return -1
+
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
+    with pytest.raises(UserError, match="refused by the system"):
+        lock_memory()

@@ -1,0 +1,150 @@
+"""The files of the service, held against systemd's own tools and a small reading of udev's rules."""
+
+import re
+import subprocess
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from daemon.config import load_daemon_config
+from daemon.service.installation import PLACES, UNIT, hidden_folder, service_file, unit_for
+
+ROOT = Path(__file__).resolve().parents[3]
+# Any program will do for systemd to look at; that the service may see ours is find_program's business.
+PROGRAM = Path("/usr/bin/true")
+
+
+def analyze(*arguments: str) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(["systemd-analyze", *arguments], capture_output=True, text=True, check=False)
+    except FileNotFoundError:
+        pytest.skip("systemd-analyze is not on this machine; `make system-packages` installs it")
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "real-time"])
+def unit(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("unit") / UNIT
+    path.write_text(unit_for(PROGRAM))
+    if request.param:
+        drop_in = path.with_name(f"{UNIT}.d") / "realtime.conf"
+        drop_in.parent.mkdir()
+        drop_in.write_text(service_file("realtime.conf"))
+    return path
+
+
+def test_the_unit_runs_the_program_given(unit: Path) -> None:
+    assert f"ExecStart={PROGRAM} run /etc/shearloop/shearloop.yaml\n" in unit.read_text()
+
+
+def test_systemd_has_nothing_to_say_of_the_unit(unit: Path) -> None:
+    done = analyze("verify", str(unit))
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_systemd_says_of_a_wrong_unit_what_is_wrong(tmp_path: Path) -> None:
+    path = tmp_path / UNIT
+    path.write_text(unit_for(PROGRAM).replace("WatchdogSec=15", "WatchdogSec=often"))
+    assert "Failed to parse sec value" in analyze("verify", str(path)).stderr
+
+
+def test_the_service_is_exposed_at_most_2_of_10(unit: Path) -> None:
+    done = analyze("security", "--offline=true", "--threshold=20", "--no-pager", str(unit))
+    assert done.returncode == 0, done.stdout
+    exposure = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
+    assert exposure is not None
+    assert float(exposure[1]) <= 2.0
+
+
+def test_the_example_is_a_configuration(tmp_path: Path) -> None:
+    path = tmp_path / "shearloop.yaml"
+    path.write_text(service_file("shearloop.yaml"))
+    assert load_daemon_config(path).fingertips["right"].device.serial_number
+
+
+def test_folders_hidden_by_the_unit_are_known() -> None:
+    assert "ProtectHome=yes" in service_file(UNIT)
+    assert "PrivateTmp=yes" in service_file(UNIT)
+    for path, folder in (("/home/ada/venv/bin/shearloop", "/home"), ("/root/x", "/root"), ("/tmp/x", "/tmp")):
+        assert hidden_folder(Path(path)) == folder
+    assert hidden_folder(Path("/opt/shearloop/bin/shearloop")) == ""
+
+
+def test_a_wheel_carries_every_file_of_the_service(tmp_path: Path) -> None:
+    build = "from setuptools import build_meta; import sys; print(build_meta.build_wheel(sys.argv[1]))"
+    source = tmp_path / "source"
+    source.mkdir()
+    # From a copy: building writes beside the sources.
+    subprocess.run(
+        ["sh", "-c", f"git ls-files -z -co --exclude-standard | tar cf - --null -T - | tar xf - -C {source}"],
+        cwd=ROOT,
+        check=True,
+    )
+    subprocess.run(["python", "-c", build, str(tmp_path)], cwd=source, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        for name in (*PLACES, "realtime.conf", "shearloop.yaml"):
+            assert archive.read(f"daemon/service_files/{name}").decode() == service_file(name)
+
+
+# ---- udev ---------------------------------------------------------------------------------------------------------
+
+_TERM = re.compile(r'([A-Z]+(?:\{\w+\})?)(==|!=|\+=|=)"([^"]*)"(?:, |$)')
+
+
+def applied(rules: str, device: dict[str, str]) -> dict[str, str]:
+    """Return what udev(7) would assign to a device: matches, GOTO and LABEL, and plain assignments."""
+    given: dict[str, str] = {}
+    wanted = ""
+    for line in rules.splitlines():
+        if not line or line.startswith("#"):
+            continue
+        terms = _TERM.findall(line)
+        assert "".join(f'{key}{sign}"{value}", ' for key, sign, value in terms).removesuffix(", ") == line
+        if wanted:
+            wanted = "" if ("LABEL", "=", wanted) in terms else wanted
+            if wanted:
+                continue
+        matches = [(key, sign, value) for key, sign, value in terms if sign in ("==", "!=")]
+        if all((device.get(key, "") in value.split("|")) == (sign == "==") for key, sign, value in matches):
+            for key, sign, value in terms:
+                if key == "GOTO":
+                    wanted = value
+                elif sign in ("=", "+=") and key != "LABEL":
+                    given[key] = value.replace("$env{ID_SERIAL_SHORT}", device.get("ENV{ID_SERIAL_SHORT}", ""))
+    assert not wanted, f"there is no LABEL {wanted}"
+    return given
+
+
+TEENSY = {
+    "ACTION": "add",
+    "SUBSYSTEM": "tty",
+    "ENV{ID_BUS}": "usb",
+    "ENV{ID_VENDOR_ID}": "16c0",
+    "ENV{ID_SERIAL_SHORT}": "12345670",
+}
+
+
+@pytest.mark.parametrize("vendor", ["16c0", "2341", "2a03", "1a86", "0403"])
+def test_a_board_is_named_by_its_serial_number_and_given_to_the_service(vendor: str) -> None:
+    given = applied(service_file("60-shearloop.rules"), {**TEENSY, "ENV{ID_VENDOR_ID}": vendor})
+    assert given == {
+        "GROUP": "shearloop",
+        "MODE": "0660",
+        "SYMLINK": "shearloop/12345670",
+        "ENV{ID_MM_DEVICE_IGNORE}": "1",
+    }
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"ACTION": "remove"},
+        {"SUBSYSTEM": "block"},
+        {"ENV{ID_BUS}": "pci"},
+        {"ENV{ID_VENDOR_ID}": "046d"},
+        {"ENV{ID_SERIAL_SHORT}": ""},
+    ],
+)
+def test_what_is_no_board_is_left_alone(other: dict[str, str]) -> None:
+    assert applied(service_file("60-shearloop.rules"), {**TEENSY, **other}) == {}

@@ -1,0 +1,272 @@
+"""The daemon: wires devices, estimators and sockets together and runs until it is told to stop."""
+
+import asyncio
+import contextlib
+import signal
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import structlog
+import zmq
+import zmq.asyncio
+
+from bank.bank_file import Bank
+from bank.calibration import Calibration
+from bank.channels import ZERO_SLOTS
+from bank.matching import ReferenceMatcher, ZeroLagMatcher
+from daemon import sd_notify
+from daemon.clock import Clock
+from daemon.command_server import CommandRefusedError, CommandServer, Handler, Reply
+from daemon.config import DaemonConfig, Fingertip
+from daemon.errors import UserError
+from daemon.estimator import LONGEST_GAP_NS, Estimator
+from daemon.fingertip import FingertipTask
+from daemon.health import HealthReporter
+from daemon.links import log_link
+from daemon.loop.senses import Source
+from daemon.publisher import Listener, Publisher
+from daemon.rig import Rig
+from daemon.skin_setup import make_skin, skin_source
+from daemon.skin_task import SKIN, SkinTask
+from daemon.supervisor import Supervisor
+from daemon.topics import STALE_AFTER_PERIODS
+from drivers.eit_kit import EitKit
+
+# How often a start that was refused is tried again, and an end looked for.
+START_RETRY_S = 0.5
+_MATCHERS = {"all_lags": ReferenceMatcher, "zero_lag": ZeroLagMatcher}
+
+
+def open_estimator(config: Fingertip) -> Estimator:
+    """Return the estimator of one fingertip; raises BankError when a file is missing, damaged or does not fit."""
+    bank = Bank.open(config.bank)
+    calibration = None
+    if config.calibration is not None:
+        calibration = Calibration.load(config.calibration, bank_identity=bank.identity)
+    matcher = _MATCHERS[config.matching].from_bank(bank)
+    return Estimator(
+        matcher,
+        calibration,
+        baseline_frames=config.baseline_frames,
+        average_frames=config.average_frames,
+        longest_gap_ns=max(LONGEST_GAP_NS, round(STALE_AFTER_PERIODS * config.frame_period_s * 1e9)),
+    )
+
+
+class Daemon:
+    """All parts of one running daemon."""
+
+    def __init__(self, config: DaemonConfig, context: zmq.asyncio.Context) -> None:
+        """Open every file that the configuration names and bind the sockets; devices may come later."""
+        self._clock = Clock()
+        self.supervisor = Supervisor()
+        self._stop = asyncio.Event()
+        estimators = {name: open_estimator(fingertip) for name, fingertip in config.fingertips.items()}
+        with contextlib.ExitStack() as opened:
+            self.publisher = Publisher(context, config.publish, self._clock)
+            opened.callback(self.publisher.close)
+            self._commands = CommandServer(context, config.commands, self._handlers())
+            opened.callback(self._commands.close)
+            self._close = opened.pop_all().close
+        self._rig: Rig | None = None
+        try:
+            if config.robot is not None:
+                self._rig = Rig(config, self.publisher, self._clock, _sources(config), self._tare_to_the_end)
+            hear = self._rig.brain.hear if self._rig is not None else lambda _: None
+            self._skin: SkinTask | None = None
+            if config.skin is not None:
+                self._skin = make_skin(config.skin, self.publisher, self._clock, hear)
+        except BaseException:
+            self._close()
+            raise
+        self._fingertips = {
+            name: FingertipTask(
+                name, _board(name, config.fingertips[name]), estimator, self.publisher, self._clock, hear
+            )
+            for name, estimator in estimators.items()
+        }
+        self._config = config
+        self._health = HealthReporter(self.publisher, self.supervisor, self._clock)
+        for name, task in self._fingertips.items():
+            self._health.add(name, task.facts)
+        if self._skin is not None:
+            self._health.add(SKIN, self._skin.facts)
+            self._health.add(f"{SKIN}.source", self._skin.source_facts)
+        if self._rig is not None:
+            self._health.add("robot", self._rig.loop.facts)
+            if self._rig.load_cell is not None:
+                self._health.add("load_cell", self._rig.load_cell.facts)
+            if self._rig.gripper is not None:
+                self._health.add("gripper", self._rig.gripper.facts)
+        self._health.add("commands", lambda: {"errors": dict(self._commands.refused)})
+
+    async def run(self) -> None:
+        """Run until `stop` is called, then end every task and close the sockets."""
+        try:
+            async with asyncio.TaskGroup() as group:
+                running = [group.create_task(task, name=name) for name, task in self._tasks()]
+                structlog.get_logger().info("running", fingertips=list(self._fingertips))
+                sd_notify.notify("READY=1")
+                await self._stop.wait()
+                sd_notify.notify("STOPPING=1")
+                for task in running:
+                    task.cancel()
+        finally:
+            self._close()
+        structlog.get_logger().info("stopped")
+
+    def stop(self) -> None:
+        """End `run` as soon as the tasks have ended."""
+        self._stop.set()
+
+    async def stopped(self) -> None:
+        """Wait until somebody has asked for the end."""
+        await self._stop.wait()
+
+    def _tasks(self) -> Iterator[tuple[str, Any]]:
+        def supervised(name: str, run: Callable[[], Any]) -> tuple[str, Any]:
+            return name, self.supervisor.keep_running(name, run)
+
+        for name, task in self._fingertips.items():
+            yield supervised(name, task.read)
+            yield supervised(f"{name}.estimator", task.estimate)
+        if self._skin is not None:
+            yield supervised(SKIN, self._skin.read)
+            yield supervised(f"{SKIN}.source", self._skin.watch_source)
+        if self._rig is not None:
+            for name, run in self._rig.tasks():
+                yield supervised(name, run)
+            if self._config.experiment is not None:
+                yield supervised("experiment", self._run_experiment)
+        yield supervised("commands", self._commands.run)
+        yield supervised("health", self._health.run)
+
+    async def _run_experiment(self) -> None:
+        """Start the configured experiment as soon as it can be started, and see it to its end."""
+        rig, path = self._rig, self._config.experiment
+        if rig is None or path is None:
+            return
+        log, told = structlog.get_logger().bind(experiment=str(path)), ""
+        while (why := await rig.start(path)) is not None:
+            if why != told:
+                log.info("waiting to start", why=why)
+                told = why
+            await asyncio.sleep(START_RETRY_S)
+        experiment = await rig.loop.ended()
+        log.info("the experiment has ended", phase=experiment.phase.value, why=experiment.why)
+        if self._config.stop_when_done:
+            self.stop()
+
+    def _handlers(self) -> Mapping[str, Handler]:
+        return {
+            "tare": self._tare,
+            "status": self._status,
+            "stop": self._stop_wanted,
+            "start": self._start,
+            "pause": self._pause,
+            "resume": self._resume,
+            "unlock": self._unlock,
+        }
+
+    async def _tare_to_the_end(self) -> str:
+        tares = [task.tare_to_the_end() for task in self._fingertips.values()]
+        if self._skin is not None:
+            tares.append(self._skin.zero())
+        return " ".join(filter(None, await asyncio.gather(*tares)))
+
+    @property
+    def _needed_rig(self) -> Rig:
+        if self._rig is None:
+            raise CommandRefusedError("the configuration has no robot; add `robot: ur.yaml` to it")
+        return self._rig
+
+    async def _start(self, request: Mapping[str, Any]) -> Reply:
+        path = request.get("experiment") or self._config.experiment
+        if not isinstance(path, str | Path):
+            raise CommandRefusedError("which experiment? Give its file, or name one in the configuration")
+        rig = self._needed_rig
+        try:
+            why = await rig.start(Path(path))
+        except UserError as error:
+            raise CommandRefusedError(str(error)) from error
+        _refuse(why)
+        return {"experiment": str(path)}
+
+    async def _pause(self, _request: Mapping[str, Any]) -> Reply:
+        _refuse(self._needed_rig.brain.pause())
+        return {}
+
+    async def _resume(self, _request: Mapping[str, Any]) -> Reply:
+        _refuse(self._needed_rig.brain.resume())
+        return {}
+
+    async def _unlock(self, _request: Mapping[str, Any]) -> Reply:
+        _refuse(await self._needed_rig.loop.unlock())
+        return {}
+
+    async def _tare(self, request: Mapping[str, Any]) -> Reply:
+        tares: dict[str, Callable[[], None]] = {name: task.tare for name, task in self._fingertips.items()}
+        if self._skin is not None:
+            tares[SKIN] = self._skin.tare
+        source = request.get("source")
+        if source is not None and not (isinstance(source, str) and source in tares):
+            raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(tares)}")
+        tared = [source] if source is not None else list(tares)
+        for name in tared:
+            tares[name]()
+        return {"tared": tared}
+
+    async def _status(self, _request: Mapping[str, Any]) -> Reply:
+        return {"tasks": self._health.tasks()}
+
+    async def _stop_wanted(self, _request: Mapping[str, Any]) -> Reply:
+        experiment = self._rig.brain.experiment if self._rig is not None else None
+        if self._rig is not None and experiment is not None and experiment.running:
+            self._rig.brain.stop("the operator said stop")
+            return {"stopped": experiment.file.name}
+        # Nothing moves: the daemon itself is what stops, once the reply is out.
+        asyncio.get_running_loop().call_later(0.05, self.stop)
+        return {}
+
+
+def _refuse(why: str | None) -> None:
+    if why:
+        raise CommandRefusedError(why)
+
+
+def _sources(config: DaemonConfig) -> dict[str, Source]:
+    """Return how often each sensor's torque comes; the mean of several frames speaks of a longer time."""
+    sources = {
+        name: Source(name=name, period_s=own.frame_period_s, window_s=own.frame_period_s * own.average_frames)
+        for name, own in config.fingertips.items()
+    }
+    skin = skin_source(config.skin) if config.skin is not None else None
+    return sources if skin is None else {**sources, skin.name: skin}
+
+
+def _board(name: str, config: Fingertip) -> EitKit:
+    return EitKit(
+        path=config.device.path,
+        serial_number=config.device.serial_number,
+        zero_slots=ZERO_SLOTS,
+        frame_period_s=config.frame_period_s,
+        on_event=partial(log_link, name),
+    )
+
+
+async def run_daemon(config: DaemonConfig, listeners: tuple[Listener, ...] = ()) -> None:
+    """Run a daemon until SIGINT, SIGTERM or the command `stop`."""
+    loop = asyncio.get_running_loop()
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(config, context)
+        for listener in listeners:
+            daemon.publisher.listen(listener)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, daemon.stop)
+        try:
+            await daemon.run()
+        finally:
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.remove_signal_handler(number)

@@ -1,0 +1,155 @@
+"""The pictures of a bank: its signals over the grid, and what the five basis models do to conductivity and signals."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from bank.channels import N_CHANNELS
+from bank.forward import ForwardModel
+from bank.mesh import Mesh
+from bank.models import MODELS, conductivity
+
+_PANELS = 10
+_BLUE, _GREY = "#1f5f99", "#8a8a8a"
+
+
+class SignalGrid(NamedTuple):
+    """Signals to draw: of K values of k and S of σ, (K, S, 896), drawn where valid (K, S)."""
+
+    model: str
+    k: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    signals: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+
+
+def spread(count: int) -> NDArray[np.int64]:
+    """Return up to ten places, evenly spread over `count`, first and last included."""
+    return np.unique(np.rint(np.linspace(0, count - 1, min(_PANELS, count))).astype(np.int64))
+
+
+def signal_figure(grid: SignalGrid) -> Figure:
+    """Draw every signal of a small grid in a panel of its own, as figure 6 of Trehan et al. 2025 does.
+
+    Every panel has a scale of its own (signals differ by a hundred times in size); the peak is written into it.
+    """
+    model = MODELS[grid.model]
+    rows, columns = len(grid.sigma), len(grid.k)
+    figure = _figure(1.35 * columns + 1.2, 0.85 * rows + 1.4)
+    axes = figure.subplots(rows, columns, squeeze=False, gridspec_kw={"wspace": 0.08, "hspace": 0.12})
+    for row, s in enumerate(reversed(range(rows))):
+        for column in range(columns):
+            panel = axes[row, column]
+            panel.set_xticks([])
+            panel.set_yticks([])
+            if grid.valid[column, s]:
+                signal = grid.signals[column, s]
+                peak = float(np.abs(signal).max())
+                panel.plot(signal / peak, color=_BLUE, linewidth=0.35)
+                panel.set_ylim(-1.15, 1.6)
+                panel.text(0.97, 0.95, f"{peak:.2g}", transform=panel.transAxes, ha="right", va="top", fontsize=6)
+            else:
+                panel.set_facecolor("#eeeeee")
+                panel.text(0.5, 0.5, "not valid", transform=panel.transAxes, ha="center", va="center", fontsize=6)
+            if row == rows - 1:
+                panel.set_xlabel(f"{grid.k[column]:.3g}", fontsize=8)
+            if column == 0:
+                panel.set_ylabel(f"{grid.sigma[s]:.3g}", fontsize=8, rotation=0, ha="right", va="center")
+    figure.supxlabel(f"k ({model.k_unit})", fontsize=10)
+    figure.supylabel(f"σ ({model.sigma_unit})", fontsize=10)
+    figure.suptitle(
+        f"Signals of the model “{model.title}”: v(k, σ) − v(homogeneous) over 896 channels, each panel scaled to "
+        "its peak (model's voltage, upper right)",
+        fontsize=10,
+    )
+    return figure
+
+
+class _Example(NamedTuple):
+    name: str
+    k: float
+    sigma: float
+
+
+def _examples(height: float) -> list[_Example]:
+    """Return parameters that show each model's shape with a conductivity positive everywhere, for any height."""
+    return [
+        _Example("step", height / 2, height),
+        _Example("linear", height / 2, 1.1 * height),
+        _Example("cut_linear", 0.65 * height, 0.7 * height),
+        # Its largest fall is e^(-1/2)/σ, with σ in cm: that sets the least σ, not the height.
+        _Example("gaussian_derivative", height / 2, max(0.9, 0.2 * height)),
+        _Example("modulated_gaussian", 3.0, 0.25 * height),
+    ]
+
+
+def models_figure(mesh: Mesh) -> Figure:
+    """Draw basis function, conductivity and signal of the five models, as figure 4 of Trehan et al. 2025 does."""
+    forward = ForwardModel(mesh)
+    homogeneous = forward.homogeneous()
+    low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)
+    y = np.linspace(low[1], high[1], 400)
+    centre = float(low[1] + high[1]) / 2
+    examples = _examples(mesh.height_cm)
+    figure = _figure(13.5, 2.25 * len(examples) + 0.9)
+    axes = figure.subplots(len(examples), 3, gridspec_kw={"width_ratios": [1.1, 1.5, 3]})
+    norm = TwoSlopeNorm(1.0, 0.0, 2.0)
+    for (curve, plane, signal), example in zip(axes, examples, strict=True):
+        basis = MODELS[example.name]
+        values = conductivity(mesh, example.name, example.k, example.sigma)
+        curve.plot(basis.function(y, example.k, example.sigma, centre), y, color=_BLUE)
+        curve.axvline(0, color=_GREY, linewidth=0.6)
+        curve.set(xlim=(-1.1, 1.1), ylim=(low[1], high[1]), ylabel="y (cm)")
+        parameters = [f"k = {example.k:.3g} {basis.k_unit}"]
+        if basis.sigma_unit != "not used":
+            parameters.append(f"σ = {example.sigma:.3g} {basis.sigma_unit}")
+        curve.set_title(f"{basis.title}: {', '.join(parameters)}", fontsize=9, loc="left")
+        drawn = plane.tripcolor(
+            *mesh.nodes.T, mesh.triangles, facecolors=values, cmap="RdBu_r", norm=norm, rasterized=True
+        )
+        for edge in mesh.electrode_edges:
+            plane.plot(*mesh.nodes[edge].T, color="black", linewidth=2.5, solid_capstyle="butt", clip_on=False)
+        plane.set(aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]), ylabel="y (cm)")
+        figure.colorbar(drawn, ax=plane, label="conductivity\n(homogeneous = 1)", ticks=[0, 0.5, 1, 1.5, 2])
+        signal.plot(forward.voltages(values) - homogeneous, color=_BLUE, linewidth=0.5)
+        signal.set(xlim=(0, N_CHANNELS), ylabel="v − v(homog.)\n(model's voltage)")
+    axes[-1, 0].set_xlabel("basis function f")
+    axes[-1, 1].set_xlabel("x (cm)")
+    axes[-1, 2].set_xlabel("channel")
+    figure.suptitle(
+        "The five basis models: f, conductivity 1 + f with the electrodes, and the signal it makes", fontsize=11
+    )
+    return figure
+
+
+def save_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
+    """Write a figure as PNG and as SVG and return the paths; raises OSError."""
+    directory.mkdir(parents=True, exist_ok=True)
+    paths = [directory / f"{name}.png", directory / f"{name}.svg"]
+    for path in paths:
+        figure.savefig(path, dpi=150)
+    return paths
+
+
+def solved_grid(mesh: Mesh, model: str, k: NDArray[np.float64], sigma: NDArray[np.float64]) -> SignalGrid:
+    """Solve the cells of a small grid of (K,) k and (S,) σ for drawing."""
+    from bank.bank_file import BankDefinition
+    from bank.build import RowSolver
+
+    solver = RowSolver(mesh, BankDefinition(mesh.digest, model, k, sigma))
+    rows = [solver.solve(row) for row in range(len(k))]
+    return SignalGrid(
+        model, k, sigma, np.stack([cells.signals for cells in rows]), np.stack([cells.valid for cells in rows])
+    )
+
+
+def _figure(width: float, height: float) -> Figure:
+    """Return an empty figure in inches, drawn without any window or global state."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure

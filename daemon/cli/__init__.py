@@ -1,0 +1,106 @@
+"""The command line, `shearloop COMMAND …`.
+
+A command is a module with `configure(parser)` and `run(args) -> exit status`; one that leaves words out where they are
+plain adds them in `spelled_out(arguments)`. Modules are imported only when
+their command is asked for, and import what is heavy only when they run, so that help and errors come at once.
+"""
+
+import argparse
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+# Many small solves and products: a BLAS that spreads each over all cores is slower. Before numpy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+class Command(NamedTuple):
+    """Where a command lives and what the overview says of it."""
+
+    module: str
+    summary: str
+
+
+COMMANDS = {
+    "run": Command("daemon.cli.run", "run the daemon that a configuration describes"),
+    "import": Command("daemon.cli.import_", "bring the paper's MATLAB streams into a recording"),
+    "evaluate": Command("daemon.cli.evaluate", "judge a calibrated estimator on recordings or slices"),
+    "check": Command("daemon.cli.check", "say whether a configuration and the files it names are in order"),
+    "listen": Command("daemon.cli.listen", "print what a running daemon publishes"),
+    "command": Command("daemon.cli.command", "ask a running daemon to tare, to tell its status, or to stop"),
+    "calibrate": Command("daemon.cli.calibrate", "calibrate the load cell or the gripper, step by step"),
+    "emulate": Command("daemon.cli.emulate", "play a device, byte for byte, on a port of its own"),
+    "bank": Command("daemon.cli.bank", "solve, build, inspect and draw banks of simulated signals"),
+    "install": Command("daemon.cli.install", "make the daemon a service of this computer"),
+    "uninstall": Command("daemon.cli.uninstall", "take the service away again"),
+    "skin": Command("daemon.cli.skin", "hold the shear skin's models against its paper, and calibrate a skin"),
+    "reproduce": Command("daemon.cli.reproduce", "compute the paper's numbers and figures anew from recorded slices"),
+}
+
+EXIT_OK, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
+
+
+class CommandModule(Protocol):
+    """What a command's module provides."""
+
+    def configure(self, parser: argparse.ArgumentParser) -> None:
+        """Add the command's arguments to its parser."""
+
+    def run(self, args: argparse.Namespace) -> int:
+        """Carry the command out and return the exit status."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; a mistake of the user ends in one sentence on stderr and exit status 2."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    overview = _overview()
+    known = overview.parse_args(arguments[:1])
+    command = COMMANDS[known.command]
+    module: CommandModule = importlib.import_module(command.module)
+    parser = argparse.ArgumentParser(prog=f"shearloop {known.command}", description=command.summary)
+    module.configure(parser)
+    spelled_out = getattr(module, "spelled_out", list)
+    args = parser.parse_args(spelled_out(arguments[1:]))
+    try:
+        return module.run(args)
+    except _user_errors() as error:
+        print(f"shearloop {known.command}: {error}", file=sys.stderr)
+        return EXIT_USAGE
+    except BrokenPipeError:
+        # The reader of our output (`| head`) has gone; that is no error.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_OK
+    except KeyboardInterrupt:
+        return 130
+
+
+def _user_errors() -> tuple[type[Exception], ...]:
+    from bank.errors import BankError
+    from daemon.errors import UserError
+    from drivers.errors import DriverError
+
+    return (BankError, DriverError, UserError)
+
+
+def _overview() -> argparse.ArgumentParser:
+    width = max(map(len, COMMANDS))
+    listing = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items())
+    parser = argparse.ArgumentParser(
+        prog="shearloop",
+        description="Closed-loop twisting with soft shear-sensing skins.",
+        epilog=f"commands:\n{listing}\n\n`shearloop COMMAND --help` explains one.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    parser.add_argument("command", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
+    return parser
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        from importlib.metadata import version
+
+        print(version("shearloop"))
+        parser.exit()

@@ -1,0 +1,41 @@
+"""`shearloop bank solve`: the 896 voltages of one conductivity."""
+
+import argparse
+from pathlib import Path
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument(
+        "--mesh", type=Path, required=True, metavar="FILE", help="a mesh (.npz, EIDORS .mat) or a fingertip (.yaml)"
+    )
+    parser.add_argument("--model", required=True, metavar="M", help="basis model")
+    parser.add_argument("--k", type=float, required=True, metavar="K", help="the model's first parameter")
+    parser.add_argument("--sigma", type=float, required=True, metavar="S", help="the model's second parameter")
+    parser.add_argument("--out", type=Path, required=True, metavar="V.npy", help="file for the 896 float64 voltages")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Solve, and write the voltages only when there is a solution."""
+    import numpy as np
+
+    from bank.errors import ConductivityError
+    from bank.forward import ForwardModel
+    from bank.models import conductivity
+    from daemon.bank_config import load_geometry
+    from daemon.errors import UserError
+
+    mesh = load_geometry(args.mesh)
+    try:
+        voltages = ForwardModel(mesh).voltages(conductivity(mesh, args.model, args.k, args.sigma))
+    except ConductivityError as error:
+        raise UserError(f"--model {args.model} --k {args.k:g} --sigma {args.sigma:g}: {error}") from error
+    try:
+        with args.out.open("wb") as file:
+            np.save(file, voltages)
+    except OSError as error:
+        raise UserError(
+            f"{args.out}: the voltages cannot be written: {error.strerror}; choose another --out"
+        ) from error
+    print(f"{args.out}: 896 voltages, norm {np.linalg.norm(voltages):.9g}")
+    return 0

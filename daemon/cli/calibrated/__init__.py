@@ -1,0 +1,1 @@
+"""`shearloop calibrate`, one module per thing that is calibrated."""

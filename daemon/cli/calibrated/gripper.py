@@ -1,0 +1,87 @@
+"""`shearloop calibrate gripper`: the fingers close on objects of known diameter, and the counts become millimetres."""
+
+import argparse
+import asyncio
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daemon.cli.operator_input import Operator
+
+if TYPE_CHECKING:
+    from drivers.robotiq.gripper import RobotiqGripper
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `calibrate gripper`."""
+    way = parser.add_mutually_exclusive_group(required=True)
+    way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
+    way.add_argument("--serial-number", metavar="NUMBER", help="the USB adapter's serial number, for Modbus RTU")
+    way.add_argument("--port", metavar="PATH", help="the USB adapter's port, for Modbus RTU")
+    parser.add_argument("--socket-port", type=int, default=63352, help="default: %(default)s")
+    parser.add_argument(
+        "--diameter-mm", type=float, action="append", required=True, metavar="MM", help="an object's; at least two"
+    )
+    parser.add_argument("--force-n", type=float, default=10.0, metavar="N", help="to grip with (default: %(default)s)")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the calibration file to write")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Grip each object, and write the calibration."""
+    from daemon.errors import UserError
+    from drivers.calibration_file import save_calibration
+    from drivers.robotiq.gripper import RobotiqGripper
+    from drivers.robotiq.messages import GripperClient
+    from drivers.robotiq.modbus_client import ModbusClient
+    from drivers.robotiq.socket_client import SocketClient
+    from drivers.robotiq.width import STROKE_MM, WidthCalibration
+
+    if any(not 0 < diameter < STROKE_MM for diameter in args.diameter_mm) or len(set(args.diameter_mm)) < 2:
+        raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")
+    if not args.out.parent.is_dir():
+        raise UserError(f"--out {args.out} cannot be written: the folder {args.out.parent} does not exist")
+    client: GripperClient
+    if args.host is not None:
+        client = SocketClient(args.host, args.socket_port)
+    else:
+        client = ModbusClient(serial_number=args.serial_number, path=args.port)
+    gauges = asyncio.run(_grip(RobotiqGripper(client, WidthCalibration.nominal()), args.diameter_mm, args.force_n))
+    calibration = WidthCalibration.of_gauges(gauges)
+    save_calibration(args.out, calibration)
+    print(f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm.")
+    print(f"Written to {args.out}.")
+    return 0
+
+
+async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], force_n: float) -> list[tuple[float, float]]:
+    async with Operator() as operator:
+        try:
+            await gripper.connect()
+            await operator.ask(
+                "The fingers will open and close. Keep clear, take out what they hold, then press Enter."
+            )
+            await gripper.activate(operator_confirmed=True)
+            gauges: list[tuple[float, float]] = []
+            while len(gauges) < len(diameters_mm):
+                diameter_mm = diameters_mm[len(gauges)]
+                await operator.ask(f"Hold the object of {diameter_mm:g} mm between the fingertips, then press Enter.")
+                counts = await _contact(gripper, force_n)
+                if counts is None:
+                    print("Refused: the fingers closed without meeting anything.", file=sys.stderr, flush=True)
+                else:
+                    print(f"  {diameter_mm:g} mm: {counts} counts.", flush=True)
+                    gauges.append((counts, diameter_mm))
+            return gauges
+        finally:
+            await gripper.close()
+
+
+async def _contact(gripper: "RobotiqGripper", force_n: float) -> int | None:
+    """Close, open again, and return the position at which the fingers stopped on something."""
+    from drivers.robotiq.messages import SPEED_MIN_MM_S, GripperCommand, ObjectStatus
+    from drivers.robotiq.width import STROKE_MM
+
+    # Past the fingers' own stop, so that reaching the target is never mistaken for a contact.
+    closed = await gripper.finish(await gripper.move(GripperCommand(-STROKE_MM, SPEED_MIN_MM_S, force_n)))
+    await gripper.finish(await gripper.move(GripperCommand(STROKE_MM)))
+    return closed.position_counts if closed.object is ObjectStatus.CONTACT_CLOSING else None

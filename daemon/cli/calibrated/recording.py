@@ -1,0 +1,48 @@
+"""`shearloop calibrate REC… --estimator NAME --out CAL`: fit an estimator to recordings."""
+
+import argparse
+from pathlib import Path
+
+ESTIMATORS = ("fused", "regression", "bank", "paper", "reconstruction")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument(
+        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) or folders of slices, oldest first"
+    )
+    parser.add_argument("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="default: %(default)s")
+    parser.add_argument("--out", type=Path, required=True, metavar="CAL", help="calibration to write")
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank, for the estimators paper and bank")
+    parser.add_argument("--mesh", type=Path, metavar="FILE", help="the mesh, for the estimator reconstruction")
+    parser.add_argument("--sides", metavar="SIDE[,SIDE]", help="sides to use, e.g. right (default: all that are there)")
+    parser.add_argument(
+        "--part", metavar="FROM:TO", default="0:1", help="share of each recording to use, e.g. 0:0.5 (default: all)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fit, write, and say what was fitted."""
+    from bank.bank_file import Bank
+    from bank.estimators import Physics, fit
+    from bank.mesh import load_mesh
+    from daemon.cli.recorded import parsed_part, parsed_sides
+    from daemon.recording.series import part_of, read_series
+
+    start, stop = parsed_part(args.part)
+    series = [one for path in args.recordings for one in read_series(path, parsed_sides(args.sides))]
+    parts = [part_of(one, start, stop) for one in series]
+    physics = Physics(
+        bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
+    )
+    names = ", ".join(path.name for path in args.recordings)
+    source = names if (start, stop) == (0.0, 1.0) else f"{names} from {start:g} to {stop:g}"
+    calibration = fit(args.estimator, parts, source, physics)
+    calibration.save(args.out)
+    quantities = [name for name in ("torque", "diameter") if getattr(calibration, name) is not None]
+    frames = sum(len(one.t_s) for one in parts)
+    print(
+        f"{args.out}: estimator {args.estimator}, {' and '.join(quantities)} from {frames} frames of the "
+        f"{' and '.join(calibration.sides)} side."
+    )
+    return 0

@@ -1,0 +1,49 @@
+"""`shearloop check`: say whether a configuration and the files it names are in order."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from daemon.config import SkinConfig
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `check`."""
+    parser.add_argument("config", type=Path, help="a YAML file such as config/demo.yaml")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Load everything that `run` would load, and open no device."""
+    from daemon.app import open_estimator
+    from daemon.cli.run import checked_emulators
+    from daemon.config import load_daemon_config
+
+    config = load_daemon_config(args.config)
+    checked_emulators(config.emulators, args.config)
+    for name, fingertip in config.fingertips.items():
+        k_grid, sigma_grid = open_estimator(fingertip).grids
+        torque = "with torque" if fingertip.calibration else "without torque: no calibration is configured"
+        print(f"{name}: bank {fingertip.bank} of {k_grid.size} × {sigma_grid.size} cells, {torque}")
+    if config.skin is not None:
+        print(f"skin: {_skin(config.skin)}")
+    print(f"{args.config} is in order")
+    return 0
+
+
+def _skin(config: "SkinConfig") -> str:
+    """Return what is told of the skin: its calibration, and what its calibration cannot tell."""
+    import math
+
+    from bank.skin.calibration_file import load_calibration
+    from daemon.skin_zero import MOST_CHANGE
+
+    calibration = load_calibration(config.calibration)
+    radius = "without torque: no tool_radius_mm" if config.tool_radius_mm is None else "with torque"
+    told = (
+        f"calibration {config.calibration} to {calibration.tension_n[0]:+.1f} … {calibration.tension_n[-1]:+.1f} N, "
+        f"± {calibration.prediction_half_width_n:.3f} N, {radius}"
+    )
+    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MOST_CHANGE:
+        told += "; its gauges are too much alike at rest for swapped wires to be noticed: see the sign of a push"
+    return told

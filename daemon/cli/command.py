@@ -1,0 +1,57 @@
+"""`shearloop command`: ask a running daemon to do something."""
+
+import argparse
+from pathlib import Path
+
+from daemon.addresses import COMMAND_ADDRESS
+
+COMMANDS = {
+    "tare": "take the zero of fingertips and skin anew, nothing gripped",
+    "status": "how each task is",
+    "start": "begin an experiment",
+    "pause": "stand still until `resume`",
+    "resume": "go on",
+    "stop": "end the experiment and stand still; where none is running, end the daemon",
+    "unlock": "let robot and gripper move again after a stop, once it is safe",
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `command`."""
+    parser.add_argument(
+        "name",
+        choices=COMMANDS,
+        help="; ".join(f"{name}: {what}" for name, what in COMMANDS.items()),
+    )
+    parser.add_argument("--source", help="the fingertip to tare, or `skin`; all by default")
+    parser.add_argument(
+        "--experiment", type=Path, metavar="FILE", help="what to start; else what the daemon's configuration names"
+    )
+    parser.add_argument("--connect", default=COMMAND_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
+    parser.add_argument(
+        "--timeout", type=float, default=2.0, metavar="S", help="how long to wait (default: %(default)s s)"
+    )
+    parser.add_argument("--json", action="store_true", help="print the reply as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Send one command and print its reply; status 1 when the daemon refused it."""
+    import json
+    import sys
+
+    from daemon.request import request
+    from daemon.subscriber import checked_timeout_s
+
+    arguments = {} if args.source is None else {"source": args.source}
+    if args.experiment is not None:
+        # The daemon may run in another folder.
+        arguments["experiment"] = str(args.experiment.resolve())
+    reply = request(args.connect, {"command": args.name, **arguments}, checked_timeout_s(args.timeout))
+    accepted = bool(reply.pop("ok", False))
+    if args.json:
+        print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
+    elif accepted:
+        print(f"{args.name}: done" if not reply else f"{args.name}: {json.dumps(reply, ensure_ascii=False, indent=2)}")
+    else:
+        print(f"shearloop command: {args.name} was refused: {reply.get('why')}", file=sys.stderr)
+    return 0 if accepted else 1

@@ -1,0 +1,42 @@
+"""`shearloop emulate DEVICE`: plays one device on a port or socket of its own.
+
+A device is a module in `daemon.cli.emulated` with `configure(parser)` and `run(args) -> exit status`, as a command is.
+"""
+
+import argparse
+import importlib
+from typing import NamedTuple
+
+
+class Device(NamedTuple):
+    """Where a device's command lives and what the overview says of it."""
+
+    module: str
+    summary: str
+
+
+DEVICES = {
+    "eit-kit": Device("daemon.cli.emulated.eit_kit", "the EIT board of a fingertip, on a pseudo-terminal"),
+    "hx711": Device("daemon.cli.emulated.hx711", "the load cell's board, on a pseudo-terminal"),
+    "gripper-socket": Device("daemon.cli.emulated.gripper_socket", "a 2F-140 behind the URCap's socket"),
+    "gripper-modbus": Device("daemon.cli.emulated.gripper_modbus", "a 2F-140 on Modbus RTU, on a pseudo-terminal"),
+    "skin": Device("daemon.cli.emulated.skin", "the shear skin with source and DAQ, and the robot that turns it"),
+    "skin-source": Device("daemon.cli.emulated.skin_source", "the Keithley 6430 that feeds the shear skin"),
+    "skin-daq": Device("daemon.cli.emulated.skin_daq", "what reads the voltages of the shear skin"),
+    "ur": Device("daemon.cli.emulated.ur", "a UR robot's controller, on an address of this machine"),
+    "rig": Device("daemon.cli.emulated.rig", "all devices of the rig, tied by one physics"),
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add a sub-parser per device."""
+    devices = parser.add_subparsers(dest="device", metavar="DEVICE", required=True)
+    for name, device in DEVICES.items():
+        module = importlib.import_module(device.module)
+        module.configure(devices.add_parser(name, help=device.summary, description=f"Play {device.summary}."))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play the device until SIGINT or SIGTERM, or until standard input, where that is a pipe, is closed."""
+    status: int = importlib.import_module(DEVICES[args.device].module).run(args)
+    return status

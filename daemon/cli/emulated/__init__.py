@@ -1,0 +1,1 @@
+"""`shearloop emulate`, one module per device."""

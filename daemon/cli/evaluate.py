@@ -1,0 +1,76 @@
+"""`shearloop evaluate CAL REC…`: estimates against the truth of recordings, in numbers and as a figure."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("calibration", type=Path, metavar="CAL", help="made by `shearloop calibrate`")
+    parser.add_argument(
+        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) or folders of slices"
+    )
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank the calibration was made with, if any")
+    parser.add_argument(
+        "--part",
+        metavar="FROM:TO",
+        default="0:1",
+        help="share of each recording to judge on (default: all)",
+    )
+    parser.add_argument("--json", action="store_true", help="print the figures as JSON, and nothing else, on stdout")
+    parser.add_argument("--plot", action="store_true", help="draw truth against estimate over time into --out")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="figure to draw (default with --plot: CAL.png)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Evaluate, print, and draw where that is asked for."""
+    from bank.bank_file import Bank
+    from bank.estimators import Calibration
+    from daemon.cli.recorded import parsed_part
+    from daemon.errors import UserError
+    from daemon.recording.evaluation import follow, judge, reasons
+    from daemon.recording.series import part_of, read_series
+
+    calibration = Calibration.load(args.calibration)
+    bank = Bank.open(args.bank) if args.bank else None
+    start, stop = parsed_part(args.part)
+    series = [one for path in args.recordings for one in read_series(path)]
+    other = next((one.kind for one in series if one.kind != calibration.kind), None)
+    if other is not None:
+        raise UserError(
+            f"{args.calibration} was made from {_KINDS[calibration.kind]}, and cannot judge {_KINDS[other]}; "
+            "calibrate on recordings of the same kind"
+        )
+    tracks = [follow(calibration, part_of(one, start, stop), bank) for one in series]
+    figures = judge(tracks)
+    if args.plot or args.out:
+        out = args.out or args.calibration.with_suffix(".png")
+        try:
+            from daemon.recording.figure import draw
+        except ModuleNotFoundError as error:
+            raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
+        try:
+            draw(tracks, f"{calibration.estimator}, fitted to {calibration.source}", out)
+        except OSError as error:
+            raise UserError(f"{out}: the figure cannot be written: {error.strerror}") from error
+        print(f"The figure is in {out}.", file=sys.stderr)
+    if args.json:
+        print(json.dumps(figures))
+        return 0
+    width = max(map(len, figures))
+    for name, value in figures.items():
+        print(f"{name:<{width}}  {_shown(value)}")
+    for why, count in reasons(tracks).most_common():
+        print(f"{count:>6} frames not valid: {why}")
+    return 0
+
+
+_KINDS = {"raw": "raw frames", "difference": "slices"}
+
+
+def _shown(value: float | None) -> str:
+    if value is None:
+        return "–"
+    return str(value) if isinstance(value, int) else f"{value:.4g}"

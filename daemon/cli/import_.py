@@ -1,0 +1,24 @@
+"""`shearloop import mat SRC… --out REC`: bring recordings made elsewhere into the project's format."""
+
+import argparse
+from pathlib import Path
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add a sub-parser per foreign format."""
+    formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True)
+    mat = formats.add_parser("mat", help="the paper's MATLAB streams", description="Import the paper's streams.")
+    mat.add_argument("sources", nargs="+", type=Path, metavar="SRC", help=".mat files of one recording, or its folder")
+    mat.add_argument("--out", type=Path, required=True, metavar="REC", help="recording to write, e.g. twist.mcap")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Import and say what came in."""
+    from daemon.recording.importing import import_mat
+
+    imported = import_mat(args.sources, args.out)
+    counts = [f"{count} frames of the {side} side" for side, count in imported.frames.items()]
+    print(f"{args.out}: {', '.join(counts)}, {imported.torques} torques.")
+    for remark in imported.remarks:
+        print(remark)
+    return 0

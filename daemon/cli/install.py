@@ -1,0 +1,56 @@
+"""`shearloop install`: make the daemon a service of this computer."""
+
+import argparse
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from daemon.service.steps import Step
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `install`."""
+    add_place(parser)
+    parser.add_argument("--program", type=Path, metavar="PATH", help="what the service runs; by default this program")
+    parser.add_argument("--real-time", action="store_true", help="with the real-time options of docs/service.md")
+
+
+def add_place(parser: argparse.ArgumentParser) -> None:
+    """Add what `install` and `uninstall` have in common."""
+    parser.add_argument("--dry-run", action="store_true", help="say what would be done, and do nothing")
+    parser.add_argument(
+        "--root", type=Path, default=Path("/"), metavar="DIR", help="the root of another system, such as an image"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Put unit, user, udev rules, folders and an example configuration in place, saying each."""
+    from daemon.errors import UserError
+    from daemon.service.installation import find_program, install_steps
+
+    program = find_program() if args.program is None else args.program.absolute()
+    if not program.is_file():
+        raise UserError(f"--program {args.program} is not a file; give the path of the installed `shearloop`")
+    root = args.root.absolute()
+    steps = install_steps(root, program, real_time=args.real_time, running=systemd_runs(root))
+    return carry_out(steps, root, dry_run=args.dry_run)
+
+
+def systemd_runs(root: Path) -> bool:
+    """Return whether this is the running system, with systemd to be told of changes."""
+    return root == Path("/") and Path("/run/systemd/system").is_dir()
+
+
+def carry_out(steps: "Iterable[Step]", root: Path, *, dry_run: bool) -> int:
+    """Say and do each step, or only say it."""
+    from daemon.errors import UserError
+
+    if not dry_run and root == Path("/") and os.geteuid() != 0:
+        raise UserError("this changes the system: run it with sudo, or see what it would do with --dry-run")
+    for step in steps:
+        print(f"{'would ' if dry_run and step.acts else ''}{step.sentence()}", flush=True)
+        if not dry_run:
+            step.carry_out()
+    return 0

@@ -1,0 +1,36 @@
+"""`shearloop listen`: print what a daemon publishes."""
+
+import argparse
+
+from daemon.addresses import PUBLISH_ADDRESS
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `listen`."""
+    parser.add_argument("topics", nargs="*", metavar="TOPIC", help="topics, or their beginnings (eit); all by default")
+    parser.add_argument("--connect", default=PUBLISH_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
+    parser.add_argument("--json", action="store_true", help="one JSON object a line, arrays included")
+    parser.add_argument("--count", type=int, metavar="N", help="stop after N messages")
+    parser.add_argument("--timeout", type=float, metavar="S", help="give up when nothing comes for S seconds")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Print messages until interrupted, or until enough have come."""
+    from daemon.errors import UserError
+    from daemon.readable import as_json, as_line
+    from daemon.subscriber import checked_timeout_s, messages
+    from daemon.topics import TOPICS
+
+    for topic in args.topics:
+        if not any(known.startswith(topic) for known in TOPICS):
+            raise UserError(f"there is no topic {topic!r}; the topics are {', '.join(TOPICS)}")
+    if args.count is not None and args.count < 1:
+        raise UserError(f"--count {args.count} is not a number of messages; give 1 or more")
+    if args.timeout is not None:
+        checked_timeout_s(args.timeout)
+    write = as_json if args.json else as_line
+    for number, (topic, content) in enumerate(messages(args.connect, args.topics, args.timeout), start=1):
+        print(write(topic, content), flush=True)
+        if number == args.count:
+            break
+    return 0

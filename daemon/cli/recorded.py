@@ -1,0 +1,25 @@
+"""Arguments that the commands on recordings share."""
+
+from daemon.errors import UserError
+from daemon.recording.schema import SIDES
+
+
+def parsed_part(text: str) -> tuple[float, float]:
+    """Return the shares of FROM:TO; UserError for anything that is not 0 ≤ FROM < TO ≤ 1."""
+    try:
+        start, stop = (float(share) for share in text.split(":"))
+    except ValueError as error:
+        raise UserError(f"--part must be two shares such as 0.5:1, not {text!r}") from error
+    if not 0 <= start < stop <= 1:
+        raise UserError(f"--part must rise from 0 or more to 1 or less, not {text!r}")
+    return start, stop
+
+
+def parsed_sides(text: str | None) -> tuple[str, ...] | None:
+    """Return the sides of SIDE[,SIDE], None for none given; UserError for an unknown one."""
+    if text is None:
+        return None
+    sides = tuple(text.split(","))
+    if not set(sides) <= set(SIDES) or len(set(sides)) < len(sides):
+        raise UserError(f"--sides must be {' or '.join(SIDES)}, or both with a comma between, not {text!r}")
+    return sides

@@ -1,0 +1,139 @@
+"""`shearloop run`: the daemon, in the foreground."""
+
+import argparse
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from daemon.config import Emulator
+
+# Long enough for an emulator to remove its port's link, short enough for a clean stop within a second.
+EMULATOR_STOP_S = 0.5
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `run`."""
+    parser.add_argument("config", type=Path, help="a YAML file such as config/demo.yaml")
+    parser.add_argument("--show", action="store_true", help="print the estimates as they come")
+    parser.add_argument(
+        "--json-log", action="store_true", default=None, help="log JSON lines (the default under systemd)"
+    )
+    parser.add_argument(
+        "--recording", type=Path, metavar="FILE", help="let the configuration's EIT emulators play this .mat recording"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run until SIGINT, SIGTERM or `shearloop command stop`."""
+    from daemon.app import run_daemon
+    from daemon.config import load_daemon_config
+    from daemon.errors import UserError
+    from daemon.logs import set_up_logging
+
+    # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    set_up_logging(json_lines=args.json_log)
+    config = load_daemon_config(args.config)
+    if args.recording is not None and not any(emulator.device == "eit-kit" for emulator in config.emulators):
+        raise UserError(f"{args.config} has no eit-kit among its `emulators` to play --recording {args.recording}")
+    if config.lock_memory:
+        from daemon.service.locked_memory import lock_memory
+
+        lock_memory()
+    checked_emulators(config.emulators, args.config)
+    if args.recording is not None:
+        from daemon.recordings import read_stream
+
+        for emulator in config.emulators:
+            if emulator.device == "eit-kit":
+                # Here, and not in the emulator's process alone: without its frames the daemon would wait for ever.
+                read_stream(args.recording, _side(emulator.arguments))
+    with _emulators(config.emulators, args.config.parent, args.recording):
+        asyncio.run(run_daemon(config, (_Show(),) if args.show else ()))
+    return 0
+
+
+def checked_emulators(emulators: "tuple[Emulator, ...]", config: Path) -> None:
+    """Raise UserError for an emulator of a device that there is none of."""
+    from daemon.cli.emulate import DEVICES
+    from daemon.errors import UserError
+
+    for number, emulator in enumerate(emulators):
+        if emulator.device not in DEVICES:
+            raise UserError(
+                f"{config}: `emulators[{number}].device` is {emulator.device!r}; there are {', '.join(DEVICES)}"
+            )
+
+
+def _side(arguments: tuple[str, ...]) -> str | None:
+    """Return which fingertip of a recording an emulator is told to play; None where it is not told."""
+    for argument, following in pairwise((*arguments, "")):
+        if argument == "--side" and following in ("left", "right"):
+            return following
+    return None
+
+
+class _Show:
+    """Prints the estimates, as long as somebody reads them."""
+
+    def __init__(self) -> None:
+        self._read = True
+
+    def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Print one message; where the reader (`| head`) has gone, the daemon goes on without."""
+        if topic in ("eit.estimate", "skin.shear") and self._read:
+            import structlog
+
+            from daemon.readable import as_line
+
+            try:
+                print(as_line(topic, content), flush=True)
+            except OSError as error:
+                self._read = False
+                # What Python still holds of the line must not fail again at the end.
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                structlog.get_logger().warning("estimates are no longer shown", why=error.strerror)
+
+
+def _same_code() -> dict[str, str]:
+    """Return an environment in which a child in another folder runs the code that runs here."""
+    here = str(Path(__file__).resolve().parents[2])
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
+
+
+@contextmanager
+def _emulators(emulators: "tuple[Emulator, ...]", folder: Path, recording: Path | None) -> Iterator[None]:
+    """Keep the configuration's emulated devices running, each as a process of its own."""
+    processes = []
+    try:
+        for emulator in emulators:
+            played = emulator.synthetic
+            if recording is not None and emulator.device == "eit-kit":
+                played = ("--recording", str(recording.resolve()))
+            command = [sys.executable, "-m", "daemon", "emulate", emulator.device, *emulator.arguments, *played]
+            # Their standard input stays open and silent: a closed one would end them.
+            processes.append(
+                subprocess.Popen(
+                    command, cwd=folder, env=_same_code(), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
+                )
+            )
+        yield
+    finally:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            try:
+                process.wait(EMULATOR_STOP_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+            if process.stdin is not None:
+                process.stdin.close()

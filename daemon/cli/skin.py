@@ -1,0 +1,95 @@
+"""`shearloop skin`: hold the shear skin's models against its paper, and calibrate a skin from a recorded table."""
+
+import argparse
+import json
+import sys
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from bank.skin.characterisation import Row
+
+SEED = 2017
+COLUMNS = ("quantity", "unit", "paper: computed", "measured", "closed form", "1-D", "2-D", "synthetic")
+EXPLANATION = """\
+Sensitivity: least squares through the origin over one loading in 0.1 N steps, from the first step up to Fn.
+1-D: membrane with the paper's own F/(EA). 2-D: plane strain, 112 elements, nothing tuned; w = 20 mm is assumed.
+Synthetic: the paper's measured figure was put into a synthetic recording; this is what the estimator found in it."""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add `characterise` and `calibrate`."""
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    characterise = actions.add_parser("characterise", help="print the paper's table beside the models'")
+    characterise.add_argument("--out", type=Path, metavar="DIR", help="draw figures 5, 6 and 7 here, PNG and SVG")
+    characterise.add_argument("--json", action="store_true", help="print the table as JSON")
+    calibrate = actions.add_parser("calibrate", help="fit a calibration to a recorded table")
+    calibrate.add_argument("table", type=Path, help="CSV with r1_ohm, r2_ohm, shear_n, normal_n")
+    calibrate.add_argument("--out", type=Path, required=True, metavar="YAML", help="where the calibration goes")
+    calibrate.add_argument("--friction", type=float, help="coefficient of friction, where the table cannot tell it")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Carry out the action asked for."""
+    return _characterise(args.out, args.json) if args.action == "characterise" else _calibrate(args)
+
+
+def _characterise(out: Path | None, as_json: bool) -> int:
+    import numpy as np
+
+    from bank.skin.characterisation import characterise
+
+    if out is not None:
+        # Before the work: a missing library is then told at once.
+        from daemon.cli.skin_figures import draw
+    found = characterise(np.random.default_rng(SEED))
+    if as_json:
+        print(json.dumps([asdict(row) for row in found.rows], indent=1, ensure_ascii=False))
+    else:
+        print(_table(found.rows))
+    if out is not None:
+        for path in draw(found, out):
+            print(f"drawn: {path}", file=sys.stderr)
+    return 0
+
+
+def _table(rows: "tuple[Row, ...]") -> str:
+    lines = [COLUMNS, *(tuple(_cell(value) for value in asdict(row).values()) for row in rows)]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
+    printed = [
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
+    ]
+    printed.insert(1, "  ".join("-" * width for width in widths))
+    return "\n".join([*printed, "", EXPLANATION])
+
+
+def _cell(value: str | float | None) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        return value
+    return f"{value:#.3g}" if value else "0"
+
+
+def _calibrate(args: argparse.Namespace) -> int:
+    from bank.skin.calibration_file import read_table, save_calibration
+    from bank.skin.calibration_fit import fit_calibration
+    from daemon.errors import UserError
+
+    if args.friction is not None and not 0 <= args.friction <= 1:
+        raise UserError(f"--friction is {args.friction}; a coefficient of friction lies between 0 and 1.")
+    calibration = fit_calibration(read_table(args.table), friction=args.friction)
+    save_calibration(calibration, args.out)
+    whence = "fitted" if args.friction is None else "given"
+    print(f"friction coefficient ({whence})        {calibration.friction:.4f}")
+    print(f"response per N of gauge tension      {calibration.slope_per_n:.4f} 1/N")
+    print(f"95 % prediction interval             ± {calibration.prediction_half_width_n:.4f} N")
+    print(
+        f"straight to {calibration.linear_to_n} N; tension calibrated  "
+        f"{calibration.tension_n[0]:.2f} … {calibration.tension_n[-1]:.2f} N"
+    )
+    print(f"rows fitted                          {calibration.rows}")
+    print(f"rows left out beyond the curve       {calibration.rows_beyond}")
+    print(f"written: {args.out}")
+    return 0

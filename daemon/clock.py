@@ -1,0 +1,32 @@
+"""The two times of the daemon: CLOCK_MONOTONIC inside, Unix time on the wire and in recordings."""
+
+import time
+
+
+class Clock:
+    """Reads the monotonic clock and translates its readings into Unix time.
+
+    The offset between the two is held between calls of `synchronise`, so that stamps taken close together keep
+    their distance even while the system's clock is being set.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns = _measured_offset_ns()
+
+    @staticmethod
+    def now_ns() -> int:
+        """Return CLOCK_MONOTONIC in nanoseconds."""
+        return time.monotonic_ns()
+
+    def unix_s(self, t_mono_ns: int) -> float:
+        """Return the Unix time, in seconds, of a reading of the monotonic clock."""
+        return (t_mono_ns + self._offset_ns) / 1e9
+
+    def synchronise(self) -> float:
+        """Measure the offset anew, as a service does once a second; return by how many seconds it had moved."""
+        before, self._offset_ns = self._offset_ns, _measured_offset_ns()
+        return (self._offset_ns - before) / 1e9
+
+
+def _measured_offset_ns() -> int:
+    return time.time_ns() - time.monotonic_ns()

@@ -1,0 +1,229 @@
+"""What a daemon is told in YAML. Units are in the keys; unknown keys are refused; nothing changes after loading."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Literal, TypeVar
+
+from pydantic import AfterValidator, Field, model_validator
+
+from daemon.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, stays_on_this_machine
+from daemon.config_file import ConfigModel, load_yaml_model
+
+
+def _safe_address(address: str) -> str:
+    if not stays_on_this_machine(address):
+        raise ValueError(
+            "must be ipc or a loopback address such as tcp://127.0.0.1:7761; "
+            "any other would open the robot to the network"
+        )
+    return address
+
+
+Address = Annotated[str, AfterValidator(_safe_address)]
+
+
+class SerialDevice(ConfigModel):
+    """A board on a serial port, named by what does not change when cables are swapped."""
+
+    serial_number: str | None = Field(None, min_length=1, description="USB serial number, as the port's maker set it")
+    path: Path | None = Field(None, description="a port that is named by path, e.g. /dev/serial/by-id/…")
+
+    @model_validator(mode="after")
+    def _one_name(self) -> "SerialDevice":
+        if (self.serial_number is None) == (self.path is None):
+            raise ValueError("give either serial_number or path, and not both")
+        return self
+
+
+class Fingertip(ConfigModel):
+    """One EIT fingertip: its board, its bank and its calibration."""
+
+    device: SerialDevice
+    bank: Path = Field(description="made by `shearloop bank build`")
+    calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
+    matching: Literal["all_lags", "zero_lag"] = "all_lags"
+    baseline_frames: int = Field(10, ge=2, le=1000, description="frames averaged into the homogeneous frame")
+    average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
+    frame_period_s: float = Field(0.5412, gt=0, le=60, description="the board's frame period before it is measured")
+
+
+class LoadCellConfig(ConfigModel):
+    """The load cell on the lever."""
+
+    device: SerialDevice
+    calibration: Path | None = Field(
+        None, description="made by `shearloop calibrate load`; without one the board's lines are torques in N·m"
+    )
+    rate_hz: float = Field(10.9, gt=0, le=1000)
+
+
+class InstrumentSocket(ConfigModel):
+    """An instrument on the network, or a serial one behind a terminal server."""
+
+    host: str = Field(min_length=1)
+    port: int = Field(ge=1, le=65535)
+
+
+class SkinSourceConfig(ConfigModel):
+    """The Keithley 6430 that feeds the skin's gauges, by its RS-232 interface or a socket."""
+
+    socket: InstrumentSocket | None = None
+    serial: SerialDevice | None = None
+    baud: int = Field(9600, ge=300, le=57600, description="of the RS-232 interface, as set on the instrument")
+    current_ma: float = Field(5.0, gt=0, le=20)
+    compliance_v: float = Field(1.0, gt=0, le=5)
+
+    @model_validator(mode="after")
+    def _one_way_in(self) -> "SkinSourceConfig":
+        if (self.socket is None) == (self.serial is None):
+            raise ValueError("give either socket or serial, and not both")
+        return self
+
+
+class ScannerConfig(ConfigModel):
+    """A scanning multimeter on a socket."""
+
+    socket: InstrumentSocket
+    channels: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=1)]] = Field(
+        (101, 102), description="the channels of gauge 1 and gauge 2"
+    )
+    range_v: float = Field(1.0, gt=0, le=300)
+
+
+class AdcConfig(ConfigModel):
+    """A converter board that sends `v1,v2` in volts, a line a reading."""
+
+    device: SerialDevice
+    full_scale_v: float = Field(0.512, gt=0, le=10)
+
+
+class SkinDaqConfig(ConfigModel):
+    """What reads the voltages of the skin's gauges, one of two."""
+
+    scanner: ScannerConfig | None = None
+    adc: AdcConfig | None = None
+    rate_hz: float = Field(10.0, ge=1, le=1000)
+
+    @model_validator(mode="after")
+    def _one_way_in(self) -> "SkinDaqConfig":
+        if (self.scanner is None) == (self.adc is None):
+            raise ValueError("give either scanner or adc, and not both")
+        return self
+
+
+class SkinConfig(ConfigModel):
+    """The shear skin: its instruments, its calibration, and what it touches."""
+
+    source: SkinSourceConfig
+    daq: SkinDaqConfig
+    calibration: Path = Field(description="made by `shearloop skin calibrate`")
+    normal_n: float = Field(1.0, ge=0, le=100, description="normal force on the skin, by which friction goes")
+    tool_radius_mm: float | None = Field(
+        None, gt=0, le=200, description="from the axis of the wrist to the skin; makes a torque of the shear force"
+    )
+    zero_samples: int = Field(20, ge=10, le=1000, description="readings averaged into the zero")
+    drift_per_hour: float = Field(2.9e-4, ge=0, le=1, description="95 % bound on the response's drift; the paper's")
+
+
+class GripperSocket(ConfigModel):
+    """The gripper behind the URCap's socket."""
+
+    host: str = Field(min_length=1)
+    port: int = Field(63352, ge=1, le=65535)
+
+
+class GripperConfig(ConfigModel):
+    """The gripper, by one of its two ways in."""
+
+    socket: GripperSocket | None = None
+    modbus: SerialDevice | None = None
+    calibration: Path | None = Field(
+        None, description="made by `shearloop calibrate gripper`; else the maker's figures"
+    )
+
+    @model_validator(mode="after")
+    def _one_way_in(self) -> "GripperConfig":
+        if (self.socket is None) == (self.modbus is None):
+            raise ValueError("give either socket or modbus, and not both")
+        return self
+
+
+class LoopConfig(ConfigModel):
+    """What is asked of the closed loop; see docs/safety.md for what each event leads to."""
+
+    allowed_noise_nm: float = Field(0.0025, gt=0, le=1, description="true torque's std that noise may cause")
+    kp: float | None = Field(None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
+    deadband_nm: float = Field(0.001, ge=0, le=1, description="the wrist rests while it is this near to the set point")
+    disagreement_nm: float = Field(0.05, gt=0, le=5)
+    jump_nm: float = Field(0.08, gt=0, le=5)
+    slip_nm: float = Field(
+        0.06, gt=0, le=5, description="the torque at a fixed angle moved by more: it slips or drifts"
+    )
+    wrist_speed_rad_per_s: float = Field(0.5, gt=0, le=3.14)
+    gain_margin: float = Field(2.0, ge=1, le=100)
+    phase_margin_deg: float = Field(45.0, ge=0, le=90)
+
+
+class Emulator(ConfigModel):
+    """A device that is played by a process of its own, for demonstrations."""
+
+    device: str
+    arguments: tuple[str, ...] = ()
+    synthetic: tuple[str, ...] = Field((), description="further arguments where no recording is played")
+
+
+class DaemonConfig(ConfigModel):
+    """A whole configuration."""
+
+    publish: Address = PUBLISH_ADDRESS
+    commands: Address = COMMAND_ADDRESS
+    fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], Fingertip] = Field(default_factory=dict)
+    skin: SkinConfig | None = None
+    load_cell: LoadCellConfig | None = None
+    robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
+    gripper: GripperConfig | None = None
+    loop: LoopConfig = Field(default_factory=lambda: LoopConfig.model_validate({}))
+    experiment: Path | None = Field(None, description="started as soon as all devices are there")
+    stop_when_done: bool = Field(False, description="whether the daemon ends with that experiment")
+    lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
+    emulators: tuple[Emulator, ...] = ()
+
+    @model_validator(mode="after")
+    def _loop_is_whole(self) -> "DaemonConfig":
+        if not self.fingertips and self.skin is None:
+            raise ValueError("nothing is measured: give `fingertips`, a `skin`, or both")
+        if self.publish == self.commands and not self.publish.endswith(":*"):
+            raise ValueError(f"`publish` and `commands` are both {self.publish}; give each an address of its own")
+        if self.experiment is not None and self.robot is None:
+            raise ValueError("an experiment needs a robot: add `robot: ur.yaml`, or take `experiment` out")
+        if self.gripper is not None and self.robot is None:
+            raise ValueError("a gripper without a robot cannot be driven: add `robot: ur.yaml`, or take `gripper` out")
+        return self
+
+
+def load_daemon_config(path: Path) -> DaemonConfig:
+    """Return the configuration in a YAML file, with the paths in it taken from the file's own folder.
+
+    Raises UserError naming every mistake at once.
+    """
+    config = load_yaml_model(path, DaemonConfig)
+    folder = path.resolve().parent
+    return _from_folder(config, folder)
+
+
+Model = TypeVar("Model", bound=ConfigModel)
+
+
+def _from_folder(section: Model, folder: Path) -> Model:
+    """Return the section with every relative path in it taken from a folder."""
+    changed: dict[str, object] = {}
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        if isinstance(value, Path):
+            # Normalised, not resolved: a port's link must be named, and not what it points to today.
+            changed[name] = Path(os.path.normpath(folder / value))
+        elif isinstance(value, ConfigModel):
+            changed[name] = _from_folder(value, folder)
+        elif isinstance(value, dict):
+            changed[name] = {key: _from_folder(item, folder) for key, item in value.items()}
+    return section.model_copy(update=changed)

@@ -1,0 +1,162 @@
+"""Reading a YAML file into a pydantic model, with every mistake reported at once, by file, key and allowed range."""
+
+from collections.abc import Hashable, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic_core import ErrorDetails
+
+from daemon.errors import UserError
+
+_LONGEST_VALUE = 60
+
+
+class ConfigModel(BaseModel):
+    """What all configuration models have in common: unknown keys are mistakes, and values do not change."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @field_validator("*")
+    @classmethod
+    def _paths_name_something(cls, value: object) -> object:
+        if isinstance(value, Path) and (value == Path() or "\0" in str(value)):
+            raise ValueError(f"must be the path of a file, not {str(value)!r}")
+        return value
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def load_yaml_model(path: str | Path, model: type[Model]) -> Model:
+    """Return a YAML file's content as a pydantic model.
+
+    Raises UserError for a file that is missing, empty, not YAML or not a map of keys, that has a key twice, or whose
+    values the model refuses; then the message names all of them.
+    """
+    path = Path(path)
+    content = _read(path)
+    if not isinstance(content, dict):
+        raise UserError(f"{path}: expected keys and values such as `{_example(model)}`, found {_shown(content)}")
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        raise UserError(f"{path}: {mistakes(error, model)}") from error
+
+
+def mistakes(error: ValidationError, model: type[BaseModel]) -> str:
+    """Return all that a model found wrong, each with its key, what was found and the allowed range."""
+    schema = model.model_json_schema()
+    return "; ".join(dict.fromkeys(_sentence(details, schema) for details in error.errors(include_url=False)))
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """A SafeLoader that refuses a key given twice, where YAML would silently take the last."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+        seen: set[Hashable] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if isinstance(key, Hashable) and key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key `{key}` is given twice", key_node.start_mark
+                )
+            if isinstance(key, Hashable):
+                seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+def _read(path: Path) -> Any:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path}: the configuration cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: the configuration is not UTF-8 text (byte {error.start})") from error
+    try:
+        content = yaml.load(text, _UniqueKeyLoader)  # noqa: S506 - it is a SafeLoader
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
+        raise UserError(f"{path}: {where}{error.problem or error.context}") from error
+    except yaml.YAMLError as error:
+        raise UserError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
+    except RecursionError as error:
+        raise UserError(f"{path}: the configuration is nested too deeply") from error
+    if content is None:
+        raise UserError(f"{path}: the configuration is empty")
+    return content
+
+
+def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
+    location = details["loc"]
+    if details["type"] == "invalid_key":
+        return f"the key {_shown(details['input'])} is a number where a name is expected"
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
+    subject = f"`{key}` " if key else ""
+    if details["type"] == "extra_forbidden":
+        return f"{subject}is not a known key{_known_keys(str(location[-1]), _schema_at(schema, location[:-1], schema))}"
+    allowed = _allowed(_schema_at(schema, location, schema))
+    if details["type"] == "missing":
+        return f"{subject}is missing{f' (allowed: {allowed})' if allowed else ''}"
+    if details["type"] in ("value_error", "assertion_error"):
+        return f"{subject}{details['msg'].split(', ', 1)[1]}"
+    reason = details["msg"].replace("Input should", "should", 1).replace("Value should", "should", 1)
+    allowed_text = f", allowed: {allowed}" if allowed else ""
+    return f"{subject}{reason} (found {_shown(details['input'])}{allowed_text})"
+
+
+def _known_keys(wrong: str, schema: Mapping[str, Any]) -> str:
+    known = list(schema.get("properties", {}))
+    near = get_close_matches(wrong, known, n=1)
+    if near:
+        return f", did you mean `{near[0]}`?"
+    return f", known are {', '.join(known)}" if known else ""
+
+
+def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the part of a JSON schema that describes a place in the document, or nothing where that is not clear."""
+    if "$ref" in schema:
+        return _schema_at(root["$defs"][schema["$ref"].rsplit("/", 1)[-1]], location, root)
+    if "anyOf" in schema:
+        candidates = [part for part in schema["anyOf"] if part.get("type") != "null"]
+        return _schema_at(candidates[0], location, root) if len(candidates) == 1 else {}
+    if not location:
+        return schema
+    step, rest = location[0], location[1:]
+    if isinstance(step, int):
+        inside = schema.get("items")
+    else:
+        named = schema.get("properties", {}).get(step)
+        inside = (
+            named
+            or schema.get("additionalProperties")
+            or next(iter(schema.get("patternProperties", {}).values()), None)
+        )
+    return _schema_at(inside, rest, root) if isinstance(inside, Mapping) else {}
+
+
+def _allowed(schema: Mapping[str, Any]) -> str:
+    bounds = []
+    for name, word in (
+        ("exclusiveMinimum", "above"),
+        ("minimum", "from"),
+        ("exclusiveMaximum", "below"),
+        ("maximum", "to"),
+    ):
+        if name in schema:
+            bounds.append(f"{word} {schema[name]:g}")
+    if "enum" in schema:
+        return ", ".join(map(str, schema["enum"]))
+    return " ".join(bounds)
+
+
+def _example(model: type[BaseModel]) -> str:
+    return f"{next(iter(model.model_fields), 'key')}: …"
+
+
+def _shown(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 1]}…"

@@ -1,0 +1,187 @@
+"""From frames to readings: baseline, average, match, calibrate. A plain object without I/O.
+
+This is the paper's way (Trehan et al. 2025, section 2): the difference to the homogeneous frame is matched against
+the bank, and the best cell's sigma and k become torque and diameter through the calibration.
+"""
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.calibration import Calibration
+from bank.matching import Match, best_match, signal_above_noise
+from bank.polynomial import Interval
+from drivers.eit_kit import Frame
+
+FloatArray: TypeAlias = NDArray[np.float64]
+
+# Above this share of unusable channels the match would be made of what is left over.
+LARGEST_UNUSABLE_SHARE = 0.10
+# One step of the board's converter (measured on recorded frames), whose rounding is the least noise there is.
+CONVERTER_STEP_V = 0.00215
+# After a longer gap than this between usable frames the mean begins anew: what was before it is not the present.
+LONGEST_GAP_NS = 3_000_000_000
+# Degrees of freedom with which the mean variance of all channels enters that of each.
+POOLED_FREEDOM = 30
+_LEAST_NOISE_V = CONVERTER_STEP_V / np.sqrt(12.0)
+
+
+class Matcher(Protocol):
+    """Anything that scores a difference signal against every cell of a bank."""
+
+    @property
+    def k_grid(self) -> FloatArray:
+        """Centres of the bank's rows."""
+
+    @property
+    def sigma_grid(self) -> FloatArray:
+        """Widths of the bank's columns."""
+
+    def heatmap(self, difference: FloatArray) -> FloatArray:
+        """Return the (k, sigma) scores of a (896,) difference, NaN at cells that are not valid."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What one frame said: the match, its heatmap, torque and diameter, and what speaks against them."""
+
+    match: Match | None = None
+    heatmap: FloatArray | None = None
+    torque_nm: Interval | None = None
+    diameter_mm: Interval | None = None
+    why: tuple[str, ...] = ()
+    # By how much the torque's own time lies before the frame's, because frames were averaged.
+    lag_ns: int = 0
+
+    @property
+    def valid(self) -> bool:
+        """Whether nothing speaks against it."""
+        return not self.why
+
+
+class Baseline:
+    """The homogeneous frame and the noise of each channel, from the first frames after a tare."""
+
+    def __init__(self, frames: int) -> None:
+        self.wanted = frames
+        self.taken = 0
+        self._sum = np.zeros(0)
+        self._sum_of_squares = np.zeros(0)
+
+    @property
+    def complete(self) -> bool:
+        """Whether enough frames have been taken."""
+        return self.taken >= self.wanted
+
+    def add(self, channels: FloatArray) -> None:
+        """Take one more frame into the average."""
+        if self.taken == 0:
+            # Sums are of deviations from the first frame: squares of volts would lose the microvolts.
+            self._first = channels
+            self._sum = np.zeros_like(channels)
+            self._sum_of_squares = np.zeros_like(channels)
+        deviation = channels - self._first
+        self._sum += deviation
+        self._sum_of_squares += deviation**2
+        self.taken += 1
+
+    @property
+    def homogeneous(self) -> FloatArray:
+        """The mean of the frames taken, (896,) in volts."""
+        return self._first + self._sum / self.taken
+
+    @property
+    def noise(self) -> FloatArray:
+        """The standard deviation of one frame, (896,) in volts, at least that of the converter's rounding.
+
+        A few frames know the variance of one channel badly, and dividing by what is too small by chance would see
+        signals in noise: each channel's variance is drawn towards the mean of all (Smyth 2004), whose converter is one.
+        """
+        mean = self._sum / self.taken
+        freedom = self.taken - 1
+        own = (self._sum_of_squares - self.taken * mean**2) / freedom
+        variance = (freedom * own + POOLED_FREEDOM * own.mean()) / (freedom + POOLED_FREEDOM)
+        return np.asarray(np.sqrt(np.maximum(variance, _LEAST_NOISE_V**2)))
+
+
+class Estimator:
+    """Turns the frames of one fingertip into readings, one for each frame, in order."""
+
+    def __init__(
+        self,
+        matcher: Matcher,
+        calibration: Calibration | None,
+        *,
+        baseline_frames: int,
+        average_frames: int,
+        longest_gap_ns: int = LONGEST_GAP_NS,
+    ) -> None:
+        self._matcher = matcher
+        self._calibration = calibration
+        self._baseline_frames = baseline_frames
+        self._longest_gap_ns = longest_gap_ns
+        self._latest: deque[Frame] = deque(maxlen=average_frames)
+        self.tare()
+
+    @property
+    def grids(self) -> tuple[FloatArray, FloatArray]:
+        """The k and the sigma of the cells that are scored."""
+        return self._matcher.k_grid, self._matcher.sigma_grid
+
+    @property
+    def baseline_complete(self) -> bool:
+        """Whether the homogeneous frame has been taken."""
+        return self._baseline.complete
+
+    def tare(self) -> None:
+        """Take a new homogeneous frame from the frames to come."""
+        self._baseline = Baseline(self._baseline_frames)
+        self._latest.clear()
+
+    def update(self, frame: Frame) -> Reading:
+        """Return what the frame says; a frame that says nothing comes back with the reasons."""
+        trouble = _unusable(frame)
+        if trouble:
+            return Reading(why=trouble)
+        if not self._baseline.complete:
+            self._baseline.add(frame.channels)
+            return Reading(why=(f"taking the homogeneous frame, {self._baseline.taken} of {self._baseline.wanted}",))
+        if self._latest and frame.t_mid_ns - self._latest[-1].t_mid_ns > self._longest_gap_ns:
+            self._latest.clear()
+        self._latest.append(frame)
+        difference = np.mean([latest.channels for latest in self._latest], axis=0) - self._baseline.homogeneous
+        noise = self._baseline.noise * np.sqrt(1.0 / len(self._latest) + 1.0 / self._baseline.taken)
+        silent = signal_above_noise(difference, noise)
+        if silent is not None:
+            return Reading(why=(silent.why,))
+        heatmap = self._matcher.heatmap(difference)
+        match = best_match(heatmap, self._matcher.k_grid, self._matcher.sigma_grid)
+        middle_ns = sum(latest.t_mid_ns for latest in self._latest) // len(self._latest)
+        return replace(self._calibrated(match, heatmap), lag_ns=frame.t_mid_ns - middle_ns)
+
+    def _calibrated(self, match: Match, heatmap: FloatArray) -> Reading:
+        calibration = self._calibration
+        if calibration is None:
+            return Reading(match, heatmap, why=("no calibration is configured: k and sigma have no torque",))
+        if calibration.torque_fit is None:
+            return Reading(match, heatmap, why=("the calibration was made without torques: sigma has no torque",))
+        why = calibration.out_of_range(match.k, match.sigma)
+        if why:
+            return Reading(match, heatmap, why=why)
+        diameter = None if calibration.diameter_fit is None else calibration.diameter(match.k)
+        return Reading(match, heatmap, calibration.torque(match.sigma), diameter)
+
+
+def _unusable(frame: Frame) -> tuple[str, ...]:
+    if frame.repeated:
+        return ("the board sent the same frame again",)
+    unusable = int(np.count_nonzero(frame.saturated | frame.dead))
+    if unusable > LARGEST_UNUSABLE_SHARE * frame.channels.size:
+        return (
+            f"{unusable} of {frame.channels.size} channels are saturated or dead; "
+            "look at the ribbon cable and the gel's contact with the electrodes",
+        )
+    return ()

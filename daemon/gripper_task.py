@@ -1,0 +1,91 @@
+"""The task of the gripper: read it, publish it, move it."""
+
+import contextlib
+from collections.abc import Callable, Mapping
+
+from daemon.experiment.wishes import GripTo
+from daemon.loop.senses import Hand
+from daemon.messages import GripperStateMessage, Scalar
+from daemon.publisher import Publisher
+from drivers.errors import DriverError
+from drivers.robotiq.gripper import RobotiqGripper
+from drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
+
+RELEASE_WIDTH_MM = 140.0
+
+
+class GripperTask:
+    """Ties the gripper to the publisher and to the loop."""
+
+    def __init__(self, gripper: RobotiqGripper, publisher: Publisher, feel: Callable[[Hand], None]) -> None:
+        self._gripper = gripper
+        self._publisher = publisher
+        self._feel = feel
+
+    async def read(self) -> None:
+        """Publish every state and pass it on, until cancelled."""
+        async with contextlib.aclosing(self._gripper.states()) as states:
+            async for state in states:
+                self._publish(state)
+                self._feel(_hand(state))
+
+    async def grip(self, wish: GripTo) -> str:
+        """Move to a width and wait for the end; return why it went wrong, or an empty text."""
+        try:
+            await self._gripper.activate()
+            sent = await self._gripper.move(GripperCommand(wish.width_mm, wish.speed_mm_per_s, wish.force_n))
+            state = await self._gripper.finish(sent)
+        except DriverError as error:
+            return str(error)
+        # The loop must know what the fingers hold before it hears that they have closed.
+        self._feel(_hand(state))
+        if wish.expect_object and state.diameter_mm is None:
+            return (
+                f"the fingers closed to {state.width_mm:.1f} mm and met nothing; "
+                "put the tool between them, or correct `width_mm`"
+            )
+        return ""
+
+    async def release(self) -> str:
+        """Open wide; return why it went wrong, or an empty text."""
+        return await self.grip(GripTo(RELEASE_WIDTH_MM, 100.0, 10.0, expect_object=False))
+
+    async def unlock(self) -> str:
+        """Activate anew after a fault, on the operator's word that the fingers are clear."""
+        state = self._gripper.latest
+        if state is not None and not state.fault.needs_activation:
+            return ""
+        try:
+            await self._gripper.activate(operator_confirmed=True)
+        except DriverError as error:
+            return str(error)
+        return ""
+
+    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return what health tells of the gripper."""
+        return self._gripper.facts()
+
+    def _publish(self, state: GripperState) -> None:
+        self._publisher.publish(
+            GripperStateMessage(
+                source="gripper",
+                t_mono_ns=state.t_ns,
+                width_mm=state.width_mm,
+                diameter_mm=state.diameter_mm,
+                diameter_std_mm=state.diameter_std_mm,
+                current_ma=state.current_ma,
+                object=state.object.text,
+                fault=state.fault.code,
+                fault_text=state.fault.sentence if state.fault.code else "",
+            )
+        )
+
+
+def _hand(state: GripperState) -> Hand:
+    return Hand(
+        state.t_ns,
+        state.width_mm,
+        holding=state.diameter_mm is not None,
+        moving=state.object is ObjectStatus.MOVING,
+        fault=state.fault.sentence if state.fault.needs_activation else "",
+    )

@@ -1,0 +1,96 @@
+"""Once a second: how the process and each task are, as one message."""
+
+import asyncio
+import os
+import resource
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from daemon import sd_notify
+from daemon.clock import Clock
+from daemon.messages import Health, Scalar
+from daemon.publisher import Publisher
+from daemon.supervisor import Supervisor
+
+HEALTH_PERIOD_S = 1.0
+TaskFacts = Mapping[str, Scalar | Mapping[str, int]]
+
+
+@dataclass(slots=True)
+class _Usage:
+    """CPU time used so far, to tell the use since the last message."""
+
+    cpu_s: float
+    at_s: float
+
+    def percent_since(self) -> float:
+        cpu_s, at_s = time.process_time(), time.monotonic()
+        percent = 100.0 * (cpu_s - self.cpu_s) / max(at_s - self.at_s, 1e-9)
+        self.cpu_s, self.at_s = cpu_s, at_s
+        return percent
+
+
+class HealthReporter:
+    """Gathers what the supervisor and the tasks' own counters know, and publishes it."""
+
+    def __init__(self, publisher: Publisher, supervisor: Supervisor, clock: Clock) -> None:
+        self._publisher = publisher
+        self._supervisor = supervisor
+        self._clock = clock
+        self._facts: dict[str, Callable[[], TaskFacts]] = {}
+
+    def add(self, name: str, facts: Callable[[], TaskFacts]) -> None:
+        """Ask `facts` for what a task counts (frames, refusals by kind, rate) at every message."""
+        self._facts[name] = facts
+
+    def tasks(self) -> dict[str, TaskFacts]:
+        """Return what is known of each task now."""
+        gathered: dict[str, TaskFacts] = {}
+        for name, record in self._supervisor.records.items():
+            gathered[name] = {"alive": record.alive, "restarts": record.restarts, "last_error": record.last_error}
+        for name, facts in self._facts.items():
+            gathered[name] = {**gathered.get(name, {}), **facts()}
+        return gathered
+
+    async def run(self) -> None:
+        """Publish once a second until cancelled."""
+        usage = _Usage(time.process_time(), time.monotonic())
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        while True:
+            due_s += HEALTH_PERIOD_S
+            await asyncio.sleep(max(0.0, due_s - loop.time()))
+            lag_s = loop.time() - due_s
+            if lag_s > HEALTH_PERIOD_S:
+                # After a long stall: one late message, not a burst of them.
+                due_s = loop.time()
+            self._clock.synchronise()
+            self._tell_systemd()
+            self._publisher.publish(
+                Health(
+                    source="daemon",
+                    t_mono_ns=self._clock.now_ns(),
+                    tasks=self.tasks(),
+                    loop_lag_s=lag_s,
+                    memory_mb=resident_memory_mb(),
+                    cpu_percent=usage.percent_since(),
+                )
+            )
+
+    def _tell_systemd(self) -> None:
+        """Feed the service manager's watchdog, unless a task is dead: one that stays dead ends the service."""
+        dead = self._supervisor.dead
+        if dead:
+            sd_notify.notify(f"STATUS=dead, to be started again: {', '.join(dead)}")
+        else:
+            sd_notify.notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
+
+
+def resident_memory_mb() -> float:
+    """Return the resident memory of this process in megabytes (the peak, where the system tells no more)."""
+    statistics = Path("/proc/self/statm")
+    if statistics.exists():
+        return int(statistics.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3

@@ -1,0 +1,90 @@
+"""The task of the load cell: read it, publish it, take its zero."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping
+
+from daemon.clock import Clock
+from daemon.loop.senses import Source, Torque
+from daemon.messages import LoadTorque, Scalar
+from daemon.publisher import Publisher
+from drivers.hx711 import LoadSample
+from drivers.load_cell import LoadCell
+
+LOAD_CELL = "load_cell"
+# Two seconds at 10.9 Hz; their mean is known ten times better than one reading moves.
+ZERO_SAMPLES = 22
+
+
+class LoadCellTask:
+    """Ties the load cell's board to the publisher and to whoever goes by its torque."""
+
+    def __init__(
+        self, board: LoadCell, publisher: Publisher, clock: Clock, hear: Callable[[Torque], None], rate_hz: float
+    ) -> None:
+        self.source = Source(name=LOAD_CELL, period_s=1.0 / rate_hz)
+        self._board = board
+        self._publisher = publisher
+        self._clock = clock
+        self._hear = hear
+        self._zeroing: list[float] | None = None
+        self._zeroed: asyncio.Future[str] | None = None
+
+    async def read(self) -> None:
+        """Publish every sample and pass it on, until cancelled."""
+        async with contextlib.aclosing(self._board.samples()) as samples:
+            async for sample in samples:
+                self._publish(sample)
+                self._hear(
+                    Torque(
+                        LOAD_CELL,
+                        sample.torque_nm if sample.trusted else None,
+                        "" if sample.trusted else _why(sample),
+                        sample.t_mid_ns,
+                        self._clock.now_ns(),
+                    )
+                )
+                self._take_zero(sample)
+
+    async def zero(self) -> str:
+        """Take the mean of the next samples for zero; return why it could not be done, or an empty text."""
+        self._zeroing = []
+        self._zeroed = asyncio.get_running_loop().create_future()
+        return await self._zeroed
+
+    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return what health tells of the board."""
+        return self._board.facts()
+
+    def _take_zero(self, sample: LoadSample) -> None:
+        if self._zeroing is None or self._zeroed is None or self._zeroed.done():
+            return
+        if sample.trusted:
+            self._zeroing.append(sample.raw)
+        if len(self._zeroing) == ZERO_SAMPLES:
+            mean = sum(self._zeroing) / ZERO_SAMPLES
+            self._board.calibration = self._board.calibration.tared(mean)
+            self._zeroing = None
+            self._zeroed.set_result("")
+
+    def _publish(self, sample: LoadSample) -> None:
+        self._publisher.publish(
+            LoadTorque(
+                source=LOAD_CELL,
+                t_mono_ns=sample.t_mid_ns,
+                torque_nm=sample.torque_nm,
+                raw=sample.raw,
+                saturated=sample.saturated,
+                spike=sample.spike,
+            )
+        )
+
+
+def _why(sample: LoadSample) -> str:
+    flags = {
+        "at the end of its range": sample.saturated,
+        "further from the last one than the rig can move": sample.spike,
+        "the same for two seconds": sample.stuck,
+        "perhaps the end of a longer line": sample.partial,
+    }
+    return "the reading is " + " and ".join(what for what, is_so in flags.items() if is_so)

@@ -1,0 +1,33 @@
+"""Structured logs: readable lines on a console, JSON where a service manager collects them."""
+
+import logging
+import os
+import sys
+
+import structlog
+
+
+def set_up_logging(*, json_lines: bool | None = None, level: int = logging.INFO) -> None:
+    """Configure structlog; JSON is chosen by itself when systemd has connected the log to its journal."""
+    if json_lines is None:
+        json_lines = "JOURNAL_STREAM" in os.environ
+    renderer: structlog.typing.Processor = (
+        structlog.processors.JSONRenderer(ensure_ascii=False)
+        if json_lines
+        else structlog.dev.ConsoleRenderer(
+            colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
+        )
+    )
+    processors: list[structlog.typing.Processor] = [
+        structlog.contextvars.merge_contextvars,
+        structlog.processors.add_log_level,
+        structlog.processors.TimeStamper(fmt="iso" if json_lines else "%H:%M:%S.%f", utc=json_lines),
+    ]
+    if json_lines:
+        processors.append(structlog.processors.format_exc_info)
+    structlog.configure(
+        processors=[*processors, renderer],
+        wrapper_class=structlog.make_filtering_bound_logger(level),
+        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=False,
+    )

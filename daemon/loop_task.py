@@ -1,0 +1,292 @@
+"""The task that closes the loop: the robot's states in, the brain's orders out, 125 times a second."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Mapping
+
+import numpy as np
+import structlog
+
+from daemon.clock import Clock
+from daemon.experiment.machine import Experiment
+from daemon.experiment.steps import ExperimentFile
+from daemon.experiment.wishes import Action, GripTo, MoveTo, TakeZero
+from daemon.gripper_task import GripperTask
+from daemon.loop.brain import Brain, Orders
+from daemon.loop.senses import Arm, Source, Torque
+from daemon.messages import LoopState, RobotStateMessage, Scalar
+from daemon.publisher import Publisher
+from drivers.ur.client import UrRobot
+from drivers.ur.messages import Enable, MoveLinear, Reply, RobotState, Stop, Unlock, WristSpeed, ZeroForceTorque
+
+WRENCH = "wrench"
+WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04)
+# The brain is asked at each state of the robot, and no less often than this when there is none.
+LONGEST_TICK_S = 0.02
+# Every fifth state is published, and speaks as the torque of the wrench: 25 of 125 a second.
+PUBLISH_EVERY = 5
+DECELERATION_RAD_PER_S2 = 4.0
+LINEAR_ACCELERATION_M_PER_S2 = 0.3
+# Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
+# take the first one's place.
+MOST_UNANSWERED = 1
+LOOP_STATE_PERIOD_S = 1.0
+# A motion begins within this time of its command, or it has not begun.
+MOTION_BEGINS_S = 2.0
+
+
+class LoopTask:
+    """Ties brain, robot and gripper together."""
+
+    def __init__(
+        self,
+        brain: Brain,
+        robot: UrRobot,
+        gripper: GripperTask | None,
+        take_zero: Callable[[], Awaitable[str]],
+        publisher: Publisher,
+        clock: Clock,
+    ) -> None:
+        self._brain = brain
+        self._robot = robot
+        self._gripper = gripper
+        self._take_zero = take_zero
+        self._publisher = publisher
+        self._clock = clock
+        self._states = 0
+        self._unanswered: set[asyncio.Task[None]] = set()
+        self._action: asyncio.Task[None] | None = None
+        self._sent_rad_per_s = 0.0
+        self._stopped = True
+        self._told: tuple[object, ...] = ()
+        self._told_ns = 0
+        self._news = asyncio.Condition()
+
+    async def drive(self) -> None:
+        """Ask the brain and carry out what it says, until cancelled; the robot stands still afterwards."""
+        try:
+            while True:
+                began_ns = self._clock.now_ns()
+                state = await self._next_state()
+                now_ns = self._clock.now_ns()
+                self._brain.senses.late_s = max(0.0, (now_ns - began_ns) / 1e9 - LONGEST_TICK_S)
+                if state is not None:
+                    self._sense(state)
+                self._carry_out(self._brain.tick(now_ns))
+                await self._tell(now_ns)
+        finally:
+            await self._end()
+
+    async def start(self, file: ExperimentFile) -> str | None:
+        """Begin an experiment, or return why it cannot be begun."""
+        reply = await self._robot.send(Enable())
+        if not reply.accepted:
+            return reply.refused
+        # The state that says so comes one cycle later.
+        for _ in range(25):
+            state = await self._next_state()
+            if state is not None and not state.blocked:
+                self._sense(state)
+                break
+        return self._brain.start(file, self._clock.now_ns())
+
+    async def ended(self) -> Experiment:
+        """Return the experiment that runs, once it has ended."""
+        async with self._news:
+            while self._brain.experiment is None or self._brain.experiment.running:
+                await self._news.wait()
+            return self._brain.experiment
+
+    async def unlock(self) -> str | None:
+        """Let robot and gripper move again after a stop, on the operator's word; return why they would not."""
+        reply = await self._robot.send(Unlock())
+        if not reply.accepted:
+            return reply.refused
+        if self._gripper is not None and (why := await self._gripper.unlock()):
+            return why
+        self._brain.acknowledge()
+        return None
+
+    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return what health tells of the robot."""
+        return {
+            "connected": self._robot.state is not None,
+            "states": self._states,
+            "errors": dict(self._robot.losses),
+            "trouble": "" if self._robot.link.status == "up" else self._robot.link.sentence,
+        }
+
+    async def _next_state(self) -> RobotState | None:
+        try:
+            async with asyncio.timeout(LONGEST_TICK_S):
+                return await self._robot.next_state()
+        except TimeoutError:
+            return None
+
+    def _sense(self, state: RobotState) -> None:
+        self._states += 1
+        self._brain.senses.arm = Arm(
+            wrist_rad=state.wrist_rad,
+            wrist_torque_nm=state.wrist_torque_nm,
+            t_ns=state.t_mono_ns,
+            protective_stop=state.protective_stop,
+            emergency_stop=state.emergency_stop,
+            blocked=state.blocked,
+            moving_linearly=state.moving_linearly,
+        )
+        if self._states % PUBLISH_EVERY == 0:
+            # The wrench is what the tool does to the wrist; the torque on the tool is its opposite.
+            self._brain.hear(
+                Torque(WRENCH, -state.wrist_torque_nm, "", state.t_mono_ns - state.age_ns, self._clock.now_ns())
+            )
+            self._publisher.publish(_message(state))
+
+    def _carry_out(self, orders: Orders) -> None:
+        if orders.stop:
+            if not self._stopped:
+                self._stopped = True
+                self._cancel_action()
+                self._send(Stop(DECELERATION_RAD_PER_S2))
+            if orders.release and self._gripper is not None:
+                self._begin(self._gripper.release())
+            return
+        self._stopped = False
+        if orders.begin is not None:
+            self._begin(self._performed(orders.begin))
+        speed = orders.wrist_rad_per_s
+        if speed == 0.0 and self._sent_rad_per_s == 0.0:
+            return
+        if len(self._unanswered) < MOST_UNANSWERED:
+            self._send(WristSpeed(speed, DECELERATION_RAD_PER_S2))
+
+    def _send(self, command: WristSpeed | Stop) -> None:
+        async def sent() -> None:
+            reply = await self._robot.send(command)
+            self._answered(reply)
+
+        task = asyncio.create_task(sent(), name="robot command")
+        self._unanswered.add(task)
+        task.add_done_callback(self._unanswered.discard)
+
+    def _answered(self, reply: Reply) -> None:
+        if not reply.accepted:
+            self._brain.note_refusal(reply.refused)
+        self._sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
+        self._brain.sent(self._sent_rad_per_s)
+
+    def _begin(self, action: Awaitable[str]) -> None:
+        """Carry an action out beside the loop; how it ended is told to the brain."""
+        self._cancel_action()
+
+        async def carried_out() -> None:
+            self._brain.action_ended(await action)
+
+        self._action = asyncio.create_task(carried_out(), name="action")
+
+    def _cancel_action(self) -> None:
+        if self._action is not None:
+            self._action.cancel()
+
+    async def _performed(self, action: Action) -> str:
+        match action:
+            case MoveTo():
+                return await self._move(action)
+            case GripTo():
+                if self._gripper is None:
+                    return "no gripper is configured; add a `gripper` section to the configuration"
+                return await self._gripper.grip(action)
+            case TakeZero():
+                return await self._zero()
+            case _:
+                raise TypeError(f"{action} is not carried out by devices")
+
+    async def _zero(self) -> str:
+        reply = await self._robot.send(ZeroForceTorque())
+        return reply.refused if not reply.accepted else await self._take_zero()
+
+    async def _move(self, action: MoveTo) -> str:
+        x, y, z, rx, ry, rz = action.pose_m_rad
+        command = MoveLinear((x, y, z, rx, ry, rz), action.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)
+        before = self._robot.state.motion_id if self._robot.state is not None else 0
+        reply = await self._robot.send(command)
+        if not reply.accepted:
+            return reply.refused
+        for why in reply.clipped:
+            structlog.get_logger().warning("the move was clipped", why=why)
+        while True:
+            state = await self._robot.next_state()
+            if state.motion_id != before and state.ended:
+                return "" if state.ended == "arrived" else f"the move ended early: {state.ended}"
+
+    async def _tell(self, now_ns: int) -> None:
+        standing, experiment = self._brain.standing, self._brain.experiment
+        key = (
+            standing.phase,
+            standing.verdict.response,
+            standing.turn.reasons,
+            experiment and experiment.progress().step,
+        )
+        if key == self._told and now_ns - self._told_ns < LOOP_STATE_PERIOD_S * 1e9:
+            return
+        if key != self._told:
+            structlog.get_logger().info(
+                "loop", phase=standing.phase, doing=standing.doing, reasons=" ".join(standing.verdict.reasons)
+            )
+        self._told, self._told_ns = key, now_ns
+        self._publisher.publish(self._loop_state(now_ns))
+        async with self._news:
+            self._news.notify_all()
+
+    def _loop_state(self, now_ns: int) -> LoopState:
+        standing, experiment = self._brain.standing, self._brain.experiment
+        progress = experiment.progress() if experiment is not None else None
+        driving = experiment.file.drive if experiment is not None else ""
+        latest = self._brain.senses.torques.get(driving)
+        controller = self._brain.controller
+        believed = controller.state if controller is not None else None
+        return LoopState(
+            source="loop",
+            t_mono_ns=now_ns,
+            phase=standing.phase,
+            experiment=experiment.file.name if experiment is not None else "",
+            step=progress.step if progress else 0,
+            steps=progress.steps if progress else 0,
+            doing=standing.doing,
+            progress=progress.share if progress else 0.0,
+            remaining_s=progress.remaining_s if progress else 0.0,
+            driving=driving,
+            torque_nm=latest.torque_nm if latest is not None else None,
+            set_point_nm=believed.set_point_nm if believed else None,
+            ramp_nm=believed.ramp_nm if believed else None,
+            expected_nm=believed.torque_nm if believed else None,
+            speed_wanted_rad_per_s=standing.turn.speed_rad_per_s,
+            speed_sent_rad_per_s=self._sent_rad_per_s,
+            response=standing.verdict.response.name.lower().replace("_", " "),
+            reasons=" ".join((*standing.verdict.reasons, *standing.turn.reasons)),
+        )
+
+    async def _end(self) -> None:
+        self._cancel_action()
+        tasks = [task for task in (*self._unanswered, self._action) if task is not None]
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def _message(state: RobotState) -> RobotStateMessage:
+    return RobotStateMessage(
+        source="robot",
+        t_mono_ns=state.t_mono_ns,
+        joints_rad=np.array(state.q_rad),
+        tcp_pose=np.array(state.tcp_pose),
+        wrench=np.array(state.wrench),
+        wrist_rad=state.wrist_rad,
+        wrist_speed_rad_per_s=state.qd_rad_per_s[5],
+        wrist_torque_nm=state.wrist_torque_nm,
+        robot_mode=state.robot_mode,
+        safety_mode=state.safety_mode,
+        speed_scaling=state.speed_scaling,
+        protective_stop=state.protective_stop,
+        emergency_stop=state.emergency_stop,
+        blocked=state.blocked,
+        age_s=state.age_ns / 1e9,
+    )

@@ -1,0 +1,102 @@
+"""Sends messages over ZeroMQ and hands them to whoever else listens in the process."""
+
+import os
+import socket as sockets
+import stat
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+import zmq
+
+from daemon.clock import Clock
+from daemon.errors import UserError
+from daemon.messages import Message, encode, wire_map
+
+# Messages kept for a subscriber that reads too slowly; older ones are dropped for it, never delayed for others.
+HIGH_WATER_MARK = 1000
+Listener: TypeAlias = Callable[[str, dict[str, Any]], None]
+
+
+class Publisher:
+    """A PUB socket that stamps and numbers every message.
+
+    Sending never waits: a subscriber that does not keep up loses messages, which it sees as gaps in `seq`.
+    """
+
+    def __init__(self, context: "zmq.Context[Any]", address: str, clock: Clock) -> None:
+        """Bind the socket; raises UserError when the address is taken or malformed."""
+        self._clock = clock
+        self._numbers: Counter[tuple[str, str]] = Counter()
+        self._listeners: list[Listener] = []
+        self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.PUB)
+        self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
+        self._socket.setsockopt(zmq.LINGER, 0)
+        bind(self._socket, address, "publish")
+
+    def listen(self, listener: Listener) -> None:
+        """Call the listener with topic and content of every message from now on (recorder, console)."""
+        self._listeners.append(listener)
+
+    def publish(self, message: Message) -> None:
+        """Stamp, number and send one message."""
+        stream = (message.topic, message.source)
+        content = wire_map(message, self._clock.unix_s(message.t_mono_ns), self._numbers[stream])
+        self._numbers[stream] += 1
+        self._socket.send_multipart([message.topic.encode(), encode(content)], zmq.NOBLOCK)
+        for listener in self._listeners:
+            listener(message.topic, content)
+
+    def close(self) -> None:
+        """Close the socket; what is not yet sent is dropped."""
+        self._socket.close()
+
+
+def bind(socket: "zmq.Socket[Any]", address: str, key: str) -> None:
+    """Bind a socket; a refusal becomes a sentence that names the configuration key and the address."""
+    try:
+        _leave_what_is_there(address, key)
+        socket.bind(address)
+    except UserError:
+        socket.close()
+        raise
+    except zmq.ZMQError as error:
+        socket.close()
+        if error.errno == zmq.EADDRINUSE:
+            raise _in_use(address, key) from error
+        raise UserError(
+            f"`{key}: {address}` cannot be bound ({error.strerror}); use e.g. tcp://127.0.0.1:7761"
+        ) from error
+
+
+def _leave_what_is_there(address: str, key: str) -> None:
+    """Refuse an ipc address whose path is taken: libzmq would delete what lies there, whatever it is, and bind."""
+    path = address.removeprefix("ipc://")
+    if path == address or path.startswith(("@", "*")):
+        return
+    try:
+        mode = os.lstat(path).st_mode
+    except OSError:
+        return
+    if not stat.S_ISSOCK(mode):
+        raise UserError(f"`{key}: {address}` cannot be bound: {path} is there and is no socket; choose another address")
+    with sockets.socket(sockets.AF_UNIX, sockets.SOCK_STREAM) as probe:
+        # Not to wait for a listener whose queue is full: it is in use all the same.
+        probe.setblocking(False)
+        try:
+            probe.connect(path)
+        except ConnectionRefusedError:
+            # What a daemon that was killed left behind.
+            return
+        except OSError as error:
+            if not isinstance(error, BlockingIOError):
+                raise UserError(
+                    f"`{key}: {address}` cannot be bound ({error.strerror}); choose another address"
+                ) from error
+        raise _in_use(address, key)
+
+
+def _in_use(address: str, key: str) -> UserError:
+    return UserError(
+        f"`{key}: {address}` is already in use; is another daemon running? Stop it, or choose another address"
+    )

@@ -1,0 +1,30 @@
+"""Sends one command to a daemon and waits for its reply."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import zmq
+
+from daemon.errors import UserError
+from daemon.messages import decode, encode
+from daemon.subscriber import connect
+
+
+def request(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+    """Return the daemon's reply; raises UserError when none comes in time."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        connect(socket, address)
+        socket.send(encode(content))
+        if not socket.poll(int(timeout_s * 1000)):
+            raise UserError(
+                f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
+                "or give the address of its `commands` key with --connect"
+            )
+        try:
+            return decode(socket.recv())
+        except ValueError as error:
+            raise UserError(
+                f"what answers at {address} is not a daemon of shearloop ({error}); give the address of its `commands` "
+                "key with --connect"
+            ) from error

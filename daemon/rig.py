@@ -1,0 +1,145 @@
+"""Builds what acts: load cell, gripper, robot and the brain between them, from the configuration."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+
+from daemon.clock import Clock
+from daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, LoopConfig
+from daemon.config_file import load_yaml_model
+from daemon.control.tuning import RequiredMargins
+from daemon.experiment.steps import ExperimentFile
+from daemon.gripper_task import GripperTask
+from daemon.links import log_event, log_link
+from daemon.load_cell_task import LoadCellTask
+from daemon.loop.brain import Brain
+from daemon.loop.senses import Hand, Source, Torque
+from daemon.loop.tune import TuneSettings, tuned
+from daemon.loop.watch import WatchSettings
+from daemon.loop.wrist import Wrist, WristSettings
+from daemon.loop_task import WRENCH, WRENCH_SOURCE, LoopTask
+from daemon.publisher import Publisher
+from drivers.calibration_file import load_calibration
+from drivers.hx711 import LoadCalibration
+from drivers.load_cell import LoadCell
+from drivers.robotiq.gripper import RobotiqGripper
+from drivers.robotiq.messages import GripperClient
+from drivers.robotiq.modbus_client import ModbusClient
+from drivers.robotiq.socket_client import SocketClient
+from drivers.robotiq.width import WidthCalibration
+from drivers.ur.client import UrRobot
+from drivers.ur.settings import read_settings
+
+
+def make_load_cell(
+    config: LoadCellConfig, publisher: Publisher, clock: Clock, hear: Callable[[Torque], None]
+) -> LoadCellTask:
+    """Return the load cell's task; raises DriverError when its calibration cannot be used."""
+    calibration = (
+        load_calibration(config.calibration, LoadCalibration)
+        if config.calibration is not None
+        else LoadCalibration.of_torque_lines()
+    )
+    device = config.device
+    board = LoadCell(
+        calibration, serial_number=device.serial_number, path=device.path, on_event=partial(log_link, "load_cell")
+    )
+    return LoadCellTask(board, publisher, clock, hear, config.rate_hz)
+
+
+def make_gripper(config: GripperConfig, publisher: Publisher, feel: Callable[[Hand], None]) -> GripperTask:
+    """Return the gripper's task; raises DriverError when its calibration cannot be used."""
+    client: GripperClient
+    if config.socket is not None:
+        client = SocketClient(config.socket.host, config.socket.port)
+    elif config.modbus is not None:
+        path = str(config.modbus.path) if config.modbus.path is not None else None
+        client = ModbusClient(serial_number=config.modbus.serial_number, path=path)
+    else:
+        raise ValueError("a gripper has a way in")
+    calibration = (
+        load_calibration(config.calibration, WidthCalibration)
+        if config.calibration is not None
+        else WidthCalibration.nominal()
+    )
+    return GripperTask(RobotiqGripper(client, calibration, on_event=partial(log_link, "gripper")), publisher, feel)
+
+
+def make_brain(config: LoopConfig, sources: Mapping[str, Source], required: tuple[str, ...]) -> Brain:
+    """Return the brain for these torques; every one of them may drive."""
+    tune = TuneSettings(
+        allowed_noise_nm=config.allowed_noise_nm,
+        kp=config.kp,
+        deadband_nm=config.deadband_nm,
+        slip_nm=config.slip_nm,
+        speed_limit_rad_per_s=config.wrist_speed_rad_per_s,
+    )
+    settings = WristSettings(
+        speed_limit_rad_per_s=config.wrist_speed_rad_per_s,
+        required=RequiredMargins(gain=config.gain_margin, phase_deg=config.phase_margin_deg),
+    )
+    wrists = {name: Wrist(source, settings, partial(tuned, tune)) for name, source in sources.items()}
+    watch = WatchSettings(disagreement_nm=config.disagreement_nm, jump_nm=config.jump_nm)
+    return Brain(wrists, watch, dict(sources), required)
+
+
+class Rig:
+    """Everything that acts, and what belongs to it."""
+
+    def __init__(
+        self,
+        config: DaemonConfig,
+        publisher: Publisher,
+        clock: Clock,
+        fingertips: Mapping[str, Source],
+        tare_fingertips: Callable[[], Awaitable[str]],
+    ) -> None:
+        """Read the settings of every device; none is opened yet."""
+        if config.robot is None:
+            raise ValueError("a rig has a robot")
+        self._tare_fingertips = tare_fingertips
+        sources = dict(fingertips)
+        self.load_cell: LoadCellTask | None = None
+        if config.load_cell is not None:
+            self.load_cell = make_load_cell(config.load_cell, publisher, clock, self._hear)
+            sources[self.load_cell.source.name] = self.load_cell.source
+        sources[WRENCH] = WRENCH_SOURCE
+        required = ("gripper",) if config.gripper is not None else ()
+        self.brain = make_brain(config.loop, sources, required)
+        self.gripper = None
+        if config.gripper is not None:
+            self.gripper = make_gripper(config.gripper, publisher, self._feel)
+        self.robot = UrRobot(
+            read_settings(config.robot),
+            on_link=lambda event: log_event("robot", event.status == "up", event.sentence, repeated=event.losses > 1),
+        )
+        self.loop = LoopTask(self.brain, self.robot, self.gripper, self.take_zero, publisher, clock)
+
+    def tasks(self) -> Iterator[tuple[str, Callable[[], Awaitable[None]]]]:
+        """Yield the name and the coroutine of every task."""
+        if self.load_cell is not None:
+            yield "load_cell", self.load_cell.read
+        if self.gripper is not None:
+            yield "gripper", self.gripper.read
+        yield "robot", self.robot.run
+        yield "loop", self.loop.drive
+
+    async def take_zero(self) -> str:
+        """Take the zero of every torque sensor at once; return why one could not, or an empty text."""
+        zeros = [self._tare_fingertips()]
+        if self.load_cell is not None:
+            zeros.append(self.load_cell.zero())
+        return " ".join(filter(None, await asyncio.gather(*zeros)))
+
+    async def start(self, path: Path) -> str | None:
+        """Begin the experiment in a file, or return why not; raises UserError for a file that is none."""
+        return await self.loop.start(load_yaml_model(path, ExperimentFile))
+
+    def _hear(self, torque: Torque) -> None:
+        self.brain.hear(torque)
+
+    def _feel(self, hand: Hand) -> None:
+        known = self.brain.senses.hand
+        if known is None or hand.t_ns >= known.t_ns:
+            self.brain.senses.hand = hand

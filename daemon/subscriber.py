@@ -1,0 +1,64 @@
+"""Receives messages over ZeroMQ, as any program on the network side would."""
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import zmq
+
+from daemon.errors import UserError
+from daemon.messages import decode
+
+# A day; what a poll takes at most is some weeks.
+LONGEST_TIMEOUT_S = 86_400
+_ENVELOPE = frozenset({"timestamp", "t_mono_ns", "seq", "source"})
+
+
+def messages(
+    address: str, topics: Iterable[str], timeout_s: float | None = None
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield (topic, content) of every message whose topic starts with one of `topics` (all, when there is none).
+
+    Raises UserError for a malformed address, and when nothing has come for `timeout_s`.
+    """
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        connect(socket, address)
+        for topic in tuple(topics) or ("",):
+            socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
+        while True:
+            if timeout_s is not None and not socket.poll(int(timeout_s * 1000)):
+                raise UserError(
+                    f"nothing was heard from {address} for {timeout_s:g} s; start the daemon with "
+                    "`shearloop run CONFIG`, or give the address of its `publish` key with --connect"
+                )
+            parts = socket.recv_multipart()
+            try:
+                name, payload = parts
+                content = decode(payload)
+                if missing := _ENVELOPE - content.keys():
+                    raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+            except ValueError as error:
+                raise UserError(
+                    f"what {address} publishes is not shearloop's ({error}); give the address of the daemon's "
+                    "`publish` key with --connect"
+                ) from error
+            yield name.decode(errors="replace"), content
+
+
+def checked_timeout_s(timeout_s: float) -> float:
+    """Return a time to wait that was given with --timeout; raises UserError for what is none."""
+    if not 0 < timeout_s <= LONGEST_TIMEOUT_S:
+        raise UserError(
+            f"--timeout {timeout_s:g} is not a time to wait; give seconds above 0, up to {LONGEST_TIMEOUT_S}"
+        )
+    return timeout_s
+
+
+def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
+    """Connect a socket; a malformed address becomes a sentence."""
+    try:
+        socket.connect(address)
+    except zmq.ZMQError as error:
+        raise UserError(
+            f"{address!r} is not an address ({error.strerror}); it looks like tcp://127.0.0.1:7761"
+        ) from error

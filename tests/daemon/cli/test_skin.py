@@ -1,0 +1,104 @@
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from bank.skin.calibration_file import load_calibration
+from bank.skin.characterisation import Row
+from bank.skin.membrane import paper_membrane
+from bank.skin.synthetic import loop, responses
+from daemon.cli import main
+from daemon.cli.skin import _table
+
+
+@pytest.fixture(scope="session")
+def fonts_open() -> None:
+    """Draw once: matplotlib keeps the files of its fonts open for the life of the process."""
+    figure = Figure()
+    figure.text(0.5, 0.5, "±")
+    figure.savefig(io.BytesIO())
+
+
+@pytest.mark.usefixtures("fonts_open")
+def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["skin", "characterise", "--json", "--out", str(tmp_path / "figures")]) == 0
+    printed = capsys.readouterr()
+    rows = {row["quantity"]: row for row in json.loads(printed.out)}
+    for normal_n in (0.5, 1.0, 1.5, 2.0):
+        row = rows[f"sensitivity, fit through origin, Fn = {normal_n} N"]
+        assert row["membrane"] == pytest.approx(float(row["paper_computed"]), rel=0.03)
+        assert row["two_d"] == pytest.approx(float(row["paper_computed"]), rel=0.1)
+    assert rows["slope without friction"]["membrane"] == pytest.approx(0.088)
+    assert rows["deadband, Fn = 1 N"]["membrane"] == pytest.approx(0.04)
+    assert rows["response to 2 N of normal force alone"]["two_d"] < 1e-6
+    for name, tolerance in {
+        "noise floor": 0.05,
+        "95 % prediction interval": 0.1,
+        "drift over an hour, std of the response": 0.4,
+    }.items():
+        assert rows[name]["synthetic"] == pytest.approx(float(rows[name]["paper_measured"]), rel=tolerance)
+    assert rows["dynamic range to 5 N"]["synthetic"] > 10
+
+    drawn = sorted((tmp_path / "figures").iterdir())
+    assert [path.name for path in drawn] == [f"figure_{n}.{kind}" for n in (5, 6, 7) for kind in ("png", "svg")]
+    assert all(path.stat().st_size > 10_000 for path in drawn)
+    assert printed.err.count("drawn: ") == 6
+
+    table = _table(tuple(Row(**row) for row in rows.values()))
+    assert len(table.splitlines()[1:]) > len(rows)
+    assert max(map(len, table.splitlines())) < 130
+    assert "0.0802" in table
+
+
+def test_figures_that_cannot_be_written_are_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("in the way")
+    assert main(["skin", "characterise", "--out", str(tmp_path / "file")]) == 2
+    assert "the figures cannot be written" in capsys.readouterr().err
+
+
+def write_table(path: Path) -> None:
+    lines = ["r1_ohm,r2_ohm,shear_n,normal_n"]
+    for normal_n in (0.5, 1.5):
+        lines.append("25.0,25.5,0,0")
+        shear_n = loop(1.1)
+        for shear, response in zip(shear_n, responses(paper_membrane(), shear_n.tolist(), normal_n), strict=True):
+            r1, r2 = 25.0 * (1 + max(response, 0.0)), 25.5 * (1 + max(-response, 0.0))
+            lines.append(f"{r1:.9f},{r2:.9f},{shear},{normal_n}")
+    path.write_text("\n".join(lines) + "\n")
+
+
+def test_calibrate_takes_a_table_to_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table, out = tmp_path / "table.csv", tmp_path / "skin.yaml"
+    write_table(table)
+    assert main(["skin", "calibrate", str(table), "--out", str(out)]) == 0
+    calibration = load_calibration(out)
+    assert calibration.friction == pytest.approx(0.04, abs=1e-4)
+    assert calibration.slope_per_n == pytest.approx(0.088, rel=1e-4)
+    assert np.isfinite(calibration.prediction_half_width_n)
+    printed = capsys.readouterr().out
+    assert "friction coefficient (fitted)        0.0400" in printed
+    assert f"rows fitted                          {2 * len(loop(1.1))}" in printed
+    assert main(["skin", "calibrate", str(table), "--out", str(out), "--friction", "0.04"]) == 0
+    assert "(given)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [(["none.csv"], "none.csv: the table cannot be read"), (["none.csv", "--friction", "2"], "--friction is 2.0")],
+)
+def test_a_mistake_ends_in_one_sentence(
+    arguments: list[str],
+    named: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["skin", "calibrate", *arguments, "--out", "skin.yaml"]) == 2
+    assert named in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

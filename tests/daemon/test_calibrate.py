@@ -1,0 +1,224 @@
+"""The guided calibrations and the emulators from the command line, each as a process of its own."""
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from drivers.calibration_file import load_calibration
+from drivers.hx711 import LoadCalibration
+from drivers.robotiq.width import WidthCalibration
+
+SHEARLOOP = (sys.executable, "-m", "daemon")
+COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)
+
+
+class Process:
+    """A command with pipes."""
+
+    def __init__(self, *arguments: str) -> None:
+        self._child = subprocess.Popen(
+            [*SHEARLOOP, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        self.said: list[str] = []
+
+    def tell(self, line: str) -> None:
+        assert self._child.stdin is not None
+        self._child.stdin.write(f"{line}\n")
+        self._child.stdin.flush()
+
+    def told(self, line: str) -> None:
+        """Tell an emulator something, and wait until it has been done: commands are taken in order."""
+        self.tell(line)
+        self.tell("?")
+        assert self._child.stderr is not None
+        assert "'?'" in self._child.stderr.readline()
+
+    def hear(self, beginning: str) -> str:
+        """Return the next line that begins like this."""
+        assert self._child.stdout is not None
+        for line in self._child.stdout:
+            self.said.append(line.strip())
+            if line.startswith(beginning):
+                return line.strip()
+        raise AssertionError(
+            f"never said {beginning!r}: {self.said}, {self._child.stderr and self._child.stderr.read()}"
+        )
+
+    def end(self) -> tuple[int, str, str]:
+        out, err = self._child.communicate(timeout=30)
+        return self._child.returncode, out, err
+
+
+@contextlib.contextmanager
+def process(*arguments: str) -> Iterator[Process]:
+    """Run a command; the end of its input ends it."""
+    running = Process(*arguments)
+    try:
+        yield running
+    finally:
+        running.end()
+
+
+def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_path: Path) -> None:
+    link, out = tmp_path / "load", tmp_path / "load.yaml"
+    with process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
+        board.hear(str(link))
+        masses = ("--mass-g", "100", "--mass-g", "200")
+        with process("calibrate", "load", "--port", str(link), *masses, "--out", str(out)) as calibrate:
+            calibrate.hear("Take every load off")
+            calibrate.tell("")
+            calibrate.hear("  0 g:")
+            # The mass was forgotten: the step is refused and asked for again.
+            calibrate.hear("Put 100 g on")
+            calibrate.tell("")
+            calibrate.hear("Put 100 g on")
+            board.told("mass 100")
+            calibrate.tell("")
+            calibrate.hear("  100 g:")
+            calibrate.hear("Put 200 g on")
+            board.told("mass 200")
+            calibrate.tell("")
+            status, said, refused = calibrate.end()
+        board.tell("nonsense")
+        assert "there is no fault 'nonsense'" in board.end()[2]
+    assert status == 0
+    assert "Refused: The reading did not change with 100 g" in refused
+    assert f"Written to {out}." in said
+    calibration = load_calibration(out, LoadCalibration)
+    assert calibration.nm_per_count * COUNTS_PER_NM == pytest.approx(1.0, rel=2e-3)
+    assert calibration.torque_nm(81_250) == pytest.approx(0.0, abs=2e-4)
+
+
+@pytest.mark.parametrize("way", ["socket", "modbus"])
+def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path: Path, way: str) -> None:
+    out, link = tmp_path / "gripper.yaml", tmp_path / "gripper"
+    arguments = ("--port", "0") if way == "socket" else ("--link", str(link))
+    with process("emulate", f"gripper-{way}", "--speed", "20", *arguments) as gripper:
+        where = gripper.hear("127.0.0.1:" if way == "socket" else str(link))
+        host, _, port = where.partition(":")
+        reach = ("--host", host, "--socket-port", port) if way == "socket" else ("--port", where)
+        diameters = ("--diameter-mm", "10", "--diameter-mm", "40")
+        with process("calibrate", "gripper", *reach, *diameters, "--out", str(out)) as calibrate:
+            calibrate.hear("The fingers will open")
+            calibrate.tell("")
+            calibrate.hear("Hold the object of 10 mm")
+            calibrate.tell("")
+            calibrate.hear("Hold the object of 10 mm")
+            for diameter in (10, 40):
+                gripper.told(f"object {diameter}")
+                calibrate.tell("")
+                calibrate.hear(f"  {diameter} mm:")
+            status, _, refused = calibrate.end()
+    assert status == 0
+    assert "without meeting anything" in refused
+    found = load_calibration(out, WidthCalibration)
+    # Two positions, each rounded to a count: the true gripper goes from 3 to 230 counts over 140 mm.
+    assert found.width_mm(3) == pytest.approx(140, abs=5)
+    assert found.width_mm(230) == pytest.approx(0, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("load", "--port", "/dev/none", "--mass-g", "100", "--out", "load.yaml"), "no serial port /dev/none"),
+        (("load", "--port", "/dev/none", "--mass-g", "-1", "--out", "load.yaml"), "mass in grams"),
+        (("load", "--port", "/dev/none", "--mass-g", "1", "--out", "no/load.yaml"), "does not exist"),
+        (
+            ("load", "--port", "/dev/none", "--mass-g", "1", "--lever-arm-mm", "0", "--out", "l.yaml"),
+            "--lever-arm-mm 0",
+        ),
+        (("gripper", "--port", "/dev/none", "--diameter-mm", "20", "--out", "g.yaml"), "two different"),
+        (
+            ("gripper", "--port", "/dev/none", "--diameter-mm", "2", "--diameter-mm", "4", "--out", "g.yaml"),
+            "/dev/none",
+        ),
+    ],
+)
+def test_a_mistake_ends_in_one_sentence(
+    arguments: tuple[str, ...],
+    said: str,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from daemon.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    assert main(["calibrate", *arguments]) == 2
+    message = capfd.readouterr().err
+    assert said in message
+    assert message.startswith("shearloop calibrate: ")
+    assert message.count("\n") == 1
+
+
+def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Path) -> None:
+    link = tmp_path / "load"
+    with process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
+        board.hear(str(link))
+        command = [
+            *SHEARLOOP,
+            "calibrate",
+            "load",
+            "--port",
+            str(link),
+            "--mass-g",
+            "100",
+            "--out",
+            tmp_path / "l.yaml",
+        ]
+        # From a file, which no event loop can wait for.
+        answers = tmp_path / "answers"
+        answers.write_text("\n")
+        with answers.open() as stdin:
+            done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == 2
+    assert "the input ended before all was measured" in done.stderr
+    assert not os.path.exists(tmp_path / "l.yaml")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("hx711", "--speed", "0"), "--speed 0"),
+        (("hx711", "--fault", "spark"), "there is no fault 'spark'"),
+        (("hx711", "--torque-nm", "nan"), "finite"),
+        (("gripper-socket", "--port", "70000"), "no port"),
+        (("gripper-socket", "--object-mm", "900"), "width in mm"),
+        (("gripper-socket", "--bind", "192.0.2.1"), "cannot be played"),
+        (("gripper-modbus", "--link", "/nowhere/at/all"), "needs a folder"),
+    ],
+)
+def test_an_emulator_that_cannot_be_played_says_why(
+    arguments: tuple[str, ...], said: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from daemon.cli import main
+
+    assert main(["emulate", *arguments]) == 2
+    assert said in capfd.readouterr().err
+
+
+def test_a_gripper_socket_fails_on_request() -> None:
+    import socket
+
+    with process("emulate", "gripper-socket", "--port", "0", "--speed", "10") as gripper:
+        host, _, port = gripper.hear("127.0.0.1:").partition(":")
+        with socket.create_connection((host, int(port)), timeout=10) as client:
+            client.sendall(b"GET FLT\n")
+            assert client.recv(64) == b"FLT 00\n"
+            gripper.tell("fault 14")
+            gripper.tell("what")
+            gripper.tell("lose 0.01")
+            # The connection breaks, and the address is listened on again.
+            with contextlib.suppress(ConnectionResetError):
+                while client.recv(64):
+                    pass
+        assert gripper.hear("127.0.0.1:") == f"{host}:{port}"
+        with socket.create_connection((host, int(port)), timeout=10) as client:
+            client.sendall(b"GET FLT\n")
+            assert client.recv(64) == b"FLT 14\n"
+        assert "'what' is no command" in gripper.end()[2]

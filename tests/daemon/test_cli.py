@@ -1,0 +1,201 @@
+"""Every mistake ends in one sentence that names the file, the key and the cure, and exit status 2."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.cli import COMMANDS, main
+from daemon.messages import decode, encode
+from daemon.readable import as_json, as_line
+
+Write = Callable[..., Path]
+
+
+def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.count("\n") == 1, err
+    assert err.startswith(f"shearloop {arguments[0]}: ")
+    return err
+
+
+def test_a_configuration_in_order_is_said_to_be(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(config())]) == 0
+    assert "is in order" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+@pytest.mark.parametrize(
+    ("changes", "parts"),
+    [
+        ({"fingertips": {}}, ["fingertips"]),
+        ({"fingertip": {}}, ["`fingertip` is not a known key", "did you mean `fingertips`?"]),
+        ({"publish": "tcp://0.0.0.0:7761"}, ["publish", "loopback"]),
+        ({"publish": "tcp://lab-pc:7761"}, ["publish", "loopback"]),
+        ({"fingertips": {"Right Hand": {}}}, ["fingertips"]),
+    ],
+)
+def test_a_mistake_in_a_configuration_names_file_key_and_cure(
+    command: str, changes: dict[str, Any], parts: list[str], config: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = config(**changes)
+    said = mistake(capsys, command, str(path))
+    for part in (str(path), *parts):
+        assert part in said
+
+
+def fingertip(**changes: Any) -> dict[str, Any]:
+    return {"right": {"device": {"path": "eit"}, "bank": "no.bank", **changes}}
+
+
+@pytest.mark.parametrize(
+    ("section", "parts"),
+    [
+        (fingertip(), ["no.bank", "shearloop bank build"]),
+        (fingertip(device={}), ["device", "either serial_number or path"]),
+        (fingertip(device={"path": "eit", "serial_number": "1"}), ["either serial_number or path"]),
+        (fingertip(baseline_frames=1), ["fingertips.right.baseline_frames", "from 2 to 1000"]),
+        (fingertip(matching="best"), ["matching", "all_lags"]),
+        (fingertip(baseline_frames=0, average_frames=0), ["baseline_frames", "average_frames"]),
+    ],
+)
+def test_a_mistake_in_a_fingertip_is_named(
+    section: dict[str, Any], parts: list[str], config: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = mistake(capsys, "check", str(config(fingertips=section)))
+    for part in parts:
+        assert part in said
+
+
+def test_a_calibration_of_another_bank_is_refused_by_name(
+    config: Write, tiny_bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import numpy as np
+
+    from bank.calibration import Calibration
+
+    foreign = tmp_path / "foreign.yaml"
+    grid = np.linspace(1, 2, 9)
+    Calibration.fit("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
+    section = fingertip(bank=str(tiny_bank), calibration=str(foreign))
+    said = mistake(capsys, "check", str(config(fingertips=section)))
+    for part in (str(foreign), "made with the bank cdcdcd", "calibrate again"):
+        assert part in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["check", "no-such.yaml"], "no-such.yaml"),
+        (["listen", "eit.torque"], "there is no topic 'eit.torque'; the topics are eit.frame, eit.estimate"),
+        (["listen", "--count", "0"], "--count 0"),
+        (["listen", "--timeout", "-1"], "--timeout -1"),
+        (["listen", "--timeout", "inf"], "--timeout inf"),
+        (["command", "status", "--timeout", "nan"], "--timeout nan"),
+        (["command", "status", "--timeout", "-1"], "--timeout -1"),
+        (["listen", "--connect", "here", "--timeout", "1"], "'here' is not an address"),
+        (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "nothing was heard"),
+        (["command", "tare", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no daemon answered"),
+    ],
+)
+def test_a_mistake_on_the_command_line_is_one_sentence(
+    arguments: list[str], part: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert part in mistake(capsys, *arguments)
+
+
+def test_a_recording_for_a_configuration_without_an_emulator_is_refused(
+    config: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = mistake(capsys, "run", str(config()), "--recording", "some.mat")
+    assert "has no eit-kit among its `emulators`" in said
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([name, "--help"])
+    assert ended.value.code == 0
+    assert f"usage: shearloop {name}" in capsys.readouterr().out
+
+
+def test_an_unknown_command_is_refused_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["fly"])
+    assert ended.value.code == 2
+    assert "'run'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [["--help"], *([name, "--help"] for name in COMMANDS)])
+def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
+    heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml")
+    program = (
+        "import sys; from daemon.cli import main\n"
+        f"try: main({arguments!r})\nexcept SystemExit: pass\n"
+        f"print(*[name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == ""
+
+
+def test_messages_are_readable() -> None:
+    content = decode(
+        encode(
+            {
+                "timestamp": 0.0,
+                "seq": 1,
+                "source": "right",
+                "t_mono_ns": 5,
+                "torque_nm": 0.05,
+                "torque_low_nm": 0.02,
+                "torque_high_nm": 0.08,
+                "diameter_mm": 31.0,
+                "k": 3.5,
+                "sigma": 1.5,
+                "score": 0.75,
+                "valid": True,
+                "why": "",
+            }
+        )
+    )
+    line = as_line("eit.estimate", content)
+    assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
+    assert as_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
+    invalid = {**content, "valid": False, "why": "no signal"}
+    assert as_line("eit.estimate", invalid).endswith("no estimate: no signal")
+
+
+def test_an_emulator_or_a_recording_that_cannot_play_is_refused_before_anything_starts(
+    config: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    unknown = str(config(emulators=[{"device": "eit-kitt"}]))
+    for command in ("check", "run"):
+        assert "`emulators[0].device` is 'eit-kitt'; there are eit-kit" in mistake(capsys, command, unknown)
+    known = str(config(emulators=[{"device": "eit-kit"}]))
+    assert "the recording cannot be read" in mistake(capsys, "run", known, "--recording", str(tmp_path / "none.mat"))
+
+
+def test_estimates_that_nobody_reads_any_longer_do_not_kill_the_estimator() -> None:
+    program = (
+        "import os, sys; from daemon.cli.run import _Show; read, write = os.pipe(); os.close(read); os.dup2(write, 1)\n"
+        "show, estimate = _Show(), {'timestamp': 0.0, 'source': 'right', 'valid': False, 'why': 'x'}\n"
+        "show('eit.estimate', estimate); show('eit.estimate', estimate)"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+
+
+def test_a_path_that_names_nothing_and_one_address_for_two_are_named(
+    config: Write, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "`experiment` must be the path of a file, not '.'" in mistake(
+        capsys, "check", str(config(experiment="", robot="ur.yaml"))
+    )
+    assert "`robot` must be the path of a file" in mistake(capsys, "check", str(config(robot="a\0b")))
+    both = "ipc:///tmp/one-for-both"
+    assert f"are both {both}" in mistake(capsys, "check", str(config(publish=both, commands=both)))

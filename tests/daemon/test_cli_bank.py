@@ -1,0 +1,191 @@
+"""`shearloop bank`: what it writes and prints, and that every mistake is one sentence and status 2."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bank.bank_file import Bank
+from bank.forward import ForwardModel
+from bank.mesh import load_mesh
+from bank.models import conductivity
+from daemon.cli import main
+from tests.daemon.test_bank_config import BANK, FINGERTIP
+
+SOLVE = ["solve", "--mesh", "{folder}/tip.yaml", "--model", "step", "--k", "1", "--sigma", "1", "--out", "{folder}/v"]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder with a configuration and the bank that the command built of it."""
+    folder = tmp_path_factory.mktemp("bank")
+    (folder / "tip.yaml").write_text(FINGERTIP)
+    (folder / "bank.yaml").write_text(BANK)
+    assert main(["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{folder}/a.bank", "--jobs", "1"]) == 0
+    return folder
+
+
+def refused(capsys, *arguments):
+    """Run a command that must end in one sentence and status 2, and return the sentence."""
+    assert main(["bank", *map(str, arguments)]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    sentences = captured.err.splitlines()
+    assert len(sentences) == 1
+    assert sentences[0].startswith("shearloop bank: ")
+    return sentences[0]
+
+
+def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys):
+    capsys.readouterr()
+    build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/b.bank", "--jobs", "1", "--json"]
+    assert main([*build, "--k", "1:2:2", "--sigma", "1:1.5:3", "--model", "linear"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    bank = Bank.open(tmp_path / "b.bank", verify=True)
+    assert (told["identity"], told["shape"], told["model"]) == (bank.identity, [2, 3, 896], "linear")
+    assert told["valid_cells"] == bank.valid.sum()
+    np.testing.assert_array_equal(bank.sigma_grid, [1, 1.25, 1.5])
+
+
+def test_info_checks_the_bank_and_says_what_it_is_of(folder, capsys):
+    assert main(["bank", "info", f"{folder}/a.bank", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["k"] == {"low": 0.5, "high": 3.0, "count": 3, "unit": "cm"}
+    assert told["valid_cells"] == 6
+    assert main(["bank", "info", f"{folder}/a.bank"]) == 0
+    assert "3 values from 0.5 to 3 (cm)" in capsys.readouterr().out
+
+
+def test_info_refuses_a_damaged_bank(folder, tmp_path, capsys):
+    content = bytearray((folder / "a.bank").read_bytes())
+    content[-5] ^= 1
+    (tmp_path / "bad.bank").write_bytes(content)
+    sentence = refused(capsys, "info", tmp_path / "bad.bank")
+    assert "bad.bank: the file is damaged: the checksum of signals" in sentence
+    assert "shearloop bank build" in sentence
+
+
+def test_solve_writes_the_absolute_voltages(folder, tmp_path):
+    solve = ["bank", "solve", "--mesh", f"{folder}/tip.yaml", "--model", "gaussian_derivative"]
+    assert main([*solve, "--k", "1.5", "--sigma", "1.1", "--out", f"{tmp_path}/v.npy"]) == 0
+    voltages = np.load(tmp_path / "v.npy")
+    assert (voltages.dtype, voltages.shape) == (np.float64, (896,))
+    assert np.linalg.norm(voltages) > 1
+
+
+def test_solve_on_the_papers_mesh_gives_the_voltages_of_eidors(shared, tmp_path):
+    with np.load(shared / "reference" / "eidors_forward.npz") as archive:
+        k, sigma, expected = (archive[f"gaussian_derivative_random_{name}"][2] for name in ("k", "sigma", "v"))
+    solve = ["bank", "solve", "--model", "gaussian_derivative", "--k", str(k), "--sigma", str(sigma)]
+    for name in ("fingertip_mesh.npz", "ModelGen.mat"):
+        assert main([*solve, "--mesh", f"{shared}/reference/{name}", "--out", f"{tmp_path}/v"]) == 0
+        found = np.load(tmp_path / "v")
+        assert np.linalg.norm(found - expected) < 1e-9 * np.linalg.norm(expected)
+
+
+def test_solve_refuses_a_conductivity_that_is_not_positive_and_writes_nothing(folder, tmp_path, capsys):
+    out = tmp_path / "v.npy"
+    sentence = refused(
+        capsys,
+        *("solve", "--mesh", folder / "tip.yaml", "--model", "gaussian_derivative"),
+        *("--k", "1.5", "--sigma", "0.4", "--out", out),
+    )
+    assert "--model gaussian_derivative --k 1.5 --sigma 0.4: the conductivity is not positive everywhere" in sentence
+    assert not out.exists()
+
+
+@pytest.fixture(scope="module")
+def pictures(folder):
+    """Draw for the whole module: matplotlib keeps its fonts' files open."""
+    out = folder / "pictures"
+    assert main(["bank", "plot", f"{folder}/a.bank", "--config", f"{folder}/bank.yaml", "--out", str(out)]) == 0
+    return out
+
+
+def test_plot_draws_signals_and_models(pictures):
+    names = ["bank_signals.png", "bank_signals.svg", "models.png", "models.svg"]
+    assert sorted(path.name for path in pictures.iterdir()) == names
+    assert (pictures / "models.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (["--k", "1:2"], "--k must be LO:HI:N such as 0.01:4.4:100, not '1:2'"),
+        (["--k", "a:2:3"], "--k must be LO:HI:N"),
+        (["--sigma", "1:2:3.5"], "--sigma must be LO:HI:N"),
+        (["--sigma", "1:2:3:4"], "--sigma must be LO:HI:N"),
+        (
+            ["--k", "1:2:1"],
+            "--k 1:2:1: `count` should be greater than or equal to 2 (found 1, allowed: from 2 to 2000)",
+        ),
+        (["--k", "2:2:5"], "--k 2:2:5: low must be below high"),
+        (["--k", "nan:2:5"], "--k nan:2:5: `low` should be a finite number"),
+        (["--sigma", "0:2:5"], "sigma must begin above 0"),
+        (["--model", "square"], "there is no basis model 'square'; choose one of step, linear"),
+        (["--jobs", "0"], "--jobs must be 1 or more, not 0"),
+        (["--out", "{folder}"], "is a directory; give the name of a file"),
+        (["--out", "{folder}/none/a.bank"], "the bank cannot be written: No such file or directory"),
+        (["--out", "{folder}/tip.yaml/a.bank"], "the bank cannot be written: Not a directory"),
+        (["--config", "{folder}/none.yaml"], "none.yaml: the configuration cannot be read"),
+        (["--config", "{folder}/tip.yaml"], "`model` is missing (allowed: step, linear"),
+    ],
+)
+def test_mistakes_of_build_are_one_sentence(folder, tmp_path, capsys, options, part):
+    build = ["build", "--config", f"{folder}/bank.yaml", "--out", f"{tmp_path}/new.bank", "--jobs", "1"]
+    assert part in refused(capsys, *build, *(option.format(folder=folder) for option in options))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "part"),
+    [
+        (["info", "{folder}/tip.yaml"], "tip.yaml: this is not a bank"),
+        (["info", "{folder}/none"], "none: the bank cannot be read"),
+        (["plot", "--out", "{folder}/f"], "give a bank's PATH, or --config FILE, or both"),
+        (["plot", "{folder}/a.bank", "--out", "{folder}/tip.yaml"], "the pictures cannot be written: File exists"),
+        ([*SOLVE, "--mesh", "{folder}/none"], "the mesh cannot be read"),
+        ([*SOLVE, "--mesh", "{folder}/a.bank"], "is not a mesh"),
+        ([*SOLVE, "--model", "x"], "no basis model"),
+        ([*SOLVE, "--k", "nan"], "finite"),
+        ([*SOLVE, "--out", "{folder}"], "the voltages cannot be written: Is a directory"),
+    ],
+)
+@pytest.mark.usefixtures("pictures")
+def test_mistakes_of_the_others_are_one_sentence(folder, capsys, arguments, part):
+    assert part in refused(capsys, *(argument.format(folder=folder) for argument in arguments))
+    assert not (folder / "v").exists()
+
+
+def test_help_comes_without_loading_what_is_heavy():
+    script = "import sys; from daemon.cli import main\ntry: main(['bank', 'build', '--help'])\nfinally: "
+    script += "print(sorted({'numpy', 'scipy', 'pydantic', 'skfem', 'matplotlib', 'tqdm'} & set(sys.modules)))"
+    root = Path(__file__).parents[2]
+    done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=True)
+    assert "--sigma LO:HI:N" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_a_bank_is_of_the_mesh_file_that_the_configuration_names(fingertip_file, tmp_path):
+    (tmp_path / "bank.yaml").write_text(BANK.replace("fingertip: tip.yaml", f"mesh: {{file: {fingertip_file.name}}}"))
+    build = ["bank", "build", "--config", f"{tmp_path}/bank.yaml", "--out", f"{tmp_path}/m.bank", "--jobs", "1"]
+    assert main(build) == 0
+    mesh = load_mesh(fingertip_file)
+    bank = Bank.open(tmp_path / "m.bank")
+    assert bank.geometry_hash == mesh.digest
+    forward = ForwardModel(mesh)
+    expected = forward.voltages(conductivity(mesh, bank.model, 1.75, 2.0)) - forward.homogeneous()
+    np.testing.assert_array_equal(bank.signals[1, 1], expected.astype(np.float32))
+
+
+@pytest.fixture
+def fingertip_file(folder, tmp_path):
+    from daemon.bank_config import load_geometry
+
+    mesh = load_geometry(folder / "tip.yaml").refined()
+    names = ("nodes", "triangles", "electrode_edges", "electrode_of_edge", "contact_impedance")
+    np.savez(tmp_path / "mesh.npz", **{name: getattr(mesh, name) for name in names})
+    return tmp_path / "mesh.npz"

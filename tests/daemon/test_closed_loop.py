@@ -1,0 +1,187 @@
+"""The whole loop over real ports: the daemon, the real drivers, and the rig played by a process of its own."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+import zmq.asyncio
+
+from bank.bank_file import Bank
+from bank.calibration import Calibration
+from daemon.app import Daemon
+from daemon.config import load_daemon_config
+from daemon.request import request
+from tests.daemon.conftest import DEADLINE_S, shearloop
+
+HOST = "127.0.0.41"
+SPEED = 5
+Write = Callable[..., Path]
+
+
+def torque_of(sigma: np.ndarray) -> np.ndarray:
+    """Where the emulated rig has its sigma at a torque, turned round."""
+    return np.asarray((1.85 - sigma) * 0.14 / 0.6)
+
+
+@pytest.fixture
+def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
+    """Write the configuration of a whole rig whose boards are SPEED times as fast."""
+    sigma = np.linspace(0.95, 2.05, 40)
+    calibration = tmp_path / "rig.yaml"
+    Calibration.fit(Bank.open(tiny_bank).identity, "synthetic", torque=(sigma, torque_of(sigma))).save(calibration)
+    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": HOST}))
+    return config(
+        fingertips={
+            "right": {
+                "device": {"path": "eit-right"},
+                "bank": str(tiny_bank),
+                "calibration": str(calibration),
+                "matching": "zero_lag",
+                "frame_period_s": 0.5412 / SPEED,
+            }
+        },
+        load_cell={"device": {"path": "load-cell"}, "rate_hz": 10.9 * SPEED},
+        robot="ur.yaml",
+        gripper={"socket": {"host": HOST}},
+        loop={"disagreement_nm": 0.2, "jump_nm": 0.3},
+    )
+
+
+def experiment(folder: Path, *steps: Mapping[str, Any]) -> str:
+    path = folder / "experiment.yaml"
+    begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
+    content = {"name": "test", "drive": "load_cell", "steps": [*begin, *map(dict, steps)]}
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
+
+
+class Watcher:
+    """Collects what the daemon publishes, and waits for what a test is after."""
+
+    def __init__(self, daemon: Daemon) -> None:
+        self.seen: dict[str, list[dict[str, Any]]] = {}
+        self._news = asyncio.Event()
+        daemon.publisher.listen(self._take)
+
+    def _take(self, topic: str, content: dict[str, Any]) -> None:
+        self.seen.setdefault(topic, []).append(content)
+        self._news.set()
+
+    async def until(self, topic: str, is_so: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        checked = 0
+        while True:
+            for content in self.seen.get(topic, [])[checked:]:
+                checked += 1
+                if is_so(content):
+                    return content
+            self._news.clear()
+            await self._news.wait()
+
+
+@asynccontextmanager
+async def running_rig(
+    path: Path, bank: Path
+) -> AsyncIterator[tuple[Daemon, Watcher, Callable[[str], None], Callable[..., Any]]]:
+    run_dir = path.parent
+    async with shearloop(
+        *("emulate", "rig", "--bank", str(bank), "--run-dir", str(run_dir), "--host", HOST),
+        *("--speed", str(SPEED), "--paper-sketch", "--unlock-wait-s", "0.2", "--power-on-s", "0.1"),
+        stdin=asyncio.subprocess.PIPE,
+    ) as rig:
+        assert rig.stdout is not None
+        assert rig.stdin is not None
+        stdin = rig.stdin
+        assert (await rig.stdout.readline()).startswith(b"rig ready")
+        with zmq.asyncio.Context() as context:
+            daemon = Daemon(load_daemon_config(path), context)
+            watcher = Watcher(daemon)
+            task = asyncio.create_task(daemon.run())
+
+            async def command(name: str, **arguments: Any) -> dict[str, Any]:
+                address = f"ipc://{run_dir}/commands"
+                return await asyncio.to_thread(request, address, {"command": name, **arguments}, DEADLINE_S)
+
+            try:
+                async with asyncio.timeout(DEADLINE_S):
+                    await watcher.until("robot.state", lambda _: True)
+                    await watcher.until("gripper.state", lambda _: True)
+                    yield daemon, watcher, lambda line: stdin.write(f"{line}\n".encode()), command
+            finally:
+                daemon.stop()
+                await task
+
+
+async def started(command: Callable[..., Any], path: str) -> None:
+    """Start an experiment as soon as the robot is ready for it."""
+    reply = await command("start", experiment=path)
+    while not reply["ok"] and "being made ready" in reply["why"]:
+        reply = await command("start", experiment=path)
+    assert reply["ok"], reply
+
+
+async def test_a_tool_is_gripped_twisted_and_released(rig_config: Path, tiny_bank: Path, tmp_path: Path) -> None:
+    twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.3, "hold_s": 1.0}
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
+        await started(command, experiment(tmp_path, twist, {"do": "release"}))
+        state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
+    assert state["phase"] == "done", state["doing"]
+    torques = [message["torque_nm"] for message in watcher.seen["load.torque"]]
+    # Gel and joint in series, and what a held gel loses.
+    assert max(torques) == pytest.approx(0.1 * 0.8 * 20 / 20.8, rel=0.1)
+    assert abs(torques[-1]) < 0.01
+    held = [message["diameter_mm"] for message in watcher.seen["gripper.state"] if message["diameter_mm"] is not None]
+    assert held[-1] == pytest.approx(20.0, abs=1.0)
+    valid = [message["torque_nm"] for message in watcher.seen["eit.estimate"] if message["valid"]]
+    assert max(valid) == pytest.approx(max(torques), abs=0.03)
+    wrench = max(abs(message["wrist_torque_nm"]) for message in watcher.seen["robot.state"])
+    assert wrench == pytest.approx(max(torques), rel=0.1)
+
+
+async def test_a_protective_stop_ends_the_experiment_and_is_unlocked_on_the_operators_word(
+    rig_config: Path, tiny_bank: Path, tmp_path: Path
+) -> None:
+    twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 60.0}
+    async with running_rig(rig_config, tiny_bank) as (daemon, watcher, fault, command):
+        path = experiment(tmp_path, twist)
+        await started(command, path)
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.01)
+        fault("protective-stop")
+        state = await watcher.until("loop.state", lambda state: state["phase"] == "stopped")
+        assert "the robot is in a protective stop" in state["reasons"]
+        assert "shearloop command unlock" in state["reasons"]
+        refused = await command("start", experiment=path)
+        assert not refused["ok"]
+        reply = await command("unlock")
+        while not reply["ok"]:
+            reply = await command("unlock")
+        await started(command, path)
+        assert (await command("pause"))["ok"]
+        assert (await command("stop")) == {"ok": True, "stopped": "test"}
+        assert not daemon.supervisor.records["loop"].restarts
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("unplug load", "no new torque has come"),
+        ("gripper fault 14", "the gripper reports a fault"),
+        ("gripper drop", "the gripper no longer holds an object"),
+    ],
+)
+async def test_each_fault_ends_in_the_tables_response(
+    line: str, sentence: str, rig_config: Path, tiny_bank: Path, tmp_path: Path
+) -> None:
+    twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.01, "hold_s": 60.0}
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, fault, command):
+        await started(command, experiment(tmp_path, twist))
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
+        fault(line)
+        state = await watcher.until("loop.state", lambda state: sentence in state["reasons"])
+        assert state["phase"] in ("held", "stopped")
+        assert state["speed_wanted_rad_per_s"] == 0.0

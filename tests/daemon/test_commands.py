@@ -1,0 +1,132 @@
+import asyncio
+import os
+import socket
+import threading
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+import zmq.asyncio
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon.clock import Clock
+from daemon.command_server import CommandRefusedError, CommandServer
+from daemon.errors import UserError
+from daemon.messages import decode, encode
+from daemon.publisher import Publisher
+from daemon.request import request
+from daemon.subscriber import messages
+
+
+def handlers() -> Mapping[str, Any]:
+    async def tare(content: Mapping[str, Any]) -> dict[str, Any]:
+        if content.get("source") == "left":
+            raise CommandRefusedError("there is no fingertip 'left'")
+        return {"tared": ["right"]}
+
+    async def unlock(_: Mapping[str, Any]) -> dict[str, Any]:
+        raise ZeroDivisionError("nothing to divide")
+
+    return {"tare": tare, "unlock": unlock}
+
+
+class Unbound(CommandServer):
+    """The deciding half of the server, without its socket."""
+
+    def __init__(self) -> None:
+        self._handlers = handlers()
+        self.refused = Counter()
+
+
+async def test_each_request_gets_one_reply_with_the_reason_when_it_is_refused() -> None:
+    server = Unbound()
+    assert await server.answer(encode({"command": "tare"})) == {"ok": True, "tared": ["right"]}
+    assert await server.answer(encode({"command": "tare", "source": "left"})) == {
+        "ok": False,
+        "why": "there is no fingertip 'left'",
+    }
+    assert (await server.answer(encode({"command": "jump"})))[
+        "why"
+    ] == "there is no command 'jump'; the commands are tare, unlock"
+    assert "not a message" in (await server.answer(b"\x92\x01\x02"))["why"]
+    assert server.refused == {"tare refused": 1, "unknown command": 1, "malformed request": 1}
+
+
+@given(st.binary(max_size=200))
+def test_no_request_brings_the_server_down(payload: bytes) -> None:
+    reply = asyncio.run(Unbound().answer(payload))
+    assert reply["ok"] or reply["why"]
+
+
+async def test_requests_over_a_socket_are_answered_to_both_kinds_of_client() -> None:
+    with zmq.asyncio.Context() as context:
+        server = CommandServer(context, "tcp://127.0.0.1:*", handlers())
+        address = server._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+        serving = asyncio.create_task(server.run())
+        assert (await asyncio.to_thread(request, address, {"command": "tare"}, 5.0))["tared"] == ["right"]
+        with context.socket(zmq.REQ) as client:
+            client.connect(address)
+            await client.send(b"\xc1 not msgpack")
+            assert not decode(await client.recv())["ok"]
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        server.close()
+
+
+def test_no_daemon_is_a_sentence() -> None:
+    with pytest.raises(UserError, match=r"no daemon answered at ipc:///nowhere-at-all within 0.01 s; start it with"):
+        request("ipc:///nowhere-at-all", {"command": "status"}, 0.01)
+
+
+def test_an_address_in_use_is_a_sentence() -> None:
+    with zmq.Context() as context, context.socket(zmq.PUB) as taken:
+        taken.bind("tcp://127.0.0.1:*")
+        address = taken.getsockopt_string(zmq.LAST_ENDPOINT)
+        with pytest.raises(UserError, match=rf"`publish: {address}` is already in use; is another daemon"):
+            Publisher(context, address, Clock())
+        with pytest.raises(UserError, match="cannot be bound"):
+            Publisher(context, "carrier-pigeon", Clock())
+
+
+async def test_a_handler_that_fails_is_answered_and_leaves_the_server_standing() -> None:
+    server = Unbound()
+    assert "unlock failed (ZeroDivisionError" in (await server.answer(encode({"command": "unlock"})))["why"]
+    assert server.refused == {"unlock failed": 1}
+    assert (await server.answer(encode({"command": "tare"})))["ok"]
+
+
+def test_an_ipc_address_takes_neither_a_file_nor_a_living_daemons_place(tmp_path: Path) -> None:
+    letter = tmp_path / "letter.txt"
+    letter.write_text("dear reader")
+    with zmq.Context() as context:
+        with pytest.raises(UserError, match=r"`publish: ipc://.*letter.txt is there and is no socket"):
+            Publisher(context, f"ipc://{letter}", Clock())
+        assert letter.read_text() == "dear reader"
+        first = Publisher(context, f"ipc://{tmp_path}/publish", Clock())
+        with pytest.raises(UserError, match="is already in use; is another daemon running"):
+            Publisher(context, f"ipc://{tmp_path}/publish", Clock())
+        first.close()
+
+
+def test_the_socket_that_a_killed_daemon_left_is_taken_over(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as killed:
+        killed.bind(os.fspath(tmp_path / "publish"))
+    with zmq.Context() as context:
+        Publisher(context, f"ipc://{tmp_path}/publish", Clock()).close()
+
+
+def test_what_is_not_a_daemons_is_a_sentence(tmp_path: Path) -> None:
+    with zmq.Context() as context, context.socket(zmq.XPUB) as stranger:
+        stranger.bind(f"ipc://{tmp_path}/stranger")
+        for content in ([b"one frame"], [b"a", b"\xc1"], [b"a", encode({"timestamp": 1.0})], [b"1", b"2", b"3"]):
+            heard = messages(f"ipc://{tmp_path}/stranger", (), 5.0)
+            sending = threading.Thread(target=lambda sent=content: (stranger.recv(), stranger.send_multipart(sent)))
+            sending.start()
+            with pytest.raises(UserError, match="is not shearloop's"):
+                next(heard)
+            sending.join()
+            stranger.recv()

@@ -1,0 +1,191 @@
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import aclosing, asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from bank.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
+from daemon.cli import EXIT_USAGE, main
+from drivers.eit_format import ADC_STEP_V
+from drivers.eit_kit import EitKit, Frame
+
+# Guards against a test that hangs; none of them waits for so long.
+DEADLINE_S = 60
+PERIOD_S = 0.5408
+
+
+@asynccontextmanager
+async def emulator(*arguments: str) -> AsyncIterator[tuple[asyncio.subprocess.Process, str]]:
+    """Run `shearloop emulate eit-kit` as a process of its own and hand over the path that it prints."""
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        *("-m", "daemon", "emulate", "eit-kit", *arguments),
+        stdin=asyncio.subprocess.PIPE,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    try:
+        async with asyncio.timeout(DEADLINE_S):
+            assert process.stdout is not None
+            path = (await process.stdout.readline()).decode().strip()
+            assert path, (await process.stderr.read()).decode() if process.stderr else ""
+            yield process, path
+    finally:
+        if process.returncode is None:
+            process.terminate()
+        await process.communicate()
+        # The transport closes its pipes one step later.
+        await asyncio.sleep(0)
+
+
+async def take(kit: EitKit, n_frames: int) -> list[Frame]:
+    frames: list[Frame] = []
+    async with aclosing(kit.frames()) as arriving:
+        async for frame in arriving:
+            frames.append(frame)
+            if len(frames) == n_frames:
+                break
+    return frames
+
+
+def recording(folder: Path, n_frames: int) -> tuple[Path, NDArray[np.float64]]:
+    from scipy.io import savemat
+
+    steps = np.random.default_rng(2).integers(1, 300, (n_frames, len(LINE_SLOTS)))
+    lines = np.round(line_of_channels(steps * ADC_STEP_V), 4)
+    days = 739_588 + np.arange(n_frames) * PERIOD_S / 86_400
+    path = folder / "stream.mat"
+    savemat(path, {"Right_Data": np.column_stack([days, lines])})
+    return path, lines
+
+
+async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_order(shared: Path) -> None:
+    from scipy.io import loadmat
+
+    folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
+    expected = loadmat(folder / "device1.mat")["Right_Data"][:, 1:]
+    async with emulator("--recording", str(folder / "device1.mat"), "--speed", "100", "--once") as (_, path):
+        kit = EitKit(zero_slots=ZERO_SLOTS, path=path)
+        frames = await take(kit, 832)
+    assert [frame.seq for frame in frames] == list(range(832))
+    np.testing.assert_array_equal([frame.raw for frame in frames], expected)
+    facts = kit.facts()
+    assert (facts["frames"], facts["errors"], facts["openings"]) == (832, {}, 1)
+    assert facts["first_partials"] == 0
+    # The pace is checked loosely: the machine may be busy, but the board does not hurry.
+    spread_s = (frames[-1].t_arrival_ns - frames[0].t_arrival_ns) / 1e9
+    assert spread_s > 0.9 * 831 * PERIOD_S / 100
+
+
+async def test_a_recording_is_played_again_and_again_under_the_name_given(tmp_path: Path) -> None:
+    path, lines = recording(tmp_path, 3)
+    link = tmp_path / "eit"
+    async with emulator("--recording", str(path), "--speed", "500", "--link", str(link)) as (process, port):
+        assert port == str(link)
+        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port), 7)
+        process.send_signal(signal.SIGINT)
+        assert await process.wait() == 0
+    np.testing.assert_array_equal([frame.raw for frame in frames], [lines[n % 3] for n in range(7)])
+    assert not link.is_symlink(), "a stopped emulator leaves no port behind"
+
+
+async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path: Path) -> None:
+    path, lines = recording(tmp_path, 40)
+    arguments = ("--recording", str(path), "--speed", "20", "--link", str(tmp_path / "eit"), "--once")
+    async with emulator(*arguments, "--fault", "cut-line@1", "--fault", "unplug:0.1@3") as (process, port):
+        kit = EitKit(zero_slots=ZERO_SLOTS, path=port)
+        frames: list[Frame] = []
+        async with aclosing(kit.frames()) as arriving:
+            async for frame in arriving:
+                frames.append(frame)
+                if len(frames) == 5:
+                    assert process.stdin is not None
+                    process.stdin.write(b"what\nnan\n")
+                    await process.stdin.drain()
+                if len(frames) == 37:
+                    break
+        assert process.stdin is not None
+        process.stdin.close()
+        assert await process.wait() == 0, "it ends when its standard input does"
+        assert process.stderr is not None
+        assert b"there is no fault 'what'" in await process.stderr.read()
+    facts = kit.facts()
+    assert facts["errors"] == {"wrong_count": 1, "nan": 1}
+    assert facts["openings"] == 2
+    sent = [line.tolist() for line in lines]
+    places = [sent.index(frame.raw.tolist()) for frame in frames]
+    assert places[:4] == [0, 2, 4, 5]
+    assert places == sorted(places)
+    assert len({*range(40)} - {*places}) == 3
+
+
+async def test_twists_are_synthesised_from_a_bank(tmp_path: Path) -> None:
+    from bank.bank_file import BankDefinition, write_bank
+
+    definition = BankDefinition("0" * 64, "gaussian_derivative", np.array([3.0, 3.5]), np.array([1.0, 2.0]))
+    homogeneous = 0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.7
+    signals = np.broadcast_to(np.cos(CHANNELS @ [0.3, 0.1, 0.2, 0.5]), (2, 2, len(CHANNELS))).astype(np.float32)
+    path = tmp_path / "bank.shb"
+    write_bank(path, definition, homogeneous, np.full((2, 2), 0.5), np.ones((2, 2), bool), signals)
+    async with emulator("--bank", str(path), "--speed", "200") as (_, port):
+        frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port), 50)
+    channels = np.array([frame.channels for frame in frames])
+    # The programme begins with 15 s of nothing, then grips within 3 s: 28 and 34 frames.
+    idle, gripped = channels[:25].mean(axis=0), channels[36:].mean(axis=0)
+    assert channels.mean() == pytest.approx(0.13, abs=0.01)
+    change = np.abs(idle + 0.17 * signals[0, 0] * 0.13 / np.abs(homogeneous).mean())
+    assert np.corrcoef(gripped - idle, change - idle)[0, 1] > 0.99
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((), "give either --recording FILE to play a recording or --bank FILE to synthesise frames"),
+        (("--recording", "absent.mat"), "absent.mat: the recording cannot be read"),
+        (("--bank", "absent.shb"), "absent.shb"),
+        (("--bank", "absent.shb", "--once"), "--once is for a recording"),
+        (("--recording", "absent.mat", "--speed", "0"), "--speed 0 is not above 0"),
+        (("--recording", "absent.mat", "--fault", "nan"), "--fault nan names no frame; write NAME@FRAME"),
+        (("--recording", "absent.mat", "--fault", "explode@3"), "there is no fault 'explode'"),
+        (("--recording", "absent.mat", "--link", "/nowhere/eit"), "--link /nowhere/eit cannot be made"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_status_two(
+    arguments: tuple[str, ...], sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["emulate", "eit-kit", *arguments]) == EXIT_USAGE
+    complaint = capsys.readouterr().err
+    assert sentence in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_help_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
+    from drivers.emulators.eit_kit import FaultKind
+
+    with pytest.raises(SystemExit) as ended:
+        main(["emulate", "eit-kit", "--help"])
+    assert ended.value.code == 0
+    told = capsys.readouterr().out
+    assert [kind.value for kind in FaultKind if kind.value not in told] == []
+
+
+def test_the_command_runs_without_a_terminal(tmp_path: Path) -> None:
+    import subprocess
+
+    path, _ = recording(tmp_path, 1)
+    with subprocess.Popen(
+        [sys.executable, "-m", "daemon", "emulate", "eit-kit", "--recording", str(path)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+    ) as process:
+        assert process.stdout is not None
+        port = process.stdout.readline().decode().strip()
+        assert os.path.exists(port)
+        process.terminate()
+        assert process.wait(DEADLINE_S) == 0

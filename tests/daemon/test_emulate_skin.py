@@ -1,0 +1,154 @@
+"""The skin's emulators as processes of their own, met by the real drivers; and the skin on the emulated rig."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import aclosing, asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.cli import main
+from daemon.cli.emulated.skin_push import PushedSkin
+from drivers.emulators.rig import Rig, RigSettings, RigSkin
+from drivers.serial_port import Link, SerialLink
+from drivers.shear_skin.adc_board import AdcBoard
+from drivers.shear_skin.daq import Daq
+from drivers.shear_skin.judge import Fault, SkinSample
+from drivers.shear_skin.scanner import ScpiScanner
+from drivers.shear_skin.skin import ShearSkin
+from drivers.shear_skin.source import Keithley6430
+from drivers.tcp_port import TcpLink
+from tests.daemon.conftest import DEADLINE_S, shearloop
+
+SPEED = 20
+
+
+async def line(process: asyncio.subprocess.Process) -> str:
+    assert process.stdout is not None
+    return (await process.stdout.readline()).decode().strip()
+
+
+async def told(process: asyncio.subprocess.Process, command: str) -> None:
+    assert process.stdin is not None
+    process.stdin.write(f"{command}\n".encode())
+    await process.stdin.drain()
+
+
+def tcp(address: str) -> Link:
+    host, port = address.split(":")
+    return TcpLink(host, int(port))
+
+
+@asynccontextmanager
+async def read(source: Link, daq: Daq) -> AsyncIterator["asyncio.Queue[SkinSample]"]:
+    skin, queue = ShearSkin(Keithley6430(source, period_s=0.05), daq), asyncio.Queue[SkinSample]()
+
+    async def listen() -> None:
+        async with aclosing(skin.samples()) as samples:
+            async for sample in samples:
+                queue.put_nowait(sample)
+
+    tasks = [asyncio.create_task(skin.watch_source()), asyncio.create_task(listen())]
+    try:
+        yield queue
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)
+
+
+async def until(queue: "asyncio.Queue[SkinSample]", *faults: Fault, r1_ohm: float | None = None) -> SkinSample:
+    async with asyncio.timeout(DEADLINE_S):
+        while True:
+            sample = await queue.get()
+            near = r1_ohm is None or (sample.r1_ohm is not None and abs(sample.r1_ohm - r1_ohm) < 0.05)
+            if set(sample.faults) == set(faults) and near:
+                return sample
+
+
+async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path: Path) -> None:
+    places = ("--source-link", str(tmp_path / "source"), "--daq-link", str(tmp_path / "daq"))
+    async with shearloop("emulate", "skin", *places, "--speed", str(SPEED), stdin=asyncio.subprocess.PIPE) as process:
+        assert {await line(process), await line(process)} == {f"source {places[1]}", f"daq {places[3]}"}
+        board = AdcBoard(SerialLink(path=places[3]), 10 * SPEED)
+        async with read(SerialLink(path=places[1], baud=9600), board) as samples:
+            assert (await until(samples)).r1_ohm == pytest.approx(24.6, rel=2e-3)
+            await told(process, "shear 0.54")
+            # 0.5 N beyond the deadband, less what friction keeps on the way to the gauge.
+            await until(samples, r1_ohm=24.6 * (1 + 0.088 * 0.5 / np.exp(0.04 * np.radians(60.7))))
+            await told(process, "open 1")
+            await until(samples, Fault.COMPLIANCE, Fault.OPEN_1)
+            await told(process, "nonsense")
+            await told(process, "normal")
+            await until(samples)
+        assert process.stdin is not None
+        process.stdin.close()
+        assert await process.wait() == 0
+        assert process.stderr is not None
+        assert b"'nonsense' is no fault of the circuit; there are open 1|2" in await process.stderr.read()
+
+
+async def test_source_and_scanner_are_played_alone_too() -> None:
+    speed = ("--speed", str(SPEED), "--port", "0")
+    async with (
+        shearloop("emulate", "skin-source", *speed, stdin=asyncio.subprocess.PIPE) as source,
+        shearloop("emulate", "skin-daq", *speed, stdin=asyncio.subprocess.PIPE) as daq,
+    ):
+        scanner = ScpiScanner(tcp(await line(daq)), rate_hz=10 * SPEED)
+        async with read(tcp(await line(source)), scanner) as samples:
+            await until(samples, r1_ohm=24.6)
+            await told(daq, "short 2")
+            await until(samples, Fault.SHORT_2)
+            await told(daq, "mend")
+            await told(source, "leads 1000")
+            await until(samples, Fault.COMPLIANCE)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["skin", "--sweep-n", "9"], "--sweep-n 9 is beyond the 5 N"),
+        (["skin", "--sweep-n", "1", "--robot", "127.0.0.1"], "leave --sweep-n or --robot out"),
+        (["skin", "--speed", "0"], "--speed 0 is not above 0"),
+        (["skin", "--source-port", "70000"], "--source-port 70000 is no port"),
+        (["skin-daq", "--link", "/nowhere/daq"], "--link /nowhere/daq cannot be made"),
+    ],
+)
+def test_mistakes_on_the_command_line_are_sentences(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["emulate", *arguments]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
+    pushed = PushedSkin()
+    skin = RigSkin(lambda nm, gripped: pushed.gripped(nm, gripped=gripped, lever_m=0.02), pushed.resistances_ohm)
+    rig = Rig(RigSettings(run_dir=tmp_path, skin=True), lambda *_: np.zeros(1024), skin=skin)
+    robot, gripper = rig.controller.robot, rig.scene.gripper
+
+    def pass_s(seconds: float) -> None:
+        for _ in range(round(seconds / 0.008)):
+            robot.step(0.008)
+
+    pass_s(0.1)
+    r1, r2 = pushed.resistances_ohm()
+    gripper.command.act = True
+    pass_s(8.0)
+    gripper.command.gto, gripper.command.pos, gripper.command.spe, gripper.command.force = True, 255, 255, 67
+    pass_s(1.0)
+    assert rig.scene.twin.state.gripped
+    robot.q_rad[5] += 0.03
+    pass_s(0.1)
+    torque_nm = rig.scene.twin.state.torque_nm
+    assert pushed.skin.shear_n == pytest.approx(torque_nm / 0.02)
+    assert pushed.skin.shear_n > 0.5
+    stretched_1, stretched_2 = pushed.resistances_ohm()
+    assert stretched_1 / r1 - 1 > 0.04
+    assert stretched_2 / r2 - 1 == pytest.approx(0.0, abs=1e-3)
+    rig.command("skin open 2")
+    assert rig.skin is not None
+    assert rig.skin.circuit.opened == {"2"}
+    rig.command("replug skin")
+    assert not rig.skin.circuit.opened

@@ -1,0 +1,63 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from daemon.messages import EitHeatmap, decode, encode, wire_map
+from daemon.topics import TOPICS
+
+SCALARS = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | st.text()
+ARRAYS = hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=3, max_side=8))
+
+
+def heatmap(scores: np.ndarray) -> EitHeatmap:
+    return EitHeatmap(
+        source="right", t_mono_ns=5, scores=scores, k_low=0.1, k_high=4.4, sigma_low=0.1, sigma_high=4.4, frame=7
+    )
+
+
+@given(ARRAYS)
+def test_arrays_come_back_as_they_were_sent(scores: np.ndarray) -> None:
+    content = decode(encode(wire_map(heatmap(scores), timestamp=1.5, seq=3)))
+    np.testing.assert_array_equal(content["scores"], scores)
+    assert "scores_shape" not in content
+    assert (content["timestamp"], content["seq"], content["source"], content["t_mono_ns"]) == (1.5, 3, "right", 5)
+
+
+def test_an_array_is_bin_with_its_shape_beside_it_so_that_plotting_tools_pass_over_it() -> None:
+    content = wire_map(heatmap(np.array([[0.25, np.nan]])), timestamp=0.0, seq=0)
+    assert content["scores"] == np.array([0.25, np.nan], "<f4").tobytes()
+    assert content["scores_shape"] == [1, 2]
+
+
+@given(st.dictionaries(st.text().filter(lambda key: not key.endswith("_shape")), SCALARS))
+def test_scalars_come_back_as_they_were_sent(content: dict[str, object]) -> None:
+    assert decode(encode(content)) == content
+
+
+@given(st.binary(max_size=300))
+def test_what_is_not_a_message_is_refused_with_a_value_error(payload: bytes) -> None:
+    try:
+        content = decode(payload)
+    except ValueError:
+        return
+    assert all(isinstance(key, str) for key in content)
+
+
+def test_a_shape_that_does_not_fit_its_array_is_refused() -> None:
+    with pytest.raises(ValueError, match="'scores' does not fit its shape"):
+        decode(encode({"scores": b"\0" * 8, "scores_shape": [3]}))
+    with pytest.raises(ValueError, match="does not fit"):
+        decode(encode({"scores": 1.0, "scores_shape": [1]}))
+
+
+def test_every_key_of_every_topic_is_documented() -> None:
+    for topic, kind in TOPICS.items():
+        assert kind.topic == topic
+        assert kind.__doc__
+        for item in dataclasses.fields(kind):
+            if item.name not in ("source", "t_mono_ns"):
+                assert item.metadata["meaning"], f"{topic}.{item.name}"

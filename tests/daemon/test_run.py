@@ -1,0 +1,184 @@
+import asyncio
+import contextlib
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zmq
+import zmq.asyncio
+from scipy.io import savemat
+
+from bank.channels import LINE_SLOTS, line_of_channels
+from daemon.app import Daemon
+from daemon.config import load_daemon_config
+from daemon.messages import decode
+from daemon.request import request
+from drivers.eit_format import ADC_STEP_V
+from tests.daemon.conftest import DEADLINE_S, shearloop
+
+Connect = Callable[[str, str], "zmq.Socket[bytes]"]
+Write = Callable[..., Path]
+
+
+def next_message(socket: "zmq.Socket[bytes]") -> dict[str, Any]:
+    _, payload = socket.recv_multipart()
+    return decode(payload)
+
+
+def recording(folder: Path, n_frames: int) -> Path:
+    random = np.random.default_rng(2)
+    idle = random.integers(20, 200, len(LINE_SLOTS))
+    steps = idle + random.integers(-1, 2, (n_frames, len(LINE_SLOTS)))
+    steps[n_frames // 2 :] += random.integers(-15, 16, len(LINE_SLOTS))
+    days = 739_588 + np.arange(n_frames) * 0.5408 / 86_400
+    path = folder / "stream.mat"
+    savemat(path, {"Right_Data": np.column_stack([days, np.round(line_of_channels(steps * ADC_STEP_V), 4)])})
+    return path
+
+
+async def test_every_frame_of_a_recording_at_a_hundred_times_its_pace_becomes_an_estimate_in_order(
+    shared: Path, config: Write, tmp_path: Path, subscriber: Connect
+) -> None:
+    play = shared / "recordings" / "streams" / "2024-12-03_16-09" / "device1.mat"
+    async with shearloop("run", str(config())) as daemon:
+        estimates = subscriber(f"ipc://{tmp_path}/publish", "eit.estimate")
+        health = subscriber(f"ipc://{tmp_path}/publish", "health")
+        assert await asyncio.to_thread(next_message, health), "the subscription has arrived"
+        link = str(tmp_path / "eit-right")
+        async with shearloop(
+            *("emulate", "eit-kit", "--recording", str(play), "--once", "--speed", "100", "--link", link),
+            stdin=asyncio.subprocess.PIPE,
+        ):
+            received = await asyncio.to_thread(lambda: [next_message(estimates) for _ in range(832)])
+        assert [message["frame"] for message in received] == list(range(832))
+        assert [message["seq"] for message in received] == list(range(832))
+        times = np.array([message["t_mono_ns"] for message in received])
+        assert (np.diff(times) > 0).all()
+        assert sum(message["valid"] for message in received) > 400
+        assert all(message["torque_nm"] is None for message in received if not message["valid"])
+        await stop_and_time(daemon, signal.SIGTERM)
+
+
+async def stop_and_time(daemon: asyncio.subprocess.Process, number: signal.Signals) -> None:
+    daemon.send_signal(number)
+    begun = time.monotonic()
+    assert await daemon.wait() == 0
+    # The issue asks for a second; the machine may be busy with other tests.
+    assert time.monotonic() - begun < 5
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+async def test_the_daemon_and_its_emulators_stop_cleanly_on_a_signal(
+    number: signal.Signals, config: Write, tmp_path: Path, subscriber: Connect
+) -> None:
+    link = tmp_path / "eit-right"
+    emulator = {"device": "eit-kit", "arguments": ["--link", str(link), "--recording", str(recording(tmp_path, 20))]}
+    async with shearloop("run", str(config(emulators=[emulator])), "--show") as daemon:
+        frames = subscriber(f"ipc://{tmp_path}/publish", "eit.frame")
+        content = await asyncio.to_thread(next_message, frames)
+        assert content["channels"].shape == (896,)
+        await stop_and_time(daemon, number)
+        assert not link.is_symlink(), "the emulator has taken its port away"
+
+
+@contextlib.asynccontextmanager
+async def running(path: Path) -> Any:
+    """Run a daemon in this process, where its parts can be reached."""
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(path), context)
+        running = asyncio.create_task(daemon.run())
+        try:
+            async with asyncio.timeout(DEADLINE_S):
+                yield daemon
+        finally:
+            daemon.stop()
+            await running
+
+
+def collector(daemon: Daemon, topic: str) -> "asyncio.Queue[dict[str, Any]]":
+    queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue()
+
+    def listen(name: str, content: dict[str, Any]) -> None:
+        if name == topic:
+            queue.put_nowait(content)
+
+    daemon.publisher.listen(listen)
+    return queue
+
+
+async def test_commands_tare_tell_the_status_and_stop(config: Write, tmp_path: Path) -> None:
+    address = f"ipc://{tmp_path}/commands"
+    play = recording(tmp_path, 60)
+    link = str(tmp_path / "eit-right")
+    async with running(config()) as daemon:
+        estimates = collector(daemon, "eit.estimate")
+        async with shearloop(
+            *("emulate", "eit-kit", "--recording", str(play), "--speed", "20", "--link", link),
+            stdin=asyncio.subprocess.PIPE,
+        ):
+            while not (await estimates.get())["valid"]:
+                continue
+            reply = await asyncio.to_thread(request, address, {"command": "tare"}, DEADLINE_S)
+            assert reply == {"ok": True, "tared": ["right"]}
+            while "taking the homogeneous frame, 1 of 10" not in (await estimates.get())["why"]:
+                continue
+            reply = await asyncio.to_thread(request, address, {"command": "tare", "source": "left"}, DEADLINE_S)
+            assert reply == {"ok": False, "why": "there is no sensor 'left' to tare; there are right"}
+            status = await asyncio.to_thread(request, address, {"command": "status"}, DEADLINE_S)
+            assert status["tasks"]["right"]["connected"]
+            assert status["tasks"]["commands"]["errors"] == {"tare refused": 1}
+        assert (await asyncio.to_thread(request, address, {"command": "stop"}, DEADLINE_S))["ok"]
+        await daemon.stopped()
+
+
+async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_health(
+    config: Write, tmp_path: Path
+) -> None:
+    link = str(tmp_path / "eit-right")
+    faults = ["--fault", "wrong-count@5", "--fault", "garbage@7", "--fault", "unplug:0.3@12"]
+    async with running(config()) as daemon:
+        frames, health = collector(daemon, "eit.frame"), collector(daemon, "health")
+        async with shearloop(
+            *("emulate", "eit-kit", "--recording", str(recording(tmp_path, 40)), "--speed", "20", "--link", link),
+            *faults,
+            stdin=asyncio.subprocess.PIPE,
+        ):
+            for _ in range(25):
+                await frames.get()
+            facts = (await health.get())["tasks"]["right"]
+            while facts["openings"] < 2 or facts["frames"] < 25:
+                facts = (await health.get())["tasks"]["right"]
+            assert facts["alive"]
+            assert facts["errors"]["wrong_count"] >= 1
+            assert sum(facts["errors"].values()) >= 2
+
+
+async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
+    config: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from daemon.estimator import Estimator
+
+    update = Estimator.update
+    deaths = iter([True])
+
+    def fragile(self: Estimator, frame: Any) -> Any:
+        if frame.seq == 3 and next(deaths, False):
+            raise RuntimeError("a bug")
+        return update(self, frame)
+
+    monkeypatch.setattr(Estimator, "update", fragile)
+    link = str(tmp_path / "eit-right")
+    async with running(config()) as daemon:
+        estimates = collector(daemon, "eit.estimate")
+        async with shearloop(
+            *("emulate", "eit-kit", "--recording", str(recording(tmp_path, 40)), "--speed", "20", "--link", link),
+            stdin=asyncio.subprocess.PIPE,
+        ):
+            seen = [(await estimates.get())["frame"] for _ in range(8)]
+    assert seen == [0, 1, 2, 4, 5, 6, 7, 8], "the frame that killed it is lost and no other"
+    record = daemon.supervisor.records["right.estimator"]
+    assert (record.restarts, record.last_error) == (1, "RuntimeError: a bug")

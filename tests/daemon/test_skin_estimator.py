@@ -1,0 +1,258 @@
+"""From resistances to shear force: every bad input is either refused with its reason or stated in the interval."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from bank.skin.calibration import SkinCalibration
+from bank.skin.calibration_file import load_calibration
+from bank.skin.calibration_fit import fit_calibration
+from bank.skin.membrane import Direction
+from daemon.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
+from daemon.synthetic_skin import REST_OHM, SyntheticSkin, SyntheticSkinSettings, calibration_table
+from drivers.shear_skin.judge import Fault, SkinSample
+
+NOISE = 1e-4
+PERIOD_NS = 100_000_000
+
+
+@pytest.fixture(scope="module")
+def calibration() -> SkinCalibration:
+    return load_calibration(Path(__file__).parents[2] / "config" / "calibrations" / "skin_demo.yaml")
+
+
+class Bench:
+    """A skin that is pushed, and an estimator that sees it ten times a second."""
+
+    def __init__(self, calibration: SkinCalibration, seed: int = 0) -> None:
+        self.skin = SyntheticSkin(seed=seed)
+        self.estimator = SkinEstimator(calibration, normal_n=1.0)
+        self.spoil: Callable[[float, float, float], tuple[float, float]] = lambda r1, r2, _: (r1, r2)
+        self._random = Random(seed)
+        self._number = 0
+        self.skin.normal_n = 0.0
+
+    @property
+    def time_s(self) -> float:
+        return self._number / 10
+
+    def sample(self, **changes: object) -> SkinSample:
+        self._number += 1
+        r1, r2 = self.spoil(*self.skin.resistances_ohm(), self.time_s)
+        r1, r2 = (r * (1 + self._random.gauss(0, NOISE)) for r in (r1, r2))
+        t_ns = self._number * PERIOD_NS
+        values = {"r1_ohm": r1, "r2_ohm": r2, "v1_v": 0.0, "v2_v": 0.0, "current_a": 5e-3}
+        return SkinSample(**{**values, "t_mid_ns": t_ns, "t_arrival_ns": t_ns, "seq": self._number, **changes})  # type: ignore[arg-type]
+
+    def at(self, shear_n: float, normal_n: float = 1.0) -> SkinReading:
+        self.skin.normal_n = normal_n
+        self.skin.push(shear_n)
+        return self.estimator.update(self.sample())
+
+    def zeroed(self) -> "Bench":
+        for _ in range(20):
+            self.at(0.0, 0.0)
+        assert self.estimator.zero is not None
+        return self
+
+    def to(self, shear_n: float, n_per_s: float = 0.5) -> Iterator[SkinReading]:
+        begin_n = self.skin.shear_n
+        steps = max(round(abs(shear_n - begin_n) / n_per_s * 10), 1)
+        for step in range(1, steps + 1):
+            yield self.at(begin_n + (shear_n - begin_n) * step / steps)
+
+    def push(self, shear_n: float) -> SkinReading:
+        return list(self.to(shear_n))[-1]
+
+
+def holds(reading: SkinReading, shear_n: float) -> bool:
+    interval = reading.interval
+    return interval is not None and interval.low_n <= shear_n <= interval.high_n
+
+
+def test_the_demo_s_calibration_is_that_of_the_emulated_skin(calibration: SkinCalibration) -> None:
+    anew = fit_calibration(calibration_table(SyntheticSkin(seed=7), NOISE))
+    assert anew.friction == pytest.approx(calibration.friction, abs=1e-3)
+    assert anew.slope_per_n == pytest.approx(calibration.slope_per_n, rel=2e-3)
+    assert anew.rest_ohm == pytest.approx(REST_OHM, rel=1e-3)
+
+
+def test_the_zero_comes_first_and_then_every_sample_is_a_force(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration)
+    said = [bench.at(0.0, 0.0) for _ in range(20)]
+    assert said[0].why == ("taking the zero, 1 of 20",)
+    assert not any(reading.valid for reading in said[:19])
+    assert said[19].valid
+    readings = list(bench.to(1.0))
+    assert all(reading.valid for reading in readings)
+    assert readings[-1].shear_n == pytest.approx(1.0, abs=0.02)
+    assert readings[-1].direction is Direction.LOADING
+    assert readings[-1].interval is not None
+    assert not readings[-1].interval.in_deadband
+    assert bench.push(-1.0).shear_n == pytest.approx(-1.0, abs=0.02)
+
+
+def test_normal_force_alone_is_no_shear(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration).zeroed()
+    readings = [bench.at(0.0, normal_n) for normal_n in (0.0, 1.0, 2.0, 2.0, 2.0, 2.0)]
+    assert all(holds(reading, 0.0) for reading in readings)
+    assert all(abs(reading.shear_n or 0.0) < 0.01 for reading in readings)
+    assert readings[-1].interval is not None
+    assert readings[-1].interval.in_deadband
+
+
+@pytest.mark.parametrize("fault", [Fault.OPEN_1, Fault.SHORT_2, Fault.REVERSED_1, Fault.COMPLIANCE, Fault.SOURCE_LOST])
+def test_what_the_driver_refuses_is_no_force_and_the_next_good_sample_is_one(
+    calibration: SkinCalibration, fault: Fault
+) -> None:
+    bench = Bench(calibration).zeroed()
+    bench.push(0.8)
+    refused = bench.estimator.update(bench.sample(r1_ohm=None, r2_ohm=None, faults=(fault,)))
+    assert refused.why == (str(fault),)
+    assert refused.shear_n is None
+    assert refused.interval is None
+    again = bench.at(0.8)
+    assert again.valid
+    assert again.direction is Direction.UNKNOWN
+    assert holds(again, 0.8)
+
+
+def test_across_missing_samples_the_direction_is_not_assumed(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration).zeroed()
+    assert bench.push(0.8).direction is Direction.LOADING
+    bench.skin.push(0.7)
+    reading = bench.estimator.update(bench.sample(missed=3))
+    assert reading.direction is Direction.UNKNOWN
+    assert holds(reading, 0.7)
+
+
+def test_a_zero_under_load_is_refused_until_the_load_is_off(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration).zeroed()
+    bench.push(0.8)
+    bench.estimator.tare()
+    readings = [bench.at(0.8) for _ in range(25)]
+    assert "would look like that" in readings[-1].why[0]
+    assert bench.estimator.zero is None
+    assert bench.estimator.refused
+    bench.push(0.0)
+    for _ in range(40):
+        reading = bench.at(0.0, 0.0)
+    assert reading.valid
+    assert not bench.estimator.refused
+
+
+@pytest.mark.parametrize("shear_n", [0.1, -0.15])
+def test_a_zero_under_a_small_load_is_stated_in_the_interval(calibration: SkinCalibration, shear_n: float) -> None:
+    bench = Bench(calibration)
+    for _ in range(20):
+        bench.at(shear_n)
+    for _ in range(10):
+        assert holds(bench.at(shear_n), shear_n)
+    unloaded = bench.push(0.0)
+    assert holds(unloaded, 0.0)
+    assert holds(bench.push(0.8), 0.8)
+
+
+def test_a_zero_under_load_that_nothing_gave_away_is_told_when_the_load_goes(calibration: SkinCalibration) -> None:
+    """The calibration's rest is that of this very load, so that the zero itself cannot be refused."""
+    from dataclasses import replace
+
+    stretched = REST_OHM[0] * (1 + 0.088 * 0.8), REST_OHM[1]
+    bench = Bench(replace(calibration, rest_ohm=stretched))
+    bench.skin.normal_n = 1.0
+    for _ in range(20):
+        bench.at(0.84)
+    assert bench.estimator.zero is not None
+    why = bench.push(0.0).why
+    assert "the zero was taken under load" in why[0]
+    assert "gauge 1 reads" in why[0]
+
+
+def test_swapped_gauges_are_refused_at_the_zero(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration)
+    bench.spoil = lambda r1, r2, _: (r2, r1)
+    for _ in range(25):
+        reading = bench.at(0.0, 0.0)
+    assert "the wires of the gauges are swapped" in reading.why[0]
+
+
+def test_gauges_that_are_swapped_after_the_zero_are_not_believed(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration).zeroed()
+    bench.spoil = lambda r1, r2, _: (r2, r1)
+    assert not bench.at(0.0).valid
+
+
+@pytest.mark.parametrize(("gauge", "per_s"), [(1, -2e-4), (2, 2e-4), (2, -2e-4)])
+def test_a_gauge_that_drifts_where_it_shows_widens_the_interval_and_is_then_named(
+    calibration: SkinCalibration, gauge: int, per_s: float
+) -> None:
+    bench = Bench(calibration).zeroed()
+    begin_s = bench.time_s
+
+    def drift(r1: float, r2: float, time_s: float) -> tuple[float, float]:
+        factor = 1 + per_s * (time_s - begin_s)
+        return (r1 * factor, r2) if gauge == 1 else (r1, r2 * factor)
+
+    # Gauge 1 is slack at rest and under a negative force, gauge 2 under a positive one.
+    shear_n = 0.0 if gauge == 1 or per_s < 0 else 0.5
+    bench.push(shear_n)
+    bench.spoil = drift
+    readings = [bench.at(shear_n) for _ in range(1500)]
+    valid = [reading for reading in readings if reading.valid]
+    assert sum(holds(reading, shear_n) for reading in valid) >= 0.99 * len(valid)
+    widths = [reading.interval.high_n - reading.interval.low_n for reading in valid if reading.interval is not None]
+    assert widths[-1] > widths[20] + 0.2
+    assert not readings[-1].valid
+    assert "drifts" in readings[-1].why[0]
+
+
+def test_a_drift_that_no_response_shows_is_learnt_at_the_next_zero(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration).zeroed()
+    assert bench.estimator.drift_per_hour == pytest.approx(DRIFT_PER_HOUR)
+    begin_s = bench.time_s
+    per_s = 1e-5  # 3.6 % an hour, and 0.4 N
+    bench.spoil = lambda r1, r2, time_s: (r1 * (1 + per_s * (time_s - begin_s)), r2)
+    for _ in range(3000):
+        bench.at(0.0, 0.0)
+    bench.estimator.tare()
+    for _ in range(20):
+        bench.at(0.0, 0.0)
+    assert bench.estimator.drift_per_hour == pytest.approx(3600 * per_s, rel=0.1)
+    held = [holds(bench.at(0.0, 0.0), 0.0) for _ in range(3000)]
+    assert all(held), "from then on the interval grows as fast as the zero is lost"
+
+
+def test_the_paper_s_own_drift_stays_within_the_interval_for_an_hour(calibration: SkinCalibration) -> None:
+    held = 0
+    for seed in range(20):
+        bench = Bench(calibration, seed).zeroed()
+        bench.skin.rest(3600.0)
+        bench._number += 36_000
+        bench.push(0.15)
+        held += holds(bench.at(0.15), 0.15)
+    assert held >= 18
+
+
+def test_a_force_beyond_the_curve_is_not_a_force(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration).zeroed()
+    assert bench.push(4.5).valid
+    assert "beyond the calibrated curve" in bench.push(6.0).why[0]
+
+
+def test_turning_the_tool_stretches_contact_and_skin_in_series() -> None:
+    skin = SyntheticSkin(SyntheticSkinSettings(normal_n=1.0))
+    hold_n = skin.membrane.friction
+    contact = skin.settings.contact_n_per_mm * skin.settings.radius_mm
+    series = 1 / (1 / skin.settings.contact_n_per_mm + 1 / skin.stiffness_n_per_mm) * skin.settings.radius_mm
+    sticking_rad = hold_n / contact
+    assert skin.turn(0.5 * sticking_rad) == pytest.approx(0.5 * hold_n)
+    loaded_n = skin.turn(0.05)
+    assert loaded_n == pytest.approx(hold_n + series * (0.05 - sticking_rad))
+    back_rad = hold_n / contact
+    assert skin.turn(0.05 - back_rad) == pytest.approx(loaded_n - hold_n), "stuck: only the contact gives way"
+    assert skin.turn(0.05) == pytest.approx(loaded_n)
+    assert skin.turn(-0.05) == pytest.approx(-loaded_n)
+    assert skin.torque_nm == pytest.approx(-loaded_n * 0.015)
+    assert abs(skin.turn(0.0)) <= hold_n, "back at the start friction keeps no more than it holds"

@@ -1,0 +1,218 @@
+"""The skin in the daemon: real drivers, played instruments over ports and sockets, and everything that can go wrong."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+import zmq
+import zmq.asyncio
+
+from daemon.app import Daemon
+from daemon.config import load_daemon_config
+from daemon.errors import UserError
+from daemon.request import request
+from daemon.synthetic_skin import SyntheticSkin
+from drivers.emulators.skin.instruments import SkinInstruments
+from tests.daemon.conftest import DEADLINE_S
+from tests.daemon.test_run import collector, running
+
+CALIBRATION = Path(__file__).parents[2] / "config" / "calibrations" / "skin_demo.yaml"
+RATE_HZ = 200.0
+
+
+class Played:
+    """The skin, its instruments, and the daemon that reads them."""
+
+    def __init__(self, daemon: Daemon, skin: SyntheticSkin, instruments: SkinInstruments, address: str) -> None:
+        self.daemon, self.skin, self.instruments, self.address = daemon, skin, instruments, address
+        self.shear = collector(daemon, "skin.shear")
+
+    async def until(self, condition: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
+        while True:
+            content = await self.shear.get()
+            if condition(content):
+                return content
+
+    async def says(self, why: str) -> dict[str, Any]:
+        said: set[str] = set()
+        try:
+            async with asyncio.timeout(20):
+                return await self.until(lambda content: said.add(content["why"]) or why in content["why"])
+        except TimeoutError:
+            pytest.fail(f"nothing says {why!r}; said was {said}")
+
+    async def valid(self) -> dict[str, Any]:
+        return await self.until(lambda content: content["valid"])
+
+    async def command(self, name: str, **arguments: Any) -> dict[str, Any]:
+        return await asyncio.to_thread(request, self.address, {"command": name, **arguments}, DEADLINE_S)
+
+    def fresh(self) -> None:
+        while not self.shear.empty():
+            self.shear.get_nowait()
+
+
+def section(daq: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    content = {
+        "source": {"serial": {"path": "skin-source"}},
+        "daq": {**daq, "rate_hz": RATE_HZ},
+        "calibration": str(CALIBRATION),
+        "tool_radius_mm": 15,
+    }
+    return {**content, **changes}
+
+
+def written(folder: Path, content: dict[str, Any]) -> Path:
+    path = folder / "skin.yaml"
+    addresses = {"publish": f"ipc://{folder}/publish", "commands": f"ipc://{folder}/commands"}
+    path.write_text(yaml.safe_dump({**addresses, **content}))
+    return path
+
+
+ADC = {"adc": {"device": {"path": "skin-daq"}}}
+
+
+@contextlib.asynccontextmanager
+async def played(folder: Path, *, socket: bool = False, **changes: Any) -> AsyncIterator[Played]:
+    skin = SyntheticSkin()
+    places: dict[str, str] = {}
+    ready = asyncio.Semaphore(0)
+
+    def on_port(device: str, port: str) -> None:
+        places[device] = port
+        ready.release()
+
+    instruments = SkinInstruments(
+        skin.resistances_ohm,
+        folder / "skin-source",
+        ("127.0.0.1", 0) if socket else folder / "skin-daq",
+        on_port=on_port,
+        speed=RATE_HZ / 10,
+    )
+    playing = asyncio.create_task(instruments.run())
+    await ready.acquire()
+    await ready.acquire()
+    daq = ADC
+    if socket:
+        host, port = places["daq"].split(":")
+        daq = {"scanner": {"socket": {"host": host, "port": int(port)}}}
+    try:
+        async with running(written(folder, {"skin": section(daq, **changes)})) as daemon:
+            yield Played(daemon, skin, instruments, f"ipc://{folder}/commands")
+    finally:
+        playing.cancel()
+        await asyncio.wait([playing])
+
+
+@pytest.mark.parametrize("socket", [False, True])
+async def test_a_shear_force_is_streamed_from_either_daq(tmp_path: Path, socket: bool) -> None:
+    async with played(tmp_path, socket=socket) as bench:
+        content = await bench.until(lambda content: "taking the zero" in content["why"])
+        assert content["shear_n"] is None
+        await bench.valid()
+        for number in range(80):
+            bench.skin.push(0.8 * number / 79)
+            content = await bench.shear.get()
+        content = await bench.until(lambda content: content["response"] > 0.0645)
+        assert content["shear_low_n"] - 0.02 <= 0.8 <= content["shear_high_n"] + 0.02
+        assert content["torque_nm"] == pytest.approx(content["shear_n"] * 0.015)
+        assert content["response"] == pytest.approx(content["response_1"] - content["response_2"])
+        assert content["r1_ohm"] == pytest.approx(24.6 * (1 + content["response_1"]), rel=1e-3)
+        assert not content["deadband"]
+        assert content["direction"] in ("loading", "unknown")
+        assert content["source"] == "skin"
+        status = (await bench.command("status"))["tasks"]
+        assert status["skin"]["connected"]
+        assert status["skin.source"]["connected"]
+        assert "MODEL 6430" in status["skin.source"]["instrument"]
+
+
+BAD = [
+    ("open 1", "gauge 1 is open"),
+    ("short 2", "gauge 2 is shorted"),
+    ("reversed 1", "the sense wires of gauge 1 are reversed"),
+    ("leads 500", "in compliance"),
+    ("swapped", "than at its zero"),
+    ("source unplug", "the current source does not answer"),
+    ("drift 2 -0.02", "drifts"),
+]
+
+
+async def test_no_bad_input_stops_the_daemon_and_each_is_named(tmp_path: Path) -> None:
+    async with played(tmp_path) as bench:
+        await bench.valid()
+        for fault, why in BAD:
+            bench.instruments.command(fault)
+            content = await bench.says(why)
+            assert content["shear_n"] is None
+            bench.instruments.command("normal")
+            await bench.valid()
+        for fault in ("daq garbage", "daq missing", "daq torn"):
+            bench.instruments.command(fault)
+        await bench.until(lambda content: content["missed"])
+        bench.instruments.command("daq unplug 0.05")
+        assert (await bench.until(lambda content: content["missed"] > 3))["direction"] == "unknown"
+        await bench.valid()
+        tasks = (await bench.command("status"))["tasks"]
+        assert tasks["skin"]["errors"]["not two decimals"] >= 2
+        assert {"open_1", "short_2", "reversed_1", "compliance", "source_lost"} <= set(tasks["skin"]["errors"])
+        assert (tasks["skin"]["restarts"], tasks["skin.source"]["restarts"]) == (0, 0)
+
+
+async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path) -> None:
+    async with played(tmp_path) as bench:
+        await bench.valid()
+        bench.skin.push(0.8)
+        assert await bench.command("tare", source="skin") == {"ok": True, "tared": ["skin"]}
+        await bench.says("the zero was refused and is taken again")
+        why = await bench.daemon._tare_to_the_end()
+        assert "the skin's zero was refused" in why
+        bench.skin.push(0.0)
+        bench.fresh()
+        await bench.valid()
+        assert await bench.daemon._tare_to_the_end() == ""
+        refused = await bench.command("tare", source="left")
+        assert refused == {"ok": False, "why": "there is no sensor 'left' to tare; there are skin"}
+
+
+async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.skin_task.ZERO_DEADLINE_S", 0.3)
+    async with played(tmp_path) as bench:
+        await bench.valid()
+        bench.instruments.command("open 2")
+        await bench.says("gauge 2 is open")
+        assert "could not be taken within 0.3 s" in (why := await bench.daemon._tare_to_the_end())
+        assert "gauge 2 is open" in why
+
+
+async def test_one_daemon_carries_a_fingertip_and_a_skin(config: Callable[..., Path]) -> None:
+    async with running(config(skin=section(ADC))) as daemon:
+        health = collector(daemon, "health")
+        tasks = (await health.get())["tasks"]
+        assert all(tasks[name]["alive"] for name in ("right", "right.estimator", "skin", "skin.source"))
+        assert "There is no serial port" in tasks["skin"]["last_loss"], "without its instruments the daemon runs on"
+
+
+def test_mistakes_in_the_skin_s_section_are_told_with_their_cure(tmp_path: Path) -> None:
+    def said(content: dict[str, Any]) -> str:
+        with pytest.raises(UserError) as error:
+            load_daemon_config(written(tmp_path, content))
+        return str(error.value)
+
+    assert "nothing is measured: give `fingertips`, a `skin`, or both" in said({})
+    both = section({**ADC, "scanner": {"socket": {"host": "a", "port": 1}}})
+    assert "`skin.daq` give either scanner or adc, and not both" in said({"skin": both})
+    assert "`skin.source` give either socket or serial" in said({"skin": section(ADC, source={})})
+    assert "`skin.normal_n`" in said({"skin": section(ADC, normal_n=-1)})
+
+
+def test_a_calibration_that_is_none_is_told_before_anything_is_opened(tmp_path: Path) -> None:
+    from bank.errors import CalibrationError
+
+    path = written(tmp_path, {"skin": section(ADC, calibration="none.yaml")})
+    with zmq.asyncio.Context() as context, pytest.raises(CalibrationError, match=r"none\.yaml: the calibration cannot"):
+        Daemon(load_daemon_config(path), context)

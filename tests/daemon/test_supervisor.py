@@ -1,0 +1,48 @@
+import asyncio
+
+import pytest
+from structlog.testing import capture_logs
+
+from daemon import supervisor
+from daemon.supervisor import Supervisor, restart_pause_s
+
+
+def test_pauses_double_from_half_a_second_to_half_a_minute() -> None:
+    assert [restart_pause_s(deaths) for deaths in (1, 2, 3, 7, 8, 500)] == [0.5, 1.0, 2.0, 30.0, 30.0, 30.0]
+
+
+async def test_a_task_that_dies_is_started_again_and_its_death_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "FIRST_PAUSE_S", 0.0)
+    watched = Supervisor()
+    starts = 0
+
+    async def dies_twice() -> None:
+        nonlocal starts
+        starts += 1
+        if starts < 3:
+            raise RuntimeError(f"death {starts}")
+
+    with capture_logs() as logs:
+        await watched.keep_running("reader", dies_twice)
+    record = watched.records["reader"]
+    assert (starts, record.restarts, record.alive) == (3, 2, False)
+    assert record.last_error == "RuntimeError: death 2"
+    assert [entry["task"] for entry in logs] == ["reader", "reader"]
+
+
+async def test_a_cancelled_task_stays_cancelled() -> None:
+    watched = Supervisor()
+    started = asyncio.Event()
+
+    async def waits() -> None:
+        started.set()
+        await asyncio.Event().wait()
+
+    task = asyncio.create_task(watched.keep_running("waits", waits))
+    await started.wait()
+    assert watched.records["waits"].alive
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert not watched.records["waits"].alive
+    assert watched.records["waits"].restarts == 0

@@ -1,0 +1,162 @@
+from dataclasses import dataclass
+from itertools import islice
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from bank.channels import CHANNELS, N_CHANNELS, ZERO_SLOTS, channels_of_line
+from daemon.errors import UserError
+from daemon.synthetic import INJECTIONS, Synthesiser, TwistProgramme, twist_frames
+from drivers.eit_line import LineParser
+from drivers.emulators.eit_kit import format_line
+
+ADC_STEP_V = 2.2 / 1024
+
+
+@dataclass(frozen=True)
+class SmallBank:
+    """Signals with the shape of a bank's, growing with k and σ, whose every value can be said in advance."""
+
+    k_grid: NDArray[np.float64]
+    sigma_grid: NDArray[np.float64]
+    homogeneous: NDArray[np.float64]
+    signals: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+
+
+def small_bank() -> SmallBank:
+    k, sigma = np.array([3.0, 3.5]), np.array([1.0, 1.5, 2.0])
+    homogeneous = 0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.7
+    shape = np.cos(CHANNELS @ [0.3, 0.1, 0.2, 0.5])
+    signals = (k[:, None, None] * sigma[None, :, None] * shape / 10).astype(np.float32)
+    valid = np.ones((2, 3), bool)
+    valid[1, 2] = False
+    return SmallBank(k, sigma, homogeneous, signals, valid)
+
+
+def test_frames_have_the_recorded_mean_noise_and_steps_and_pass_the_parser() -> None:
+    synthesiser = Synthesiser(small_bank())
+    lines = np.array([synthesiser.line(3.0, 1.5) for _ in range(400)])
+    channels = channels_of_line(lines)
+    assert channels.mean() == pytest.approx(0.13, abs=0.003)
+    # A step's own rounding adds its twelfth to the variance.
+    assert np.median(channels.std(axis=0)) == pytest.approx(np.hypot(0.002, ADC_STEP_V / 12**0.5), rel=0.05)
+    steps = channels / ADC_STEP_V
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert (lines[:, ZERO_SLOTS] == 0).all()
+    parser = LineParser(ZERO_SLOTS)
+    assert len(parser.feed(b"".join(map(format_line, lines)), 0)) == 400
+
+
+def test_no_live_channel_reads_nothing() -> None:
+    bank = small_bank()
+    bank.homogeneous[:5] = 0.0
+    lines = np.array([Synthesiser(bank, seed=seed).line(3.0, 1.5, grip=0.0) for seed in range(20)])
+    assert channels_of_line(lines).min() == pytest.approx(ADC_STEP_V)
+
+
+def test_without_noise_a_frame_is_the_magnitude_of_homogeneous_and_scaled_signal() -> None:
+    bank = small_bank()
+    synthesiser = Synthesiser(bank, amplitude=0.2, noise_v=0.0)
+    gain = 0.13 / np.abs(bank.homogeneous).mean()
+    expected = gain * np.abs(bank.homogeneous + 0.5 * 0.2 * bank.signals[0, 1].astype(float))
+    found = channels_of_line(synthesiser.line(3.0, 1.5, grip=0.5))
+    assert ((expected - found >= -1e-12) & (expected - found < ADC_STEP_V + 1e-12)).all(), "rounded down to a step"
+
+
+@given(st.floats(3.0, 3.5), st.floats(1.0, 1.5))
+def test_between_cells_the_signal_is_interpolated(k: float, sigma: float) -> None:
+    bank = small_bank()
+    shape = bank.signals[0, 0].astype(float) / (3.0 * 1.0)
+    np.testing.assert_allclose(Synthesiser(bank).signal(k, sigma), k * sigma * shape, rtol=1e-6, atol=1e-9)
+
+
+def test_a_twist_during_the_frame_shows_in_the_injections_after_it() -> None:
+    synthesiser = Synthesiser(small_bank(), noise_v=0.0)
+    before, after = (channels_of_line(synthesiser.line(3.0, sigma)) for sigma in (1.9, 1.1))
+    sigma = np.where(np.arange(32) < 20, 1.9, 1.1)
+    found = channels_of_line(synthesiser.line(3.0, sigma[INJECTIONS], np.ones(32)[INJECTIONS]))
+    # 28 channels belong to each injection.
+    np.testing.assert_array_equal(found, np.concatenate([before[: 20 * 28], after[20 * 28 :]]))
+    assert np.count_nonzero(before != after) > N_CHANNELS / 4
+
+
+@pytest.mark.parametrize(
+    ("k", "sigma", "sentence"),
+    [
+        (2.9, 1.5, "k from 3 to 3.5, and not 2.9"),
+        (3.0, 2.1, "sigma from 1 to 2, and not 2.1"),
+        (3.4, 1.9, "no signal"),
+        (3.0, np.nan, "not nan"),
+    ],
+)
+def test_what_the_bank_does_not_have_is_refused(k: float, sigma: float, sentence: str) -> None:
+    with pytest.raises(UserError, match=sentence):
+        Synthesiser(small_bank()).line(k, sigma)
+
+
+def test_a_programme_idles_grips_twists_and_lets_go() -> None:
+    programme = TwistProgramme(torque_nm=0.1, idle_s=10, grip_s=2, turn_s=4, hold_s=6, cycles=2)
+    at = programme.at
+    assert [at(t) for t in (0.0, 9.9)] == [(0.0, 0.0)] * 2
+    assert at(11.0) == (0.5, 0.0)
+    assert at(14.0) == (1.0, pytest.approx(0.05))
+    assert at(18.0) == (1.0, 0.1)
+    assert at(24.0) == (1.0, pytest.approx(0.05))
+    assert at(28.0) == (1.0, 0.0)
+    assert at(38.0) == (1.0, 0.1), "the second cycle"
+    assert at(53.0) == (0.5, 0.0)
+    assert at(54.0 + 14.0) == at(14.0), "and again"
+
+
+def test_frames_come_with_the_truth_behind_them() -> None:
+    programme = TwistProgramme(torque_nm=0.1, idle_s=1, grip_s=1, turn_s=2, hold_s=2, cycles=1)
+    frames = list(
+        islice(
+            twist_frames(
+                Synthesiser(small_bank(), noise_v=0.0, amplitude=1.0),
+                programme,
+                k=3.25,
+                sigma_of_torque=lambda torque_nm: 1.5 - 5 * torque_nm,
+                period_s=0.5,
+            ),
+            22,
+        )
+    )
+    assert [frame.t_s for frame in frames[:2]] == [0.25, 0.75]
+    for frame in frames:
+        assert (frame.grip, frame.torque_nm) == programme.at(frame.t_s)
+        assert frame.sigma == pytest.approx(1.5 - 5 * frame.torque_nm)
+        assert frame.line.shape == (1024,)
+    idle, held = frames[0].line, frames[9].line
+    assert frames[9].torque_nm == 0.1
+    assert np.count_nonzero(channels_of_line(idle != held)) > N_CHANNELS / 2
+
+
+def test_the_same_seed_gives_the_same_frames() -> None:
+    first, again, other = (Synthesiser(small_bank(), seed=seed).line(3.0, 1.5) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first, again)
+    assert (first != other).any()
+
+
+def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared) -> None:
+    from bank.forward import ForwardModel
+    from bank.mesh import load_mesh
+    from bank.models import conductivity
+    from daemon.recordings import read_torque_slices
+
+    mesh = load_mesh(shared / "reference" / "fingertip_mesh.npz")
+    forward = ForwardModel(mesh)
+    homogeneous = forward.voltages(np.ones(len(mesh.triangles)))
+    k, sigma = np.array([3.25]), np.array([1.25, 1.85])
+    signals = [[forward.voltages(conductivity(mesh, "gaussian_derivative", k[0], s)) - homogeneous for s in sigma]]
+    bank = SmallBank(k, sigma, homogeneous, np.array(signals, np.float32), np.ones((1, 2), bool))
+    synthesiser = Synthesiser(bank)
+    idle, gripped = (
+        np.mean([channels_of_line(synthesiser.line(3.25, 1.55, grip)) for _ in range(60)], axis=0) for grip in (0, 1)
+    )
+    recorded = read_torque_slices(shared / "recordings" / "torque_slices").differences
+    assert np.sqrt(np.mean((gripped - idle) ** 2)) == pytest.approx(np.sqrt(np.mean(recorded**2)), rel=0.1)

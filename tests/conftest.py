@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import structlog
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
@@ -55,6 +56,8 @@ def nothing_left_over(request: pytest.FixtureRequest) -> Iterator[None]:
             request.getfixturevalue(name)
     threads, files = set(threading.enumerate()), _open_files()
     yield
+    # A command under test sets the log up with the error stream of its test, which is closed in the next one.
+    structlog.reset_defaults()
     gc.collect()
     new_threads = [thread for thread in threading.enumerate() if thread not in threads]
     assert not new_threads, f"threads left over: {new_threads}"

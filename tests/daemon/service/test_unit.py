@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import sys
 import zipfile
 from pathlib import Path
 
@@ -80,7 +81,7 @@ def test_a_wheel_carries_every_file_of_the_service(tmp_path: Path) -> None:
         cwd=ROOT,
         check=True,
     )
-    subprocess.run(["python", "-c", build, str(tmp_path)], cwd=source, check=True, capture_output=True)
+    subprocess.run([sys.executable, "-c", build, str(tmp_path)], cwd=source, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         for name in (*PLACES, "realtime.conf", "shearloop.yaml"):

@@ -3,8 +3,36 @@
 import logging
 import os
 import sys
+from collections.abc import Callable
+from functools import partial
+from typing import TextIO, cast
 
 import structlog
+
+
+def silence(stream: TextIO) -> None:
+    """Let a stream whose reader has gone lead nowhere, so that what Python still holds of it does not fail again."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+class _Enduring:
+    """A stream for the log that goes quiet once its reader has gone (`2>&1 | head`): what it tells of goes on."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self.flush = partial(self._try, stream.flush)
+
+    def _try(self, do: Callable[[], object]) -> None:
+        try:
+            do()
+        except OSError:
+            silence(self._stream)
+
+    def write(self, text: str) -> None:
+        """Write a line, as far as anybody reads it."""
+        self._try(partial(self._stream.write, text))
 
 
 def set_up_logging(*, json_lines: bool | None = None, level: int = logging.INFO) -> None:
@@ -28,6 +56,6 @@ def set_up_logging(*, json_lines: bool | None = None, level: int = logging.INFO)
     structlog.configure(
         processors=[*processors, renderer],
         wrapper_class=structlog.make_filtering_bound_logger(level),
-        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
+        logger_factory=structlog.WriteLoggerFactory(cast(TextIO, _Enduring(sys.stderr))),
         cache_logger_on_first_use=False,
     )

@@ -92,14 +92,14 @@ class _Show:
         if topic in ("eit.estimate", "skin.shear") and self._read:
             import structlog
 
+            from daemon.logs import silence
             from daemon.readable import as_line
 
             try:
                 print(as_line(topic, content), flush=True)
             except OSError as error:
                 self._read = False
-                # What Python still holds of the line must not fail again at the end.
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+                silence(sys.stdout)
                 structlog.get_logger().warning("estimates are no longer shown", why=error.strerror)
 
 

@@ -1,6 +1,8 @@
 import asyncio
 import contextlib
+import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -90,13 +92,13 @@ async def running(path: Path) -> Any:
     """Run a daemon in this process, where its parts can be reached."""
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(path), context)
-        running = asyncio.create_task(daemon.run())
-        try:
-            async with asyncio.timeout(DEADLINE_S):
+        # A daemon that dies ends the test at once.
+        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+            group.create_task(daemon.run())
+            try:
                 yield daemon
-        finally:
-            daemon.stop()
-            await running
+            finally:
+                daemon.stop()
 
 
 def collector(daemon: Daemon, topic: str) -> "asyncio.Queue[dict[str, Any]]":
@@ -182,3 +184,21 @@ async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
     assert seen == [0, 1, 2, 4, 5, 6, 7, 8], "the frame that killed it is lost and no other"
     record = daemon.supervisor.records["right.estimator"]
     assert (record.restarts, record.last_error) == (1, "RuntimeError: a bug")
+
+
+async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, tmp_path: Path) -> None:
+    address = f"ipc://{tmp_path}/commands"
+    reader, writer = os.pipe()
+    process = await asyncio.create_subprocess_exec(sys.executable, "-m", "daemon", "run", str(config()), stderr=writer)
+    os.close(writer)
+    try:
+        async with asyncio.timeout(DEADLINE_S):
+            assert await asyncio.to_thread(os.read, reader, 1), "it runs, and says so"
+            os.close(reader)
+            for command in ("status", "tare", "stop"):
+                assert (await asyncio.to_thread(request, address, {"command": command}, DEADLINE_S))["ok"]
+            assert await process.wait() == 0
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()

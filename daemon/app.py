@@ -52,6 +52,7 @@ def open_estimator(config: Fingertip) -> Estimator:
         baseline_frames=config.baseline_frames,
         average_frames=config.average_frames,
         longest_gap_ns=max(LONGEST_GAP_NS, round(STALE_AFTER_PERIODS * config.frame_period_s * 1e9)),
+        model=bank.model,
     )
 
 
@@ -83,7 +84,13 @@ class Daemon:
             raise
         self._fingertips = {
             name: FingertipTask(
-                name, _board(name, config.fingertips[name]), estimator, self.publisher, self._clock, hear
+                name,
+                _board(name, config.fingertips[name]),
+                estimator,
+                self.publisher,
+                self._clock,
+                hear,
+                always_heatmap=config.fingertips[name].heatmap == "always",
             )
             for name, estimator in estimators.items()
         }

@@ -45,6 +45,9 @@ class Fingertip(ConfigModel):
     baseline_frames: int = Field(10, ge=2, le=1000, description="frames averaged into the homogeneous frame")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
     frame_period_s: float = Field(0.5412, gt=0, le=60, description="the board's frame period before it is measured")
+    heatmap: Literal["on_request", "always"] = Field(
+        "on_request", description="whether eit.heatmap is computed only while somebody subscribes to it"
+    )
 
 
 class LoadCellConfig(ConfigModel):

@@ -46,15 +46,18 @@ class Matcher(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What one frame said: the match, its heatmap, torque and diameter, and what speaks against them."""
+    """What one frame said: the match, torque and diameter, and what speaks against them."""
 
     match: Match | None = None
+    # The scores of all cells, where they were computed on the way.
     heatmap: FloatArray | None = None
     torque_nm: Interval | None = None
     diameter_mm: Interval | None = None
     why: tuple[str, ...] = ()
     # By how much the torque's own time lies before the frame's, because frames were averaged.
     lag_ns: int = 0
+    # The (896,) difference that was matched.
+    difference: FloatArray | None = None
 
     @property
     def valid(self) -> bool:
@@ -118,7 +121,9 @@ class Estimator:
         baseline_frames: int,
         average_frames: int,
         longest_gap_ns: int = LONGEST_GAP_NS,
+        model: str = "",
     ) -> None:
+        self.model = model
         self._matcher = matcher
         self._calibration = calibration
         self._baseline_frames = baseline_frames
@@ -160,7 +165,16 @@ class Estimator:
         heatmap = self._matcher.heatmap(difference)
         match = best_match(heatmap, self._matcher.k_grid, self._matcher.sigma_grid)
         middle_ns = sum(latest.t_mid_ns for latest in self._latest) // len(self._latest)
-        return replace(self._calibrated(match, heatmap), lag_ns=frame.t_mid_ns - middle_ns)
+        return replace(self._calibrated(match, heatmap), difference=difference, lag_ns=frame.t_mid_ns - middle_ns)
+
+    def heatmap(self, reading: Reading) -> FloatArray | None:
+        """Return the (K, S) scores of what a reading was made from, None where nothing was matched.
+
+        It may take many milliseconds, which are spent only where somebody looks at it.
+        """
+        if reading.heatmap is not None or reading.difference is None:
+            return reading.heatmap
+        return self._matcher.heatmap(reading.difference)
 
     def _calibrated(self, match: Match, heatmap: FloatArray) -> Reading:
         calibration = self._calibration

@@ -29,6 +29,8 @@ class FingertipTask:
         publisher: Publisher,
         clock: Clock,
         hear: Callable[[Torque], None] = lambda _: None,
+        *,
+        always_heatmap: bool = False,
     ) -> None:
         self.name = name
         self._hear = hear
@@ -36,6 +38,7 @@ class FingertipTask:
         self._estimator = estimator
         self._publisher = publisher
         self._clock = clock
+        self._always_heatmap = always_heatmap
         self._backlog: asyncio.Queue[Frame] = asyncio.Queue(LARGEST_BACKLOG)
         self._tare_wanted = False
         self._tared: list[asyncio.Future[str]] = []
@@ -76,6 +79,7 @@ class FingertipTask:
                     if not waiting.done():
                         waiting.set_result("")
                 self._tared.clear()
+            await self._publish_heatmap(frame, reading)
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board and the estimates."""
@@ -132,8 +136,14 @@ class FingertipTask:
                 latency_s=(self._clock.now_ns() - frame.t_arrival_ns) / 1e9,
             )
         )
-        if reading.heatmap is not None:
-            self._publisher.publish(self._heatmap_message(frame, reading.heatmap))
+
+    async def _publish_heatmap(self, frame: Frame, reading: Reading) -> None:
+        """Publish all scores where somebody looks at them, at their own price: no estimate waits for them."""
+        if not (self._always_heatmap or self._publisher.wanted(EitHeatmap.topic)) or not self._backlog.empty():
+            return
+        heatmap = await asyncio.to_thread(self._estimator.heatmap, reading)
+        if heatmap is not None:
+            self._publisher.publish(self._heatmap_message(frame, heatmap))
 
     def _heatmap_message(self, frame: Frame, heatmap: np.ndarray) -> EitHeatmap:
         k_grid, sigma_grid = self._estimator.grids
@@ -145,5 +155,6 @@ class FingertipTask:
             k_high=float(k_grid[-1]),
             sigma_low=float(sigma_grid[0]),
             sigma_high=float(sigma_grid[-1]),
+            model=self._estimator.model,
             frame=frame.seq,
         )

@@ -74,7 +74,7 @@ class EitEstimate(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EitHeatmap(Message):
-    """The scores of all cells for one frame; NaN at cells that are not valid."""
+    """The scores of all cells for one frame, NaN at cells that are not valid; sent only while somebody subscribes."""
 
     topic: ClassVar[str] = "eit.heatmap"
     rate_hz: ClassVar[float | None] = None
@@ -84,6 +84,7 @@ class EitHeatmap(Message):
     k_high: float = column("cm", "last k of the grid")
     sigma_low: float = column("cm", "first sigma of the grid")
     sigma_high: float = column("cm", "last sigma of the grid")
+    model: str = column("", "basis model of the bank, which says what conductivity k and sigma stand for")
     frame: int = column("", "number of the frame that it was made from")
 
 

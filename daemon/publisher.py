@@ -12,14 +12,19 @@ import zmq
 from daemon.clock import Clock
 from daemon.errors import UserError
 from daemon.messages import Message, encode, wire_map
+from daemon.topics import TOPICS
 
 # Messages kept for a subscriber that reads too slowly; older ones are dropped for it, never delayed for others.
 HIGH_WATER_MARK = 1000
+# What a subscriber sends is a topic's beginning; a peer that sends more than this is cut off.
+LARGEST_SUBSCRIPTION_BYTES = 256
+# Subscriptions taken in at a time, so that a peer that changes its mind without end keeps nothing waiting.
+SUBSCRIPTIONS_AT_ONCE = 100
 Listener: TypeAlias = Callable[[str, dict[str, Any]], None]
 
 
 class Publisher:
-    """A PUB socket that stamps and numbers every message.
+    """A PUB socket that stamps and numbers every message, and knows which topics somebody subscribes to.
 
     Sending never waits: a subscriber that does not keep up loses messages, which it sees as gaps in `seq`.
     """
@@ -29,7 +34,11 @@ class Publisher:
         self._clock = clock
         self._numbers: Counter[tuple[str, str]] = Counter()
         self._listeners: list[Listener] = []
-        self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.PUB)
+        # Beginnings of topics that are subscribed to at present.
+        self._subscribed: set[bytes] = set()
+        # To subscribers an XPUB is a PUB; to us it tells their subscriptions.
+        self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
         self._socket.setsockopt(zmq.LINGER, 0)
         bind(self._socket, address, "publish")
@@ -44,12 +53,30 @@ class Publisher:
         content = wire_map(message, self._clock.unix_s(message.t_mono_ns), self._numbers[stream])
         self._numbers[stream] += 1
         self._socket.send_multipart([message.topic.encode(), encode(content)], zmq.NOBLOCK)
+        self._hear_subscribers()
         for listener in self._listeners:
             listener(message.topic, content)
+
+    def wanted(self, topic: str) -> bool:
+        """Return whether any subscriber asks for this topic: what is dear to compute waits for that."""
+        self._hear_subscribers()
+        return any(topic.encode().startswith(beginning) for beginning in self._subscribed)
 
     def close(self) -> None:
         """Close the socket; what is not yet sent is dropped."""
         self._socket.close()
+
+    def _hear_subscribers(self) -> None:
+        for _ in range(SUBSCRIPTIONS_AT_ONCE):
+            if not self._socket.poll(0, zmq.POLLIN):
+                return
+            message = self._socket.recv(zmq.NOBLOCK)
+            kind, beginning = message[:1], message[1:]
+            # Only beginnings of our own topics are kept: nobody can fill the memory with others.
+            if kind == b"\x01" and any(topic.encode().startswith(beginning) for topic in TOPICS):
+                self._subscribed.add(beginning)
+            elif kind == b"\x00":
+                self._subscribed.discard(beginning)
 
 
 def bind(socket: "zmq.Socket[Any]", address: str, key: str) -> None:

@@ -15,7 +15,15 @@ ARRAYS = hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=3, max_sid
 
 def heatmap(scores: np.ndarray) -> EitHeatmap:
     return EitHeatmap(
-        source="right", t_mono_ns=5, scores=scores, k_low=0.1, k_high=4.4, sigma_low=0.1, sigma_high=4.4, frame=7
+        source="right",
+        t_mono_ns=5,
+        scores=scores,
+        k_low=0.1,
+        k_high=4.4,
+        sigma_low=0.1,
+        sigma_high=4.4,
+        model="gaussian_derivative",
+        frame=7,
     )
 
 

@@ -137,6 +137,29 @@ async def test_commands_tare_tell_the_status_and_stop(config: Write, tmp_path: P
         await daemon.stopped()
 
 
+async def test_a_heatmap_is_computed_only_while_somebody_subscribes(
+    config: Write, tmp_path: Path, subscriber: Connect
+) -> None:
+    play, link = recording(tmp_path, 60), str(tmp_path / "eit-right")
+    async with running(config()) as daemon:
+        estimates, heatmaps = collector(daemon, "eit.estimate"), collector(daemon, "eit.heatmap")
+        async with shearloop(
+            *("emulate", "eit-kit", "--recording", str(play), "--speed", "20", "--link", link),
+            stdin=asyncio.subprocess.PIPE,
+        ):
+            while not (await estimates.get())["valid"]:
+                continue
+            await estimates.get()
+            assert heatmaps.empty()
+            socket = subscriber(f"ipc://{tmp_path}/publish", "eit.heatmap")
+            heatmap = await asyncio.to_thread(next_message, socket)
+            while (estimate := await estimates.get())["frame"] != heatmap["frame"]:
+                continue
+        assert heatmap["scores"].shape == (8, 8)
+        assert heatmap["scores"].max() == pytest.approx(estimate["score"])
+        assert heatmap["model"] == "gaussian_derivative"
+
+
 async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_health(
     config: Write, tmp_path: Path
 ) -> None:

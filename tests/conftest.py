@@ -3,6 +3,7 @@
 import asyncio
 import gc
 import inspect
+import io
 import os
 import threading
 from collections.abc import Iterator
@@ -20,6 +21,17 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("needs the reference data in ../shared, which is not on this machine")
     return SHARED
+
+
+@pytest.fixture(scope="session")
+def fonts() -> None:
+    """Have matplotlib open its fonts, which it keeps open, before any test is watched for open files."""
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    figure.text(0, 0, "σ − · $x^{-2}$ $\\times 10$")
+    figure.savefig(io.BytesIO(), format="png")
+    figure.savefig(io.BytesIO(), format="svg")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -1,5 +1,4 @@
 import asyncio
-import io
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
@@ -16,17 +15,6 @@ from bank.calibration import Calibration
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60
-
-
-@pytest.fixture(scope="session")
-def fonts() -> None:
-    """Have matplotlib open its fonts, which it keeps open, before any test is watched for open files."""
-    from matplotlib.figure import Figure
-
-    figure = Figure()
-    figure.text(0, 0, "σ − ·")
-    figure.savefig(io.BytesIO(), format="png")
-    figure.savefig(io.BytesIO(), format="svg")
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,69 @@
+"""`shearloop chart NAME [RECORDING…] --out DIR`: measure, and draw as JSON, SVG and PNG."""
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+NAMES = {
+    "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    listing = "; ".join(f"{name}: {what}" for name, what in NAMES.items())
+    parser.add_argument("name", choices=NAMES, metavar="NAME", help=listing)
+    parser.add_argument(
+        "recordings",
+        nargs="*",
+        type=Path,
+        metavar="REC",
+        help="recordings (.mcap) or folders of slices; synthetic frames where none is given",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the chart and its numbers")
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="bank to match with (default: a small one, built)")
+    parser.add_argument(
+        "--mesh", type=Path, metavar="FILE", help="mesh or fingertip to reconstruct and solve on (default: our own)"
+    )
+    parser.add_argument(
+        "--split", type=float, default=0.6, metavar="SHARE", help="earlier part, which is fitted to (default: 0.6)"
+    )
+    parser.add_argument(
+        "--rounds", type=int, default=5, metavar="N", help="how often everything is timed, by turns (default: 5)"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw one chart and say where it is."""
+    from daemon.errors import UserError
+
+    if not 0.1 <= args.split <= 0.9:
+        raise UserError(f"--split must be a share from 0.1 to 0.9, not {args.split:g}")
+    if args.rounds < 1:
+        raise UserError(f"--rounds must be 1 or more, not {args.rounds}")
+    try:
+        import matplotlib as _  # noqa: F401 - so that its absence is told before anything is measured
+    except ModuleNotFoundError as error:
+        raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
+    charts: dict[str, Callable[[argparse.Namespace], list[Path]]] = {"speed-accuracy": _speed_accuracy}
+    for path in charts[args.name](args):
+        print(path)
+    return 0
+
+
+def _speed_accuracy(args: argparse.Namespace) -> list[Path]:
+    from bench.charts.sources import bank_of, mesh_of, splits
+    from bench.charts.speed_accuracy import chart
+    from daemon.bank_config import load_geometry
+
+    scratch = args.out / "banks"
+    mesh = mesh_of(args.mesh)
+    own = load_geometry(args.mesh) if args.mesh else None
+    return chart(
+        splits(args.recordings, args.split, scratch),
+        bank_of(args.bank, mesh, scratch),
+        mesh,
+        own,
+        args.out,
+        args.rounds,
+    )

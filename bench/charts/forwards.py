@@ -1,0 +1,114 @@
+"""Forward methods: time per cell of a bank against error to a converged mesh."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.forward import ForwardModel
+from bank.mesh import Mesh
+from bank.models import conductivity
+from bench.charts.sources import own_fingertip
+
+Floats = NDArray[np.float64]
+MODEL = "gaussian_derivative"
+# Cells all over the valid part of the paper's grid.
+CELLS = ((3.2, 1.2), (3.3, 1.9), (2.2, 1.0), (1.4, 1.4), (0.8, 2.5), (4.0, 3.5))
+DIRECT_SIZES_CM = (0.4, 0.2, 0.1, 0.05)
+# Errors fall in proportion to the mesh size: two fine meshes tell where they go (Richardson).
+CONVERGED_SIZES_CM = (0.04, 0.025)
+# Measured with warm caches, EIDORS on the paper's mesh of 4882 triangles: its voltages the direct solve gives to 1e-9.
+EIDORS_CELL_S, PYEIT_CELL_S, PAPER_TRIANGLES = 0.034, 0.244, 4882
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """A forward method: ms per cell (median, fastest and slowest round), relative L2 error of the difference signal.
+
+    What is cited was not measured here; its error is None where nobody has measured it.
+    """
+
+    name: str
+    family: str
+    triangles: int
+    cell_ms: float
+    cell_low_ms: float
+    cell_high_ms: float
+    error: float | None
+    cited: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Solver:
+    name: str
+    family: str
+    mesh: Mesh
+    solve: Callable[[], Floats]
+    truth: Floats
+
+
+def forwards(
+    rounds: int,
+    mesh: Mesh | None,
+    sizes_cm: Sequence[float] = DIRECT_SIZES_CM,
+    converged_cm: tuple[float, float] = CONVERGED_SIZES_CM,
+) -> list[Solved]:
+    """Return all forward methods: direct solves on ever finer meshes, on `mesh` too where it is given, and the peers.
+
+    Methods take turns, so that a busy moment of the machine meets all of them alike.
+    """
+    coarse, fine = (own_fingertip(size).mesh() for size in converged_cm)
+    truth = converged(coarse, fine, converged_cm[0] / converged_cm[1])
+    solvers = []
+    for size in sizes_cm:
+        own = own_fingertip(size).mesh()
+        solvers.append(_Solver(f"direct, {size:g} cm", "direct", own, direct(own), truth))
+    if mesh is not None:
+        once = mesh.refined()
+        solvers.append(
+            _Solver(
+                "direct, --mesh", "direct, the given mesh", mesh, direct(mesh), converged(once, once.refined(), 2.0)
+            )
+        )
+    times: dict[str, list[float]] = {one.name: [] for one in solvers}
+    found = []
+    for turn in range(rounds):
+        for one in solvers:
+            begun = time.perf_counter()
+            signals = one.solve()
+            times[one.name].append(1e3 * (time.perf_counter() - begun) / len(CELLS))
+            if turn == rounds - 1:
+                own_ms = times[one.name]
+                found.append(
+                    Solved(
+                        one.name, one.family, len(one.mesh.triangles), float(np.median(own_ms)), min(own_ms),
+                        max(own_ms), error_of(signals, one.truth),
+                    )
+                )  # fmt: skip
+    alike = min(found, key=lambda one: abs(one.triangles - PAPER_TRIANGLES))
+    eidors, pyeit = 1e3 * EIDORS_CELL_S, 1e3 * PYEIT_CELL_S
+    return [
+        *found,
+        Solved("EIDORS 3.10 (cited)", "EIDORS", PAPER_TRIANGLES, eidors, eidors, eidors, alike.error, cited=True),
+        Solved("pyEIT (cited)", "pyEIT", PAPER_TRIANGLES, pyeit, pyeit, pyeit, None, cited=True),
+    ]
+
+
+def direct(mesh: Mesh) -> Callable[[], Floats]:
+    """Return what solves the (m, 896) difference signals of the cells on a mesh."""
+    model = ForwardModel(mesh)
+    homogeneous = model.homogeneous()
+    return lambda: np.array([model.voltages(conductivity(mesh, MODEL, k, s)) - homogeneous for k, s in CELLS])
+
+
+def converged(coarse: Mesh, fine: Mesh, ratio: float) -> Floats:
+    """Return the signals that two meshes point to, the first `ratio` times as coarse, with an error of first order."""
+    first, second = direct(coarse)(), direct(fine)()
+    return np.asarray(second + (second - first) / (ratio - 1.0))
+
+
+def error_of(signals: Floats, truth: Floats) -> float:
+    """Return the median over the cells of ‖signal − truth‖ / ‖truth‖."""
+    return float(np.median(np.linalg.norm(signals - truth, axis=1) / np.linalg.norm(truth, axis=1)))

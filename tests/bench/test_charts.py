@@ -1,0 +1,91 @@
+"""The charts on small synthetic recordings: what they are drawn from, and that a user's mistakes are sentences."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.charts.forwards import converged, direct, error_of, forwards
+from bench.charts.picture import frontier
+from bench.charts.sources import bank_of, own_fingertip, splits, synthetic_stream
+from bench.charts.speed_accuracy import measured, write
+from bench.charts.windows import followed
+from daemon.cli import main
+from daemon.reproduce.banks import Grid
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("charts")
+
+
+def test_the_frontier_is_what_nothing_beats_in_both() -> None:
+    costs, errors = [1.0, 2.0, 3.0, 4.0, 2.5], [9.0, 5.0, 6.0, 1.0, 5.0]
+    assert frontier(costs, errors) == [0, 1, 3]
+
+
+def test_of_equally_fast_points_the_more_accurate_is_on_the_frontier() -> None:
+    assert frontier([1.0, 1.0], [2.0, 1.0]) == [1]
+
+
+def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch: Path) -> None:
+    slices, stream = splits([], 0.6, scratch)
+    assert slices.past.t_s[-1] < slices.future.t_s[0]
+    assert len(slices.past.t_s) + len(slices.future.t_s) == 49
+    # The judged part of a stream begins with frames that only fill the memory.
+    assert stream.future.t_s[0] < stream.past.t_s[-1]
+    again = synthetic_stream(scratch)
+    np.testing.assert_array_equal(again.channels[: len(stream.past.t_s)], stream.past.channels)
+
+
+def test_errors_fall_in_proportion_to_the_mesh_size_towards_what_two_meshes_foretell() -> None:
+    meshes = [own_fingertip(size).mesh() for size in (0.2, 0.1, 0.05)]
+    truth = converged(meshes[1], meshes[2], 2.0)
+    errors = [error_of(direct(mesh)(), truth) for mesh in meshes]
+    assert errors[0] > 1.5 * errors[1] > 2.0 * errors[2] > 0
+
+
+@pytest.mark.usefixtures("fonts")
+def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Path, tmp_path: Path) -> None:
+    mesh = own_fingertip(0.4).mesh()
+    bank = bank_of(None, mesh, scratch, Grid(np.linspace(3.0, 3.6, 7), np.linspace(1.0, 2.1, 12)))
+    compared = [measured(split, bank, mesh, 1) for split in splits([], 0.6, scratch)]
+    solved, loop = forwards(1, None, (0.4, 0.2), (0.2, 0.1)), followed((0.004,), 1, (1, 3))
+    written = write(compared, solved, loop, bank, tmp_path)
+    assert [path.suffix for path in written] == [".json", ".svg", ".png"]
+    assert all(path.stat().st_size > 1000 for path in written)
+    content = json.loads(written[0].read_text())
+    slices, stream = content["methods"].values()
+    by_name = {row["name"]: row for row in slices}
+    paper, fast = by_name["paper: all lags, reference"], by_name["all lags, fast and exact"]
+    # The same maximum: the same torques.
+    assert fast["rmse_nm"] == paper["rmse_nm"]
+    assert fast["latency_ratio"] == fast["latency_ms"] / paper["latency_ms"]
+    assert {"rank 8", "zero lag, float16", "64 channels", "fused"} <= set(by_name)
+    assert {"fused, right", "fused, both"} <= {row["name"] for row in stream}
+    assert [row["error"] for row in content["forward"] if row["family"] == "direct"] == [
+        one.error for one in solved[:2]
+    ]
+    compensated, late = (
+        next(run["rms_nm"] for run in content["loop"]["runs"] if run["loop"] == name and run["frames"] == 1)
+        for name in ("twist controller", "no delay compensator")
+    )
+    assert 0 < compensated < 0.02 > late > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--split", "0.95"], "--split must be a share from 0.1 to 0.9"),
+        (["--rounds", "0"], "--rounds must be 1 or more"),
+        (["no-such.mcap"], "no-such.mcap"),
+    ],
+)
+def test_a_mistake_is_one_sentence(
+    arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["chart", "speed-accuracy", *arguments, "--out", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert complaint in said
+    assert said.count("\n") == 1

@@ -1,56 +1,51 @@
-"""Building a bank: row by row (a row is one k), in processes, and going on where an interrupted build stopped.
+"""Building a bank: row by row (a row is one k), in threads, and going on where an interrupted build stopped.
 
-The finished bank has the same bytes however often the build was interrupted and however many processes took part.
+The finished bank has the same bytes however often the build was interrupted and however many threads took part.
 """
 
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
-from multiprocessing import get_context, parent_process
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bank.bank_file import MIN_SIGNAL_NORM, BankDefinition, write_bank
+from bank.batch_forward import BatchForwardModel
 from bank.channels import N_CHANNELS
 from bank.errors import BankFileError
-from bank.forward import ForwardModel
 from bank.journal import BankRow, RowJournal
 from bank.mesh import Mesh
-from bank.models import conductivity
+from bank.models import Conductivities
 
 Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]
 
 
 class RowSolver:
-    """Solves a bank's rows on its mesh; `homogeneous` are the (896,) voltages that signals are differences from."""
+    """Solves a bank's rows on its mesh, in several threads if need be.
+
+    `homogeneous` are the (896,) voltages that signals are differences from.
+    """
 
     def __init__(self, mesh: Mesh, definition: BankDefinition) -> None:
-        """Assemble the forward model and solve it for the homogeneous voltages."""
-        self._forward = ForwardModel(mesh)
+        """Prepare the forward model and solve it for the homogeneous voltages."""
+        self._forward = BatchForwardModel(mesh)
+        self._conductivities = Conductivities(mesh)
         self._definition = definition
-        self.homogeneous = self._forward.homogeneous()
+        (self.homogeneous,) = self._forward.voltages(np.ones((1, len(mesh.triangles))))
 
     def solve(self, row: int) -> BankRow:
         """Return the cells of the k at `row`. A cell whose conductivity is not positive is not solved."""
         k, sigmas = float(self._definition.k_grid[row]), self._definition.sigma_grid
-        smallest = np.empty(len(sigmas))
-        valid = np.zeros(len(sigmas), dtype=np.bool_)
+        cells = np.array([self._conductivities.of(self._definition.model, k, sigma) for sigma in sigmas.tolist()])
+        smallest = cells.min(axis=1)
+        valid = smallest > 0
         signals = np.zeros((len(sigmas), N_CHANNELS), dtype=np.float32)
-        for column, sigma in enumerate(sigmas.tolist()):
-            cell = conductivity(self._forward.mesh, self._definition.model, k, sigma)
-            smallest[column] = cell.min()
-            if smallest[column] <= 0:
-                continue
-            difference = self._forward.voltages(cell) - self.homogeneous
-            if np.linalg.norm(difference) >= MIN_SIGNAL_NORM:
-                valid[column] = True
-                signals[column] = difference
+        differences = self._forward.voltages(cells[valid]) - self.homogeneous
+        loud = np.linalg.norm(differences, axis=1) >= MIN_SIGNAL_NORM
+        valid[valid] = loud
+        signals[valid] = differences[loud]
         return BankRow(smallest, valid, signals)
 
 
@@ -81,9 +76,7 @@ def build_bank(
         missing = [row for row in range(total) if row not in journal.rows]
         tell = on_row or _ignore
         tell(total - len(missing), total)
-        alone = jobs <= 1 or len(missing) <= 1
-        solved = _in_turn(solver, missing) if alone else _in_processes(mesh, definition, missing, jobs)
-        for row, cells in solved:
+        for row, cells in _solve(solver, missing, jobs):
             journal.append(row, cells)
             tell(len(journal.rows), total)
         rows = [journal.rows[row] for row in range(total)]
@@ -98,51 +91,15 @@ def build_bank(
         journal.remove()
 
 
-def _in_turn(solver: RowSolver, rows: Sequence[int]) -> Iterator[tuple[int, BankRow]]:
-    for row in rows:
-        yield row, solver.solve(row)
-
-
-def _in_processes(
-    mesh: Mesh, definition: BankDefinition, rows: Sequence[int], jobs: int
-) -> Iterator[tuple[int, BankRow]]:
-    """Yield rows as they are finished. Processes are spawned: none inherits our files, threads or locks."""
-    with ProcessPoolExecutor(
-        min(jobs, len(rows)), get_context("spawn"), initializer=_start_worker, initargs=(mesh, definition)
-    ) as pool:
+def _solve(solver: RowSolver, rows: Sequence[int], jobs: int) -> Iterator[tuple[int, BankRow]]:
+    """Yield rows as they are finished. What takes long in them leaves the interpreter to the other threads."""
+    with ThreadPoolExecutor(max(1, min(jobs, len(rows)))) as pool:
         try:
-            tasks = {pool.submit(_solve_row, row): row for row in rows}
+            tasks = {pool.submit(solver.solve, row): row for row in rows}
             for task in as_completed(tasks):
                 yield tasks.pop(task), task.result()
-        except BrokenProcessPool as error:
-            raise BankFileError(
-                "a process that solves rows was killed, perhaps for want of memory; build again with fewer --jobs: "
-                "the finished rows are kept"
-            ) from error
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-
-
-_worker: list[RowSolver] = []
-
-
-def _start_worker(mesh: Mesh, definition: BankDefinition) -> None:
-    # Ctrl-C reaches every process of the terminal: the parent decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    _worker.append(RowSolver(mesh, definition))
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent has gone, even killed: a worker waits for rows and would wait for ever."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _solve_row(row: int) -> BankRow:
-    return _worker[0].solve(row)
 
 
 def _ignore(*_: object) -> None:

@@ -32,9 +32,9 @@ class CompleteElectrodeModel:
     def __init__(self, mesh: Mesh) -> None:
         """Assemble what does not depend on conductivity."""
         self.mesh = mesh
-        stiffness, contact = _assemble(mesh)
+        stiffness, contact = assemble(mesh)
         n, n_triangles = len(mesh.nodes) + mesh.n_electrodes, len(mesh.triangles)
-        place = _elimination_order(mesh, stiffness)
+        place = elimination_order(mesh, stiffness)
         rows = place[np.concatenate([stiffness.rows, contact.rows])]
         columns = place[np.concatenate([stiffness.columns, contact.columns])]
         values = np.concatenate([stiffness.values, contact.values])
@@ -82,7 +82,10 @@ class CompleteElectrodeModel:
 
 
 class ForwardModel:
-    """The 896 voltages of a fingertip. Raises GeometryError for a mesh that has not 32 electrodes."""
+    """The 896 voltages of a fingertip. Raises GeometryError for a mesh that has not 32 electrodes.
+
+    currents (32, 16) go into the electrodes in the first half of the patterns.
+    """
 
     def __init__(self, mesh: Mesh) -> None:
         """Check the mesh and assemble."""
@@ -91,7 +94,7 @@ class ForwardModel:
         self._solver = CompleteElectrodeModel(mesh)
         # Opposite injection: the second half of the patterns is the first with the sign changed.
         half = N_ELECTRODES // 2
-        self._currents = STIMULATION_CURRENT * np.vstack([-np.eye(half), np.eye(half)])
+        self.currents = STIMULATION_CURRENT * np.vstack([-np.eye(half), np.eye(half)])
         sink, _, self._positive, self._negative = CHANNELS.T
         self._pattern = sink % half
         self._sign = np.where(sink < half, 1.0, -1.0)
@@ -101,9 +104,12 @@ class ForwardModel:
 
         Raises ConductivityError, before anything is solved, where conductivity is not positive.
         """
-        potentials = self._solver.electrode_potentials(conductivity, self._currents)
+        return self.channels_of(self._solver.electrode_potentials(conductivity, self.currents))
+
+    def channels_of(self, potentials: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the (…, 896) voltages of the (…, 32, 16) potentials that `currents` raise."""
         differences: NDArray[np.float64] = (
-            potentials[self._positive, self._pattern] - potentials[self._negative, self._pattern]
+            potentials[..., self._positive, self._pattern] - potentials[..., self._negative, self._pattern]
         )
         return self._sign * differences
 
@@ -140,11 +146,11 @@ def _load(v, w):  # type: ignore[no-untyped-def]  # as above
     return v / w.z
 
 
-def _assemble(mesh: Mesh) -> tuple["_Terms", "_Terms"]:
+def assemble(mesh: Mesh) -> tuple["Terms", "Terms"]:
     """Return the terms ∫∇u·∇v of every triangle, and those of the contacts, with the electrodes after the nodes."""
     domain = MeshTri(mesh.nodes.T.copy(), mesh.triangles.T.copy())
     inside = _stiffness.coo_data(Basis(domain, ElementTriP1(), intorder=0))
-    stiffness = _Terms(inside.indices[0], inside.indices[1], inside.data)
+    stiffness = Terms(inside.indices[0], inside.indices[1], inside.data)
 
     edges = FacetBasis(domain, ElementTriP1(), facets=_facets_of(domain, mesh.electrode_edges), intorder=2)
     impedance = mesh.contact_impedance[mesh.electrode_of_edge]
@@ -152,7 +158,7 @@ def _assemble(mesh: Mesh) -> tuple["_Terms", "_Terms"]:
     mass, load = _mass.coo_data(edges, z=z), _load.coo_data(edges, z=z)
     node = load.indices[0]
     electrode = len(mesh.nodes) + np.tile(mesh.electrode_of_edge, 3)
-    contact = _Terms(
+    contact = Terms(
         np.concatenate([mass.indices[0], node, electrode, electrode]),
         np.concatenate([mass.indices[1], electrode, node, electrode]),
         # An edge's functions add up to 1, so its loads add up to its length over z.
@@ -162,7 +168,7 @@ def _assemble(mesh: Mesh) -> tuple["_Terms", "_Terms"]:
     return stiffness, contact.where(np.abs(contact.values) > 1e-12 * np.abs(contact.values).max())
 
 
-def _elimination_order(mesh: Mesh, stiffness: "_Terms") -> NDArray[np.int64]:
+def elimination_order(mesh: Mesh, stiffness: "Terms") -> NDArray[np.int64]:
     """Return each unknown's place: −1 for the grounded node, then nodes in an order of little fill, then electrodes."""
     n = len(mesh.nodes)
     laplacian = sp.csc_array((stiffness.values, (stiffness.rows, stiffness.columns)), shape=(n, n))
@@ -183,12 +189,13 @@ def _facets_of(domain: MeshTri, edges: NDArray[np.int64]) -> NDArray[np.int64]:
     return found
 
 
-class _Terms(NamedTuple):
+class Terms(NamedTuple):
     """What is added up in a matrix: (P,) row and column numbers and values."""
 
     rows: NDArray[np.int64]
     columns: NDArray[np.int64]
     values: NDArray[np.float64]
 
-    def where(self, keep: NDArray[np.bool_]) -> "_Terms":
-        return _Terms(self.rows[keep], self.columns[keep], self.values[keep])
+    def where(self, keep: NDArray[np.bool_]) -> "Terms":
+        """Return some of the terms."""
+        return Terms(self.rows[keep], self.columns[keep], self.values[keep])

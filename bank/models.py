@@ -85,12 +85,40 @@ def conductivity(mesh: Mesh, model: str, k: float, sigma: float) -> NDArray[np.f
 
     It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
     """
+    values: NDArray[np.float64] = _mean(_averaging_heights(mesh), _centre(mesh), model, k, sigma)
+    return values
+
+
+class Conductivities:
+    """What `conductivity` returns, to the bit, for many parameters on one mesh: triangles alike are averaged once."""
+
+    def __init__(self, mesh: Mesh) -> None:
+        """Find the triangles whose corners have the same heights."""
+        corners = mesh.nodes[:, 1][mesh.triangles]
+        _, first, self._alike = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+        self._heights = _averaging_heights(mesh)[first]
+        self._centre = _centre(mesh)
+
+    def of(self, model: str, k: float, sigma: float) -> NDArray[np.float64]:
+        """Return the (T,) conductivity; errors as of `conductivity`."""
+        values: NDArray[np.float64] = _mean(self._heights, self._centre, model, k, sigma)[self._alike]
+        return values
+
+
+def _averaging_heights(mesh: Mesh) -> Values:
+    heights: Values = mesh.nodes[:, 1][mesh.triangles] @ averaging_points().T
+    return heights
+
+
+def _centre(mesh: Mesh) -> float:
+    return float((mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2)
+
+
+def _mean(heights: Values, centre: float, model: str, k: float, sigma: float) -> Values:
     basis = model_named(model)
     if not (np.isfinite(k) and np.isfinite(sigma)):
         raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
     if sigma <= 0 and basis.sigma_unit != "not used":
         raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
-    heights = mesh.nodes[:, 1][mesh.triangles] @ averaging_points().T
-    centre = (mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2
-    values: NDArray[np.float64] = 1.0 + basis.function(heights, k, sigma, float(centre)).mean(axis=1)
+    values: Values = 1.0 + basis.function(heights, k, sigma, centre).mean(axis=1)
     return values

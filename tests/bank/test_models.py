@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from bank.errors import ModelError
 from bank.mesh import Mesh
-from bank.models import MODELS, averaging_points, conductivity
+from bank.models import MODELS, Conductivities, averaging_points, conductivity
 
 
 def test_the_averaging_points_are_those_of_the_reference(shared):
@@ -75,3 +75,13 @@ def test_mistakes_are_refused(fingertip: Mesh):
     with pytest.raises(ModelError, match="finite"):
         conductivity(fingertip, "linear", np.nan, 1)
     assert conductivity(fingertip, "step", 1, 0).min() == 0.5
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_many_conductivities_are_those_of_one_to_the_bit(name, fingertip, paper_mesh):
+    for mesh in (fingertip, paper_mesh):
+        many = Conductivities(mesh)
+        for k, sigma in [(0.7, 0.3), (2.0, 1.1)]:
+            np.testing.assert_array_equal(many.of(name, k, sigma), conductivity(mesh, name, k, sigma))
+    with pytest.raises(ModelError, match="finite"):
+        many.of(name, np.nan, 1.0)

@@ -20,7 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="what the bank is of (YAML)")
     parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="the bank file to write")
     add_overrides(parser)
-    parser.add_argument("--jobs", type=int, metavar="N", help="processes that solve (default: one per core)")
+    parser.add_argument("--jobs", type=int, metavar="N", help="threads that solve (default: one per core)")
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 

@@ -1,0 +1,112 @@
+"""Many solutions at once against the direct solve of each, and against what a Schur complement is."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from bank.batch_forward import LARGEST_LEAK, BatchForwardModel, rounding_leaks
+from bank.elimination import LANES, Elimination, Pattern
+from bank.errors import ConductivityError, GeometryError
+from bank.mesh import Mesh
+from bank.models import MODELS, conductivity
+from tests.bank.conftest import rectangle
+
+
+@pytest.fixture(scope="module")
+def batch(fingertip: Mesh) -> BatchForwardModel:
+    return BatchForwardModel(fingertip)
+
+
+def relative(found, expected):
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 14), st.integers(1, 4))
+@settings(max_examples=25, deadline=None)
+def test_what_is_left_is_the_schur_complement(seed, n, kept):
+    rng = np.random.default_rng(seed)
+    kept = min(kept, n - 1)
+    links = [(i, int(rng.integers(0, i))) for i in range(1, n)] + [tuple(p) for p in rng.integers(0, n, (n, 2))]
+    links = [(max(pair), min(pair)) for pair in links if pair[0] != pair[1]]
+    # Each link adds its factor to a Laplacian, and the last factor stands on the whole diagonal.
+    rows, columns, values, source = [], [], [], []
+    for number, (i, j) in enumerate(links):
+        rows += [i, j, i, j]
+        columns += [i, j, j, i]
+        values += [1.0, 1.0, -1.0, -1.0]
+        source += [number] * 4
+    pattern = Pattern(
+        *(np.array(each + list(range(n)) if k < 2 else each) for k, each in enumerate((rows, columns))),
+        np.array(values + [1.0] * n),
+        np.array(source + [len(links)] * n),
+    )
+    factors = rng.uniform(0.1, 10, (LANES + 3, len(links) + 1))
+    found = Elimination(pattern, n, kept).schur_complements(factors)
+    for each, factor in zip(found, factors, strict=True):
+        matrix = np.zeros((n, n))
+        np.add.at(matrix, (pattern.rows, pattern.columns), pattern.values * factor[pattern.source])
+        inner, coupling = matrix[:-kept, :-kept], matrix[:-kept, -kept:]
+        expected = matrix[-kept:, -kept:] - coupling.T @ np.linalg.solve(inner, coupling)
+        np.testing.assert_allclose(each, expected, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_all_models_give_the_direct_solves_signals(batch, fingertip, model):
+    rng = np.random.default_rng(3)
+    cells = [conductivity(fingertip, model, *rng.uniform(0.05, 4.4, 2)) for _ in range(60)]
+    cells = np.array([each for each in cells if each.min() > 0])
+    assert len(cells) > LANES // 2
+    homogeneous = batch.direct.homogeneous()
+    found = batch.voltages(cells) - homogeneous
+    for signal, cell in zip(found, cells, strict=True):
+        expected = batch.direct.voltages(cell) - homogeneous
+        assert np.linalg.norm(signal - expected) <= 1e-9 * np.linalg.norm(expected) + 1e-12
+
+
+def test_every_reference_solution_on_the_papers_mesh(paper_mesh, eidors):
+    model = BatchForwardModel(paper_mesh)
+    stem = "gaussian_derivative_random"
+    positive = eidors[f"{stem}_min_conductivity"] > 0
+    cells = [
+        conductivity(paper_mesh, "gaussian_derivative", k, sigma)
+        for k, sigma in zip(eidors[f"{stem}_k"][positive], eidors[f"{stem}_sigma"][positive], strict=True)
+    ]
+    for found, expected in zip(model.voltages(np.array(cells)), eidors[f"{stem}_v"][positive], strict=True):
+        assert relative(found, expected) < 1e-9
+
+
+def test_the_bits_do_not_depend_on_what_else_is_solved(batch, fingertip):
+    cells = np.random.default_rng(5).uniform(0.2, 3, (2 * LANES + 1, len(fingertip.triangles)))
+    together = batch.voltages(cells)
+    np.testing.assert_array_equal(together[7:8], batch.voltages(cells[7:8]))
+    np.testing.assert_array_equal(together[-3:], batch.voltages(cells[-3:]))
+    assert batch.voltages(cells[:0]).shape == (0, 896)
+
+
+def test_a_cell_that_rounding_spoils_is_solved_directly(batch, fingertip):
+    """An island of the gel hardly conducts to the rest: its potential is all but free."""
+    middle = fingertip.nodes[fingertip.triangles].mean(axis=1)
+    cells = np.ones((3, len(fingertip.triangles)))
+    cells[1, middle[:, 1] > 1.6] = 1e-13
+    factors = np.column_stack([cells, np.ones(3)])
+    leaks = rounding_leaks(batch._elimination.schur_complements(factors))
+    assert leaks[1] > LARGEST_LEAK > 1e-13 > max(leaks[0], leaks[2])
+    found = batch.voltages(cells)
+    np.testing.assert_array_equal(found[1], batch.direct.voltages(cells[1]))
+    assert relative(found[0], batch.direct.voltages(cells[0])) < 1e-12
+
+
+def test_matrices_that_mean_nothing_leak_without_bound():
+    broken = np.array([np.eye(2), [[1.0, -1.0], [-1.0, 1.0]], [[np.nan, 1.0], [1.0, 1.0]], [[-1.0, 1.0], [2.0, -1.0]]])
+    np.testing.assert_array_equal(rounding_leaks(broken), [1.0, 0.0, np.inf, np.inf])
+
+
+def test_what_has_no_solution_is_refused(batch, fingertip):
+    cells = np.ones((2, len(fingertip.triangles)))
+    cells[1, 5] = -1
+    with pytest.raises(ConductivityError, match="smallest value is -1"):
+        batch.voltages(cells)
+    nodes, triangles = rectangle(2, 2, 1, 1)
+    with pytest.raises(GeometryError, match="2 electrodes"):
+        BatchForwardModel(Mesh(nodes, triangles, [[0, 1], [7, 8]], [0, 1], [1, 1]))

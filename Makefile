@@ -7,13 +7,13 @@ export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install install-dev system-packages demo test lint format clean
 
-# What running takes; the tools of the tests and the static checks come with `install-dev`.
+# What running and drawing take; the tools of the tests and the static checks come with `install-dev`.
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
 $(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable .
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot]'
 	touch $@
 
 $(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed

@@ -14,8 +14,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from bank.mesh import Mesh
+    from daemon.synthetic import Signals
     from drivers.emulators.eit_kit import Fault
 
+DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
 # Where the paper's method finds its screwdriver: σ at rest and at the largest torque of the slices, in N·m.
 K_CM = 3.25
 SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM, LARGEST_TORQUE_NM = 1.85, 1.25, 0.14
@@ -31,7 +34,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     frames = parser.add_argument_group("what is played")
     frames.add_argument("--recording", type=Path, metavar="FILE", help="a recorded stream (.mat)")
     frames.add_argument("--side", choices=("left", "right"), help="which fingertip, if the file holds both")
-    frames.add_argument("--bank", type=Path, metavar="FILE", help="synthesise twists from this bank's signals")
+    frames.add_argument(
+        "--bank",
+        type=Path,
+        metavar="FILE",
+        help="synthesise twists from this bank's signals (default, without --recording: the demo's fingertip, solved)",
+    )
     frames.add_argument("--k", type=float, default=K_CM, help="k of the synthetic twists (default: %(default)s)")
     frames.add_argument(
         "--sigma",
@@ -94,11 +102,11 @@ def _fault_at(text: str) -> tuple[int, "Fault"]:
 def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
     from daemon.errors import UserError
 
-    if (args.recording is None) == (args.bank is None):
+    if args.recording is not None and args.bank is not None:
         raise UserError("give either --recording FILE to play a recording or --bank FILE to synthesise frames")
-    if args.bank is not None and args.once:
-        raise UserError("--once is for a recording; synthetic frames have no end")
-    if args.bank is not None:
+    if args.recording is None:
+        if args.once:
+            raise UserError("--once is for a recording; synthetic frames have no end")
         return _synthetic(args, period_s)
     from daemon.recordings import read_stream
 
@@ -108,16 +116,30 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
 
 def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
     from bank.bank_file import Bank
-    from daemon.synthetic import Synthesiser, TwistProgramme, twist_frames
+    from daemon.synthetic import Synthesiser, TwistProgramme, solved_signals, twist_frames
 
     rest, largest = args.sigma
 
     def sigma_of_torque(torque_nm: float) -> float:
         return float(rest + (largest - rest) * torque_nm / LARGEST_TORQUE_NM)
 
-    synthesiser = Synthesiser(Bank.open(args.bank), seed=args.seed)
+    if args.bank is not None:
+        signals: Signals = Bank.open(args.bank)
+    else:
+        signals = solved_signals(_demo_mesh(), args.k, min(rest, largest), max(rest, largest))
+    synthesiser = Synthesiser(signals, seed=args.seed)
     # What cannot be synthesised is said before a port appears.
     for torque_nm in (0.0, LARGEST_TORQUE_NM):
         synthesiser.signal(args.k, sigma_of_torque(torque_nm))
     frames = twist_frames(synthesiser, TwistProgramme(), k=args.k, sigma_of_torque=sigma_of_torque, period_s=period_s)
     return (frame.line for frame in frames)
+
+
+def _demo_mesh() -> "Mesh":
+    """Return the mesh of the demo's bank; raises UserError where the project's `config/` is not beside its code."""
+    from daemon.bank_config import load_bank_plan
+    from daemon.errors import UserError
+
+    if not DEMO_BANK.is_file():
+        raise UserError(f"{DEMO_BANK} is not there; give --recording FILE to play, or --bank FILE to synthesise from")
+    return load_bank_plan(DEMO_BANK).mesh

@@ -12,9 +12,38 @@ def stays_on_this_machine(address: str) -> bool:
     parts = urlsplit(address)
     if parts.scheme == "ipc":
         return bool(address.removeprefix("ipc://"))
-    if parts.scheme != "tcp" or parts.hostname is None:
+    # After a semicolon libzmq takes another address.
+    if parts.scheme != "tcp" or parts.hostname is None or ";" in address:
         return False
     try:
         return ipaddress.ip_address(parts.hostname).is_loopback
     except ValueError:
         return False
+
+
+def needs_keys(address: str) -> bool:
+    """Return whether a client needs keys to speak to an address: it lies beyond this machine.
+
+    The name `localhost` is as good as a loopback IP for one who connects; nobody binds to it.
+    """
+    return (
+        address.startswith("tcp://")
+        and urlsplit(address).hostname != "localhost"
+        and not stays_on_this_machine(address)
+    )
+
+
+def open_stop_address(address: str) -> str:
+    """Return where everyone on the machine can say `stop` to a daemon whose commands are on the network.
+
+    An abstract socket, which has no permissions and leaves no file behind; named by the port of `commands`.
+    """
+    return f"ipc://@shearloop-stop-{address.rpartition(':')[2]}"
+
+
+def open_to_the_network(address: str, key: str) -> str:
+    """Return the sentence for an address that is not to be bound in the clear."""
+    return (
+        f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
+        "tcp://127.0.0.1:7761, or add `curve` with keys made by `shearloop keys`"
+    )

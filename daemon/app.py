@@ -17,13 +17,15 @@ from bank.calibration import Calibration
 from bank.channels import ZERO_SLOTS
 from bank.matching import ReferenceMatcher, ZeroLagMatcher
 from daemon import sd_notify
+from daemon.addresses import open_stop_address
 from daemon.clock import Clock
-from daemon.command_server import CommandRefusedError, CommandServer, Handler, Reply
+from daemon.command_server import STATUS, STOP, CommandRefusedError, CommandServer, Handler, Reply
 from daemon.config import DaemonConfig, Fingertip
 from daemon.errors import UserError
 from daemon.estimator import LONGEST_GAP_NS, Estimator
 from daemon.fingertip import FingertipTask
-from daemon.health import HealthReporter
+from daemon.health import HealthReporter, TaskFacts
+from daemon.keys import Gatekeeper, load_server_keys
 from daemon.links import log_link
 from daemon.loop.senses import Source
 from daemon.publisher import Listener, Publisher
@@ -66,10 +68,19 @@ class Daemon:
         self._stop = asyncio.Event()
         estimators = {name: open_estimator(fingertip) for name, fingertip in config.fingertips.items()}
         with contextlib.ExitStack() as opened:
-            self.publisher = Publisher(context, config.publish, self._clock)
+            keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
+            self._gate: Gatekeeper | None = None
+            if config.curve is not None and config.network_addresses:
+                self._gate = Gatekeeper(context, config.curve.clients)
+                opened.callback(self._gate.close)
+            self.publisher = Publisher(context, config.publish, self._clock, keys)
             opened.callback(self.publisher.close)
-            self._commands = CommandServer(context, config.commands, self._handlers())
+            self._commands = CommandServer(context, config.commands, self._handlers(), keys)
             opened.callback(self._commands.close)
+            self._open_stop: CommandServer | None = None
+            if "commands" in config.network_addresses:
+                self._open_stop = CommandServer(context, open_stop_address(config.commands), self._open_handlers())
+                opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
         self._rig: Rig | None = None
         try:
@@ -107,7 +118,7 @@ class Daemon:
                 self._health.add("load_cell", self._rig.load_cell.facts)
             if self._rig.gripper is not None:
                 self._health.add("gripper", self._rig.gripper.facts)
-        self._health.add("commands", lambda: {"errors": dict(self._commands.refused)})
+        self._health.add("commands", self._command_facts)
 
     async def run(self) -> None:
         """Run until `stop` is called, then end every task and close the sockets."""
@@ -148,6 +159,10 @@ class Daemon:
             if self._config.experiment is not None:
                 yield supervised("experiment", self._run_experiment)
         yield supervised("commands", self._commands.run)
+        if self._gate is not None:
+            yield supervised("keys", self._gate.run)
+        if self._open_stop is not None:
+            yield supervised("open_stop", self._open_stop.run)
         yield supervised("health", self._health.run)
 
     async def _run_experiment(self) -> None:
@@ -176,6 +191,22 @@ class Daemon:
             "resume": self._resume,
             "unlock": self._unlock,
         }
+
+    def _open_handlers(self) -> Mapping[str, Handler]:
+        """Return what everyone on the machine may do where commands need a key: look, and stop."""
+
+        async def refuse(_request: Mapping[str, Any]) -> Reply:
+            raise CommandRefusedError("this needs a key: give --key and --server-key; without one there is only `stop`")
+
+        return {name: own if name in (STOP, STATUS) else refuse for name, own in self._handlers().items()}
+
+    def _command_facts(self) -> TaskFacts:
+        """Return what was refused, by kind: commands, and clients that had no right to connect."""
+        refused = self._commands.refused.copy()
+        for other in (self._gate, self._open_stop):
+            if other is not None:
+                refused.update(other.refused)
+        return {"errors": dict(refused)}
 
     async def _tare_to_the_end(self) -> str:
         tares = [task.tare_to_the_end() for task in self._fingertips.values()]

@@ -6,20 +6,24 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, model_validator
 
-from daemon.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, stays_on_this_machine
+from daemon.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, open_to_the_network, stays_on_this_machine
 from daemon.config_file import ConfigModel, load_yaml_model
 
 
-def _safe_address(address: str) -> str:
-    if not stays_on_this_machine(address):
-        raise ValueError(
-            "must be ipc or a loopback address such as tcp://127.0.0.1:7761; "
-            "any other would open the robot to the network"
-        )
+def _known_transport(address: str) -> str:
+    if not address.startswith(("ipc://", "tcp://")):
+        raise ValueError("must be ipc or a tcp address, for this machine alone a loopback one: tcp://127.0.0.1:7761")
     return address
 
 
-Address = Annotated[str, AfterValidator(_safe_address)]
+Address = Annotated[str, AfterValidator(_known_transport)]
+
+
+class CurveConfig(ConfigModel):
+    """Keys for the addresses that can be reached from the network; made by `shearloop keys`."""
+
+    server_key: Path = Field(description="the daemon's own .key_secret; under systemd its credential of this name")
+    clients: Path = Field(description="the allow-list: a folder with the .key of each client")
 
 
 class SerialDevice(ConfigModel):
@@ -180,6 +184,7 @@ class DaemonConfig(ConfigModel):
 
     publish: Address = PUBLISH_ADDRESS
     commands: Address = COMMAND_ADDRESS
+    curve: CurveConfig | None = Field(None, description="keys, for addresses that are not on this machine alone")
     fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], Fingertip] = Field(default_factory=dict)
     skin: SkinConfig | None = None
     load_cell: LoadCellConfig | None = None
@@ -195,6 +200,9 @@ class DaemonConfig(ConfigModel):
     def _loop_is_whole(self) -> "DaemonConfig":
         if not self.fingertips and self.skin is None:
             raise ValueError("nothing is measured: give `fingertips`, a `skin`, or both")
+        for key, address in self.network_addresses.items():
+            if self.curve is None:
+                raise ValueError(open_to_the_network(address, key))
         if self.publish == self.commands and not self.publish.endswith(":*"):
             raise ValueError(f"`publish` and `commands` are both {self.publish}; give each an address of its own")
         if self.experiment is not None and self.robot is None:
@@ -202,6 +210,12 @@ class DaemonConfig(ConfigModel):
         if self.gripper is not None and self.robot is None:
             raise ValueError("a gripper without a robot cannot be driven: add `robot: ur.yaml`, or take `gripper` out")
         return self
+
+    @property
+    def network_addresses(self) -> dict[str, str]:
+        """The keys and addresses that can be reached from beyond this machine."""
+        addresses = {"publish": self.publish, "commands": self.commands}
+        return {key: address for key, address in addresses.items() if not stays_on_this_machine(address)}
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:

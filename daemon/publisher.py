@@ -9,8 +9,10 @@ from typing import Any, TypeAlias
 
 import zmq
 
+from daemon.addresses import open_to_the_network, stays_on_this_machine
 from daemon.clock import Clock
 from daemon.errors import UserError
+from daemon.keys import KeyPair
 from daemon.messages import Message, encode, wire_map
 from daemon.topics import TOPICS
 
@@ -29,8 +31,8 @@ class Publisher:
     Sending never waits: a subscriber that does not keep up loses messages, which it sees as gaps in `seq`.
     """
 
-    def __init__(self, context: "zmq.Context[Any]", address: str, clock: Clock) -> None:
-        """Bind the socket; raises UserError when the address is taken or malformed."""
+    def __init__(self, context: "zmq.Context[Any]", address: str, clock: Clock, keys: KeyPair | None = None) -> None:
+        """Bind the socket; raises UserError when the address is taken, malformed, or needs keys and has none."""
         self._clock = clock
         self._numbers: Counter[tuple[str, str]] = Counter()
         self._listeners: list[Listener] = []
@@ -41,7 +43,7 @@ class Publisher:
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
         self._socket.setsockopt(zmq.SNDHWM, HIGH_WATER_MARK)
         self._socket.setsockopt(zmq.LINGER, 0)
-        bind(self._socket, address, "publish")
+        bind(self._socket, address, "publish", keys)
 
     def listen(self, listener: Listener) -> None:
         """Call the listener with topic and content of every message from now on (recorder, console)."""
@@ -79,9 +81,16 @@ class Publisher:
                 self._subscribed.discard(beginning)
 
 
-def bind(socket: "zmq.Socket[Any]", address: str, key: str) -> None:
-    """Bind a socket; a refusal becomes a sentence that names the configuration key and the address."""
+def bind(socket: "zmq.Socket[Any]", address: str, key: str, keys: KeyPair | None = None) -> None:
+    """Bind a socket; a refusal becomes a sentence that names the configuration key and the address.
+
+    Beyond this machine it is encrypted and authenticated by `keys`, or not bound at all.
+    """
     try:
+        if "://" in address and not stays_on_this_machine(address):
+            if keys is None:
+                raise UserError(open_to_the_network(address, key))
+            keys.serve(socket)
         _leave_what_is_there(address, key)
         socket.bind(address)
     except UserError:

@@ -6,20 +6,23 @@ from typing import Any
 import zmq
 
 from daemon.errors import UserError
+from daemon.keys import ClientKeys
 from daemon.messages import decode, encode
-from daemon.subscriber import connect
+from daemon.subscriber import connect, keys_hint
 
 
-def request(address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+def request(
+    address: str, content: Mapping[str, Any], timeout_s: float, keys: ClientKeys | None = None
+) -> dict[str, Any]:
     """Return the daemon's reply; raises UserError when none comes in time."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
-        connect(socket, address)
+        connect(socket, address, keys)
         socket.send(encode(content))
         if not socket.poll(int(timeout_s * 1000)):
             raise UserError(
                 f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
-                "or give the address of its `commands` key with --connect"
+                f"or give the address of its `commands` key with --connect{keys_hint(keys)}"
             )
         try:
             return decode(socket.recv())

@@ -5,7 +5,9 @@ from typing import Any
 
 import zmq
 
+from daemon.addresses import needs_keys
 from daemon.errors import UserError
+from daemon.keys import ClientKeys
 from daemon.messages import decode
 
 # A day; what a poll takes at most is some weeks.
@@ -14,7 +16,7 @@ _ENVELOPE = frozenset({"timestamp", "t_mono_ns", "seq", "source"})
 
 
 def messages(
-    address: str, topics: Iterable[str], timeout_s: float | None = None
+    address: str, topics: Iterable[str], timeout_s: float | None = None, keys: ClientKeys | None = None
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield (topic, content) of every message whose topic starts with one of `topics` (all, when there is none).
 
@@ -22,7 +24,7 @@ def messages(
     """
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.LINGER, 0)
-        connect(socket, address)
+        connect(socket, address, keys)
         for topic in tuple(topics) or ("",):
             socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
         while True:
@@ -30,6 +32,7 @@ def messages(
                 raise UserError(
                     f"nothing was heard from {address} for {timeout_s:g} s; start the daemon with "
                     "`shearloop run CONFIG`, or give the address of its `publish` key with --connect"
+                    f"{keys_hint(keys)}"
                 )
             parts = socket.recv_multipart()
             try:
@@ -54,8 +57,22 @@ def checked_timeout_s(timeout_s: float) -> float:
     return timeout_s
 
 
-def connect(socket: "zmq.Socket[bytes]", address: str) -> None:
-    """Connect a socket; a malformed address becomes a sentence."""
+def keys_hint(keys: ClientKeys | None) -> str:
+    """Return what to look at besides when nobody answers: a daemon on the network says nothing to a wrong key."""
+    if keys is None:
+        return "; a daemon whose address is one of the network answers nobody without --key and --server-key"
+    return "; it answers only keys that it was told of with `shearloop keys allow`"
+
+
+def connect(socket: "zmq.Socket[bytes]", address: str, keys: ClientKeys | None = None) -> None:
+    """Connect a socket; a malformed address becomes a sentence, and so does one of the network without keys."""
+    if keys is not None:
+        keys.use(socket)
+    elif needs_keys(address):
+        raise UserError(
+            f"{address} is not on this machine: give your key with --key and the daemon's with --server-key, "
+            "made by `shearloop keys`"
+        )
     try:
         socket.connect(address)
     except zmq.ZMQError as error:

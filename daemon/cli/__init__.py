@@ -34,6 +34,7 @@ COMMANDS = {
     "calibrate": Command("daemon.cli.calibrate", "calibrate the load cell or the gripper, step by step"),
     "emulate": Command("daemon.cli.emulate", "play a device, byte for byte, on a port of its own"),
     "bank": Command("daemon.cli.bank", "solve, build, inspect and draw banks of simulated signals"),
+    "keys": Command("daemon.cli.keys", "make the keys for daemon and clients on a network"),
     "install": Command("daemon.cli.install", "make the daemon a service of this computer"),
     "uninstall": Command("daemon.cli.uninstall", "take the service away again"),
     "skin": Command("daemon.cli.skin", "hold the shear skin's models against its paper, and calibrate a skin"),

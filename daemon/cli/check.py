@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from daemon.config import SkinConfig
+    from daemon.config import CurveConfig, SkinConfig
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,8 @@ def run(args: argparse.Namespace) -> int:
 
     config = load_daemon_config(args.config)
     checked_emulators(config.emulators, args.config)
+    if config.curve is not None:
+        print(f"keys: {_clients(config.curve)} may connect")
     for name, fingertip in config.fingertips.items():
         k_grid, sigma_grid = open_estimator(fingertip).grids
         torque = "with torque" if fingertip.calibration else "without torque: no calibration is configured"
@@ -29,6 +31,13 @@ def run(args: argparse.Namespace) -> int:
         print(f"skin: {_skin(config.skin)}")
     print(f"{args.config} is in order")
     return 0
+
+
+def _clients(curve: "CurveConfig") -> str:
+    from daemon.keys import admitted_clients, load_server_keys
+
+    load_server_keys(curve.server_key)
+    return ", ".join(sorted(admitted_clients(curve.clients).values()))
 
 
 def _skin(config: "SkinConfig") -> str:

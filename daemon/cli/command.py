@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from daemon.addresses import COMMAND_ADDRESS
+from daemon.addresses import COMMAND_ADDRESS, needs_keys
+from daemon.cli.connection import add_connection, client_keys, stop_address
 
 COMMANDS = {
     "tare": "take the zero of fingertips and skin anew, nothing gripped",
@@ -27,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--experiment", type=Path, metavar="FILE", help="what to start; else what the daemon's configuration names"
     )
-    parser.add_argument("--connect", default=COMMAND_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
+    add_connection(parser, COMMAND_ADDRESS)
     parser.add_argument(
         "--timeout", type=float, default=2.0, metavar="S", help="how long to wait (default: %(default)s s)"
     )
@@ -46,7 +47,13 @@ def run(args: argparse.Namespace) -> int:
     if args.experiment is not None:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())
-    reply = request(args.connect, {"command": args.name, **arguments}, checked_timeout_s(args.timeout))
+    address, keys = args.connect, None
+    if args.name in ("stop", "status") and args.key is None and not needs_keys(address):
+        # Where the daemon's commands need keys, these two do not.
+        address = stop_address(address)
+    else:
+        keys = client_keys(args)
+    reply = request(address, {"command": args.name, **arguments}, checked_timeout_s(args.timeout), keys)
     accepted = bool(reply.pop("ok", False))
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))

@@ -3,12 +3,13 @@
 import argparse
 
 from daemon.addresses import PUBLISH_ADDRESS
+from daemon.cli.connection import add_connection, client_keys
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `listen`."""
     parser.add_argument("topics", nargs="*", metavar="TOPIC", help="topics, or their beginnings (eit); all by default")
-    parser.add_argument("--connect", default=PUBLISH_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
+    add_connection(parser, PUBLISH_ADDRESS)
     parser.add_argument("--json", action="store_true", help="one JSON object a line, arrays included")
     parser.add_argument("--count", type=int, metavar="N", help="stop after N messages")
     parser.add_argument("--timeout", type=float, metavar="S", help="give up when nothing comes for S seconds")
@@ -29,7 +30,8 @@ def run(args: argparse.Namespace) -> int:
     if args.timeout is not None:
         checked_timeout_s(args.timeout)
     write = as_json if args.json else as_line
-    for number, (topic, content) in enumerate(messages(args.connect, args.topics, args.timeout), start=1):
+    heard = messages(args.connect, args.topics, args.timeout, client_keys(args))
+    for number, (topic, content) in enumerate(heard, start=1):
         print(write(topic, content), flush=True)
         if number == args.count:
             break

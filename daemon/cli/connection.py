@@ -1,0 +1,64 @@
+"""How a command finds a daemon, on this machine or by keys on another: `--connect`, `--key`, `--server-key`."""
+
+import argparse
+import os
+import socket
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daemon.addresses import needs_keys, open_stop_address
+
+if TYPE_CHECKING:
+    from daemon.keys import ClientKeys
+
+
+def own_key_folder() -> Path:
+    """Return where a user's keys lie."""
+    home = os.environ.get("XDG_CONFIG_HOME")
+    return (Path(home) if home else Path.home() / ".config") / "shearloop"
+
+
+def add_connection(parser: argparse.ArgumentParser, default: str) -> None:
+    """Add the options of a command that speaks to a daemon."""
+    parser.add_argument("--connect", default=default, metavar="ADDRESS", help="default: %(default)s")
+    parser.add_argument(
+        "--key", type=Path, metavar="FILE", help="your .key_secret, for a daemon on the network (default: in ~/.config)"
+    )
+    parser.add_argument("--server-key", type=Path, metavar="FILE", help="that daemon's .key (default: in ~/.config)")
+
+
+def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
+    """Return the keys to connect with, or None for an address on this machine; UserError for keys that are no good."""
+    from daemon.errors import UserError
+
+    given = (args.key, args.server_key)
+    if given == (None, None) and not needs_keys(args.connect):
+        return None
+    from daemon.keys import ClientKeys, load_key_pair, load_public_key
+
+    folder = own_key_folder()
+    key = args.key or folder / "client.key_secret"
+    server_key = args.server_key or folder / "server.key"
+    for path, option, cure in (
+        (key, "--key", "make one with `shearloop keys client`"),
+        (server_key, "--server-key", "copy the daemon's server.key there"),
+    ):
+        if not path.exists():
+            raise UserError(
+                f"{args.connect} is not on this machine, and there is no key {path}: {cure}, or give {option}"
+            )
+    return ClientKeys(load_key_pair(key), load_public_key(server_key))
+
+
+def stop_address(address: str) -> str:
+    """Return where `stop` is heard without a key: the address itself, or the open socket of a daemon on the network."""
+    open_address = open_stop_address(address)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect("\0" + open_address.removeprefix("ipc://@"))
+        except BlockingIOError:
+            return open_address
+        except OSError:
+            return address
+    return open_address

@@ -1,0 +1,199 @@
+"""A hundred thousand malformed frames and requests: no crash, no leak, no motion, and every one of them counted."""
+
+import asyncio
+import os
+import random
+import tty
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+import zmq.asyncio
+
+from daemon.app import Daemon
+from daemon.command_server import MOST_AT_ONCE
+from daemon.config import load_daemon_config
+from daemon.health import resident_memory_mb
+from daemon.messages import decode, encode
+from daemon.rate_limit import ALL_BURST, ALL_PER_S, PER_CLIENT_BURST, PER_CLIENT_PER_S, RateLimit
+from drivers.ur.client import UrRobot
+from drivers.ur.messages import Reply
+
+FRAMES = REQUESTS = 50_000
+DEADLINE_S = 120
+ROBOT = str(Path(__file__).resolve().parents[2] / "config/ur.yaml")
+# What the daemon may keep of it all: caches, free lists, its sockets' buffers.
+MOST_GROWTH_MB = 16.0
+COMMANDS = ("tare", "start", "pause", "resume", "stop", "status", "unlock", "set")
+
+
+def malformed_requests(count: int) -> Iterator[list[bytes]]:
+    """Yield requests, each one or several frames, of which none is a command."""
+    chance = random.Random(1)
+    sound = [encode({"command": name, "experiment": "config/experiments/hold_torque.yaml"}) for name in COMMANDS]
+    kinds: list[Callable[[], list[bytes]]] = [
+        lambda: [chance.randbytes(chance.randrange(60))],
+        lambda: [(whole := chance.choice(sound))[: chance.randrange(len(whole))]],
+        lambda: [flipped(chance.choice(sound), chance)],
+        lambda: [encode({"command": chance.choice(COMMANDS).upper()})],
+        lambda: [encode({"command": chance.choice([None, 1, ["start"], {"start": 1}, b"start", 1.5, True])})],
+        lambda: [encode({"commands": "start"})],
+        lambda: [chance.choice(sound), chance.choice(sound)],
+        lambda: [b"", b"", chance.choice(sound)],
+        lambda: [b"\x81" * chance.randrange(300)],
+        lambda: [encode({"command": "x" * chance.randrange(2000)})],
+    ]
+    made = 0
+    while made < count:
+        frames = chance.choice(kinds)()
+        # What is a command after all, by a flip of a bit elsewhere, is not sent; nor the delimiter alone of a REQ.
+        if len(frames) == 1 and is_command(frames[0]):
+            continue
+        made += 1
+        yield frames
+
+
+def flipped(payload: bytes, chance: random.Random) -> bytes:
+    position = chance.randrange(len(payload))
+    return payload[:position] + bytes([payload[position] ^ 1 << chance.randrange(8)]) + payload[position + 1 :]
+
+
+def is_command(payload: bytes) -> bool:
+    try:
+        return decode(payload).get("command") in COMMANDS
+    except (ValueError, TypeError):
+        return False
+
+
+def malformed_frames(count: int) -> Iterator[bytes]:
+    """Yield lines that are no frame of the EIT-kit: as a whole 10 MB of them."""
+    chance = random.Random(2)
+    for number in range(count):
+        if number % 500 == 0:
+            yield b"0.1234, " * chance.choice([1023, 1025, 3000]) + b"\n"
+        elif number % 500 == 1:
+            yield b"nan, " * 1024 + b"\n"
+        else:
+            yield chance.randbytes(chance.randrange(80)).replace(b"\n", b"") + b"\n"
+
+
+class Arm:
+    """A robot that would do whatever it is told, and remembers it."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.told: list[Any] = []
+        arm = self
+
+        async def waits(_robot: UrRobot) -> Any:
+            await asyncio.Event().wait()
+
+        async def send(_robot: UrRobot, command: Any) -> Reply:
+            arm.told.append(command)
+            return Reply()
+
+        monkeypatch.setattr(UrRobot, "run", waits)
+        monkeypatch.setattr(UrRobot, "next_state", waits)
+        monkeypatch.setattr(UrRobot, "send", send)
+
+
+async def test_a_flood_of_malformed_frames_and_requests(
+    config: Callable[..., Path], tiny_bank: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arm = Arm(monkeypatch)
+    board, port = os.openpty()
+    tty.setraw(port)
+    fingertip = {"device": {"path": os.ttyname(port)}, "bank": str(tiny_bank)}
+    path = config(robot=ROBOT, fingertips={"right": fingertip})
+    published: Counter[str] = Counter()
+    told = asyncio.Event()
+
+    def count(topic: str, _content: dict[str, Any]) -> None:
+        published[topic] += 1
+        told.set()
+
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(path), context)
+        daemon.publisher.listen(count)
+        running = asyncio.create_task(daemon.run())
+        try:
+            async with asyncio.timeout(DEADLINE_S):
+                address = daemon._config.commands
+                await asyncio.to_thread(exchange, address, malformed_requests(200))
+                before_mb, tasks = resident_memory_mb(), len(asyncio.all_tasks())
+                replies, _ = await asyncio.gather(
+                    asyncio.to_thread(exchange, address, malformed_requests(REQUESTS)),
+                    asyncio.to_thread(write_all, board, malformed_frames(FRAMES)),
+                )
+                while (refused := sum(daemon._fingertips["right"].facts()["errors"].values())) < FRAMES - 1:
+                    told.clear()
+                    await told.wait()
+            assert replies == {False: REQUESTS}, "each is answered, and none is carried out"
+            assert sum(daemon._commands.refused.values()) == REQUESTS + 200
+            assert set(daemon._commands.refused) <= {"malformed request", "unknown command", "too many requests"}
+            assert refused <= FRAMES
+            assert published["eit.estimate"] == published["eit.frame"] == 0
+            assert arm.told == [], "nothing was asked of the robot"
+            assert daemon._rig is not None
+            assert daemon._rig.brain.experiment is None
+            assert not daemon.supervisor.dead
+            assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
+            assert resident_memory_mb() - before_mb < MOST_GROWTH_MB
+            assert len(asyncio.all_tasks()) <= tasks + MOST_AT_ONCE
+            status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
+            assert status == {True: 1}, "stop is heard in the middle of it all"
+            await daemon.stopped()
+        finally:
+            daemon.stop()
+            await running
+            os.close(port)
+            os.close(board)
+
+
+def exchange(address: str, requests: Iterator[list[bytes]]) -> Counter[bool]:
+    """Send requests as a client that keeps some under way, and count the replies by whether they were accepted."""
+    replies: Counter[bool] = Counter()
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.RCVTIMEO, DEADLINE_S * 1000)
+        socket.connect(address)
+        waiting = 0
+        for frames in requests:
+            socket.send_multipart(frames)
+            waiting += 1
+            if waiting >= 500:
+                replies[decode(socket.recv())["ok"]] += 1
+                waiting -= 1
+        for _ in range(waiting):
+            replies[decode(socket.recv())["ok"]] += 1
+    return replies
+
+
+def write_all(board: int, lines: Iterator[bytes]) -> None:
+    batch = b""
+    for line in lines:
+        batch += line
+        if len(batch) > 4096:
+            while batch:
+                batch = batch[os.write(board, batch) :]
+    while batch:
+        batch = batch[os.write(board, batch) :]
+
+
+def test_the_limit_is_a_clients_own_and_lets_go_again() -> None:
+    limit = RateLimit()
+    allowed = [limit.allows(b"loud", 0) for _ in range(1000)]
+    assert sum(allowed) == PER_CLIENT_BURST
+    assert limit.allows(b"quiet", 0)
+    assert limit.flooded(0)
+    assert not limit.flooded(10**9)
+    assert sum(limit.allows(b"loud", 10**9) for _ in range(1000)) == PER_CLIENT_PER_S
+
+
+def test_many_clients_have_no_more_than_one_limit_together() -> None:
+    limit = RateLimit()
+    allowed = sum(limit.allows(b"%d" % number, number * 1000) for number in range(100_000))
+    assert allowed <= ALL_BURST + 0.1 * ALL_PER_S + 1
+    assert len(limit._each) <= 256

@@ -1,0 +1,212 @@
+"""CURVE on anything but loopback and ipc, keys by `shearloop keys`, an allow-list, and no way round them."""
+
+import asyncio
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq
+import zmq.asyncio
+
+from daemon.addresses import needs_keys, open_stop_address, stays_on_this_machine
+from daemon.app import Daemon
+from daemon.cli import main
+from daemon.config import load_daemon_config
+from daemon.errors import UserError
+from daemon.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
+from daemon.messages import decode, encode
+
+Write = Callable[..., Path]
+NETWORK = "tcp://0.0.0.0:*"
+# How long somebody is waited for who is not to be heard.
+SILENCE_MS = 300
+
+
+@pytest.fixture
+def keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """A server and one client who knows it, made as a user makes them."""
+    server, client = str(tmp_path / "keys"), str(tmp_path / "ada")
+    assert main(["keys", "server", "--dir", server]) == 0
+    assert main(["keys", "client", "--dir", client]) == 0
+    assert main(["keys", "allow", f"{client}/client.key", "--name", "ada", "--dir", server]) == 0
+    capsys.readouterr()
+    return tmp_path
+
+
+def curve(folder: Path) -> dict[str, str]:
+    return {"server_key": str(folder / "keys/server.key_secret"), "clients": str(folder / "keys/clients")}
+
+
+def ada(folder: Path) -> ClientKeys:
+    return ClientKeys(load_key_pair(folder / "ada/client.key_secret"), load_public_key(folder / "keys/server.key"))
+
+
+def test_what_can_be_reached_from_the_network() -> None:
+    for address in ("tcp://127.0.0.1:1", "tcp://[::1]:1", "ipc:///run/x", "ipc://@x"):
+        assert stays_on_this_machine(address), address
+    for address in ("tcp://0.0.0.0:1", "tcp://*:1", "tcp://10.0.0.1:1", "tcp://pc:1", "tcp://127.0.0.1:1;0.0.0.0:2"):
+        assert not stays_on_this_machine(address), address
+    assert not needs_keys("tcp://localhost:1")
+    assert needs_keys("tcp://pc:1")
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_no_network_address_without_keys(command: str, config: Write, capsys: pytest.CaptureFixture[str]) -> None:
+    for key in ("publish", "commands"):
+        assert main([command, str(config(**{key: "tcp://0.0.0.0:7769"}))]) == 2
+        assert f"`{key}: tcp://0.0.0.0:7769` would open the robot to the network" in capsys.readouterr().err
+
+
+def test_nor_one_whose_keys_are_not_there(config: Write, keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    missing = {"server_key": str(keys / "none.key_secret"), "clients": str(keys / "keys/clients")}
+    path = str(config(commands=NETWORK, curve=missing))
+    for command in ("run", "check"):
+        assert main([command, path]) == 2
+        assert "make it with `shearloop keys`" in capsys.readouterr().err
+    assert main(["keys", "revoke", "ada", "--dir", str(keys / "keys")]) == 0
+    assert main(["run", str(config(commands=NETWORK, curve=curve(keys)))]) == 2
+    assert "holds no key, so that nobody could connect" in capsys.readouterr().err
+
+
+@pytest.fixture
+def connect() -> Iterator[Callable[..., "zmq.asyncio.Socket"]]:
+    with zmq.asyncio.Context() as context:
+        sockets = []
+
+        def connected(kind: int, address: str, client: ClientKeys | None) -> "zmq.asyncio.Socket":
+            socket = context.socket(kind)
+            sockets.append(socket)
+            socket.setsockopt(zmq.LINGER, 0)
+            if client is not None:
+                client.use(socket)
+            if kind == zmq.SUB:
+                socket.setsockopt(zmq.SUBSCRIBE, b"")
+            socket.connect(address)
+            return socket
+
+        yield connected
+        for socket in sockets:
+            socket.close()
+
+
+def address_of(socket: Any) -> str:
+    return str(socket.getsockopt_string(zmq.LAST_ENDPOINT)).replace("//0.0.0.0:", "//127.0.0.1:")
+
+
+async def test_only_the_allowed_come_in_and_only_encrypted(
+    config: Write, keys: Path, connect: Callable[..., Any]
+) -> None:
+    path = config(publish=NETWORK, commands=NETWORK, curve=curve(keys))
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(path), context)
+        running = asyncio.create_task(daemon.run())
+        try:
+            commands, published = address_of(daemon._commands._socket), address_of(daemon.publisher._socket)
+            known = ada(keys)
+            async with asyncio.timeout(60):
+                asking = connect(zmq.DEALER, commands, known)
+                await asking.send(encode({"command": "status"}))
+                assert decode(await asking.recv())["ok"]
+                topic, _ = await connect(zmq.SUB, published, known).recv_multipart()
+                assert topic == b"health"
+            strangers = {
+                "in the clear": None,
+                "a key that is not allowed": ClientKeys(KeyPair(*zmq.curve_keypair()), known.server_public),
+                "a server that is not ours": ClientKeys(known.own, zmq.curve_keypair()[0]),
+            }
+            for who, stranger in strangers.items():
+                asking, hearing = connect(zmq.DEALER, commands, stranger), connect(zmq.SUB, published, stranger)
+                await asking.send(encode({"command": "status"}))
+                assert not await asking.poll(SILENCE_MS), who
+                assert not await hearing.poll(0), who
+            assert daemon._command_facts()["errors"]["key is not allowed"] >= 1
+            await _stop_without_a_key(daemon, connect)
+        finally:
+            daemon.stop()
+            await running
+
+
+async def _stop_without_a_key(daemon: Daemon, connect: Callable[..., Any]) -> None:
+    assert daemon._open_stop is not None
+    anyone = connect(zmq.DEALER, address_of(daemon._open_stop._socket), None)
+    for name in ("start", "resume", "unlock", "tare", "pause"):
+        await anyone.send(encode({"command": name}))
+        assert "this needs a key" in decode(await anyone.recv())["why"]
+    await anyone.send(encode({"command": "stop"}))
+    assert decode(await anyone.recv())["ok"]
+    await daemon.stopped()
+
+
+def test_the_open_stop_is_named_by_the_port() -> None:
+    assert (
+        open_stop_address("tcp://0.0.0.0:7762")
+        == open_stop_address("tcp://127.0.0.1:7762")
+        == "ipc://@shearloop-stop-7762"
+    )
+
+
+def test_a_client_never_speaks_in_the_clear_to_another_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    for command in (["listen"], ["command", "stop"]):
+        assert main([*command, "--connect", "tcp://192.0.2.1:7761"]) == 2
+        assert "make one with `shearloop keys client`" in capsys.readouterr().err
+    assert main(["keys", "client"]) == 0
+    assert main(["listen", "--connect", "tcp://192.0.2.1:7761"]) == 2
+    assert "copy the daemon's server.key there" in capsys.readouterr().err
+
+
+def test_keys_are_made_once_shown_and_taken_back(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = keys / "keys"
+    assert (folder / "server.key_secret").stat().st_mode & 0o777 == 0o600
+    assert (folder / "clients/ada.key").stat().st_mode & 0o777 == 0o644
+    assert main(["keys", "server", "--dir", str(folder)]) == 2
+    assert "is there already" in capsys.readouterr().err
+    assert main(["keys", "list", "--dir", str(folder), "--json"]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["clients"] == {"ada": load_public_key(keys / "ada/client.key").decode()}
+    assert main(["keys", "allow", str(keys / "ada/client.key"), "--name", "eve", "--dir", str(folder)]) == 2
+    assert "is allowed already, as ada" in capsys.readouterr().err
+    assert main(["keys", "allow", str(folder / "server.key"), "--name", "../eve", "--dir", str(folder)]) == 2
+    assert "is not a client's name" in capsys.readouterr().err
+    assert main(["keys", "revoke", "eve", "--dir", str(folder)]) == 2
+    assert "there is no client 'eve'; allowed is ada" in capsys.readouterr().err
+    assert main(["keys", "revoke", "ada", "--dir", str(folder)]) == 0
+    assert main(["keys", "list", "--dir", str(folder)]) == 0
+    assert "nobody may connect yet" in capsys.readouterr().out
+
+
+def test_a_damaged_key_is_a_sentence(keys: Path) -> None:
+    secret = keys / "keys/server.key_secret"
+    other = KeyPair(*zmq.curve_keypair())
+    for text, part in (
+        ("", "is no key file"),
+        ('public-key = "short"\n', "damaged key"),
+        (f'public-key = "{other.public.decode()}"\n', "holds no secret key"),
+        (secret.read_text().replace(load_public_key(secret).decode(), other.public.decode()), "are no pair"),
+    ):
+        secret.write_text(text)
+        with pytest.raises(UserError, match=part):
+            load_key_pair(secret)
+
+
+def test_under_systemd_the_credential_takes_the_files_place(
+    keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    handed = tmp_path / "handed"
+    handed.mkdir()
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(handed))
+    secret = keys / "keys/server.key_secret"
+    (handed / secret.name).write_text(secret.read_text())
+    assert load_server_keys(Path("/etc/shearloop/keys/server.key_secret")) == load_key_pair(secret)
+    (handed / secret.name).write_text("none")
+    with pytest.raises(UserError, match="run `sudo shearloop keys server`"):
+        load_server_keys(Path("/etc/shearloop/keys/server.key_secret"))
+
+
+def test_a_key_is_not_shown_by_accident() -> None:
+    pair = KeyPair(*zmq.curve_keypair())
+    assert pair.secret.decode() not in repr(pair)

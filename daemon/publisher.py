@@ -18,8 +18,9 @@ from daemon.topics import TOPICS
 
 # Messages kept for a subscriber that reads too slowly; older ones are dropped for it, never delayed for others.
 HIGH_WATER_MARK = 1000
-# What a subscriber sends is a topic's beginning; a peer that sends more than this is cut off.
-LARGEST_SUBSCRIPTION_BYTES = 256
+# What a subscriber sends is a topic's beginning, and about 300 bytes of CURVE's handshake before it; a peer that sends
+# more than this is cut off.
+LARGEST_SUBSCRIPTION_BYTES = 1024
 # Subscriptions taken in at a time, so that a peer that changes its mind without end keeps nothing waiting.
 SUBSCRIPTIONS_AT_ONCE = 100
 Listener: TypeAlias = Callable[[str, dict[str, Any]], None]

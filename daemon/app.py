@@ -15,7 +15,7 @@ import zmq.asyncio
 from bank.bank_file import Bank
 from bank.calibration import Calibration
 from bank.channels import ZERO_SLOTS
-from bank.matching import ReferenceMatcher, ZeroLagMatcher
+from bank.fast_matching import FastMatcher, FastZeroLagMatcher
 from daemon import sd_notify
 from daemon.addresses import open_stop_address
 from daemon.clock import Clock
@@ -38,7 +38,7 @@ from drivers.eit_kit import EitKit
 
 # How often a start that was refused is tried again, and an end looked for.
 START_RETRY_S = 0.5
-_MATCHERS = {"all_lags": ReferenceMatcher, "zero_lag": ZeroLagMatcher}
+_MATCHERS = {"all_lags": FastMatcher, "zero_lag": FastZeroLagMatcher}
 
 
 def open_estimator(config: Fingertip) -> Estimator:

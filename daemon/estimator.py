@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bank.calibration import Calibration
-from bank.matching import Match, best_match, signal_above_noise
+from bank.matching import Match, signal_above_noise
 from bank.polynomial import Interval
 from drivers.eit_kit import Frame
 
@@ -39,6 +39,9 @@ class Matcher(Protocol):
     @property
     def sigma_grid(self) -> FloatArray:
         """Widths of the bank's columns."""
+
+    def match(self, difference: FloatArray) -> Match:
+        """Return the best cell of a (896,) difference, and its runner-up."""
 
     def heatmap(self, difference: FloatArray) -> FloatArray:
         """Return the (k, sigma) scores of a (896,) difference, NaN at cells that are not valid."""
@@ -162,10 +165,9 @@ class Estimator:
         silent = signal_above_noise(difference, noise)
         if silent is not None:
             return Reading(why=(silent.why,))
-        heatmap = self._matcher.heatmap(difference)
-        match = best_match(heatmap, self._matcher.k_grid, self._matcher.sigma_grid)
+        match = self._matcher.match(difference)
         middle_ns = sum(latest.t_mid_ns for latest in self._latest) // len(self._latest)
-        return replace(self._calibrated(match, heatmap), difference=difference, lag_ns=frame.t_mid_ns - middle_ns)
+        return replace(self._calibrated(match), difference=difference, lag_ns=frame.t_mid_ns - middle_ns)
 
     def heatmap(self, reading: Reading) -> FloatArray | None:
         """Return the (K, S) scores of what a reading was made from, None where nothing was matched.
@@ -176,17 +178,17 @@ class Estimator:
             return reading.heatmap
         return self._matcher.heatmap(reading.difference)
 
-    def _calibrated(self, match: Match, heatmap: FloatArray) -> Reading:
+    def _calibrated(self, match: Match) -> Reading:
         calibration = self._calibration
         if calibration is None:
-            return Reading(match, heatmap, why=("no calibration is configured: k and sigma have no torque",))
+            return Reading(match, why=("no calibration is configured: k and sigma have no torque",))
         if calibration.torque_fit is None:
-            return Reading(match, heatmap, why=("the calibration was made without torques: sigma has no torque",))
+            return Reading(match, why=("the calibration was made without torques: sigma has no torque",))
         why = calibration.out_of_range(match.k, match.sigma)
         if why:
-            return Reading(match, heatmap, why=why)
+            return Reading(match, why=why)
         diameter = None if calibration.diameter_fit is None else calibration.diameter(match.k)
-        return Reading(match, heatmap, calibration.torque(match.sigma), diameter)
+        return Reading(match, torque_nm=calibration.torque(match.sigma), diameter_mm=diameter)
 
 
 def _unusable(frame: Frame) -> tuple[str, ...]:

@@ -66,6 +66,8 @@ class Daemon:
         self._clock = Clock()
         self.supervisor = Supervisor()
         self._stop = asyncio.Event()
+        # The configured experiment, until it has begun.
+        self._awaited: Path | None = None
         estimators = {name: open_estimator(fingertip) for name, fingertip in config.fingertips.items()}
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
@@ -171,11 +173,16 @@ class Daemon:
         if rig is None or path is None:
             return
         log, told = structlog.get_logger().bind(experiment=str(path)), ""
+        self._awaited = path
         while (why := await rig.start(path)) is not None:
+            if self._awaited is None:
+                log.info("the operator said stop: it is not started")
+                return
             if why != told:
                 log.info("waiting to start", why=why)
                 told = why
             await asyncio.sleep(START_RETRY_S)
+        self._awaited = None
         experiment = await rig.loop.ended()
         log.info("the experiment has ended", phase=experiment.phase.value, why=experiment.why)
         if self._config.stop_when_done:
@@ -259,11 +266,14 @@ class Daemon:
     async def _status(self, _request: Mapping[str, Any]) -> Reply:
         return {"tasks": self._health.tasks()}
 
-    async def _stop_wanted(self, _request: Mapping[str, Any]) -> Reply:
-        experiment = self._rig.brain.experiment if self._rig is not None else None
-        if self._rig is not None and experiment is not None and experiment.running:
-            self._rig.brain.stop("the operator said stop")
-            return {"stopped": experiment.file.name}
+    async def _stop_wanted(self, request: Mapping[str, Any]) -> Reply:
+        stopped = self._rig.stop() if self._rig is not None else ""
+        awaited, self._awaited = self._awaited, None
+        if stopped:
+            return {"stopped": stopped}
+        if request.get("spare_daemon"):
+            # From a page that everyone may press stop on: it ends what moves or is about to, and nothing else.
+            return {"stopped": f"the start of {awaited.name}" if awaited is not None else ""}
         # Nothing moves: the daemon itself is what stops, once the reply is out.
         asyncio.get_running_loop().call_later(0.05, self.stop)
         return {}

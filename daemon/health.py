@@ -49,7 +49,12 @@ class HealthReporter:
         """Return what is known of each task now."""
         gathered: dict[str, TaskFacts] = {}
         for name, record in self._supervisor.records.items():
-            gathered[name] = {"alive": record.alive, "restarts": record.restarts, "last_error": record.last_error}
+            gathered[name] = {
+                "alive": record.alive,
+                "done": record.done,
+                "restarts": record.restarts,
+                "last_error": record.last_error,
+            }
         for name, facts in self._facts.items():
             gathered[name] = {**gathered.get(name, {}), **facts()}
         return gathered

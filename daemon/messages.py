@@ -197,7 +197,7 @@ class Health(Message):
     rate_hz: ClassVar[float | None] = 1.0
 
     tasks: Mapping[str, Mapping[str, Scalar | Mapping[str, int]]] = column(
-        "", "per task: alive, restarts, rate_hz, expected_hz, errors by kind, and a sentence for what is wrong"
+        "", "per task: alive, done, restarts, rate_hz, expected_hz, errors by kind, and a sentence for what is wrong"
     )
     loop_lag_s: float = column("s", "how late the event loop woke this message's task")
     memory_mb: float = column("MB", "resident memory")

@@ -60,7 +60,7 @@ def _shear(content: Mapping[str, Any]) -> str:
 def _health(content: Mapping[str, Any]) -> str:
     tasks = []
     for name, facts in content["tasks"].items():
-        state = "alive" if facts.get("alive", True) else "DEAD"
+        state = "done" if facts.get("done") else "alive" if facts.get("alive", True) else "DEAD"
         errors = "".join(f", {count} {kind}" for kind, count in (facts.get("errors") or {}).items())
         trouble = f" ({facts['trouble']})" if facts.get("trouble") else ""
         restarts = f", {facts['restarts']} restarts" if facts.get("restarts") else ""

@@ -99,6 +99,7 @@ class Rig:
         if config.robot is None:
             raise ValueError("a rig has a robot")
         self._tare_fingertips = tare_fingertips
+        self._stops = 0
         sources = dict(fingertips)
         self.load_cell: LoadCellTask | None = None
         if config.load_cell is not None:
@@ -134,7 +135,21 @@ class Rig:
 
     async def start(self, path: Path) -> str | None:
         """Begin the experiment in a file, or return why not; raises UserError for a file that is none."""
-        return await self.loop.start(load_yaml_model(path, ExperimentFile))
+        before = self._stops
+        why = await self.loop.start(load_yaml_model(path, ExperimentFile))
+        if why is None and self._stops != before:
+            self.brain.stop("the operator said stop")
+            return "stop was said while it was being started"
+        return why
+
+    def stop(self) -> str:
+        """End the experiment that runs, or is just being started, on the operator's word; return its name."""
+        self._stops += 1
+        experiment = self.brain.experiment
+        if experiment is None or not experiment.running:
+            return ""
+        self.brain.stop("the operator said stop")
+        return experiment.file.name
 
     def _hear(self, torque: Torque) -> None:
         self.brain.hear(torque)

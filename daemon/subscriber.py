@@ -64,7 +64,7 @@ def keys_hint(keys: ClientKeys | None) -> str:
     return "; it answers only keys that it was told of with `shearloop keys allow`"
 
 
-def connect(socket: "zmq.Socket[bytes]", address: str, keys: ClientKeys | None = None) -> None:
+def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
     """Connect a socket; a malformed address becomes a sentence, and so does one of the network without keys."""
     if keys is not None:
         keys.use(socket)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 import zmq
 import zmq.asyncio
 from scipy.io import savemat
@@ -158,6 +159,30 @@ async def test_a_heatmap_is_computed_only_while_somebody_subscribes(
         assert heatmap["scores"].shape == (8, 8)
         assert heatmap["scores"].max() == pytest.approx(estimate["score"])
         assert heatmap["model"] == "gaussian_derivative"
+
+
+@pytest.fixture
+def robotless(config: Write, tmp_path: Path) -> Path:
+    """Write a configuration with an experiment, and with a robot that is not there."""
+    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": "127.0.0.62"}))
+    return config(robot="ur.yaml", experiment=str(Path("config/experiments/loosen.yaml").resolve()))
+
+
+async def test_a_stop_calls_off_an_experiment_that_waits_for_its_devices_and_spares_the_daemon(
+    robotless: Path, tmp_path: Path
+) -> None:
+    async with running(robotless) as daemon:
+        health = collector(daemon, "health")
+        while not (await health.get())["tasks"]["experiment"]["alive"]:
+            continue
+        stop = {"command": "stop", "spare_daemon": True}
+        reply = await asyncio.to_thread(request, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
+        assert reply == {"ok": True, "stopped": "the start of loosen.yaml"}
+        while not (await health.get())["tasks"]["experiment"]["done"]:
+            continue
+        reply = await asyncio.to_thread(request, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
+        assert reply == {"ok": True, "stopped": ""}
 
 
 async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_health(

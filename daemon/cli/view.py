@@ -1,0 +1,79 @@
+"""`shearloop view`: what a daemon does, as a page in the browser."""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daemon.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys
+from daemon.cli.connection import add_connection, client_keys, stop_address
+
+if TYPE_CHECKING:
+    from bank.fingertip import Fingertip
+
+PORT = 7760
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `view`."""
+    add_connection(parser, PUBLISH_ADDRESS)
+    parser.add_argument("--commands", default=COMMAND_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
+    parser.add_argument(
+        "--port", type=int, default=PORT, help="on 127.0.0.1; 0 for any that is free (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--fingertip", type=Path, metavar="FILE", help="the fingertip's measures; by default the paper's fingertip"
+    )
+    parser.add_argument("--token-file", type=Path, metavar="FILE", help="default: ~/.local/state/shearloop/view-token")
+    parser.add_argument("--new-token", action="store_true", help="make the token anew; the one before opens nothing")
+    parser.add_argument("--json", action="store_true", help="print the page's address as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the page until SIGINT or SIGTERM."""
+    import asyncio
+    import json
+    from importlib.util import find_spec
+
+    from daemon.errors import UserError
+
+    if find_spec("aiohttp") is None:
+        raise UserError("the live view needs aiohttp; install it with `pip install 'shearloop[view]'`")
+    if not 0 <= args.port <= 65535:
+        raise UserError(f"--port {args.port} is not a port; give one from 1 to 65535, or 0 for any that is free")
+    from daemon.logs import set_up_logging
+    from daemon.view.bridge import Place
+    from daemon.view.serve import serve
+    from daemon.view.token_file import default_path, kept_token
+
+    set_up_logging()
+    keys = client_keys(args)
+    # Where the daemon's commands need keys and there are none here, a stop is heard all the same.
+    stop = None if keys is not None or needs_keys(args.commands) else lambda: stop_address(args.commands)
+    place = Place(args.connect, args.commands, keys, stop)
+    path = args.token_file or default_path()
+    token = kept_token(path, anew=args.new_token)
+    fingertip = _fingertip(args.fingertip)
+
+    def ready(port: int) -> None:
+        page = f"http://127.0.0.1:{port}/"
+        if args.json:
+            print(json.dumps({"url": page, "url_with_token": f"{page}#token={token}", "token_file": str(path)}))
+        else:
+            print(f"{page}#token={token}")
+            print(f"Without what follows the slash the page shows all and stops, but moves nothing. Token: {path}")
+
+    asyncio.run(serve(place, args.port, token, fingertip, ready))
+    return 0
+
+
+def _fingertip(path: Path | None) -> "Fingertip":
+    """Return the fingertip that is drawn; raises UserError and GeometryError for a file that describes none."""
+    from importlib import resources
+
+    from daemon.bank_config import FingertipConfig
+    from daemon.config_file import load_yaml_model
+
+    if path is not None:
+        return load_yaml_model(path, FingertipConfig).fingertip()
+    with resources.as_file(resources.files("daemon.view") / "assets" / "fingertip.yaml") as paper:
+        return load_yaml_model(paper, FingertipConfig).fingertip()

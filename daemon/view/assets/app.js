@@ -1,0 +1,133 @@
+// The page: takes messages in as they come, and draws thirty times a second what is known.
+
+import { TimeChart } from "./chart.js";
+import { Controls } from "./controls.js";
+import { Link } from "./link.js";
+import { FingertipPanel, gripperPanel, healthPanel, loopPanel, robotPanel, shearPanel, torquePanel } from "./panels.js";
+import { Series } from "./series.js";
+import { age, byId, number, put } from "./text.js";
+
+const REDRAWS_PER_S = 30;
+// Estimates are drawn in shapes that differ, and in blues and browns of different lightness.
+const TIPS = [{ stroke: "#0b4f8a", fill: "#0b4f8a33" }, { stroke: "#8a4b00", fill: "#8a4b0033", hollow: true }];
+
+// Stop works before anything else is known.
+new Controls();
+const settings = await (await fetch("settings.json")).json();
+
+const torques = new Series();
+const forces = new Series();
+const tips = new Map();
+const drawn = {};
+const torqueChart = new TimeChart(byId("torque-chart"), byId("torque-legend"), "N·m", 0.05);
+const shearChart = new TimeChart(byId("shear-chart"), byId("shear-legend"), "N", 0.2);
+
+const gap = (topic) => settings.stale_after_s[topic];
+const unlessInvalid = (said, value) => (said.valid ? value : null);
+
+const takers = {
+  "eit.estimate": (said) => {
+    torques.add(said.timestamp, {
+      [said.source]: unlessInvalid(said, said.torque_nm),
+      [`${said.source} low`]: unlessInvalid(said, said.torque_low_nm),
+      [`${said.source} high`]: unlessInvalid(said, said.torque_high_nm),
+    }, gap("eit.estimate"));
+  },
+  "load.torque": (said) => torques.add(said.timestamp, { load: said.spike ? null : said.torque_nm }, gap("load.torque")),
+  "loop.state": (said) => torques.add(said.timestamp, { wanted: said.ramp_nm }, gap("loop.state")),
+  "skin.shear": (said) => {
+    forces.add(said.timestamp, {
+      shear: unlessInvalid(said, said.shear_n),
+      "shear low": unlessInvalid(said, said.shear_low_n),
+      "shear high": unlessInvalid(said, said.shear_high_n),
+    }, gap("skin.shear"));
+    torques.add(said.timestamp, { skin: unlessInvalid(said, said.torque_nm) }, gap("skin.shear"));
+  },
+};
+
+const link = new Link(settings, (message) => takers[message.topic]?.(message.content));
+
+function chartLines() {
+  const lines = link.sources("eit.estimate").map((source, i) => ({
+    name: source, low: `${source} low`, high: `${source} high`, label: `estimate of ${source}, with its 95 % interval`, points: true, ...TIPS[i % TIPS.length],
+  }));
+  if (link.get("load.torque")) lines.push({ name: "load", label: "load cell", stroke: "#10212e", width: 1.5 });
+  if (link.get("skin.shear")?.content.torque_nm != null || torques.columns.get("skin")?.some((value) => value != null)) {
+    lines.push({ name: "skin", label: "shear skin", stroke: "#3d6b1f", width: 2, dash: [2, 3] });
+  }
+  if (link.get("loop.state")) lines.push({ name: "wanted", label: "wanted", stroke: "#9d1c12", width: 2.5, dash: [9, 5] });
+  return lines;
+}
+
+function fingertips() {
+  const sources = link.sources("eit.estimate");
+  for (const [source, panel] of tips) {
+    if (!sources.includes(source)) {
+      panel.remove();
+      tips.delete(source);
+    }
+  }
+  for (const source of sources) {
+    if (!tips.has(source)) tips.set(source, new FingertipPanel(source, settings.fingertip));
+    tips.get(source).update(link);
+  }
+}
+
+function linkLine() {
+  const state = link.state();
+  byId("link").dataset.state = state;
+  const heard = Number.isFinite(link.sinceDaemon());
+  const [name, why] = {
+    live: ["● live", ""],
+    connecting: ["connecting", "to the viewer on the rig's computer"],
+    lost: ["✗ VIEWER LOST", `no word from the viewer for ${age(link.sinceBatch())}; what is shown is old, and it is tried again`],
+    dead: heard
+      ? ["✗ DAEMON SILENT", `nothing from it for ${age(link.sinceDaemon())}; what is shown is old`]
+      : ["✗ NO DAEMON", `nothing is heard at ${settings.publish}; start one with \`shearloop run CONFIG\``],
+  }[state];
+  put(byId("link-state"), name);
+  put(byId("link-why"), why);
+}
+
+function draw() {
+  linkLine();
+  loopPanel(link);
+  torquePanel(link);
+  fingertips();
+  shearPanel(link);
+  robotPanel(link);
+  gripperPanel(link);
+  healthPanel(link, drawn);
+  torqueChart.setLines(chartLines());
+  torqueChart.draw(torques, link.unixNow());
+  if (link.get("skin.shear")) {
+    shearChart.setLines([{ name: "shear", low: "shear low", high: "shear high", label: "shear force, with its interval", stroke: "#0b4f8a", fill: "#0b4f8a33", width: 2 }]);
+    shearChart.draw(forces, link.unixNow());
+  }
+  const refused = Object.entries(link.refused).map(([kind, count]) => `${count} ${kind}`).join(", ");
+  put(byId("bridge"), refused ? `the viewer refused: ${refused}` : "");
+}
+
+// How many redraws there were in the last second, and what one takes.
+const rate = { count: 0, spent: 0, since: performance.now() };
+
+function tellRate(now) {
+  const passed = (now - rate.since) / 1000;
+  if (passed < 1) return;
+  put(byId("rate"), `${number(rate.count / passed, 1)} redraws/s, ${number(rate.spent / rate.count, 1, "ms")} each`);
+  Object.assign(rate, { count: 0, spent: 0, since: now });
+}
+
+let due = performance.now();
+function onFrame() {
+  requestAnimationFrame(onFrame);
+  const now = performance.now();
+  // Half a screen's frame early is in time.
+  if (now < due - 8) return;
+  due = Math.max(due + 1000 / REDRAWS_PER_S, now);
+  draw();
+  rate.count += 1;
+  rate.spent += performance.now() - now;
+  tellRate(now);
+}
+requestAnimationFrame(onFrame);

@@ -1,0 +1,112 @@
+// A minute of torques or forces, scrolling. Lines are told apart by shape first: points, solid, dashed.
+
+const SPAN_S = 60;
+const INK = "#10212e";
+
+const clock = (t) => new Date(t * 1000).toLocaleTimeString([], { hour12: false });
+
+// A line of the chart: label, stroke, and how it is drawn (dash, width, points, hollow); `low` and `high` name the
+// columns of its interval.
+export class TimeChart {
+  constructor(element, legend, unit, least) {
+    this.element = element;
+    this.legend = legend;
+    this.unit = unit;
+    this.least = least;
+    this.lines = [];
+    new ResizeObserver(() => this.resize()).observe(element);
+  }
+
+  setLines(lines) {
+    if (JSON.stringify(lines) === JSON.stringify(this.lines)) return;
+    this.lines = lines;
+    this.names = lines.flatMap((line) => (line.low ? [line.low, line.high, line.name] : [line.name]));
+    this.chart?.destroy();
+    this.chart = new uPlot(this.options(lines), [[], ...this.names.map(() => [])], this.element);
+    this.legend.replaceChildren(...lines.map((line) => this.sample(line)));
+  }
+
+  options(lines) {
+    const series = [{}];
+    const bands = [];
+    for (const line of lines) {
+      if (line.low) {
+        const edge = { stroke: line.stroke, width: 0.5, points: { show: false } };
+        bands.push({ series: [series.length + 1, series.length], fill: line.fill });
+        series.push(edge, { ...edge });
+      }
+      series.push({
+        stroke: line.stroke,
+        width: line.width ?? 1.5,
+        dash: line.dash,
+        points: line.points ? { show: true, size: 8, stroke: line.stroke, fill: line.hollow ? "#fff" : line.stroke, width: 2 } : { show: false },
+      });
+    }
+    const axis = { stroke: INK, grid: { stroke: "#dfe4e8", width: 1 }, ticks: { stroke: INK, width: 1 }, font: "13px system-ui, DejaVu Sans, sans-serif" };
+    return {
+      ...this.size(),
+      series,
+      bands,
+      legend: { show: false },
+      cursor: { show: false },
+      scales: {
+        x: { time: false, auto: false, range: () => [this.now - SPAN_S, this.now] },
+        y: { range: (_, low, high) => this.range(low, high) },
+      },
+      axes: [
+        { ...axis, incrs: [10, 20, 30], space: 90, values: (_, splits) => splits.map(clock), size: 32 },
+        { ...axis, size: 62, label: this.unit, labelSize: 18, labelFont: axis.font },
+      ],
+    };
+  }
+
+  range(low, high) {
+    if (low === null || high === null || !(high >= low)) return [-this.least, this.least];
+    const room = 0.1 * Math.max(high - low, this.least);
+    return [Math.min(low - room, -this.least / 5), Math.max(high + room, this.least)];
+  }
+
+  size() { return { width: Math.max(200, this.element.clientWidth), height: Math.max(120, this.element.clientHeight) }; }
+
+  resize() {
+    if (this.chart) this.chart.setSize(this.size());
+  }
+
+  draw(series, now) {
+    if (!this.chart) return;
+    this.now = now;
+    this.chart.setData(series.data(this.names), true);
+  }
+
+  // The legend shows each line as it is drawn.
+  sample(line) {
+    const label = document.createElement("span");
+    const canvas = document.createElement("canvas");
+    canvas.width = 88;
+    canvas.height = 28;
+    const pen = canvas.getContext("2d");
+    pen.scale(2, 2);
+    if (line.low) {
+      pen.fillStyle = line.fill;
+      pen.fillRect(0, 1, 44, 12);
+    }
+    pen.strokeStyle = line.stroke;
+    pen.lineWidth = line.width ?? 1.5;
+    pen.setLineDash(line.dash ?? []);
+    pen.beginPath();
+    pen.moveTo(0, 7);
+    pen.lineTo(44, 7);
+    pen.stroke();
+    if (line.points) {
+      pen.setLineDash([]);
+      pen.lineWidth = 2;
+      pen.beginPath();
+      pen.arc(22, 7, 4, 0, 7);
+      pen.fillStyle = line.hollow ? "#fff" : line.stroke;
+      pen.fill();
+      pen.stroke();
+    }
+    label.append(canvas, line.label);
+    return label;
+  }
+}

@@ -1,0 +1,81 @@
+// The buttons: stop for everyone, what moves something with the token alone.
+
+import { byId, put } from "./text.js";
+
+const KEY = "shearloop-token";
+// A daemon that lives answers in some milliseconds; `unlock` takes its time.
+const LATE_MS = 20000;
+const STOP_LATE_MS = 4000;
+
+export class Controls {
+  constructor() {
+    this.takeTokenFromAddress();
+    byId("stop").addEventListener("click", () => this.stop());
+    document.addEventListener("keydown", (event) => {
+      if (event.key === "Escape" && !event.repeat) this.stop();
+    });
+    for (const button of this.buttons()) button.addEventListener("click", () => this.command(button.dataset.command));
+    byId("token-form").addEventListener("submit", (event) => {
+      event.preventDefault();
+      this.keep(byId("token").value.trim());
+      byId("token").value = "";
+    });
+    this.refresh();
+  }
+
+  buttons() { return document.querySelectorAll("#controls [data-command]"); }
+
+  // The token comes behind the #, which browsers send to nobody; it does not stay in the address bar.
+  takeTokenFromAddress() {
+    const given = new URLSearchParams(location.hash.slice(1)).get("token");
+    if (!given) return;
+    sessionStorage.setItem(KEY, given);
+    history.replaceState(null, "", location.pathname);
+  }
+
+  keep(token) {
+    if (token) sessionStorage.setItem(KEY, token);
+    else sessionStorage.removeItem(KEY);
+    this.refresh();
+  }
+
+  refresh() {
+    const token = sessionStorage.getItem(KEY);
+    for (const button of this.buttons()) {
+      button.disabled = !token;
+      button.title = token ? "" : "needs the token: open the address that `shearloop view` printed";
+    }
+    byId("token-form").hidden = Boolean(token);
+  }
+
+  async stop() {
+    this.tell("stopping …");
+    const reply = await this.ask("stop", {}, STOP_LATE_MS);
+    if (reply.ok) this.tell(reply.stopped ? `stopped: ${reply.stopped}` : "stop: nothing was moving");
+    else this.tell(`STOP NOT CONFIRMED: ${reply.why}. Use the emergency stop of the robot.`, "bad");
+  }
+
+  async command(name) {
+    this.tell(`${name} …`);
+    const reply = await this.ask(`commands/${name}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
+    if (reply.ok) this.tell(`${name}: done`);
+    else this.tell(`${name} was refused: ${reply.why}`, "bad");
+    // A token that is not the right one is asked for anew.
+    if (reply.status === 403) this.keep("");
+  }
+
+  async ask(path, headers, lateMs) {
+    try {
+      const response = await fetch(path, { method: "POST", headers, keepalive: true, signal: AbortSignal.timeout(lateMs) });
+      return { status: response.status, ...(await response.json()) };
+    } catch {
+      return { ok: false, why: "the viewer on the rig's computer does not answer" };
+    }
+  }
+
+  tell(sentence, kind = "") {
+    const answer = byId("answer");
+    answer.dataset.kind = kind;
+    put(answer, sentence);
+  }
+}

@@ -1,0 +1,82 @@
+// The page's end of the wire: what was heard last, when, and whether anybody is still there.
+
+const RETRY_MS = 500;
+// The viewer says something every quarter of a second; after this silence the connection is taken for lost.
+const LOST_AFTER_S = 1.0;
+
+const seconds = () => performance.now() / 1000;
+
+export class Link {
+  // onMessage(message) is called for each message, and for what was before this page.
+  constructor(settings, onMessage) {
+    this.settings = settings;
+    this.latest = new Map();
+    this.refused = {};
+    this.onMessage = onMessage;
+    this.batchAt = null;
+    this.daemonAt = null;
+    this.offset = Date.now() / 1000 - seconds();
+    this.connect();
+  }
+
+  connect() {
+    const socket = new WebSocket(`ws://${location.host}/stream`);
+    this.socket = socket;
+    socket.onmessage = (event) => { if (socket === this.socket) this.take(JSON.parse(event.data)); };
+    socket.onclose = () => { if (socket === this.socket) setTimeout(() => this.connect(), RETRY_MS); };
+  }
+
+  take(batch) {
+    const now = seconds();
+    if (batch.first) {
+      // Another viewer, perhaps another daemon: nothing from before may stand beside what comes now.
+      this.latest.clear();
+      this.daemonAt = null;
+    }
+    this.batchAt = now;
+    this.offset = batch.now - now;
+    this.refused = batch.refused;
+    for (const message of batch.history) this.onMessage(message);
+    if (batch.quiet_s !== null) this.daemonAt = now - batch.quiet_s;
+    for (const message of batch.messages) {
+      message.at = now - message.age_s;
+      this.latest.set(`${message.topic}/${message.content.source}`, message);
+      this.onMessage(message);
+    }
+  }
+
+  // Unix time by the viewer's clock: the tablet's own may be wrong.
+  unixNow() { return seconds() + this.offset; }
+
+  sinceBatch() { return this.batchAt === null ? Infinity : seconds() - this.batchAt; }
+
+  sinceDaemon() { return this.daemonAt === null ? Infinity : seconds() - this.daemonAt; }
+
+  // live; dead: no daemon is heard; lost: the viewer itself is not.
+  state() {
+    if (this.sinceBatch() > LOST_AFTER_S) {
+      // A socket that is open and silent, as after the computer slept, is given up.
+      if (this.batchAt !== null && this.sinceBatch() > 3 && this.socket.readyState === WebSocket.OPEN) this.socket.close();
+      return this.batchAt === null ? "connecting" : "lost";
+    }
+    return this.sinceDaemon() > this.settings.dead_after_s ? "dead" : "live";
+  }
+
+  ageOf(message) { return seconds() - message.at; }
+
+  // Whether a message says nothing of the present any more.
+  isOld(message) {
+    return this.state() !== "live" || this.ageOf(message) > (this.settings.stale_after_s[message.topic] ?? 3);
+  }
+
+  // The latest message of a topic: of one source, or of the first that was heard.
+  get(topic, source) {
+    if (source !== undefined) return this.latest.get(`${topic}/${source}`);
+    for (const message of this.latest.values()) if (message.topic === topic) return message;
+    return undefined;
+  }
+
+  sources(topic) {
+    return [...this.latest.values()].filter((message) => message.topic === topic).map((message) => message.content.source).sort();
+  }
+}

@@ -1,0 +1,235 @@
+// What each message says, in its panel. A panel whose message is old says so, and strikes its numbers.
+
+import { drawGel, drawMap } from "./pictures.js";
+import { age, array, byId, interval, number, put, show, warn } from "./text.js";
+
+// Names of the UR controller's modes (RTDE guide).
+const ROBOT_MODES = { "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle", 6: "backdrive", 7: "running", 8: "updating" };
+const SAFETY_MODES = { 1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "system emergency stop", 7: "robot emergency stop", 8: "violation", 9: "fault", 10: "validate joint", 11: "undefined" };
+const MARK_OLD_AFTER_S = 1;
+
+const mode = (names, n) => `${names[n] ?? "unknown"} (${n})`;
+
+export function markAge(panel, link, message) {
+  const old = message === undefined || link.isOld(message);
+  panel.classList.toggle("old", message !== undefined && old);
+  const badge = panel.querySelector(".age");
+  if (message === undefined) put(badge, "nothing heard");
+  else if (old) put(badge, `OLD, ${age(link.ageOf(message))} ago`);
+  else put(badge, link.ageOf(message) > MARK_OLD_AFTER_S ? `${age(link.ageOf(message))} ago` : "");
+}
+
+// Torque, what is wanted, load cell and diameter. The estimate that drives the loop comes first.
+export function torquePanel(link) {
+  const loop = link.get("loop.state");
+  const driving = loop?.content.driving;
+  const estimate = link.get("eit.estimate", driving) ?? link.get("eit.estimate");
+  const skin = link.get("skin.shear");
+  const shown = estimate ?? skin;
+  markAge(byId("torque"), link, shown);
+  const said = shown?.content;
+  put(byId("torque-source"), said ? `estimate of ${said.source}${said.source === driving ? ", drives the loop" : ""}` : "estimate");
+  const valid = said?.valid ?? false;
+  put(byId("torque-now"), valid ? number(said.torque_nm, 4, "N·m", { signed: true }) : "–");
+  put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? interval(said.torque_low_nm, said.torque_high_nm, 4) : "");
+  warn(byId("torque-why"), said && !valid ? `no estimate: ${said.why}` : "");
+  const wanted = loop && !link.isOld(loop) ? loop.content : {};
+  put(byId("wanted"), number(wanted.ramp_nm, 4, "N·m", { signed: true }));
+  put(byId("set-point"), wanted.set_point_nm == null ? "" : `set point ${number(wanted.set_point_nm, 3, "", { signed: true })}`);
+  loadFigure(link);
+  diameterFigure(link, estimate);
+}
+
+function loadFigure(link) {
+  const load = link.get("load.torque");
+  show(byId("load"), load !== undefined);
+  if (!load) return;
+  const old = link.isOld(load);
+  put(byId("load-torque"), old ? "–" : number(load.content.torque_nm, 4, "N·m", { signed: true }));
+  const trouble = load.content.saturated ? "at full scale" : load.content.spike ? "spike, cannot be true" : "";
+  put(byId("load-note"), old ? `OLD, ${age(link.ageOf(load))}` : trouble);
+}
+
+function diameterFigure(link, estimate) {
+  const gripper = link.get("gripper.state");
+  const seen = estimate && !link.isOld(estimate) && estimate.content.valid ? estimate.content.diameter_mm : null;
+  const held = gripper && !link.isOld(gripper) ? gripper.content.diameter_mm : null;
+  put(byId("diameter"), number(seen, 1, "mm"));
+  put(byId("diameter-note"), held == null ? "" : `gripper ${number(held, 1, "mm")}`);
+}
+
+export class FingertipPanel {
+  constructor(source, geometry) {
+    this.source = source;
+    this.geometry = geometry;
+    this.panel = byId("fingertip-template").content.firstElementChild.cloneNode(true);
+    this.panel.dataset.source = source;
+    put(this.part("name"), source);
+    byId("torque").after(this.panel);
+    this.drawn = {};
+    new ResizeObserver(() => { this.drawn = {}; }).observe(this.panel);
+  }
+
+  part(name) { return this.panel.querySelector(`.${name}`); }
+
+  update(link) {
+    const estimate = link.get("eit.estimate", this.source);
+    const heatmap = link.get("eit.heatmap", this.source);
+    markAge(this.panel, link, estimate ?? heatmap);
+    const said = estimate?.content ?? {};
+    put(this.part("score"), number(said.score, 4));
+    put(this.part("runner-up"), number(said.runner_up, 4));
+    put(this.part("k"), number(said.k, 3, "cm"));
+    put(this.part("sigma"), number(said.sigma, 3, "cm"));
+    put(this.part("frame"), said.frame === undefined ? "–" : String(said.frame));
+    put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
+    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.why}` : "");
+    if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
+    if (this.drawn.map !== heatmap) this.drawMap(heatmap);
+    if (heatmap) this.mapText(heatmap, said);
+  }
+
+  drawGel(estimate) {
+    if (this.drawn.gel === (estimate ?? null)) return;
+    this.drawn.gel = estimate ?? null;
+    const { k, sigma } = estimate?.content ?? {};
+    const conductivity = estimate?.conductivity ?? null;
+    const canvas = this.part("gel");
+    drawGel(canvas, this.geometry, conductivity, k, sigma);
+    canvas.setAttribute("aria-label", conductivity
+      ? `conductivity over the height, from ${Math.min(...conductivity).toFixed(2)} to ${Math.max(...conductivity).toFixed(2)} of the untouched gel's`
+      : "no conductivity is known");
+  }
+
+  drawMap(heatmap) {
+    this.drawn.map = heatmap;
+    if (!heatmap) return;
+    const { scores, k_low: kLow, k_high: kHigh, sigma_low: sigmaLow, sigma_high: sigmaHigh } = heatmap.content;
+    drawMap(this.part("map"), { scores: array(scores), k: [kLow, kHigh], sigma: [sigmaLow, sigmaHigh] }, heatmap.peaks);
+  }
+
+  mapText(heatmap, said) {
+    const [rows, columns] = heatmap.content.scores.shape;
+    const late = said.frame !== undefined && said.frame !== heatmap.content.frame ? `, of frame ${heatmap.content.frame}` : "";
+    put(this.part("map-text"), `scores of ${rows} k × ${columns} σ, ✕ maximum, ○ runner-up${late}`);
+    const cell = (peak) => (peak ? `row ${peak[0]}, column ${peak[1]}` : "none");
+    this.part("map").setAttribute("aria-label", `heatmap of ${rows} by ${columns} cells; maximum at ${cell(heatmap.peaks?.best)}, runner-up at ${cell(heatmap.peaks?.runner_up)}`);
+  }
+
+  remove() { this.panel.remove(); }
+}
+
+export function shearPanel(link) {
+  const message = link.get("skin.shear");
+  show(byId("shear"), message !== undefined);
+  if (!message) return;
+  markAge(byId("shear"), link, message);
+  const said = message.content;
+  put(byId("shear-now"), said.valid ? number(said.shear_n, 3, "N", { signed: true }) : "–");
+  put(byId("shear-interval"), said.valid ? interval(said.shear_low_n, said.shear_high_n, 3) : "");
+  put(byId("shear-response"), number(said.response, 5, "", { signed: true }));
+  put(byId("shear-gauges"), `${number(said.r1_ohm, 3)} · ${number(said.r2_ohm, 3)} Ω`);
+  put(byId("shear-state"), said.deadband ? "within the deadband" : said.direction);
+  warn(byId("shear-why"), said.valid ? "" : `no force: ${said.why}`);
+}
+
+export function robotPanel(link) {
+  const message = link.get("robot.state");
+  const known = "robot" in (link.get("health")?.content.tasks ?? {});
+  show(byId("robot"), message !== undefined || known);
+  markAge(byId("robot"), link, message);
+  if (!message) return;
+  const said = message.content;
+  const stops = [said.emergency_stop ? "EMERGENCY STOP" : "", said.protective_stop ? "PROTECTIVE STOP" : "", said.blocked];
+  warn(byId("robot-blocked"), stops.filter(Boolean).join(": "));
+  put(byId("wrist"), number(said.wrist_rad, 3, "rad", { signed: true }));
+  put(byId("wrist-speed"), number(said.wrist_speed_rad_per_s, 3, "rad/s", { signed: true }));
+  put(byId("wrist-torque"), number(said.wrist_torque_nm, 3, "N·m", { signed: true }));
+  put(byId("robot-mode"), mode(ROBOT_MODES, said.robot_mode));
+  put(byId("safety-mode"), mode(SAFETY_MODES, said.safety_mode));
+  put(byId("speed-scaling"), `${number(100 * said.speed_scaling, 0)} %`);
+  const tcp = array(said.tcp_pose).values;
+  put(byId("tcp"), `${[...tcp.slice(0, 3)].map((m) => number(1000 * m, 0)).join(" · ")} mm`);
+  const loop = link.get("loop.state");
+  const sent = loop && !link.isOld(loop) ? loop.content : {};
+  put(byId("speed-sent"), number(sent.speed_sent_rad_per_s, 3, "rad/s", { signed: true }));
+  const clipped = sent.speed_wanted_rad_per_s !== undefined && Math.abs(sent.speed_wanted_rad_per_s - sent.speed_sent_rad_per_s) > 0.0005;
+  put(byId("speed-wanted"), clipped ? `wanted ${number(sent.speed_wanted_rad_per_s, 3, "", { signed: true })}` : "");
+}
+
+export function gripperPanel(link) {
+  const message = link.get("gripper.state");
+  const known = "gripper" in (link.get("health")?.content.tasks ?? {});
+  show(byId("gripper"), message !== undefined || known);
+  markAge(byId("gripper"), link, message);
+  if (!message) return;
+  const said = message.content;
+  warn(byId("gripper-fault"), said.fault ? `fault ${said.fault}: ${said.fault_text}` : "");
+  put(byId("gripper-width"), number(said.width_mm, 1, "mm"));
+  put(byId("gripper-object"), said.object);
+  const spread = said.diameter_std_mm == null ? "" : ` ± ${number(said.diameter_std_mm, 1)}`;
+  put(byId("gripper-diameter"), said.diameter_mm == null ? "nothing held" : `${number(said.diameter_mm, 1)}${spread} mm`);
+  put(byId("gripper-current"), number(said.current_ma, 0, "mA"));
+}
+
+export function healthPanel(link, drawn) {
+  const message = link.get("health");
+  markAge(byId("health"), link, message);
+  if (message === drawn.health) return;
+  drawn.health = message;
+  if (!message) {
+    byId("tasks").replaceChildren();
+    put(byId("process"), "");
+    return;
+  }
+  byId("tasks").replaceChildren(...Object.entries(message.content.tasks).map(([name, facts]) => taskRow(name, facts)));
+  const said = message.content;
+  put(byId("process"), `${number(said.memory_mb, 0, "MB")}, ${number(said.cpu_percent, 1, "%")} of a core, event loop ${number(1000 * said.loop_lag_s, 1, "ms")} late`);
+}
+
+function taskRow(name, facts) {
+  const row = document.createElement("tr");
+  const dead = facts.alive === false && !facts.done;
+  const alive = facts.done ? "✓ done" : facts.alive === undefined ? "–" : dead ? "✗ DEAD" : "✓ alive";
+  row.className = dead ? "dead" : "";
+  const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`} Hz`;
+  const errors = Object.entries(facts.errors ?? {}).map(([kind, count]) => `${count} ${kind}`).join(", ");
+  const trouble = facts.trouble || facts.last_error || "";
+  for (const text of [name, alive, rate, errors || "0", String(facts.restarts ?? ""), trouble]) {
+    const cell = document.createElement("td");
+    put(cell, text);
+    row.append(cell);
+  }
+  return row;
+}
+
+// Where the loop stands, and every reason for holding, above everything else.
+export function loopPanel(link) {
+  const message = link.get("loop.state");
+  const current = message && !link.isOld(message) ? message.content : undefined;
+  const step = current?.steps ? `, step ${current.step} of ${current.steps}` : "";
+  put(byId("phase-name"), current ? `${current.phase}${current.experiment ? `: ${current.experiment}` : ""}${step}` : "–");
+  const reasons = current?.reasons ?? "";
+  // What stopped it stands below, with its cure.
+  put(byId("phase-doing"), current?.phase === "stopped" && reasons ? "" : current?.doing ?? "");
+  const share = current?.progress ?? 0;
+  if (byId("progress").value !== share) byId("progress").value = share;
+  put(byId("progress-text"), current?.steps ? `${Math.round(100 * share)} %, about ${Math.round(current.remaining_s)} s left` : "");
+  show(byId("holding"), reasons !== "");
+  if (reasons === "") return;
+  const stop = current.response.startsWith("stop");
+  byId("holding").dataset.kind = stop ? "stop" : "hold";
+  put(byId("holding-title"), { note: "Note", "refuse start": "No start" }[current.response] ?? (stop ? `Stopped: ${current.response}` : "Holding, because"));
+  const items = sentences(reasons);
+  const list = byId("reasons");
+  if (list.dataset.shown === reasons) return;
+  list.dataset.shown = reasons;
+  list.replaceChildren(...items.map((sentence) => {
+    const item = document.createElement("li");
+    put(item, sentence);
+    return item;
+  }));
+}
+
+// A reason begins with a small letter and its cure with a capital: a new one begins after a full stop.
+const sentences = (reasons) => reasons.split(/(?<=\.) (?=[a-z])/);

@@ -1,0 +1,56 @@
+// Samples of several sources on one time axis, for a minute. A row has `undefined` for those that did not speak then,
+// and `null` where one said that it knows nothing: lines run through the first and break at the second.
+
+const KEPT_S = 65;
+const MOST_ROWS = 6000;
+// Times that fall by more are another clock's: nothing from before can stand beside them.
+const LATEST_S = 10;
+
+export class Series {
+  constructor() { this.clear(); }
+
+  clear() {
+    this.times = [];
+    this.columns = new Map();
+    this.last = new Map();
+  }
+
+  column(name) {
+    if (!this.columns.has(name)) this.columns.set(name, new Array(this.times.length).fill(undefined));
+    return this.columns.get(name);
+  }
+
+  // Add values by column name at a time; after a pause longer than gapS the lines begin anew.
+  add(t, values, gapS) {
+    const names = Object.keys(values);
+    const before = this.last.get(names[0]);
+    if (before !== undefined && t < before - LATEST_S) this.clear();
+    else if (before !== undefined && t <= before) return;
+    else if (before !== undefined && t - before > gapS) {
+      this.insert(before + gapS / 2, Object.fromEntries(names.map((name) => [name, null])));
+    }
+    this.last.set(names[0], t);
+    this.insert(t, values);
+    this.trim(this.times[this.times.length - 1] - KEPT_S);
+  }
+
+  insert(t, values) {
+    // Frames speak of the middle of their acquisition and come a little out of order.
+    let at = this.times.length;
+    while (at > 0 && this.times[at - 1] > t) at -= 1;
+    for (const name of Object.keys(values)) this.column(name);
+    this.times.splice(at, 0, t);
+    for (const [name, column] of this.columns) column.splice(at, 0, values[name]);
+  }
+
+  trim(before) {
+    let drop = Math.max(0, this.times.length - MOST_ROWS);
+    while (drop < this.times.length && this.times[drop] < before) drop += 1;
+    // Not one by one: arrays are cut a second at a time.
+    if (drop < 40) return;
+    this.times.splice(0, drop);
+    for (const column of this.columns.values()) column.splice(0, drop);
+  }
+
+  data(names) { return [this.times, ...names.map((name) => this.column(name))]; }
+}

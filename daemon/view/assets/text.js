@@ -1,0 +1,40 @@
+// Numbers and sentences into the page; an element is touched only where its text changes.
+
+const MINUS = "\u2212";
+
+export const byId = (id) => document.getElementById(id);
+
+export function put(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+export function show(element, shown) {
+  if (element.hidden === shown) element.hidden = !shown;
+}
+
+export function warn(element, sentence) {
+  put(element, sentence);
+  show(element, sentence !== "");
+}
+
+// A number with its unit; a dash where there is none.
+export function number(value, digits, unit = "", { signed = false } = {}) {
+  if (value === null || value === undefined) return "–";
+  const text = Math.abs(value).toFixed(digits);
+  const zero = Number(text) === 0;
+  const sign = value < 0 && !zero ? MINUS : signed && !zero ? "+" : "";
+  return `${sign}${text}${unit ? ` ${unit}` : ""}`;
+}
+
+export function interval(low, high, digits) {
+  if (low === null || low === undefined || high === null || high === undefined) return "";
+  return `${number(low, digits, "", { signed: true })} to ${number(high, digits, "", { signed: true })}`;
+}
+
+export const age = (seconds) => (seconds < 10 ? `${seconds.toFixed(1)} s` : `${Math.round(seconds)} s`);
+
+// A message's array: its shape and its numbers.
+export function array(packed) {
+  const bytes = Uint8Array.from(atob(packed.float32), (letter) => letter.charCodeAt(0));
+  return { shape: packed.shape, values: new Float32Array(bytes.buffer) };
+}

@@ -1,0 +1,91 @@
+import os
+import stat
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from daemon.errors import UserError
+from daemon.view.access import host_allowed, origin_allowed, token_given
+from daemon.view.token_file import default_path, kept_token
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:7760", "localhost:9000", "LOCALHOST:1", "[::1]:7760"])
+def test_this_computers_loopback_is_answered_on_any_port(host: str) -> None:
+    assert host_allowed(host)
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        *(None, "", "evil.example", "127.0.0.1.evil.example:7760", "evil.example@127.0.0.1", "localhost.evil.example"),
+        *("192.168.1.5:7760", "0.0.0.0:7760", "127.0.0.1:99999", "[::1", "127.0.0.1/@evil.example", "127.0.0.1:x"),
+    ],
+)
+def test_a_name_of_a_strangers_own_that_leads_here_is_not_answered(host: str | None) -> None:
+    assert not host_allowed(host)
+
+
+@given(st.text(max_size=40))
+def test_no_host_header_breaks_the_check(host: str) -> None:
+    assert isinstance(host_allowed(host), bool)
+
+
+def test_only_the_page_itself_and_programs_without_an_origin_are_answered() -> None:
+    assert origin_allowed(None, "127.0.0.1:7760")
+    assert origin_allowed("http://127.0.0.1:7760", "127.0.0.1:7760")
+    for origin in (
+        "null",
+        "",
+        "http://127.0.0.1:7761",
+        "https://127.0.0.1:7760",
+        "http://localhost:7760",
+        "http://a.b",
+    ):
+        assert not origin_allowed(origin, "127.0.0.1:7760"), origin
+
+
+def test_the_token_is_taken_whole_or_not_at_all() -> None:
+    assert token_given("Bearer abc", "abc")
+    for header in (None, "", "abc", "Bearer", "Bearer ", "Bearer ab", "Bearer abcd", "Basic abc", "Bearer äbc"):
+        assert not token_given(header, "abc"), header
+
+
+def test_a_token_is_made_once_and_read_by_its_owner_alone(tmp_path: Path) -> None:
+    path = tmp_path / "state" / "shearloop" / "view-token"
+    token = kept_token(path)
+    assert len(token) >= 43
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert kept_token(path) == token
+    assert kept_token(path, anew=True) != token
+
+
+def test_a_token_that_others_may_read_is_refused_and_so_is_what_is_none(tmp_path: Path) -> None:
+    path = tmp_path / "token"
+    kept_token(path)
+    path.chmod(0o640)
+    with pytest.raises(UserError, match="nobody else may read"):
+        kept_token(path)
+    for content in ("", "short", "x" * 500, "a token with spaces in it, long enough as it is"):
+        path.write_text(content)
+        path.chmod(0o600)
+        with pytest.raises(UserError, match="holds no token"):
+            kept_token(path)
+
+
+def test_a_link_or_a_pipe_in_the_tokens_place_is_refused(tmp_path: Path) -> None:
+    kept_token(tmp_path / "other")
+    (tmp_path / "link").symlink_to(tmp_path / "other")
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    for name, why in (("link", "cannot be kept"), ("pipe", "must be a file")):
+        with pytest.raises(UserError, match=why):
+            kept_token(tmp_path / name)
+
+
+def test_the_token_is_kept_where_programs_keep_their_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_STATE_HOME", "/state")
+    assert default_path() == Path("/state/shearloop/view-token")
+    monkeypatch.setenv("XDG_STATE_HOME", "not/absolute")
+    monkeypatch.setenv("HOME", "/home/somebody")
+    assert default_path() == Path("/home/somebody/.local/state/shearloop/view-token")

@@ -1,0 +1,282 @@
+"""The page's server over real sockets: who is answered, what is passed on, what is never done."""
+
+import asyncio
+import hashlib
+import json
+import socket
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import aiohttp
+import pytest
+import zmq.asyncio
+from aiohttp import web
+
+from daemon.addresses import PUBLISH_ADDRESS
+from daemon.clock import Clock
+from daemon.command_server import CommandRefusedError, CommandServer
+from daemon.errors import UserError
+from daemon.messages import EitHeatmap, LoadTorque
+from daemon.publisher import Publisher
+from daemon.view import bridge as bridge_module
+from daemon.view import server as server_module
+from daemon.view.bridge import Bridge, Place
+from daemon.view.latest import Latest
+from daemon.view.serve import serve
+from daemon.view.server import HEADERS, NEEDS_TOKEN, make_app
+from tests.daemon.conftest import DEADLINE_S, shearloop
+
+TOKEN = "the token of this test, long enough for anybody"  # noqa: S105 - opens nothing but this test's page
+BEARER = {"Authorization": f"Bearer {TOKEN}"}
+
+
+@dataclass
+class Served:
+    """A page's server, and the daemon's sockets that it looks at."""
+
+    publisher: Publisher
+    bridge: Bridge
+    asked: list[str]
+    base: str
+    http: aiohttp.ClientSession
+
+
+@asynccontextmanager
+async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
+    """Serve the page before a daemon that accepts every command, but for `pause`, and for `other` handlers."""
+    asked: list[str] = []
+
+    def handler(name: str) -> Callable[[Mapping[str, Any]], Any]:
+        async def handle(request: Mapping[str, Any]) -> dict[str, Any]:
+            asked.append(name)
+            if name == "pause":
+                raise CommandRefusedError("no experiment is running")
+            return {"stopped": "test"} if name == "stop" and request.get("spare_daemon") else {}
+
+        return handle
+
+    publish, commands = f"ipc://{tmp_path}/publish", f"ipc://{tmp_path}/commands"
+    handlers = {name: handler(name) for name in (*NEEDS_TOKEN, "stop", "set")} | other
+    with zmq.asyncio.Context() as context:
+        publisher = Publisher(context, publish, Clock())
+        daemon = CommandServer(context, commands, handlers)
+        bridge = Bridge(context, Place(publish, commands), Latest(3.6))
+        tasks = [asyncio.create_task(run()) for run in (daemon.run, bridge.run)]
+        runner = web.AppRunner(make_app(bridge, TOKEN, {"width_cm": 4.4}, publish), access_log=None)
+        await runner.setup()
+        await web.TCPSite(runner, "127.0.0.1", 0).start()
+        try:
+            async with asyncio.timeout(DEADLINE_S), aiohttp.ClientSession() as http:
+                yield Served(publisher, bridge, asked, f"http://127.0.0.1:{runner.addresses[0][1]}", http)
+        finally:
+            await runner.cleanup()
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+            bridge.close()
+            daemon.close()
+            publisher.close()
+
+
+async def until(is_so: Callable[[], bool]) -> None:
+    """Wait for what another thread of libzmq brings about."""
+    while not is_so():  # noqa: ASYNC110 - nobody tells it to an event loop
+        await asyncio.sleep(0.001)
+
+
+async def post(page: Served, path: str, **headers: str) -> tuple[int, dict[str, Any]]:
+    async with page.http.post(page.base + path, headers=headers) as response:
+        return response.status, await response.json()
+
+
+async def test_what_moves_something_needs_the_token_and_stop_does_not(tmp_path: Path) -> None:
+    async with served(tmp_path) as page:
+        for name in NEEDS_TOKEN:
+            assert (await post(page, f"/commands/{name}"))[0] == 403
+            assert (await post(page, f"/commands/{name}", Authorization="Bearer wrong"))[0] == 403
+        assert page.asked == []
+        assert await post(page, "/stop") == (200, {"ok": True, "stopped": "test"})
+        assert await post(page, "/commands/start", **BEARER) == (200, {"ok": True})
+        assert await post(page, "/commands/pause", **BEARER) == (409, {"ok": False, "why": "no experiment is running"})
+        # Other commands of the daemon are not the page's.
+        for name in ("stop", "set", "status"):
+            assert (await post(page, f"/commands/{name}", **BEARER))[0] == 404
+        assert page.asked == ["stop", "start", "pause"]
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "evil.example:7760"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Host": "evil.example", "Origin": "http://evil.example"},
+    ],
+)
+async def test_pages_of_strangers_in_the_same_browser_get_nothing(headers: dict[str, str], tmp_path: Path) -> None:
+    async with served(tmp_path) as page:
+        for path in ("/", "/assets/app.js", "/settings.json"):
+            async with page.http.get(page.base + path, headers=headers) as response:
+                assert response.status in (403, 421)
+                assert "shearloop" not in (await response.text()).replace("127.0.0.1", "")
+        assert (await post(page, "/stop", **headers))[0] in (403, 421)
+        assert (await post(page, "/commands/start", **BEARER, **headers))[0] in (403, 421)
+        with pytest.raises(aiohttp.WSServerHandshakeError):
+            await page.http.ws_connect(f"{page.base}/stream", headers=headers)
+        assert page.asked == []
+
+
+async def test_every_answer_tells_the_browser_to_load_nothing_from_elsewhere(tmp_path: Path) -> None:
+    async with served(tmp_path) as page:
+        for path in ("/", "/assets/view.css", "/settings.json", "/assets/..%2Fserver.py", "/none", "/stop"):
+            async with page.http.get(page.base + path) as response:
+                assert {key: response.headers[key] for key in HEADERS} == HEADERS, path
+                assert response.status == (
+                    200 if path in ("/", "/assets/view.css", "/settings.json") else response.status
+                )
+                assert "Access-Control-Allow-Origin" not in response.headers
+        assert "unsafe" not in HEADERS["Content-Security-Policy"]
+        async with page.http.get(f"{page.base}/assets/..%2Fserver.py") as response:
+            assert response.status == 404
+
+
+def test_the_page_names_nothing_outside_of_itself() -> None:
+    assets = resources.files("daemon.view") / "assets"
+    for item in assets.iterdir():
+        if item.name.endswith((".html", ".css", ".js")):
+            text = item.read_text()
+            # The library's own address stands in its head, as a comment.
+            assert "//" not in text.replace("// ", "").replace("ws://", "").removeprefix("/*! https://"), item.name
+            assert "eval(" not in text, item.name
+    assert "MIT" in (assets / "uPlot.LICENSE.txt").read_text()
+    record = Path("docs/decisions/0070-live-view.md").read_text()
+    for name in ("uPlot.iife.min.js", "uPlot.min.css"):
+        assert f"{hashlib.sha256((assets / name).read_bytes()).hexdigest()}  {name}" in record
+    html = (assets / "index.html").read_text()
+    assert "style=" not in html
+    assert "onclick" not in html
+
+
+async def test_messages_reach_an_open_page_and_heatmaps_are_asked_for_while_one_is_open(tmp_path: Path) -> None:
+    async with served(tmp_path) as page:
+        await until(lambda: page.publisher.wanted("load.torque"))
+        assert not page.publisher.wanted(EitHeatmap.topic)
+        async with page.http.ws_connect(f"{page.base}/stream") as stream:
+            first = await stream.receive_json()
+            assert first["first"]
+            assert (first["messages"], first["quiet_s"]) == ([], None)
+            await until(lambda: page.publisher.wanted(EitHeatmap.topic))
+            page.publisher.publish(
+                LoadTorque(source="load_cell", t_mono_ns=1, torque_nm=0.1, raw=5.0, saturated=False, spike=False)
+            )
+            while not (batch := await stream.receive_json())["messages"]:
+                continue
+            assert not batch["first"]
+            assert batch["messages"][0]["content"]["torque_nm"] == 0.1
+        async with page.http.ws_connect(f"{page.base}/stream") as again:
+            first = await again.receive_json()
+            assert first["messages"][0]["content"]["torque_nm"] == 0.1, "a page that comes later gets what is known"
+            assert first["history"][0]["content"]["torque_nm"] == 0.1
+        await until(lambda: not page.publisher.wanted(EitHeatmap.topic))
+
+
+async def test_a_flood_of_stops_is_one_request_and_passes_commands_that_hang(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 30.0)
+    released, all_in, stops, wanted = asyncio.Event(), asyncio.Event(), 0, 0
+
+    async def hang(_: Mapping[str, Any]) -> dict[str, Any]:
+        await released.wait()
+        return {}
+
+    async def stop(_: Mapping[str, Any]) -> dict[str, Any]:
+        nonlocal stops
+        stops += 1
+        await all_in.wait()
+        return {}
+
+    async def counted() -> dict[str, Any]:
+        nonlocal wanted
+        wanted += 1
+        if wanted == 50:
+            all_in.set()
+        return await passed_on()
+
+    async with served(tmp_path, tare=hang, stop=stop) as page:
+        hanging = [asyncio.create_task(post(page, "/commands/tare", **BEARER)) for _ in range(6)]
+        done, _ = await asyncio.wait(hanging, return_when=asyncio.FIRST_COMPLETED)
+        assert (await done.pop())[0] == 429
+        passed_on = page.bridge.stop
+        monkeypatch.setattr(page.bridge, "stop", counted)
+        replies = await asyncio.gather(*(post(page, "/stop") for _ in range(50)))
+        assert {status for status, _ in replies} == {200}
+        assert stops == 1
+        released.set()
+        assert sorted(status for status, _ in await asyncio.gather(*hanging)) == [200] * 4 + [429] * 2
+
+
+async def test_without_a_daemon_a_stop_says_that_it_was_not_heard(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
+    async with served(tmp_path) as page:
+        page.bridge._place = Place("", f"ipc://{tmp_path}/nobody")
+        status, reply = await post(page, "/stop")
+        assert (status, reply["ok"]) == (503, False)
+        assert "no daemon answered" in reply["why"]
+
+
+async def test_no_more_pages_than_can_be_served_and_none_that_talks_at_length(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_module, "MOST_PAGES", 1)
+    async with served(tmp_path) as page:
+        async with page.http.ws_connect(f"{page.base}/stream") as stream:
+            with pytest.raises(aiohttp.WSServerHandshakeError):
+                await page.http.ws_connect(f"{page.base}/stream")
+            await stream.send_str("x" * 10_000)
+            while (message := await stream.receive()).type is aiohttp.WSMsgType.TEXT:
+                continue
+            assert message.type is aiohttp.WSMsgType.CLOSE
+        async with page.http.post(f"{page.base}/stop", data=b"x" * 100_000) as response:
+            assert response.status in (200, 413)
+
+
+async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tmp_path: Path) -> None:
+    def ready(_: int) -> None:
+        raise AssertionError
+
+    from daemon.cli.view import _fingertip
+
+    tip = _fingertip(None)
+    assert (tip.width_cm, tip.height_cm) == (4.4, 3.6)
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(UserError, match=f"cannot be served on 127.0.0.1:{port}"):
+            await serve(Place(PUBLISH_ADDRESS, f"ipc://{tmp_path}/c"), port, TOKEN, tip, ready)
+    for publish, commands in (("nonsense", PUBLISH_ADDRESS), (PUBLISH_ADDRESS, "nonsense")):
+        with pytest.raises(UserError, match="'nonsense' is not an address"):
+            await serve(Place(publish, commands), 0, TOKEN, tip, ready)
+
+
+async def test_the_command_prints_its_address_with_the_token_once_and_ends_on_a_signal(tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    addresses = ("--connect", f"ipc://{tmp_path}/p", "--commands", f"ipc://{tmp_path}/c")
+    async with shearloop("view", "--port", "0", "--json", "--token-file", str(token), *addresses) as view:
+        assert view.stdout is not None
+        told = json.loads(await view.stdout.readline())
+        assert told["url_with_token"] == f"{told['url']}#token={token.read_text().strip()}"
+        async with aiohttp.ClientSession() as http, http.ws_connect(f"{told['url']}stream") as stream:
+            assert (await stream.receive_json())["first"]
+            view.terminate()
+            while (await stream.receive()).type is not aiohttp.WSMsgType.CLOSE:
+                continue
+        assert await view.wait() == 0
+        assert token.read_text().strip() not in (await view.stdout.read()).decode()

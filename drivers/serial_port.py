@@ -295,11 +295,15 @@ class Link(ABC):
 
     async def lost(self, error: DriverError) -> None:
         """Close the port for the reason given, and wait for as long as is sensible before it is opened again."""
+        await asyncio.sleep(self.given_up(error).wait_s)
+
+    def given_up(self, error: DriverError) -> Retry:
+        """Close the port for the reason given, and tell it; return when it might be tried again."""
         self._close()
         self.last_error = str(error)
         retry = self._policy.failed(time.monotonic_ns())
         self._on_event(LinkEvent(up=False, sentence=self.last_error, repeated=retry.repeated))
-        await asyncio.sleep(retry.wait_s)
+        return retry
 
     def _close(self) -> None:
         if self.port is not None:

@@ -42,7 +42,7 @@ class Polled(ABC, Generic[ReadingT]):
         """Ask for one reading."""
 
     async def _leave(self) -> None:
-        """Tell an instrument that it is no longer wanted."""
+        """Tell an instrument that it is no longer wanted; its port may have gone."""
 
     async def readings(self) -> AsyncGenerator[ReadingT]:
         """Yield a reading every period, for ever, whatever becomes of the instrument meanwhile.
@@ -66,8 +66,7 @@ class Polled(ABC, Generic[ReadingT]):
                     self._count += 1
                     yield reading
             finally:
-                if self._link.port is not None:
-                    await self._leave()
+                await self._leave()
 
     def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
         """Return what health tells of the instrument; counts are since the process began."""

@@ -115,6 +115,13 @@ class ScpiSession:
         await self.tell(query)
         return await self._next(asked_ns, query)
 
+    async def ask_until(self, query: str, answer: str, deadline_s: float) -> None:
+        """Read past replies to older questions until a query is answered so; DeviceLostError when that never comes."""
+        await self.tell(query)
+        deadline_ns = monotonic_ns() + int(deadline_s * 1e9)
+        while (await self._next(0, query, deadline_ns)).text != answer:
+            pass
+
     async def check(self) -> None:
         """Raise ProtocolError when the instrument refused something that it was told."""
         reply = (await self.ask(":SYST:ERR?")).text
@@ -134,14 +141,17 @@ class ScpiSession:
             raise DeviceLostError(f"There is no connection to {self._what} at present.")
         return self._link.port
 
-    async def _next(self, asked_ns: int, query: str) -> Reply:
-        deadline_ns = monotonic_ns() + int(self._deadline_s * 1e9)
+    async def _next(self, asked_ns: int, query: str, deadline_ns: int | None = None) -> Reply:
+        begin_ns = monotonic_ns()
+        if deadline_ns is None:
+            deadline_ns = begin_ns + int(self._deadline_s * 1e9)
         while not self._waiting:
             left_s = (deadline_ns - monotonic_ns()) / 1e9
             received = await self._port.read(left_s) if left_s > 0 else None
             if received is None:
+                waited_s = (deadline_ns - begin_ns) / 1e9
                 raise DeviceLostError(
-                    f"{self._what} at {self._port.path} has not answered {query!r} within {self._deadline_s:g} s; "
+                    f"{self._what} at {self._port.path} has not answered {query!r} within {waited_s:.2g} s; "
                     "see that it is on, and that baud rate and line end are as configured."
                 )
             self._waiting += [(text, received.t_arrival_ns) for text in self.lines.feed(received.data)]

@@ -6,7 +6,7 @@ Voltage and current are both measured: the current of a source that sits in comp
 
 from dataclasses import dataclass
 
-from drivers.errors import DriverError, ProtocolError
+from drivers.errors import DeviceLostError, DriverError, ProtocolError
 from drivers.serial_port import Link
 from drivers.shear_skin.polled import Polled
 from drivers.shear_skin.scpi import NOT_A_NUMBER, REPLY_DEADLINE_S, numbers
@@ -19,6 +19,8 @@ CURRENT_A = 5e-3
 COMPLIANCE_V = 1.0
 # Two readings a second leave the RS-232 interface time to spare, and a current source does not change in between.
 PERIOD_S = 0.5
+# A reading that was under way and its reply take some tenths of a second; whoever stops the daemon waits for this.
+SWITCH_OFF_S = 1.0
 # The status word (manual, page 17-47).
 _OVERFLOW, _COMPLIANCE, _OVERVOLTAGE, _RANGE_COMPLIANCE = 1 << 0, 1 << 3, 1 << 4, 1 << 16
 
@@ -60,11 +62,13 @@ class Keithley6430(Polled[SourceReading]):
         self.current_a = current_a
         self.compliance_v = compliance_v
         self._was_reset = False
+        self._may_be_on = False
 
     async def _set_up(self) -> str:
         name = await self._session.identified(*MODELS)
         if not self._was_reset:
             await self._session.tell("*RST")
+        self._may_be_on = True
         # After a break all that matters is told again, without the reset, which would interrupt the current.
         await self._session.tell(
             "*CLS",
@@ -94,8 +98,19 @@ class Keithley6430(Polled[SourceReading]):
         return read_elements(reply.text, reply.t_arrival_ns)
 
     async def _leave(self) -> None:
+        """Switch the output off and see it go off: what is only sent is lost where the port is closed too soon."""
+        if not self._may_be_on:
+            return
         try:
-            await self._session.tell(":OUTP OFF")
-        except DriverError:
-            # It went away in this very moment: its own power switch is what is left.
+            # Twice: whoever was interrupted in the middle of a command has left its beginning on the line.
+            await self._session.tell(":OUTP OFF", ":OUTP OFF")
+            await self._session.ask_until(":OUTP?", "0", SWITCH_OFF_S)
+            self._may_be_on = False
+        except DriverError as error:
             self._errors["not switched off"] += 1
+            self._link.given_up(
+                DeviceLostError(
+                    "The current source has not confirmed that its output is off; press its OUTPUT key, "
+                    f"or the current flows on through the gauges. {error}"
+                )
+            )

@@ -3,7 +3,6 @@
 What is computed here, in float32, decides only where it is worth while to score exactly.
 """
 
-from abc import ABC, abstractmethod
 from typing import NamedTuple
 
 import numpy as np
@@ -52,49 +51,39 @@ class Neighbourhood:
         return outside
 
 
-class Bounds(ABC):
-    """A unit frame, (896,), estimated and bounded at a matcher's lags."""
-
-    @abstractmethod
-    def seed(self, around: Neighbourhood | None) -> tuple[int, FloatArray] | None:
-        """Return a cell outside a neighbourhood that is likely to score high, and the (1, 896) frame at its lag.
-
-        None where there is no such cell, or none is found at once.
-        """
-
-    @abstractmethod
-    def left(self, score: float) -> Left:
-        """Return the cells that may have a score, or a higher one."""
-
-
-class ZeroLagBounds(Bounds):
-    """At lag 0 alone all cells are estimated at once."""
+class ZeroLagBounds:
+    """A unit frame, (896,), estimated and bounded at lag 0; frames (1, 896) is that frame."""
 
     def __init__(self, bank: CompressedBank, frame: FloatArray) -> None:
         self._bank = bank
-        self._frames = frame[None]
+        self.frames = frame[None]
         parts = bank.basis @ frame.astype(np.float32)
-        self._fine = column(parts)
-        self._coarse = column(parts[:COARSE_RANK])
-        self._estimates = self._coarse[:-2] @ bank.estimators
+        self._fine, t = column(parts, COARSE_RANK)
+        n = len(bank.left_out)
+        # One place more, for what is no cell.
+        self._estimates = np.empty(n + 1, dtype=np.float32)
+        np.dot(parts[:COARSE_RANK], bank.estimators, out=self._estimates[:n])
+        self._bounds = np.empty(n + 1, dtype=np.float32)
+        np.multiply(bank.left_out, t, out=self._bounds[:n])
+        self._bounds[:n] += self._estimates[:n]
+        self._estimates[n] = self._bounds[n] = -np.inf
 
-    def seed(self, around: Neighbourhood | None) -> tuple[int, FloatArray] | None:
-        """Return the cell of the highest estimate."""
-        if around is None:
-            return int(np.argmax(self._estimates)), self._frames
-        outside = around.lacks(slice(None))
-        cell = int(np.argmax(np.where(outside, self._estimates, -np.inf)))
-        return (cell, self._frames) if outside[cell] else None
+    def leave_out(self, cells: Indices) -> None:
+        """Find these cells no more."""
+        self._estimates[cells] = self._bounds[cells] = -np.inf
+
+    def seed(self) -> int | None:
+        """Return the cell of the highest estimate; None where all are left out."""
+        cell = int(self._estimates.argmax())
+        return None if self._estimates[cell] == -np.inf else cell
 
     def left(self, score: float) -> Left:
-        """Bound all cells at the coarse rank, and what is left at the fine one."""
-        bounds = self._bank.left_out * self._coarse[-1]
-        bounds += self._estimates
-        cells = np.flatnonzero(bounds >= score - ROUNDING)
-        return Left(cells, self._bank.fine.take(cells, axis=0) @ self._fine, self._frames)
+        """Return the cells that may have a score, or a higher one."""
+        (cells,) = (self._bounds >= score - ROUNDING).nonzero()
+        return Left(cells, self._bank.fine.take(cells, axis=0) @ self._fine, self.frames)
 
 
-class AllLagsBounds(Bounds):
+class AllLagsBounds:
     """Lags are left out first, then groups, then cells. Lags are numbered as in _LAGS.
 
     spectra (r, 897) are the conjugate transforms of the basis's first directions, from `spectra_of`.
@@ -113,7 +102,11 @@ class AllLagsBounds(Bounds):
         self._estimates = _products(bank.groups[:, :-2], self._columns[:-2, self._seed_lags])
 
     def seed(self, around: Neighbourhood | None) -> tuple[int, FloatArray] | None:
-        """Return the cell of the highest estimate in the group of the highest estimate, at the likeliest lags."""
+        """Return a cell outside a neighbourhood that is likely to score high, and the (1, 896) frame at its lag.
+
+        It is the one of the highest estimate in the group of the highest estimate, at the likeliest lags; None where
+        there is no such cell, or none is found at once.
+        """
         estimates = self._estimates
         if around is not None:
             estimates = np.where(around.lacks(self._bank.centres), estimates, -np.inf)
@@ -126,7 +119,10 @@ class AllLagsBounds(Bounds):
         return self._best_of(cells, self._seed_lags[lag]), self._frames(self._seed_lags[lag, None])
 
     def left(self, score: float) -> Left:
-        """Bound groups, then the cells of those that are left, at the lags that are left, at both ranks."""
+        """Return the cells that may have a score, or a higher one.
+
+        Groups are bounded first, then the cells of those that are left, at the lags that are left, at both ranks.
+        """
         if score < self._bounded_down_to:
             self._bound_groups(score)
         bank, least = self._bank, score - ROUNDING

@@ -94,14 +94,17 @@ def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
     )
 
 
-def column(parts: Single) -> Single:
-    """Return the (r + 2,) column of a frame y of norm 1; parts (r,) are Φᵀ y."""
-    inside = float(parts @ parts)
+def column(parts: Single, rank: int) -> tuple[Single, np.float32]:
+    """Return the (r + 2,) column of a frame y of norm 1, and its t at a lower rank; parts (r,) are Φᵀ y."""
+    first, rest = parts[:rank], parts[rank:]
+    inside = float(first @ first)
+    t = np.float32(math.sqrt(max(1.0 - inside, 0.0) + _SQUARE_ROUNDING))
+    inside += float(rest @ rest)
     found = np.empty(len(parts) + 2, dtype=np.float32)
     found[:-2] = parts
     found[-2] = math.sqrt(inside)
     found[-1] = math.sqrt(max(1.0 - inside, 0.0) + _SQUARE_ROUNDING)
-    return found
+    return found, t
 
 
 def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Single:

@@ -10,8 +10,9 @@ from abc import abstractmethod
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bank.bounds import AllLagsBounds, Bounds, Left, Mask, Neighbourhood, ZeroLagBounds, spectra_of
+from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, ZeroLagBounds, spectra_of
 from bank.compression import ROUNDING, Indices, compress
+from bank.errors import MatchingError
 from bank.matching import (
     CHUNK_CELLS,
     RUNNER_UP_RADIUS,
@@ -21,7 +22,7 @@ from bank.matching import (
     Matcher,
     ReferenceMatcher,
     ZeroLagMatcher,
-    unit_magnitudes,
+    unit_magnitude,
 )
 
 # How far two ways of adding up 896 products in float64 may be apart: where a tie hangs on less, the reference decides.
@@ -30,6 +31,8 @@ _ROUNDING_64 = 1e-14
 _ROUNDING_32 = 6e-5
 # With more lags, a transform costs a cell less than its products.
 _FEW_LAGS = 128
+# With fewer cells, sorting them out in float32 costs more than scoring them.
+_FEW_CELLS = 48
 
 
 class _Undecided(Exception):  # noqa: N818 - it is not an error
@@ -54,54 +57,29 @@ class _PruningMatcher(Matcher):
 
         Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
         """
-        (frame,) = unit_magnitudes(np.asarray(difference)[None])
+        frame = unit_magnitude(difference)
         try:
             return self._search(frame, runner_up)
         except _Undecided:
             return super().match(difference)
 
     @abstractmethod
-    def _bounds(self, frame: FloatArray) -> Bounds: ...
+    def _search(self, frame: FloatArray, runner_up: bool) -> Match: ...
 
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
-        bounds = self._bounds(frame)
-        near, reached = self._reached(bounds, None)
-        if not runner_up:
-            return self._match(self._settled(frame, bounds.left(reached), reached), None)
-        # What is outside at twice the radius is outside of the peak of every cell in this one's peak.
-        far, least = self._reached(bounds, self._around(near, 2 * RUNNER_UP_RADIUS))
-        left = bounds.left(min(reached, least))
-        best = self._settled(frame, left, reached)
-        peak = self._around(best[0], RUNNER_UP_RADIUS)
-        if far >= 0 and not peak.lacks(np.array([far]))[0]:
-            _, least = self._reached(bounds, peak)
-            left = bounds.left(least)
-        left = left.among(peak.lacks(left.cells))
-        return self._match(best, self._settled(frame, left, least) if len(left.cells) else None)
-
-    def _around(self, cell: int, radius: int) -> Neighbourhood:
-        return Neighbourhood(self._row, self._column, cell, radius)
-
-    def _reached(self, bounds: Bounds, around: Neighbourhood | None) -> tuple[int, float]:
-        """Return a cell outside a neighbourhood and a score that it reaches; −1 and 0 where there is none."""
-        seed = bounds.seed(around)
-        if seed is None:
-            return -1, 0.0
-        cell, frames = seed
-        return cell, self._score(cell, frames)
-
-    def _settled(self, frame: FloatArray, left: Left, reached: float) -> tuple[int, float]:
+    def _settled(self, frame: FloatArray, left: Left, reached: float, seed: int = -1) -> tuple[int, float]:
         """Return the cell of the highest score, the lowest of those that tie, and the score.
 
-        One of the cells that are left must reach the score `reached`.
+        One of the cells that are left must reach the score `reached`: `seed`, where that is known.
         """
-        reached = max(reached, self._score(int(left.cells[np.argmax(left.bounds)]), left.frames))
+        likeliest = int(left.cells[left.bounds.argmax()])
+        if likeliest != seed:
+            reached = max(reached, self._score(likeliest, left.frames))
         cells = left.cells[left.bounds >= reached - ROUNDING]
         parts = [
             self._contenders(frame, cells[i : i + CHUNK_CELLS], left.frames, reached)
             for i in range(0, len(cells), CHUNK_CELLS)
         ]
-        cells, scores = (np.concatenate(each) for each in zip(*parts, strict=True))
+        cells, scores = parts[0] if len(parts) == 1 else (np.concatenate(each) for each in zip(*parts, strict=True))
         behind = scores.max() - scores
         if (np.abs(behind - TIE) < _ROUNDING_64).any():
             raise _Undecided
@@ -115,6 +93,9 @@ class _PruningMatcher(Matcher):
         if len(frames) > _FEW_LAGS:
             return cells, self._scores(frame[None], self._unit_signals(self._cells[cells]))[0]
         magnitudes = np.abs(self._signals.take(self._cells[cells], axis=0))
+        if len(cells) <= _FEW_CELLS:
+            scores = (frames @ magnitudes.astype(np.float64).T).max(axis=0) / self._norms[cells]
+            return cells, scores
         nearly = (frames.astype(np.float32) @ magnitudes.T).max(axis=0) / self._norms[cells]
         close = np.flatnonzero(nearly >= reached - _ROUNDING_32)
         scores = (frames @ magnitudes[close].astype(np.float64).T).max(axis=0) / self._norms[cells[close]]
@@ -141,10 +122,38 @@ class _PruningMatcher(Matcher):
 
 
 class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
-    """Matches at lag 0 alone; its heatmaps are those of `ZeroLagMatcher`, at that one's price."""
+    """Matches at lag 0 alone; its heatmaps are those of `ZeroLagMatcher`, at that one's price.
 
-    def _bounds(self, frame: FloatArray) -> Bounds:
-        return ZeroLagBounds(self._bank, frame)
+    With one lag all cells are estimated at once, and a search is a few operations on one number per cell.
+    """
+
+    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+        """Compress the bank; arguments and errors as of any pruning matcher."""
+        super().__init__(signals, valid, k_grid, sigma_grid)
+        # Every place of the grid has the number of its cell; those that are not valid share one that is none.
+        self._numbers = np.full(valid.shape, len(self._cells))
+        self._numbers[valid] = np.arange(len(self._cells))
+
+    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
+        bounds = ZeroLagBounds(self._bank, frame)
+        best = self._best(frame, bounds)
+        if best is None:
+            raise MatchingError("no cell of the bank is valid")
+        if not runner_up:
+            return self._match(best, None)
+        row, column = self._place(best[0])
+        rows = slice(max(row - RUNNER_UP_RADIUS, 0), row + RUNNER_UP_RADIUS + 1)
+        columns = slice(max(column - RUNNER_UP_RADIUS, 0), column + RUNNER_UP_RADIUS + 1)
+        bounds.leave_out(self._numbers[rows, columns])
+        return self._match(best, self._best(frame, bounds))
+
+    def _best(self, frame: FloatArray, bounds: ZeroLagBounds) -> tuple[int, float] | None:
+        """Return the cell of the highest score among those not left out, and the score."""
+        seed = bounds.seed()
+        if seed is None:
+            return None
+        reached = self._score(seed, bounds.frames)
+        return self._settled(frame, bounds.left(reached), reached, seed)
 
 
 class FastMatcher(_PruningMatcher, ReferenceMatcher):
@@ -155,5 +164,29 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
         super().__init__(signals, valid, k_grid, sigma_grid)
         self._spectra = spectra_of(self._bank)
 
-    def _bounds(self, frame: FloatArray) -> Bounds:
-        return AllLagsBounds(self._bank, self._spectra, frame)
+    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
+        bounds = AllLagsBounds(self._bank, self._spectra, frame)
+        near, reached = self._reached(bounds, None)
+        if not runner_up:
+            return self._match(self._settled(frame, bounds.left(reached), reached), None)
+        # What is outside at twice the radius is outside of the peak of every cell in this one's peak.
+        far, least = self._reached(bounds, self._around(near, 2 * RUNNER_UP_RADIUS))
+        left = bounds.left(min(reached, least))
+        best = self._settled(frame, left, reached)
+        peak = self._around(best[0], RUNNER_UP_RADIUS)
+        if far >= 0 and not peak.lacks(np.array([far]))[0]:
+            _, least = self._reached(bounds, peak)
+            left = bounds.left(least)
+        left = left.among(peak.lacks(left.cells))
+        return self._match(best, self._settled(frame, left, least) if len(left.cells) else None)
+
+    def _around(self, cell: int, radius: int) -> Neighbourhood:
+        return Neighbourhood(self._row, self._column, cell, radius)
+
+    def _reached(self, bounds: AllLagsBounds, around: Neighbourhood | None) -> tuple[int, float]:
+        """Return a cell outside a neighbourhood and a score that it reaches; −1 and 0 where there is none."""
+        seed = bounds.seed(around)
+        if seed is None:
+            return -1, 0.0
+        cell, frames = seed
+        return cell, self._score(cell, frames)

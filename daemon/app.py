@@ -29,12 +29,15 @@ from daemon.keys import Gatekeeper, load_server_keys
 from daemon.links import log_link
 from daemon.loop.senses import Source
 from daemon.publisher import Listener, Publisher
+from daemon.recording.identity import Attached, identity_of
+from daemon.recording.recorder import Recorder
 from daemon.rig import Rig
 from daemon.skin_setup import make_skin, skin_source
 from daemon.skin_task import SKIN, SkinTask
 from daemon.supervisor import Supervisor
 from daemon.topics import STALE_AFTER_PERIODS
 from drivers.eit_kit import EitKit
+from drivers.raw_input import Tap, no_tap
 
 # How often a start that was refused is tried again, and an end looked for.
 START_RETRY_S = 0.5
@@ -83,11 +86,14 @@ class Daemon:
             if "commands" in config.network_addresses:
                 self._open_stop = CommandServer(context, open_stop_address(config.commands), self._open_handlers())
                 opened.callback(self._open_stop.close)
+            self._recorder = _recorder(config, self.publisher, self._clock, self._busy, self._recording_failed)
+            if self._recorder is not None:
+                opened.callback(self._recorder.close)
             self._close = opened.pop_all().close
         self._rig: Rig | None = None
         try:
             if config.robot is not None:
-                self._rig = Rig(config, self.publisher, self._clock, _sources(config), self._tare_to_the_end)
+                self._rig = Rig(config, self.publisher, self._clock, _sources(config), self._tare_to_the_end, self._tap)
             hear = self._rig.brain.hear if self._rig is not None else lambda _: None
             self._skin: SkinTask | None = None
             if config.skin is not None:
@@ -98,12 +104,13 @@ class Daemon:
         self._fingertips = {
             name: FingertipTask(
                 name,
-                _board(name, config.fingertips[name]),
+                _board(name, config.fingertips[name], self._tap(name)),
                 estimator,
                 self.publisher,
                 self._clock,
                 hear,
                 always_heatmap=config.fingertips[name].heatmap == "always",
+                tap=self._tap(name),
             )
             for name, estimator in estimators.items()
         }
@@ -120,6 +127,8 @@ class Daemon:
                 self._health.add("load_cell", self._rig.load_cell.facts)
             if self._rig.gripper is not None:
                 self._health.add("gripper", self._rig.gripper.facts)
+        if self._recorder is not None:
+            self._health.add("recording", self._recorder.facts)
         self._health.add("commands", self._command_facts)
 
     async def run(self) -> None:
@@ -134,7 +143,11 @@ class Daemon:
                 for task in running:
                     task.cancel()
         finally:
+            if self._recorder is not None:
+                # It may have to wait for the disk.
+                await asyncio.to_thread(self._recorder.close)
             self._close()
+        self._tell_of_recordings()
         structlog.get_logger().info("stopped")
 
     def stop(self) -> None:
@@ -160,6 +173,8 @@ class Daemon:
                 yield supervised(name, run)
             if self._config.experiment is not None:
                 yield supervised("experiment", self._run_experiment)
+        if self._recorder is not None:
+            yield supervised("recording", self._recorder.run)
         yield supervised("commands", self._commands.run)
         if self._gate is not None:
             yield supervised("keys", self._gate.run)
@@ -174,7 +189,7 @@ class Daemon:
             return
         log, told = structlog.get_logger().bind(experiment=str(path)), ""
         self._awaited = path
-        while (why := await rig.start(path)) is not None:
+        while (why := await self._begin(path)) is not None:
             if self._awaited is None:
                 log.info("the operator said stop: it is not started")
                 return
@@ -187,6 +202,35 @@ class Daemon:
         log.info("the experiment has ended", phase=experiment.phase.value, why=experiment.why)
         if self._config.stop_when_done:
             self.stop()
+
+    async def _begin(self, path: Path) -> str | None:
+        """Begin the experiment in a file, recorded, or return why not; raises UserError for a file that is none."""
+        rig, recorder = self._needed_rig, self._recorder
+        attached = Attached.if_there(path) if recorder is not None else ()
+        why = await rig.start(path)
+        if why is None and recorder is not None and rig.brain.experiment is not None:
+            recorder.experiment(rig.brain.experiment.file.name, attached)
+        return why
+
+    def _tap(self, source: str) -> Tap:
+        return no_tap if self._recorder is None else self._recorder.tap(source)
+
+    def _busy(self) -> bool:
+        """Return whether an experiment is running."""
+        experiment = self._rig.brain.experiment if self._rig is not None else None
+        return experiment is not None and experiment.running
+
+    def _recording_failed(self, why: str) -> None:
+        if self._rig is not None:
+            self._rig.brain.senses.recording_failed = why
+
+    def _tell_of_recordings(self) -> None:
+        if self._recorder is None:
+            return
+        for path in self._recorder.finished:
+            structlog.get_logger().info("recorded", file=str(path))
+        if self._recorder.failure:
+            structlog.get_logger().error("the recording could not be finished", why=self._recorder.failure)
 
     def _handlers(self) -> Mapping[str, Handler]:
         return {
@@ -231,9 +275,8 @@ class Daemon:
         path = request.get("experiment") or self._config.experiment
         if not isinstance(path, str | Path):
             raise CommandRefusedError("which experiment? Give its file, or name one in the configuration")
-        rig = self._needed_rig
         try:
-            why = await rig.start(Path(path))
+            why = await self._begin(Path(path))
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
         _refuse(why)
@@ -294,13 +337,29 @@ def _sources(config: DaemonConfig) -> dict[str, Source]:
     return sources if skin is None else {**sources, skin.name: skin}
 
 
-def _board(name: str, config: Fingertip) -> EitKit:
+def _recorder(
+    config: DaemonConfig,
+    publisher: Publisher,
+    clock: Clock,
+    busy: Callable[[], bool],
+    on_failure: Callable[[str], None],
+) -> Recorder | None:
+    """Return what records all that is published, where that is configured; raises UserError where it cannot."""
+    if config.recording is None:
+        return None
+    recorder = Recorder(config.recording.folder, identity_of(config), clock, busy=busy, on_failure=on_failure)
+    publisher.listen(recorder.record)
+    return recorder
+
+
+def _board(name: str, config: Fingertip, tap: Tap) -> EitKit:
     return EitKit(
         path=config.device.path,
         serial_number=config.device.serial_number,
         zero_slots=ZERO_SLOTS,
         frame_period_s=config.frame_period_s,
         on_event=partial(log_link, name),
+        tap=tap,
     )
 
 

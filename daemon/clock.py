@@ -22,6 +22,11 @@ class Clock:
         """Return the Unix time, in seconds, of a reading of the monotonic clock."""
         return (t_mono_ns + self._offset_ns) / 1e9
 
+    @property
+    def offset_ns(self) -> int:
+        """Unix time less the monotonic clock, in nanoseconds, as it is used at present."""
+        return self._offset_ns
+
     def synchronise(self) -> float:
         """Measure the offset anew, as a service does once a second; return by how many seconds it had moved."""
         before, self._offset_ns = self._offset_ns, _measured_offset_ns()

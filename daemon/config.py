@@ -171,6 +171,12 @@ class LoopConfig(ConfigModel):
     phase_margin_deg: float = Field(45.0, ge=0, le=90)
 
 
+class RecordingConfig(ConfigModel):
+    """What is kept of every run: all messages and all raw inputs, a file for each experiment."""
+
+    folder: Path = Field(description="made where it is not there; one daemon writes some 80 MB an hour")
+
+
 class Emulator(ConfigModel):
     """A device that is played by a process of its own, for demonstrations."""
 
@@ -193,6 +199,7 @@ class DaemonConfig(ConfigModel):
     loop: LoopConfig = Field(default_factory=lambda: LoopConfig.model_validate({}))
     experiment: Path | None = Field(None, description="started as soon as all devices are there")
     stop_when_done: bool = Field(False, description="whether the daemon ends with that experiment")
+    recording: RecordingConfig | None = Field(None, description="without one, nothing is recorded")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
     emulators: tuple[Emulator, ...] = ()
 

@@ -12,6 +12,7 @@ from daemon.loop.senses import Torque
 from daemon.messages import EitEstimate, EitFrame, EitHeatmap, Scalar
 from daemon.publisher import Publisher
 from drivers.eit_kit import EitKit, Frame
+from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 
 # Frames that may wait for the estimator. When they are this many the port is read no further: the board's own
 # buffer and then the board wait, and nothing is lost.
@@ -31,7 +32,9 @@ class FingertipTask:
         hear: Callable[[Torque], None] = lambda _: None,
         *,
         always_heatmap: bool = False,
+        tap: Tap = no_tap,
     ) -> None:
+        self._tap = tap
         self.name = name
         self._hear = hear
         self._board = board
@@ -68,6 +71,8 @@ class FingertipTask:
             frame = await self._backlog.get()
             if self._tare_wanted:
                 self._tare_wanted = False
+                # A replay takes its zero before the same frame.
+                self._tap(RawInput(InputKind.TARE, self._clock.now_ns(), str(frame.seq).encode()))
                 self._estimator.tare()
             # Scoring every cell takes many milliseconds; the loop has commands and other devices to serve.
             reading = await asyncio.to_thread(self._estimator.update, frame)

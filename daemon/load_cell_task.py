@@ -63,7 +63,7 @@ class LoadCellTask:
             self._zeroing.append(sample.raw)
         if len(self._zeroing) == ZERO_SAMPLES:
             mean = sum(self._zeroing) / ZERO_SAMPLES
-            self._board.calibration = self._board.calibration.tared(mean)
+            self._board.tare(mean)
             self._zeroing = None
             self._zeroed.set_result("")
 

@@ -12,7 +12,7 @@ from daemon.control.tuning import RequiredMargins
 from daemon.experiment.steps import ExperimentFile
 from daemon.gripper_task import GripperTask
 from daemon.links import log_event, log_link
-from daemon.load_cell_task import LoadCellTask
+from daemon.load_cell_task import LOAD_CELL, LoadCellTask
 from daemon.loop.brain import Brain
 from daemon.loop.senses import Hand, Source, Torque
 from daemon.loop.tune import TuneSettings, tuned
@@ -23,6 +23,7 @@ from daemon.publisher import Publisher
 from drivers.calibration_file import load_calibration
 from drivers.hx711 import LoadCalibration
 from drivers.load_cell import LoadCell
+from drivers.raw_input import Tap, no_tap
 from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import GripperClient
 from drivers.robotiq.modbus_client import ModbusClient
@@ -33,7 +34,7 @@ from drivers.ur.settings import read_settings
 
 
 def make_load_cell(
-    config: LoadCellConfig, publisher: Publisher, clock: Clock, hear: Callable[[Torque], None]
+    config: LoadCellConfig, publisher: Publisher, clock: Clock, hear: Callable[[Torque], None], tap: Tap = no_tap
 ) -> LoadCellTask:
     """Return the load cell's task; raises DriverError when its calibration cannot be used."""
     calibration = (
@@ -43,7 +44,11 @@ def make_load_cell(
     )
     device = config.device
     board = LoadCell(
-        calibration, serial_number=device.serial_number, path=device.path, on_event=partial(log_link, "load_cell")
+        calibration,
+        serial_number=device.serial_number,
+        path=device.path,
+        on_event=partial(log_link, LOAD_CELL),
+        tap=tap,
     )
     return LoadCellTask(board, publisher, clock, hear, config.rate_hz)
 
@@ -94,8 +99,9 @@ class Rig:
         clock: Clock,
         fingertips: Mapping[str, Source],
         tare_fingertips: Callable[[], Awaitable[str]],
+        tap: Callable[[str], Tap] = lambda _: no_tap,
     ) -> None:
-        """Read the settings of every device; none is opened yet."""
+        """Read the settings of every device; none is opened yet. `tap` gives what hears of a source's raw inputs."""
         if config.robot is None:
             raise ValueError("a rig has a robot")
         self._tare_fingertips = tare_fingertips
@@ -103,7 +109,7 @@ class Rig:
         sources = dict(fingertips)
         self.load_cell: LoadCellTask | None = None
         if config.load_cell is not None:
-            self.load_cell = make_load_cell(config.load_cell, publisher, clock, self._hear)
+            self.load_cell = make_load_cell(config.load_cell, publisher, clock, self._hear, tap(LOAD_CELL))
             sources[self.load_cell.source.name] = self.load_cell.source
         sources[WRENCH] = WRENCH_SOURCE
         required = ("gripper",) if config.gripper is not None else ()

@@ -1,6 +1,7 @@
 """The EIT-kit (a Teensy on USB): starts it, turns what it sends into frames, and awaits it when it goes away."""
 
 import os
+import time
 from collections.abc import AsyncGenerator, Callable, Mapping
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from drivers.eit_line import NOMINAL_PERIOD_NS, Frame, LineParser
 from drivers.errors import DeviceLostError, DriverError
+from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.serial_port import LinkEvent, Received, SerialLink
 
 __all__ = ["EitKit", "Frame"]
@@ -25,7 +27,7 @@ class EitKit:
     """One board, named by USB serial number or path.
 
     `zero_slots` (1024,) is true where its injection pattern makes a value 0; `frame_period_s` serves until the period
-    is measured; `on_event` hears when the board comes and goes.
+    is measured; `on_event` hears when the board comes and goes, `tap` of all that the parser is told.
     """
 
     def __init__(
@@ -36,7 +38,9 @@ class EitKit:
         path: str | os.PathLike[str] | None = None,
         frame_period_s: float = NOMINAL_PERIOD_NS / 1e9,
         on_event: Callable[[LinkEvent], None] = lambda _: None,
+        tap: Tap = no_tap,
     ) -> None:
+        self._tap = tap
         self._link = SerialLink(
             serial_number=serial_number, path=None if path is None else os.fspath(path), on_event=on_event
         )
@@ -58,7 +62,7 @@ class EitKit:
                     await self._link.lost(error)
                     continue
                 if received is not None:
-                    for frame in self._parser.feed(received.data, received.t_arrival_ns):
+                    for frame in self._told(InputKind.DATA, received.t_arrival_ns, received.data):
                         yield frame
 
     async def _receive(self) -> Received | None:
@@ -67,7 +71,7 @@ class EitKit:
         if port is None:
             port = await self._link.open()
             self._unanswered = 0
-            self._parser.port_opened()
+            self._told(InputKind.OPENED, time.monotonic_ns())
             await port.write(START)
         received = await port.read(max(SILENT_PERIODS * self._parser.clock.period_ns / 1e9, SHORTEST_SILENCE_S))
         if received is not None:
@@ -80,9 +84,14 @@ class EitKit:
             )
         self._unanswered += 1
         self._silences += 1
-        self._parser.board_started()
+        self._told(InputKind.STARTED, time.monotonic_ns())
         await port.write(START)
         return None
+
+    def _told(self, kind: InputKind, t_ns: int, data: bytes = b"") -> list[Frame]:
+        told = RawInput(kind, t_ns, data)
+        self._tap(told)
+        return self._parser.take(told)
 
     def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
         """Return what health tells of the board; counts are since the process began."""

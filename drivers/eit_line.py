@@ -17,6 +17,7 @@ from drivers.eit_format import (
     read_line,
 )
 from drivers.frame_clock import FrameClock
+from drivers.raw_input import InputKind, RawInput
 
 # The board's own period, 1.85 frames/s; the one in use is learned from the frames as they come.
 NOMINAL_PERIOD_NS = 541_000_000
@@ -90,6 +91,19 @@ class LineParser:
         self._last_line: bytes | None = None
         self._last_channels = np.full(len(self._slots), np.nan)
         self._equal_frames = np.zeros(len(self._slots), np.int64)
+
+    def take(self, told: RawInput) -> list[Frame]:
+        """Do what an input says, live or recorded; return the frames that it completes. A tare is not the parser's."""
+        match told.kind:
+            case InputKind.OPENED:
+                self.port_opened()
+            case InputKind.STARTED:
+                self.board_started()
+            case InputKind.DATA:
+                return self.feed(told.data, told.t_ns)
+            case InputKind.TARE:
+                pass
+        return []
 
     def port_opened(self) -> None:
         """Begin anew: what was half received stays so, and a line may be under way already."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 from drivers.calibration_file import CalibrationModel, Finite, Positive
+from drivers.raw_input import InputKind, RawInput
 
 BAUD_RATE = 115200
 # Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second, nominally.
@@ -167,6 +168,19 @@ class LoadParser:
         self._last_mid_ns: int | None = None
         self.calibration = calibration
         self.restart()
+
+    def take(self, told: RawInput) -> list[LoadSample]:
+        """Do what an input says, live or recorded; return the samples that it completes. A tare brings its raw zero."""
+        match told.kind:
+            case InputKind.OPENED:
+                self.restart()
+            case InputKind.TARE:
+                self.calibration = self.calibration.tared(float(told.data))
+            case InputKind.DATA:
+                return self.feed(told.data, told.t_ns)
+            case InputKind.STARTED:
+                pass
+        return []
 
     def restart(self) -> None:
         """Forget everything but the counters: the port was opened (again), and bytes before that are lost."""

@@ -1,10 +1,12 @@
 """The load cell as a device: kept connected, and lost when it falls silent."""
 
 import os
+import time
 from collections.abc import AsyncGenerator, Callable, Mapping
 
 from drivers.errors import DeviceLostError, DriverError
 from drivers.hx711 import BAUD_RATE, PERIOD_NS, LoadCalibration, LoadLimits, LoadParser, LoadSample, refusals
+from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.serial_port import LinkEvent, Received, ReconnectPolicy, SerialLink
 
 # Opening the port resets an Uno, whose boot loader waits before it starts the sketch.
@@ -25,8 +27,10 @@ class LoadCell:
         path: str | os.PathLike[str] | None = None,
         policy: ReconnectPolicy | None = None,
         on_event: Callable[[LinkEvent], None] = lambda _: None,
+        tap: Tap = no_tap,
     ) -> None:
-        """Name the board; nothing is opened yet."""
+        """Name the board; nothing is opened yet. `tap` hears of all that the parser is told."""
+        self._tap = tap
         self._link = SerialLink(
             serial_number=serial_number,
             path=None if path is None else os.fspath(path),
@@ -41,12 +45,12 @@ class LoadCell:
 
     @property
     def calibration(self) -> LoadCalibration:
-        """The calibration of the samples to come; a tare assigns a new one."""
+        """The calibration of the samples to come; a tare makes a new one."""
         return self._parser.calibration
 
-    @calibration.setter
-    def calibration(self, calibration: LoadCalibration) -> None:
-        self._parser.calibration = calibration
+    def tare(self, raw_at_rest: float) -> None:
+        """Take a raw value for the zero of the samples to come."""
+        self._told(InputKind.TARE, time.monotonic_ns(), repr(raw_at_rest).encode())
 
     async def samples(self) -> AsyncGenerator[LoadSample]:
         """Yield every sample that arrives, in order and for ever, whatever becomes of the board meanwhile.
@@ -60,7 +64,7 @@ class LoadCell:
                 except DriverError as error:
                     await self._link.lost(error)
                     continue
-                for sample in self._parser.feed(received.data, received.t_arrival_ns):
+                for sample in self._told(InputKind.DATA, received.t_arrival_ns, received.data):
                     self._samples += 1
                     self._flagged += not sample.trusted
                     yield sample
@@ -69,7 +73,7 @@ class LoadCell:
         port = self._link.port
         if port is None:
             port = await self._link.open()
-            self._parser.restart()
+            self._told(InputKind.OPENED, time.monotonic_ns())
             self._patience_s = BOOT_S
         received = await port.read(self._patience_s)
         if received is None:
@@ -79,6 +83,11 @@ class LoadCell:
             )
         self._patience_s = SILENCE_S
         return received
+
+    def _told(self, kind: InputKind, t_ns: int, data: bytes = b"") -> list[LoadSample]:
+        told = RawInput(kind, t_ns, data)
+        self._tap(told)
+        return self._parser.take(told)
 
     def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
         """Return what health tells of the board; counts are since the process began."""

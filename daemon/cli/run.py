@@ -29,12 +29,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--recording", type=Path, metavar="FILE", help="let the configuration's EIT emulators play this .mat recording"
     )
+    parser.add_argument("--record", type=Path, metavar="DIR", help="record everything into files in this folder")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run until SIGINT, SIGTERM or `shearloop command stop`."""
     from daemon.app import run_daemon
-    from daemon.config import load_daemon_config
+    from daemon.config import RecordingConfig, load_daemon_config
     from daemon.errors import UserError
     from daemon.logs import set_up_logging
 
@@ -44,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
     config = load_daemon_config(args.config)
     if args.recording is not None and not any(emulator.device == "eit-kit" for emulator in config.emulators):
         raise UserError(f"{args.config} has no eit-kit among its `emulators` to play --recording {args.recording}")
+    if args.record is not None:
+        config = config.model_copy(update={"recording": RecordingConfig(folder=args.record)})
     if config.lock_memory:
         from daemon.service.locked_memory import lock_memory
 

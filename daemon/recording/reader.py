@@ -15,6 +15,9 @@ from bank.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
 from daemon.errors import UserError
 from daemon.recording.schema import FORMAT_VERSION, FRAME_TOPIC, LOAD_TOPIC, METADATA
 
+_UNFINISHED = "it has no index at its end: it is still being written, or was not closed"
+# What every recording says of itself, beside the notes of this one.
+_IDENTITIES = ("format_version", "channel_table_hash", "software", "code_sha256")
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -48,10 +51,12 @@ def read_recording(path: str | Path) -> Recording:
             reader = make_reader(file, validate_crcs=True)
             summary = reader.get_summary()
             if summary is None:
-                raise _unusable(path, "it has no index at its end: it is truncated, or is still being written")
+                raise _unusable(path, _UNFINISHED)
             metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
             _check(path, metadata.get(METADATA))
-            messages = [(channel, message) for _, channel, message in reader.iter_messages()]
+            topics = {channel.topic for channel in summary.channels.values()}
+            wanted = [topic for topic in topics if topic == LOAD_TOPIC or topic.startswith(f"{FRAME_TOPIC}.")]
+            messages = [(channel, message) for _, channel, message in reader.iter_messages(wanted)]
     except OSError as error:
         raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
     # The library raises its own errors, and those of its decoders and of struct, on damaged files.
@@ -81,7 +86,9 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
         content = _content(path, channel, message)
         try:
             if channel.topic == LOAD_TOPIC:
-                torques.append((message.log_time, float(content["torque_nm"])))
+                # What the driver took for no load at all is no truth to calibrate on.
+                if not (content.get("saturated") or content.get("spike")):
+                    torques.append((message.log_time, float(content["torque_nm"])))
             elif channel.topic.startswith(f"{FRAME_TOPIC}."):
                 line = content["line"]
                 if len(line) != N_LINE_VALUES:
@@ -99,7 +106,7 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
             np.array([row[1] for row in rows], dtype=np.int64),
             np.array([row[2] for row in rows], dtype=np.float64),
         )
-    notes = {key: value for key, value in identities.items() if key not in ("format_version", "channel_table_hash")}
+    notes = {key: value for key, value in identities.items() if key not in _IDENTITIES}
     return Recording(
         path,
         notes.pop("source", ""),
@@ -121,6 +128,9 @@ def _content(path: Path, channel: Channel, message: Message) -> dict[str, Any]:
 
 
 def _unusable(path: Path, why: str) -> UserError:
-    return UserError(
-        f"{path}: this recording cannot be used: {why}; record it again, or import it with `shearloop import`"
+    cure = (
+        f"`shearloop recording repair {path}` saves what is in it"
+        if why is _UNFINISHED
+        else "record it again, or import it with `shearloop import`"
     )
+    return UserError(f"{path}: this recording cannot be used: {why}; {cure}")

@@ -1,51 +1,119 @@
 """What stands in a recording: topics, their JSON schemas, and the metadata that says what it was made with.
 
-A recording is an MCAP file (mcap.dev). Log times are Unix nanoseconds: of a frame the middle of its acquisition, of a
-torque when it was measured. Any MCAP tool can show and plot one; the schemas describe every key.
+A recording is an MCAP file (mcap.dev). Log times are Unix nanoseconds: of a message the time that it speaks of (of a
+frame the middle of its acquisition), of a raw input when it arrived. Any MCAP tool can show and plot one; the schemas
+describe every key.
+
+Topics are those of the wire; where several fingertips send one, its source follows: `eit.frame.right`. `input.SOURCE`
+holds all that a parser was told, bytes as text (Latin-1, so that each byte is one character), and `input.clock` how the
+monotonic clock was translated into Unix time: from these two a recording can be replayed.
 """
 
+import dataclasses
+import types
+import typing
+from collections.abc import Mapping
+from functools import cache
 from typing import Any
 
-FRAME_TOPIC = "eit.frame"
-LOAD_TOPIC = "load.torque"
+import numpy as np
+
+from daemon.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque
+from daemon.topics import TOPICS
+
+FRAME_TOPIC = EitFrame.topic
+LOAD_TOPIC = LoadTorque.topic
+INPUT = "input"
+CLOCK_TOPIC = f"{INPUT}.clock"
 # MCAP metadata record with the identities; a reader refuses a file without it.
 METADATA = "shearloop"
+# One more for each experiment that was started.
+EXPERIMENT_METADATA = "shearloop.experiment"
+# And one at the end of a recording that was closed.
+END_METADATA = "shearloop.end"
+CONFIGURATION = "configuration.json"
 FORMAT_VERSION = "1"
 PROFILE = "shearloop"
 SIDES = ("right", "left")
 
-_NUMBER = {"type": "number"}
+_OF_FINGERTIPS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
+_NAMES = {float: "number", int: "integer", str: "string", bool: "boolean", type(None): "null"}
+_TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
 
-SCHEMAS: dict[str, dict[str, Any]] = {
-    FRAME_TOPIC: {
-        "title": FRAME_TOPIC,
-        "type": "object",
-        "properties": {
-            "arrival_unix_ns": {"type": "integer", "description": "when the last byte of the line was read"},
-            "line": {
-                "type": "array",
-                "items": _NUMBER,
-                "minItems": 1024,
-                "maxItems": 1024,
-                "description": "the 1024 values of the raw line in V, in the board's order",
-            },
-        },
-        "required": ["arrival_unix_ns", "line"],
-    },
-    LOAD_TOPIC: {
-        "title": LOAD_TOPIC,
-        "type": "object",
-        "properties": {"torque_nm": {**_NUMBER, "description": "torque on the lever in N·m"}},
-        "required": ["torque_nm"],
-    },
-}
+
+def recorded_topic(topic: str, source: str) -> str:
+    """Return the topic under which a message is recorded."""
+    return f"{topic}.{source}" if topic in _OF_FINGERTIPS else topic
 
 
 def frame_topic(side: str) -> str:
     """Return the topic of a side's frames."""
-    return f"{FRAME_TOPIC}.{side}"
+    return recorded_topic(FRAME_TOPIC, side)
+
+
+def input_topic(source: str) -> str:
+    """Return the topic of what a source's parser was told."""
+    return f"{INPUT}.{source}"
 
 
 def schema_of(topic: str) -> str:
-    """Return the name of a topic's schema."""
-    return FRAME_TOPIC if topic.startswith(f"{FRAME_TOPIC}.") else topic
+    """Return the name of a recorded topic's schema."""
+    if topic == CLOCK_TOPIC or topic in TOPICS:
+        return topic
+    if topic.startswith(f"{INPUT}."):
+        return INPUT
+    return next(wire for wire in _OF_FINGERTIPS if topic.startswith(f"{wire}."))
+
+
+@cache
+def schemas() -> Mapping[str, dict[str, Any]]:
+    """Return the JSON schema of each name that `schema_of` gives."""
+    raw = {
+        INPUT: {
+            "t_mono_ns": _TIME,
+            "kind": {"type": "string", "description": "opened or started (the board), data, or tare"},
+            "data": {"type": "string", "description": "the bytes as Latin-1 text, or what belongs to a tare"},
+        },
+        CLOCK_TOPIC: {
+            "t_mono_ns": _TIME,
+            "offset_ns": {"type": "integer", "description": "Unix time less CLOCK_MONOTONIC in ns, from now on"},
+        },
+    }
+    return {
+        **{name: _object(name, properties, list(properties)) for name, properties in raw.items()},
+        **{topic: _of_message(topic) for topic in TOPICS},
+    }
+
+
+def _of_message(topic: str) -> dict[str, Any]:
+    properties: dict[str, Any] = {
+        "timestamp": {"type": "number", "description": "Unix time in s that the message speaks of"},
+        "seq": {"type": "integer", "description": "number of the message, without gaps, per topic and source"},
+    }
+    required = []
+    hints = typing.get_type_hints(TOPICS[topic])
+    for item in dataclasses.fields(TOPICS[topic]):
+        unit, meaning = item.metadata.get("unit", ""), item.metadata.get("meaning", "")
+        properties[item.name] = {**_type(hints[item.name]), "description": f"{meaning} ({unit})" if unit else meaning}
+    if topic == FRAME_TOPIC:
+        properties["arrival_unix_ns"] = {"type": "integer", "description": "when the last byte of the line was read"}
+        # A recording that was brought in from elsewhere has no more of a frame.
+        required = ["arrival_unix_ns", "line"]
+    elif topic == LOAD_TOPIC:
+        required = ["torque_nm"]
+    return _object(topic, properties, required or list(properties))
+
+
+def _type(hint: Any) -> dict[str, Any]:
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return {"type": [_NAMES[one] for one in typing.get_args(hint)]}
+    if hint in _NAMES:
+        # A number that is NaN or infinite has no JSON form and is written as null.
+        return {"type": ["number", "null"] if hint is float else _NAMES[hint]}
+    if typing.get_origin(hint) is np.ndarray:
+        return {"type": "array", "items": {"type": ["number", "null"]}}
+    return {"type": "object"}
+
+
+def _object(title: str, properties: dict[str, Any], required: list[str]) -> dict[str, Any]:
+    return {"title": title, "type": "object", "properties": properties, "required": required}

@@ -1,30 +1,22 @@
-"""Writes a recording, message by message, live or not. A file that was not closed keeps the name NAME.partial."""
+"""Writes a recording message by message, from data that is there already; a live one is `recorder`'s business."""
 
-import json
-import os
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Self
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
-from bank.bank_file import sync_directory
-from bank.channels import CHANNEL_TABLE_HASH
 from daemon.errors import UserError
-from daemon.recording.schema import (
-    FORMAT_VERSION,
-    LOAD_TOPIC,
-    METADATA,
-    PROFILE,
-    SCHEMAS,
-    frame_topic,
-    schema_of,
-)
+from daemon.recording.content import as_json
+from daemon.recording.identity import basic_identity
+from daemon.recording.mcap_file import PARTIAL, McapFile
+from daemon.recording.schema import LOAD_TOPIC, METADATA, frame_topic
 
 # Decimals of a volt: the board sends four.
 _DECIMALS = 6
+# A chunk of a megabyte or so.
+_FLUSH_EVERY = 128
 
 
 class RecordingWriter:
@@ -33,27 +25,12 @@ class RecordingWriter:
     def __init__(self, path: str | Path, source: str, notes: dict[str, str] | None = None) -> None:
         """Create `path`.partial; `source` says in words where the data is from. Raises UserError where it cannot be."""
         self.path = Path(path)
-        self._partial = self.path.with_name(f"{self.path.name}.partial")
         try:
-            self._file: BinaryIO = self._partial.open("wb")
+            partial = self.path.with_name(self.path.name + PARTIAL)
+            self._file = McapFile(self.path, partial.open("wb", buffering=0))
         except OSError as error:
-            raise UserError(
-                f"{self.path}: the recording cannot be written: {error.strerror}; choose another --out"
-            ) from error
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD)
-        self._writer.start(profile=PROFILE, library="shearloop")
-        self._writer.add_metadata(
-            METADATA,
-            {
-                "format_version": FORMAT_VERSION,
-                "channel_table_hash": CHANNEL_TABLE_HASH,
-                "source": source,
-                **(notes or {}),
-            },
-        )
-        self._schemas: dict[str, int] = {}
-        self._channels: dict[str, int] = {}
-        self._sequence: dict[str, int] = {}
+            raise self._unwritable(error) from error
+        self._file.metadata(METADATA, {**basic_identity(source), **(notes or {})})
 
     def frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
         """Append one frame: the (1024,) values of its line in volts."""
@@ -64,36 +41,12 @@ class RecordingWriter:
         """Append one torque of the load cell in N·m."""
         self._add(LOAD_TOPIC, t_unix_ns, {"torque_nm": torque_nm})
 
-    def _add(self, topic: str, time_ns: int, content: dict[str, object]) -> None:
-        if topic not in self._channels:
-            name = schema_of(topic)
-            if name not in self._schemas:
-                text = json.dumps(SCHEMAS[name], sort_keys=True).encode()
-                self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
-            self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[name])
-            self._sequence[topic] = 0
-        self._writer.add_message(
-            self._channels[topic],
-            log_time=time_ns,
-            publish_time=time_ns,
-            sequence=self._sequence[topic],
-            data=json.dumps(content, separators=(",", ":")).encode(),
-        )
-        self._sequence[topic] += 1
-
     def close(self, complete: bool = True) -> None:
         """Finish the file, flush it to the disk and, when it is complete, give it its name."""
-        if self._file.closed:
-            return
         try:
-            self._writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves its return type out
-            self._file.flush()
-            os.fsync(self._file.fileno())
-        finally:
-            self._file.close()
-        if complete:
-            self._partial.replace(self.path)
-            sync_directory(self.path.parent)
+            self._file.close(complete)
+        except OSError as error:
+            raise self._unwritable(error) from error
 
     def __enter__(self) -> Self:
         """Return the writer itself."""
@@ -104,3 +57,14 @@ class RecordingWriter:
     ) -> None:
         """Close; after an error what was written stays under the name NAME.partial."""
         self.close(complete=kind is None)
+
+    def _add(self, topic: str, time_ns: int, content: dict[str, object]) -> None:
+        self._file.add(topic, time_ns, time_ns, as_json(content))
+        if self._file.messages % _FLUSH_EVERY == 0:
+            try:
+                self._file.flush()
+            except OSError as error:
+                raise self._unwritable(error) from error
+
+    def _unwritable(self, error: OSError) -> UserError:
+        return UserError(f"{self.path}: the recording cannot be written: {error.strerror}; choose another --out")

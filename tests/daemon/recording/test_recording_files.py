@@ -6,7 +6,7 @@ from mcap.writer import Writer
 
 from bank.channels import line_of_channels
 from daemon.errors import UserError
-from daemon.recording import writer as writer_module
+from daemon.recording import identity
 from daemon.recording.reader import read_recording
 from daemon.recording.writer import RecordingWriter
 
@@ -90,11 +90,11 @@ def test_foreign_and_stale_files_are_refused(tmp_path, monkeypatch):
         read_recording(tmp_path / "other.mcap")
     with pytest.raises(UserError, match="No such file"):
         read_recording(tmp_path / "none.mcap")
-    monkeypatch.setattr(writer_module, "CHANNEL_TABLE_HASH", "0" * 64)
+    monkeypatch.setattr(identity, "CHANNEL_TABLE_HASH", "0" * 64)
     written(tmp_path / "stale.mcap")
     with pytest.raises(UserError, match="channel table 000000000000…"):
         read_recording(tmp_path / "stale.mcap")
-    monkeypatch.setattr(writer_module, "FORMAT_VERSION", "99")
+    monkeypatch.setattr(identity, "FORMAT_VERSION", "99")
     written(tmp_path / "new.mcap")
     with pytest.raises(UserError, match="format version 99, expected 1"):
         read_recording(tmp_path / "new.mcap")

@@ -154,7 +154,7 @@ async def test_silence_is_reported_as_a_loss(tmp_path: Path) -> None:
 async def test_a_tare_takes_effect_with_the_next_sample(tmp_path: Path) -> None:
     async with a_rig(tmp_path, repeat(0.03).__next__) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
-        rig.cell.calibration = rig.cell.calibration.tared(rig.samples[-1].raw)
+        rig.cell.tare(rig.samples[-1].raw)
         n = len(rig.samples)
         await rig.until(lambda: len(rig.samples) > n + 1)
         assert rig.samples[-1].torque_nm == pytest.approx(0.0, abs=0.001)

@@ -1,0 +1,133 @@
+"""`shearloop recording info|repair|export`: look into recordings, save what was not closed, make tables of them."""
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from daemon.recording.summary import Summary
+
+FORMS = ("csv", "parquet", "mat")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add a sub-parser for each of the three."""
+    parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
+    info = parts.add_parser("info", help="what is in it", description="Say what is in recordings, closed or not.")
+    info.add_argument("recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap or .mcap.partial)")
+    info.add_argument("--json", action="store_true", help="one JSON object a recording")
+    repair = parts.add_parser(
+        "repair",
+        help="save what is sound of one that was not closed",
+        description="Copy what is sound of a recording that was not closed, or is damaged, into one with an index.",
+    )
+    repair.add_argument("recording", type=Path, metavar="REC", help="e.g. NAME.mcap.partial; it stays as it is")
+    repair.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.mcap, or NAME.repaired.mcap")
+    export = parts.add_parser(
+        "export", help="as CSV, Parquet or for MATLAB", description="Write a recording's topics as tables."
+    )
+    export.add_argument("recording", type=Path, metavar="REC")
+    export.add_argument("--format", choices=FORMS, default="csv", help="default: %(default)s")
+    export.add_argument(
+        "--out", type=Path, metavar="PATH", help="a folder for a file per topic; for mat a file (default: beside REC)"
+    )
+    export.add_argument("--topic", action="append", metavar="TOPIC", help="only this topic; may be given several times")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Do one of the three."""
+    return {"info": _info, "repair": _repair, "export": _export}[args.part](args)
+
+
+def _info(args: argparse.Namespace) -> int:
+    from daemon.recording.summary import summarise
+
+    for path in args.recordings:
+        with _bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
+            found = summarise(path, progress)
+        print(json.dumps(found.as_map(), ensure_ascii=False) if args.json else _told(found))
+    return 0
+
+
+def _told(found: "Summary") -> str:
+    from datetime import datetime
+
+    from daemon.recording.identity import software_version
+
+    lines = [str(found.path)]
+    if found.first_ns is not None:
+        began = datetime.fromtimestamp(found.first_ns / 1e9).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+        lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.size / 1e6:.2f} MB")
+    lines.append(f"  source   {found.metadata.get('source', 'unknown: it is no recording of shearloop')}")
+    lines += [f"  ran      {name}" for name in found.experiments]
+    if software := found.metadata.get("software"):
+        here = "the same code as here" if found.same_code else f"other code than here ({software_version()})"
+        lines.append(f"  made by  shearloop {software}, {here}")
+    for name, topic in sorted(found.topics.items()):
+        rate = "" if topic.rate_hz is None else f"{topic.rate_hz:8.2f} Hz"
+        lines.append(f"  {name:<20} {topic.messages:>8} messages {rate}")
+    lines += [f"  attached {name}" for name in found.attachments]
+    if not found.closed:
+        lines.append(
+            f"  It was not closed, or is still being written; {found.torn_bytes} bytes at its end are torn. "
+            f"`shearloop recording repair {found.path}` makes an indexed copy."
+        )
+    if found.damaged_chunks:
+        lines.append(f"  {found.damaged_chunks} chunks are damaged and were left out.")
+    if found.dropped:
+        lines.append(f"  {found.dropped} messages were dropped, because the disk did not take them in time.")
+    return "\n".join(lines)
+
+
+def _repair(args: argparse.Namespace) -> int:
+    from daemon.recording.salvage import condition_of, repair
+
+    size = condition_of(args.recording).size
+    with _bar(args.recording.name, size, "B") as progress:
+        repaired = repair(args.recording, args.out, progress)
+    condition = repaired.condition
+    lost = [f"{condition.torn_bytes} torn bytes at the end"] if condition.torn_bytes else []
+    if condition.damaged_chunks:
+        lost.append(f"{condition.damaged_chunks} damaged chunks")
+    print(f"{repaired.path}: {repaired.messages} messages are safe; left out: {' and '.join(lost) or 'nothing'}.")
+    return 0
+
+
+def _export(args: argparse.Namespace) -> int:
+    from daemon.errors import UserError
+    from daemon.recording.export import export, topics_of
+
+    there = topics_of(args.recording)
+    unknown = [topic for topic in args.topic or () if topic not in there]
+    if unknown:
+        raise UserError(f"{args.recording} has no topic {unknown[0]!r}; it has {', '.join(sorted(there))}")
+    topics = args.topic or sorted(topic for topic, count in there.items() if count)
+    stem = args.recording.name.partition(".mcap")[0]
+    out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")
+    with _bar(args.format, sum(there[topic] for topic in topics), "message") as progress:
+        done = 0
+
+        def count(step: int) -> None:
+            nonlocal done
+            done += step
+            progress(done)
+
+        written = export(args.recording, args.format, out, topics, count)
+    for path in written:
+        print(path)
+    return 0
+
+
+@contextmanager
+def _bar(name: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+    """Show how far long work is, on a terminal; the function takes how much is done in all."""
+    from tqdm import tqdm
+
+    # tqdm's own watch on slow bars is a thread that outlives them.
+    tqdm.monitor_interval = 0
+    options: dict[str, Any] = {"unit_scale": True} if unit == "B" else {}
+    with tqdm(total=total, unit=unit, desc=name, disable=None, leave=False, **options) as bar:
+        yield lambda done: (bar.update(done - bar.n), None)[1]

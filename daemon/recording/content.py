@@ -1,0 +1,62 @@
+"""Messages and raw inputs as the JSON that stands in a recording."""
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from daemon.messages import EitFrame
+from drivers.raw_input import InputKind, RawInput
+
+# Of arrays, which are float32 on the wire: a microvolt, a microradian.
+_DECIMALS = 6
+_SHAPE = "_shape"
+
+
+def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
+    """Return a message's map, as it goes on the wire, as JSON: arrays as flat lists, NaN and infinity as null."""
+    plain: dict[str, Any] = {}
+    for key, value in content.items():
+        if f"{key}{_SHAPE}" in content:
+            plain[key] = _numbers(np.frombuffer(value, "<f4"))
+        elif not key.endswith(_SHAPE):
+            plain[key] = value
+    if topic == EitFrame.topic:
+        plain["arrival_unix_ns"] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns
+    return as_json(plain)
+
+
+def input_json(told: RawInput) -> bytes:
+    """Return a raw input as JSON, each byte a character."""
+    return as_json({"t_mono_ns": told.t_ns, "kind": told.kind.value, "data": told.data.decode("latin-1")})
+
+
+def input_of(content: Mapping[str, Any]) -> RawInput:
+    """Return the raw input of a recorded message; raises KeyError, TypeError or ValueError for what is none."""
+    return RawInput(InputKind(content["kind"]), int(content["t_mono_ns"]), content["data"].encode("latin-1"))
+
+
+def as_json(content: Mapping[str, Any]) -> bytes:
+    """Return compact JSON of what has a JSON form, with null for the numbers that have none."""
+    try:
+        text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+    except ValueError:
+        text = json.dumps(_finite(content), separators=(",", ":"), allow_nan=False)
+    return text.encode()
+
+
+def _numbers(values: np.ndarray) -> list[float | None]:
+    rounded: list[float | None] = np.round(values.astype(np.float64), _DECIMALS).tolist()
+    if np.isfinite(values).all():
+        return rounded
+    return [value if value is not None and math.isfinite(value) else None for value in rounded]
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

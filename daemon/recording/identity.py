@@ -1,0 +1,108 @@
+"""What a recording was made with: software, configuration, and every file that the configuration names."""
+
+import hashlib
+import platform
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+
+from bank.bank_file import Bank
+from bank.channels import CHANNEL_TABLE_HASH
+from daemon.config import DaemonConfig
+from daemon.config_file import ConfigModel
+from daemon.recording.schema import CONFIGURATION, FORMAT_VERSION
+
+_PACKAGES = ("bank", "drivers", "daemon")
+# Calibrations and settings are far smaller; a bank is named by its hash.
+_LARGEST_ATTACHED_BYTES = 32 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Attached:
+    """A file that goes into the recording whole."""
+
+    name: str
+    media_type: str
+    data: bytes
+
+    @classmethod
+    def if_there(cls, path: Path) -> tuple["Attached", ...]:
+        """Read a file; nothing where it cannot be read, is no file or too large."""
+        try:
+            if not path.is_file() or path.stat().st_size > _LARGEST_ATTACHED_BYTES:
+                return ()
+            media_type = "application/yaml" if path.suffix in (".yaml", ".yml") else "application/octet-stream"
+            return (cls(str(path), media_type, path.read_bytes()),)
+        except OSError:
+            return ()
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """The metadata of a recording, and what is attached to it."""
+
+    metadata: Mapping[str, str]
+    attached: tuple[Attached, ...] = ()
+
+
+def basic_identity(source: str) -> dict[str, str]:
+    """Return the metadata that every recording has; `source` says in words where the data is from."""
+    return {
+        "format_version": FORMAT_VERSION,
+        "channel_table_hash": CHANNEL_TABLE_HASH,
+        "source": source,
+        "software": software_version(),
+        "code_sha256": code_digest(),
+    }
+
+
+def identity_of(config: DaemonConfig) -> Identity:
+    """Return the identity of a daemon's recordings; raises BankError for a bank that cannot be opened."""
+    metadata = basic_identity(f"a daemon on {platform.node()}")
+    metadata["python"] = f"{platform.python_version()}, numpy {np.__version__}, {platform.machine()}"
+    for name, fingertip in config.fingertips.items():
+        metadata[f"bank_{name}"] = Bank.open(fingertip.bank).identity
+    attached = [Attached(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode())]
+    for path in dict.fromkeys(_files(config)):
+        for one in Attached.if_there(path):
+            attached.append(one)
+            metadata[f"sha256 {path}"] = hashlib.sha256(one.data).hexdigest()
+    return Identity(metadata, tuple(attached))
+
+
+def software_version() -> str:
+    """Return the version of this program, as it was installed."""
+    try:
+        return version("shearloop")
+    except PackageNotFoundError:
+        return "not installed"
+
+
+@cache
+def code_digest() -> str:
+    """Return a hash of the program's own sources: what made two recordings is the same only where it is the same."""
+    root = Path(__file__).resolve().parents[2]
+    digest = hashlib.sha256()
+    for package in _PACKAGES:
+        for path in sorted((root / package).rglob("*.py")):
+            digest.update(f"{path.relative_to(root)}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _files(section: ConfigModel) -> Iterator[Path]:
+    """Yield the paths that a configuration names, but for those of banks."""
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        if isinstance(value, Path) and name != "bank":
+            yield value
+        elif isinstance(value, ConfigModel):
+            yield from _files(value)
+        elif isinstance(value, dict):
+            for one in value.values():
+                if isinstance(one, ConfigModel):
+                    yield from _files(one)

@@ -1,0 +1,276 @@
+"""Records a running daemon: every message and every raw input, without ever making the loop wait for a disk.
+
+What is recorded waits in a queue with a bound; three times a second a thread turns it into JSON and writes it as one chunk.
+A file begins with the daemon and with every further experiment, and in any case after an hour without one.
+"""
+
+import asyncio
+import re
+import threading
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from daemon.clock import Clock
+from daemon.errors import UserError
+from daemon.messages import Scalar
+from daemon.recording.content import as_json, input_json, message_json
+from daemon.recording.identity import Attached, Identity
+from daemon.recording.mcap_file import McapFile
+from daemon.recording.schema import (
+    CLOCK_TOPIC,
+    END_METADATA,
+    EXPERIMENT_METADATA,
+    METADATA,
+    input_topic,
+    recorded_topic,
+)
+from drivers.raw_input import RawInput, Tap
+
+# A kill costs what came since the last flush: below a second, and so even where the machine is busy.
+FLUSH_S = 0.3
+# What may wait for a disk that is slow or full: minutes at rated speed. Beyond it things are dropped, and counted.
+MOST_WAITING_BYTES = 32 << 20
+LONGEST_IDLE_FILE_S = 3600.0
+# What a message costs beside its arrays: the map and its scalars.
+_OVERHEAD_BYTES = 1000
+# Files that begin in the same second.
+_MOST_ALIKE = 100
+
+
+@dataclass(frozen=True, slots=True)
+class _Message:
+    topic: str
+    content: Mapping[str, Any]
+    offset_ns: int
+    now_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Input:
+    source: str
+    told: RawInput
+    offset_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class _Experiment:
+    name: str
+    attached: tuple[Attached, ...]
+    t_unix_ns: int
+
+
+_Item: TypeAlias = _Message | _Input | _Experiment
+
+
+class Recorder:
+    """Writes into files of a folder. `record`, `tap` and `experiment` are called in the event loop and never wait."""
+
+    def __init__(
+        self,
+        folder: Path,
+        identity: Identity,
+        clock: Clock,
+        *,
+        busy: Callable[[], bool] = lambda: False,
+        on_failure: Callable[[str], None] = lambda _: None,
+        opener: Callable[[Path], McapFile] = McapFile,
+        most_waiting_bytes: int = MOST_WAITING_BYTES,
+    ) -> None:
+        """Begin the first file; raises UserError where that is not possible.
+
+        `busy` says whether an experiment is running; `on_failure` hears why nothing can be written, or an empty text.
+        """
+        self._folder = folder
+        self._identity = identity
+        self._clock = clock
+        self._busy = busy
+        self._on_failure = on_failure
+        self._opener = opener
+        self._most_waiting_bytes = most_waiting_bytes
+        self._queue: deque[tuple[_Item, int]] = deque()
+        # Each is counted up by one thread alone; what waits is their difference.
+        self._taken_bytes = 0
+        self._done_bytes = 0
+        self._dropped = 0
+        # One thread at a time writes: a flush that was cancelled may still be under way when the end comes.
+        self._writing = threading.Lock()
+        self._ended = False
+        self.failure = ""
+        self.finished: list[Path] = []
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._begin()
+        except OSError as error:
+            raise UserError(
+                f"{folder}: nothing can be recorded there: {error.strerror}; choose another folder"
+            ) from error
+
+    @property
+    def path(self) -> Path:
+        """The file being written."""
+        return self._file.partial
+
+    def record(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Take in a published message, as it goes on the wire."""
+        # In JSON the four bytes of a float32 become some eight.
+        size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
+        self._add(_Message(topic, content, self._clock.offset_ns, self._clock.now_ns()), size)
+
+    def tap(self, source: str) -> Tap:
+        """Return what hears of all that a source's parser is told."""
+
+        def hear(told: RawInput) -> None:
+            self._add(_Input(source, told, self._clock.offset_ns), _OVERHEAD_BYTES + len(told.data))
+
+        return hear
+
+    def experiment(self, name: str, attached: tuple[Attached, ...] = ()) -> None:
+        """Take note that an experiment was started: another file begins, unless this one has had none yet."""
+        self._add(_Experiment(name, attached, self._clock.now_ns() + self._clock.offset_ns), _OVERHEAD_BYTES)
+
+    async def run(self) -> None:
+        """Write every FLUSH_S until cancelled."""
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        while True:
+            due_s = max(due_s + FLUSH_S, loop.time())
+            await asyncio.sleep(due_s - loop.time())
+            await asyncio.to_thread(self.write)
+            self._on_failure(self.failure)
+
+    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return what health tells of the recording."""
+        return {
+            "file": str(self.path),
+            "files": len(self.finished) + 1,
+            "file_messages": self._file.messages,
+            "file_bytes": self._file.bytes_written,
+            "waiting_bytes": self._waiting_bytes,
+            "errors": {"dropped": self._dropped} if self._dropped else {},
+            "trouble": self.failure,
+        }
+
+    def write(self) -> None:
+        """Write all that waits. A disk that does not take it is told in `failure`, and is tried again next time."""
+        with self._writing:
+            if not self._ended:
+                self._write()
+
+    def close(self) -> None:
+        """Write what is left and give the file its name; where that fails, `failure` says so."""
+        with self._writing:
+            if not self._ended:
+                self._ended = True
+                self._write()
+                if self._file.messages or self._experiment:
+                    self._finish(self._file)
+                else:
+                    # A daemon that did not get as far as its first message has nothing to keep.
+                    self._file.discard()
+
+    @property
+    def _waiting_bytes(self) -> int:
+        return self._taken_bytes - self._done_bytes + self._file.bytes_waiting
+
+    def _add(self, item: _Item, size: int) -> None:
+        if self._waiting_bytes + size > self._most_waiting_bytes:
+            self._dropped += 1
+            return
+        self._taken_bytes += size
+        self._queue.append((item, size))
+
+    def _write(self) -> None:
+        self.failure = ""
+        # What comes meanwhile waits for the next time.
+        for _ in range(len(self._queue)):
+            item, size = self._queue.popleft()
+            if self._begins_another(item):
+                self._begin_another()
+            self._put(item)
+            self._done_bytes += size
+        self._flush()
+
+    def _flush(self) -> bool:
+        try:
+            self._file.flush()
+        except OSError as error:
+            self.failure = f"{self.path}: {error.strerror}"
+            return False
+        return True
+
+    def _begins_another(self, item: _Item) -> bool:
+        if isinstance(item, _Experiment):
+            return bool(self._experiment)
+        return (self._clock.now_ns() - self._began_ns) / 1e9 > LONGEST_IDLE_FILE_S and not self._busy()
+
+    def _begin_another(self) -> None:
+        """Go on in another file; where none can be begun, in the same one."""
+        if not self._flush():
+            return
+        finished = self._file, self._experiment
+        try:
+            self._begin()
+        except OSError as error:
+            self.failure = f"{self._folder}: {error.strerror}"
+            return
+        self._finish(*finished)
+
+    def _begin(self) -> None:
+        now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
+        file = self._opened(datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ"))
+        file.metadata(METADATA, self._identity.metadata)
+        for one in self._identity.attached:
+            file.attach(one.name, one.media_type, one.data, now_ns + offset_ns)
+        file.flush()
+        self._file, self._began_ns = file, now_ns
+        self._offset_ns: int | None = None
+        self._experiment = ""
+
+    def _opened(self, name: str) -> McapFile:
+        for number in range(2, _MOST_ALIKE):
+            try:
+                return self._opener(self._folder / f"{name}.mcap")
+            except FileExistsError:
+                name = f"{name.partition('Z')[0]}Z-{number}"
+        raise FileExistsError(17, f"there are {_MOST_ALIKE} files of this second")
+
+    def _finish(self, file: McapFile, experiment: str | None = None) -> None:
+        """Close a file, under a name that tells its experiment; what cannot be closed stays PARTIAL, to be repaired."""
+        experiment = self._experiment if experiment is None else experiment
+        slug = re.sub(r"[^a-z0-9.]+", "-", experiment.lower()).strip("-.")
+        if slug:
+            file.path = file.path.with_name(f"{file.path.stem}_{slug}.mcap")
+        try:
+            file.metadata(END_METADATA, {"dropped": str(self._dropped)})
+            self.finished.append(file.close())
+        except OSError as error:
+            self.failure = f"{file.partial}: {error.strerror}"
+
+    def _put(self, item: _Item) -> None:
+        match item:
+            case _Message(topic, content, offset_ns, now_ns):
+                self._put_clock(now_ns, offset_ns)
+                name = recorded_topic(topic, content["source"])
+                data = message_json(topic, content, offset_ns)
+                self._file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
+            case _Input(source, told, offset_ns):
+                self._put_clock(told.t_ns, offset_ns)
+                t_unix_ns = told.t_ns + offset_ns
+                self._file.add(input_topic(source), t_unix_ns, t_unix_ns, input_json(told))
+            case _Experiment(name, attached, t_unix_ns):
+                self._experiment = name
+                self._file.metadata(EXPERIMENT_METADATA, {"name": name, "t_unix_ns": str(t_unix_ns)})
+                for one in attached:
+                    if one not in self._identity.attached:
+                        self._file.attach(one.name, one.media_type, one.data, t_unix_ns)
+
+    def _put_clock(self, now_ns: int, offset_ns: int) -> None:
+        if offset_ns == self._offset_ns:
+            return
+        self._offset_ns = offset_ns
+        content = {"t_mono_ns": now_ns, "offset_ns": offset_ns}
+        self._file.add(CLOCK_TOPIC, now_ns + offset_ns, now_ns + offset_ns, as_json(content))

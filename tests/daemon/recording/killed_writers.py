@@ -1,0 +1,74 @@
+"""Records in many processes, each killed at a random moment of its life; prints the folder of each."""
+
+import asyncio
+import mmap
+import os
+import random
+import signal
+import struct
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from daemon.clock import Clock
+from daemon.messages import EitFrame, wire_map
+from daemon.recording.identity import Identity, basic_identity
+from daemon.recording.recorder import Recorder
+
+# Five boards of frames: a kill in the middle of a write is likely.
+PERIOD_S = 0.1
+BETWEEN_S = 0.05
+
+
+async def write(folder: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(folder, Identity(basic_identity("a test")), clock)
+    # It survives a kill: when recording began, and when the last message was taken in.
+    (folder / "times").write_bytes(struct.pack("<qq", clock.now_ns(), clock.now_ns()))
+    with (folder / "times").open("r+b") as file:
+        times = mmap.mmap(file.fileno(), 0)
+    task = asyncio.create_task(recorder.run())
+    generator = np.random.default_rng(1)
+    seq = 0
+    while not task.done():
+        now_ns = clock.now_ns()
+        frame = EitFrame(
+            source="right",
+            t_mono_ns=now_ns,
+            channels=generator.uniform(size=896),
+            line=generator.uniform(size=1024),
+            frame=seq,
+            age_s=0.0,
+            saturated=0,
+            dead=0,
+            repeated=False,
+        )
+        recorder.record(frame.topic, wire_map(frame, clock.unix_s(now_ns), seq))
+        times[8:] = struct.pack("<q", now_ns)
+        seq += 1
+        await asyncio.sleep(PERIOD_S)
+
+
+def main(folder: Path, number: int, longest_s: float) -> None:
+    draw = random.Random(7)
+    lives: list[tuple[float, int, Path]] = []
+    begun = 0
+    while begun < number or lives:
+        if begun < number:
+            own = folder / str(begun)
+            begun += 1
+            if (child := os.fork()) == 0:
+                asyncio.run(write(own))
+            lives.append((time.monotonic() + draw.uniform(0.1, longest_s), child, own))
+        time.sleep(BETWEEN_S)
+        for life in [life for life in lives if life[0] < time.monotonic()]:
+            lives.remove(life)
+            os.kill(life[1], signal.SIGKILL)
+            os.waitpid(life[1], 0)
+            print(life[2], flush=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))

@@ -1,0 +1,114 @@
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from bank.channels import line_of_channels
+from daemon.cli import main
+from daemon.recording.reader import read_recording
+from daemon.recording.writer import RecordingWriter
+
+LINES = line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    path = tmp_path / "twist.mcap"
+    with RecordingWriter(path, "a bench") as writer:
+        for i, line in enumerate(LINES):
+            writer.frame("right", 10**18 + i * 541_000_000, 10**18 + i * 541_000_000 + 300_000_000, line)
+            writer.torque(10**18 + i, 0.01 * i)
+    return path
+
+
+def test_info_says_what_is_in_it(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["recording", "info", str(recording)]) == 0
+    told = capsys.readouterr().out
+    assert "a bench" in told
+    assert "eit.frame.right             4 messages     1.85 Hz" in told
+    assert "the same code as here" in told
+    assert main(["recording", "info", "--json", str(recording)]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["topics"]["load.torque"]["messages"] == 4
+    assert (told["closed"], told["same_code"], told["size_bytes"]) == (True, True, recording.stat().st_size)
+
+
+def test_a_torn_recording_is_refused_with_its_cure_and_repaired(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = recording.read_bytes()
+    torn = tmp_path / "torn.mcap.partial"
+    torn.write_bytes(whole[: len(whole) - 400])
+    assert main(["evaluate", "x.cal", str(torn)]) == 2
+    assert main(["recording", "export", str(torn)]) == 2
+    assert f"shearloop recording repair {torn}" in capsys.readouterr().err
+    assert main(["recording", "info", str(torn)]) == 0
+    assert "It was not closed" in capsys.readouterr().out
+    assert main(["recording", "repair", str(torn)]) == 0
+    assert "torn.mcap: 8 messages are safe" in capsys.readouterr().out
+    assert torn.exists(), "the original stays"
+    found = read_recording(tmp_path / "torn.mcap")
+    np.testing.assert_array_equal(found.sides["right"].lines, LINES)
+    assert found.source == "a bench"
+    assert main(["recording", "repair", str(torn)]) == 2
+    assert "is there already" in capsys.readouterr().err
+
+
+def test_a_damaged_chunk_is_left_out_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.recording.writer._FLUSH_EVERY", 1)
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, "a bench") as writer:
+        for i in range(100):
+            writer.torque(10**18 + i, 0.01 * i)
+    content = bytearray(path.read_bytes())
+    at = content.index(b'{"torque_nm":0.5}') if b'{"torque_nm":0.5}' in content else len(content) // 4
+    content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])
+    path.write_bytes(content)
+    assert main(["recording", "repair", str(path)]) == 0
+    told = capsys.readouterr().out
+    assert "a.repaired.mcap" in told
+    kept = read_recording(tmp_path / "a.repaired.mcap").torque_nm
+    assert set(np.round(kept, 2)) < set(np.round(0.01 * np.arange(100), 2))
+    assert len(kept) >= 24
+
+
+def test_csv_parquet_and_matlab_hold_the_same(recording: Path, tmp_path: Path) -> None:
+    pyarrow_parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
+    for form in ("csv", "parquet", "mat"):
+        assert main(["recording", "export", str(recording), "--format", form]) == 0
+    with (tmp_path / "twist_csv" / "eit.frame.right.csv").open(newline="") as file:
+        rows = list(csv.reader(file))
+    assert rows[0][:3] == ["log_time_ns", "arrival_unix_ns", "line_0"]
+    np.testing.assert_array_equal(np.array(rows[1:])[:, 2:].astype(float), LINES)
+    table = pyarrow_parquet.read_table(tmp_path / "twist_parquet" / "eit.frame.right.parquet").to_pydict()
+    np.testing.assert_array_equal(np.array(table["line"]), LINES)
+    assert table["log_time_ns"][1] == 10**18 + 541_000_000
+    struct = loadmat(tmp_path / "twist.mat", simplify_cells=True)
+    np.testing.assert_array_equal(struct["eit_frame_right"]["line"], LINES)
+    np.testing.assert_allclose(struct["load_torque"]["torque_nm"], 0.01 * np.arange(4))
+    assert struct["load_torque"]["log_time_ns"].tolist() == [10**18 + i for i in range(4)]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["info", "nowhere.mcap"], "nowhere.mcap: the recording cannot be read: No such file"),
+        (["info", "{folder}/text.mcap"], "is not an MCAP file"),
+        (["repair", "{folder}/text.mcap"], "is not an MCAP file"),
+        (["export", "{recording}", "--topic", "eit.frame.left"], "it has eit.frame.right, load.torque"),
+        (["export", "{recording}", "--out", "{folder}/text.mcap"], "the export cannot be written: File exists"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(
+    arguments: list[str], message: str, recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "text.mcap").write_text("not a recording at all")
+    given = [one.format(folder=tmp_path, recording=recording) for one in arguments]
+    assert main(["recording", *given]) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.glob("*.repairing"))

@@ -1,0 +1,317 @@
+import asyncio
+import errno
+import json
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from bank.channels import LINE_SLOTS, line_of_channels
+from daemon.clock import Clock
+from daemon.errors import UserError
+from daemon.messages import EitFrame, LoadTorque, wire_map
+from daemon.recording import recorder as recorder_module
+from daemon.recording.identity import Attached, Identity, basic_identity
+from daemon.recording.mcap_file import McapFile
+from daemon.recording.reader import read_recording
+from daemon.recording.recorder import Recorder
+from daemon.recording.salvage import repair
+from daemon.recording.summary import summarise
+from drivers.raw_input import InputKind, RawInput
+
+IDENTITY = Identity(basic_identity("a test"), (Attached("configuration.json", "application/json", b"{}"),))
+
+
+def frame(clock: Clock, number: int) -> dict:
+    rng = np.random.default_rng(number)
+    channels = np.round(rng.uniform(0.01, 0.5, len(LINE_SLOTS)), 4)
+    message = EitFrame(
+        source="right",
+        t_mono_ns=clock.now_ns() - 300_000_000,
+        channels=channels,
+        line=line_of_channels(channels),
+        frame=number,
+        age_s=0.3,
+        saturated=0,
+        dead=0,
+        repeated=False,
+    )
+    return wire_map(message, clock.unix_s(message.t_mono_ns), number)
+
+
+def torque(clock: Clock, number: int, torque_nm: float = 0.1) -> dict:
+    message = LoadTorque(
+        source="load_cell", t_mono_ns=clock.now_ns(), torque_nm=torque_nm, raw=1.0, saturated=False, spike=False
+    )
+    return wire_map(message, clock.unix_s(message.t_mono_ns), number)
+
+
+def topics(path: Path) -> dict[str, list[dict]]:
+    found: dict[str, list[dict]] = {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False):
+            content = json.loads(message.data)
+            assert set(json.loads(schema.data)["required"]) <= set(content)
+            found.setdefault(channel.topic, []).append(content)
+    return found
+
+
+def test_everything_is_recorded_with_its_schema_and_its_time(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path / "new" / "folder", IDENTITY, clock)
+    recorder.tap("right")(RawInput(InputKind.OPENED, 5))
+    recorder.tap("right")(RawInput(InputKind.DATA, 7, bytes(range(256))))
+    one = frame(clock, 0)
+    recorder.record("eit.frame", one)
+    recorder.record("load.torque", torque(clock, 0, float("nan")))
+    recorder.close()
+    assert recorder.failure == ""
+    (path,) = recorder.finished
+    found = topics(path)
+    assert found["input.right"][0] == {"t_mono_ns": 5, "kind": "opened", "data": ""}
+    assert found["input.right"][1]["data"].encode("latin-1") == bytes(range(256))
+    assert found["input.clock"][0]["offset_ns"] == clock.offset_ns
+    (kept,) = found["eit.frame.right"]
+    np.testing.assert_array_equal(np.float32(kept["channels"]), np.frombuffer(one["channels"], "<f4"))
+    assert kept["timestamp"] == one["timestamp"]
+    assert "channels_shape" not in kept
+    assert found["load.torque"][0]["torque_nm"] is None, "NaN has no JSON form"
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        assert [one.name for one in reader.iter_attachments()] == ["configuration.json"]
+    told = summarise(path)
+    assert (told.closed, told.dropped, told.same_code) == (True, 0, True)
+    assert told.topics["input.right"].messages == 2
+    assert told.metadata["source"] == "a test"
+
+
+def test_a_live_recording_is_read_as_an_imported_one(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock)
+    frames = [frame(clock, n) for n in range(3)]
+    for n, one in enumerate(frames):
+        recorder.record("eit.frame", one)
+        recorder.record("load.torque", torque(clock, n))
+    recorder.record("load.torque", {**torque(clock, 3, 9.0), "spike": True})
+    recorder.close()
+    found = read_recording(recorder.finished[0])
+    wanted = np.round(np.array([np.frombuffer(one["line"], "<f4") for one in frames], dtype=np.float64), 4)
+    np.testing.assert_array_equal(found.sides["right"].lines, wanted)
+    np.testing.assert_allclose(found.sides["right"].arrival_ns - found.sides["right"].t_mid_ns, 300_000_000)
+    assert found.torque_nm.tolist() == [0.1] * 3, "a spike is no truth"
+
+
+def test_each_experiment_has_a_file_which_bears_its_name(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock)
+    recorder.record("load.torque", torque(clock, 0))
+    recorder.experiment("Hold 0.10 N·m", (Attached("hold.yaml", "application/yaml", b"name: hold"),))
+    recorder.record("load.torque", torque(clock, 1))
+    recorder.write()
+    recorder.experiment("again")
+    recorder.record("load.torque", torque(clock, 2))
+    recorder.close()
+    first, second = recorder.finished
+    assert first.name.endswith("_hold-0.10-n-m.mcap")
+    assert second.name.endswith("_again.mcap")
+    assert [one["seq"] for one in topics(first)["load.torque"]] == [0, 1], "what led to it is with it"
+    assert [one["seq"] for one in topics(second)["load.torque"]] == [2]
+    assert summarise(first).experiments == ["Hold 0.10 N·m"]
+    assert summarise(first).attachments == ["configuration.json", "hold.yaml"]
+    assert topics(second)["input.clock"], "each can be replayed by itself"
+
+
+def test_without_an_experiment_a_file_is_no_longer_than_an_hour(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock()
+    busy = True
+    recorder = Recorder(tmp_path, IDENTITY, clock, busy=lambda: busy)
+    monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
+    recorder.record("load.torque", torque(clock, 0))
+    recorder.write()
+    busy = False
+    recorder.record("load.torque", torque(clock, 1))
+    recorder.close()
+    assert [topics(path)["load.torque"][0]["seq"] for path in recorder.finished] == [0, 1]
+
+
+def test_a_daemon_without_a_message_leaves_no_file(tmp_path: Path) -> None:
+    Recorder(tmp_path, IDENTITY, Clock()).close()
+    assert list(tmp_path.iterdir()) == []
+
+
+class SmallDisk:
+    """A file on a disk that has room for so many bytes, and takes what it can, as a file system does."""
+
+    def __init__(self, path: Path, room: int) -> None:
+        self.file = path.open("xb", buffering=0)
+        self.room = room
+
+    def write(self, data: memoryview, /) -> int:
+        room = self.room - self.file.tell()
+        if room <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return self.file.write(data[:room])
+
+    def seek(self, offset: int, /) -> int:
+        return self.file.seek(offset)
+
+    def truncate(self, size: int, /) -> int:
+        return self.file.truncate(size)
+
+    def fileno(self) -> int:
+        return self.file.fileno()
+
+    def close(self) -> None:
+        self.file.close()
+
+
+def test_wherever_the_disk_is_full_all_that_was_flushed_is_kept(tmp_path: Path) -> None:
+    clock = Clock()
+    for n, room in enumerate(np.random.default_rng(3).integers(2_000, 40_000, 50)):
+        disks = []
+
+        def opener(path: Path, room: int = int(room), disks: list[SmallDisk] = disks) -> McapFile:
+            disks.append(SmallDisk(path.with_name(path.name + ".partial"), room))
+            return McapFile(path, disks[0])
+
+        recorder = Recorder(tmp_path / str(n), IDENTITY, clock, opener=opener)
+        safe = -1
+        for number in range(12):
+            recorder.record("eit.frame", frame(clock, number))
+            recorder.write()
+            if not recorder.failure:
+                safe = number
+        recorder.close()
+        assert "No space left on device" in recorder.failure
+        (partial,) = (tmp_path / str(n)).iterdir()
+        if safe < 0:
+            continue
+        repaired = repair(partial)
+        assert repaired.condition.torn_bytes == 0, "the file ends with its last whole chunk"
+        numbers = [one["frame"] for one in topics(repaired.path)["eit.frame.right"]]
+        assert numbers == list(range(safe + 1))
+
+
+def test_when_there_is_room_again_nothing_is_missing(tmp_path: Path) -> None:
+    clock = Clock()
+    disks: list[SmallDisk] = []
+
+    def opener(path: Path) -> McapFile:
+        disks.append(SmallDisk(path.with_name(path.name + ".partial"), 20_000))
+        return McapFile(path, disks[-1])
+
+    told: list[str] = []
+    recorder = Recorder(tmp_path, IDENTITY, clock, opener=opener, on_failure=told.append)
+    for number in range(20):
+        recorder.record("eit.frame", frame(clock, number))
+        recorder.write()
+    assert "No space left on device" in recorder.failure
+    facts = recorder.facts()
+    assert facts["trouble"] == recorder.failure
+    assert facts["waiting_bytes"] > 0
+    recorder.experiment("another")
+    recorder.write()
+    assert len(disks) == 1, "no other file is begun on a full disk"
+    disks[0].room = 10_000_000
+    recorder.write()
+    assert recorder.failure == ""
+    recorder.close()
+    (path,) = recorder.finished
+    assert [one["frame"] for one in topics(path)["eit.frame.right"]] == list(range(20))
+
+
+def test_what_waits_has_a_bound_and_what_is_dropped_is_counted(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock, most_waiting_bytes=100_000)
+    for number in range(20):
+        recorder.record("eit.frame", frame(clock, number))
+    dropped = recorder.facts()["errors"]["dropped"]
+    assert 0 < dropped < 20
+    recorder.close()
+    (path,) = recorder.finished
+    assert [one["frame"] for one in topics(path)["eit.frame.right"]] == list(range(20 - dropped))
+    assert summarise(path).dropped == dropped
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], check=False, capture_output=True
+    )
+    if mounted.returncode:
+        pytest.skip("a small file system can be mounted by root alone, and not in every container")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+async def test_on_a_real_full_disk_the_failure_is_told_and_what_was_written_is_saved(
+    small_disk: Path, tmp_path: Path
+) -> None:
+    clock = Clock()
+    failed = asyncio.Event()
+    why = []
+
+    def on_failure(failure: str) -> None:
+        if failure:
+            why.append(failure)
+            failed.set()
+
+    recorder = Recorder(small_disk, IDENTITY, clock, on_failure=on_failure)
+    task = asyncio.create_task(recorder.run())
+    numbers = iter(range(10_000))
+    async with asyncio.timeout(60):
+        while not failed.is_set():
+            recorder.record("eit.frame", frame(clock, next(numbers)))
+            await asyncio.sleep(0.05)
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    await asyncio.to_thread(recorder.close)
+    assert "No space left on device" in why[0]
+    repaired = repair(recorder.path, tmp_path / "saved.mcap")
+    kept = [one["frame"] for one in topics(repaired.path)["eit.frame.right"]]
+    assert kept == list(range(len(kept)))
+    assert len(kept) > 1
+
+
+def test_a_folder_where_nothing_can_be_written_is_a_mistake(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="nothing can be recorded there"):
+        Recorder(tmp_path / "file", IDENTITY, Clock())
+
+
+def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path) -> None:
+    """Fifty recorders, each killed at a random moment of its first two seconds."""
+    killed = subprocess.run(
+        [sys.executable, "-m", "tests.daemon.recording.killed_writers", str(tmp_path), "50", "2"],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    folders = [Path(line) for line in killed.stdout.splitlines()]
+    assert len(folders) == 50
+    with_messages = 0
+    for folder in folders:
+        if not (folder / "times").exists() or not (times := (folder / "times").read_bytes()):
+            # Killed before it recorded anything.
+            continue
+        began_ns, accepted_ns = struct.unpack("<qq", times)
+        (partial,) = folder.glob("*.partial")
+        kept = []
+        if summarise(partial).topics:
+            kept = topics(repair(partial).path)["eit.frame.right"]
+        assert [one["seq"] for one in kept] == list(range(len(kept)))
+        with_messages += bool(kept)
+        last_ns = kept[-1]["t_mono_ns"] if kept else began_ns
+        assert (accepted_ns - last_ns) / 1e9 < 1.0
+    assert with_messages > 20

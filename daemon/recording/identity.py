@@ -17,7 +17,9 @@ from daemon.config_file import ConfigModel
 from daemon.recording.schema import CONFIGURATION, FORMAT_VERSION
 
 _PACKAGES = ("bank", "drivers", "daemon")
-# Calibrations and settings are far smaller; a bank is named by its hash.
+# Keys of the configuration whose files are attached. Never a secret key; and a bank is named by its hash.
+_ATTACHED = ("calibration", "robot", "experiment")
+# Calibrations and settings are far smaller.
 _LARGEST_ATTACHED_BYTES = 32 << 20
 
 
@@ -95,10 +97,10 @@ def code_digest() -> str:
 
 
 def _files(section: ConfigModel) -> Iterator[Path]:
-    """Yield the paths that a configuration names, but for those of banks."""
+    """Yield the files named in a configuration that go into a recording."""
     for name in type(section).model_fields:
         value = getattr(section, name)
-        if isinstance(value, Path) and name != "bank":
+        if isinstance(value, Path) and name in _ATTACHED:
             yield value
         elif isinstance(value, ConfigModel):
             yield from _files(value)

@@ -1,7 +1,7 @@
 """Records a running daemon: every message and every raw input, without ever making the loop wait for a disk.
 
-What is recorded waits in a queue with a bound; three times a second a thread turns it into JSON and writes it as one chunk.
-A file begins with the daemon and with every further experiment, and in any case after an hour without one.
+What is recorded waits in a queue with a bound; three times a second a thread turns it into JSON and writes it as one
+chunk. A file begins with the daemon and with every further experiment, and in any case after an hour without one.
 """
 
 import asyncio

@@ -188,26 +188,22 @@ class SafetyGate:
 
     def judge(self, troubles: Iterable[Trouble], t_ns: int) -> Verdict:
         """Return the response to the troubles of this moment (t_ns on the monotonic clock)."""
-        now = {trouble.event: trouble for trouble in troubles}
-        self._since_ns = {event: self._since_ns.get(event, t_ns) for event in now}
-        active = tuple(now.values())
+        active = tuple(troubles)
+        self._since_ns = {each.event: self._since_ns.get(each.event, t_ns) for each in active}
         response = max((self._response(trouble, t_ns) for trouble in active), default=Response.NOTE)
         verdict = Verdict(response, active)
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stopped is None or response > self._stopped.response):
             self._stopped = verdict
         if self._stopped is None:
             return verdict
-        # A stop outlives its cause; what has come since is told beside it.
-        first = [trouble for trouble in self._stopped.troubles if trouble.event not in now]
-        return Verdict(self._stopped.response, (*first, *active))
+        return self._with_the_stop(self._stopped, active)
 
     def look(self, troubles: Iterable[Trouble]) -> Verdict:
         """Return what is wrong while nothing moves: a stop that waits is kept, but none is begun."""
         active = tuple(troubles)
         if self._stopped is None:
             return Verdict(Response.NOTE, active)
-        events = {trouble.event for trouble in active}
-        return Verdict(self._stopped.response, (*(t for t in self._stopped.troubles if t.event not in events), *active))
+        return self._with_the_stop(self._stopped, active)
 
     def acknowledge(self) -> None:
         """Let a stop go, on the operator's word; what is still wrong stops again at the next judgement."""
@@ -218,6 +214,13 @@ class SafetyGate:
     def stopped(self) -> bool:
         """Whether a stop waits for the operator."""
         return self._stopped is not None
+
+    @staticmethod
+    def _with_the_stop(stop: Verdict, active: tuple[Trouble, ...]) -> Verdict:
+        """Return what is wrong: a stop outlives its cause, and what has come since is told beside it."""
+        events = {trouble.event for trouble in active}
+        first = (trouble for trouble in stop.troubles if trouble.event not in events)
+        return Verdict(stop.response, (*first, *active))
 
     def _response(self, trouble: Trouble, t_ns: int) -> Response:
         rule = trouble.rule

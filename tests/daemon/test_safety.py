@@ -82,3 +82,10 @@ def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(
         assert {found.event for found in verdict.troubles} >= set(events)
         strongest = max(strongest, verdict.response)
         assert gate.stopped == (strongest in STOPS)
+
+
+def test_two_things_of_one_kind_are_both_told() -> None:
+    both = [Trouble(Event.DEVICE_LOST, "the gripper"), Trouble(Event.DEVICE_LOST, "the load cell")]
+    gate = SafetyGate()
+    for seen in (gate.judge(both, 0), gate.judge([], SECOND), gate.look([])):
+        assert [found.detail for found in seen.troubles] == ["the gripper", "the load cell"]

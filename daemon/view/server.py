@@ -27,6 +27,8 @@ MOST_PAGES = 16
 LARGEST_BODY_BYTES = 4096
 # Health comes once a second: longer silence than this is a daemon that is dead, and the page says so within 2 s.
 DEAD_AFTER_S = 1.6
+# What a message may take through us and the browser: nothing on the page is called old before.
+LEAST_STALE_S = 0.5
 
 _TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 HEADERS = {
@@ -88,7 +90,9 @@ class _Page:
             "publish": publish,
             "dead_after_s": DEAD_AFTER_S,
             "stale_after_s": {
-                topic: stale_after_s(topic) for topic, kind in TOPICS.items() if kind.rate_hz is not None
+                topic: max(stale_after_s(topic), LEAST_STALE_S)
+                for topic, kind in TOPICS.items()
+                if kind.rate_hz is not None
             },
         }
         self._open: set[web.WebSocketResponse] = set()

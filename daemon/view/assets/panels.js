@@ -122,8 +122,8 @@ export class FingertipPanel {
 export function shearPanel(link) {
   const message = link.get("skin.shear");
   show(byId("shear"), message !== undefined);
-  if (!message) return;
   markAge(byId("shear"), link, message);
+  if (!message) return;
   const said = message.content;
   put(byId("shear-now"), said.valid ? number(said.shear_n, 3, "N", { signed: true }) : "–");
   put(byId("shear-interval"), said.valid ? interval(said.shear_low_n, said.shear_high_n, 3) : "");
@@ -182,25 +182,29 @@ export function healthPanel(link, drawn) {
     put(byId("process"), "");
     return;
   }
-  byId("tasks").replaceChildren(...Object.entries(message.content.tasks).map(([name, facts]) => taskRow(name, facts)));
+  const tasks = Object.entries(message.content.tasks);
+  const rows = byId("tasks").rows;
+  while (rows.length > tasks.length) byId("tasks").deleteRow(-1);
+  tasks.forEach(([name, facts], i) => fillRow(rows[i] ?? newRow(), name, facts));
   const said = message.content;
   put(byId("process"), `${number(said.memory_mb, 0, "MB")}, ${number(said.cpu_percent, 1, "%")} of a core, event loop ${number(1000 * said.loop_lag_s, 1, "ms")} late`);
 }
 
-function taskRow(name, facts) {
-  const row = document.createElement("tr");
+function newRow() {
+  const row = byId("tasks").insertRow();
+  for (let i = 0; i < 6; i += 1) row.insertCell();
+  return row;
+}
+
+function fillRow(row, name, facts) {
   const dead = facts.alive === false && !facts.done;
   const alive = facts.done ? "✓ done" : facts.alive === undefined ? "–" : dead ? "✗ DEAD" : "✓ alive";
   row.className = dead ? "dead" : "";
   const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`} Hz`;
   const errors = Object.entries(facts.errors ?? {}).map(([kind, count]) => `${count} ${kind}`).join(", ");
   const trouble = facts.trouble || facts.last_error || "";
-  for (const text of [name, alive, rate, errors || "0", String(facts.restarts ?? ""), trouble]) {
-    const cell = document.createElement("td");
-    put(cell, text);
-    row.append(cell);
-  }
-  return row;
+  const texts = [name, alive, rate, errors || "0", String(facts.restarts ?? ""), trouble];
+  texts.forEach((text, i) => put(row.cells[i], text));
 }
 
 // Where the loop stands, and every reason for holding, above everything else.

@@ -1,0 +1,174 @@
+"""A browser, a viewer as a process of its own, and a daemon's sockets before it, for the tests of the page."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
+
+from tests.daemon.conftest import DEADLINE_S
+
+CHROMIUM_ARGUMENTS = (
+    *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),
+    *("--disable-component-update", "--disable-sync"),
+)
+
+
+class FakeDaemon:
+    """The sockets of a daemon, in a process that can be killed."""
+
+    def __init__(self, folder: Path) -> None:
+        self.publish, self.commands = f"ipc://{folder}/publish", f"ipc://{folder}/commands"
+        self._folder = folder
+        self._process: subprocess.Popen[bytes] | None = None
+        self.forget()
+
+    def say(self, *, refusal: str = "", **changed: Mapping[str, Any] | None) -> None:
+        """Say all messages from now on, with changes to some; None takes one out. Refuse commands where told so."""
+        new = self._folder / "changed.new"
+        new.write_text(json.dumps({"messages": changed, "refusal": refusal}))
+        new.rename(self._folder / "changed")
+
+    @property
+    def asked(self) -> list[str]:
+        """The commands that came, in order."""
+        return (self._folder / "asked").read_text().split()
+
+    def forget(self) -> None:
+        (self._folder / "asked").write_text("")
+
+    def start(self) -> None:
+        if self._process is None:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "tests.daemon.view.fake_daemon", str(self._folder)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+
+    def kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+
+class Viewer:
+    """`shearloop view` as a process of its own, on a port that it keeps when it is started again."""
+
+    def __init__(self, folder: Path, daemon: FakeDaemon) -> None:
+        self._folder, self._daemon = folder, daemon
+        self._port = 0
+        self._process: subprocess.Popen[bytes] | None = None
+        self.url = self.url_with_token = ""
+
+    def start(self) -> None:
+        printed = self._folder / "printed"
+        with printed.open("wb") as out:
+            self._process = subprocess.Popen(
+                [
+                    *(sys.executable, "-m", "daemon", "view", "--json", "--port", str(self._port)),
+                    *("--connect", self._daemon.publish, "--commands", self._daemon.commands),
+                    *("--token-file", str(self._folder / "token")),
+                ],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.DEVNULL,
+            )
+        deadline_s = time.monotonic() + DEADLINE_S
+        while not printed.read_text().endswith("\n"):
+            assert self._process.poll() is None, "the viewer has ended"
+            assert time.monotonic() < deadline_s
+            time.sleep(0.01)
+        told = json.loads(printed.read_text())
+        self.url, self.url_with_token = told["url"], told["url_with_token"]
+        self._port = int(self.url.rstrip("/").rpartition(":")[2])
+
+    def kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+
+class Browsed:
+    """One page in a browser, with everything around it that a test moves."""
+
+    def __init__(self, page: Page, daemon: FakeDaemon, viewer: Viewer) -> None:
+        self.page, self.daemon, self.viewer = page, daemon, viewer
+        self.complaints: list[str] = []
+        self.hosts: set[str] = set()
+        page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        page.on("console", lambda line: self.complaints.append(line.text) if line.type == "error" else None)
+        page.on("request", lambda request: self.hosts.add(request.url.split("/")[2]))
+
+    def open(self, *, token: bool = False) -> Page:
+        """Open the page anew, with or without the token, and wait until it is live."""
+        self.page.goto("about:blank")
+        self.page.goto(self.viewer.url_with_token if token else self.viewer.url)
+        if not token and self.page.evaluate("sessionStorage.length"):
+            self.page.evaluate("sessionStorage.clear()")
+            self.page.reload()
+        self.until("#link-state", "● live")
+        return self.page
+
+    def text(self, selector: str) -> str:
+        """Return the text of one element."""
+        return self.page.inner_text(selector)
+
+    def until(self, selector: str, text: str) -> None:
+        """Wait until an element has a text in it."""
+        self.page.wait_for_function(
+            "([selector, text]) => document.querySelector(selector)?.textContent.includes(text)", arg=[selector, text]
+        )
+
+    def until_shown(self, shown: Mapping[str, str]) -> None:
+        """Wait until elements have these texts, all at one moment; where they never have, tell the difference."""
+        texts = (
+            "(shown) => Object.fromEntries(Object.keys(shown).map((s) => [s, document.querySelector(s)?.innerText]))"
+        )
+        equal = f"(shown) => Object.entries(({texts})(shown)).every(([s, text]) => text === shown[s])"
+        try:
+            self.page.wait_for_function(equal, arg=dict(shown))
+        except PlaywrightTimeoutError:
+            assert self.page.evaluate(texts, dict(shown)) == shown
+
+    def until_old(self, count: int) -> None:
+        """Wait until so many panels are marked as old."""
+        self.page.wait_for_function("n => document.querySelectorAll('.panel.old').length === n", arg=count)
+
+
+@pytest.fixture(scope="module")
+def browsed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browsed]:
+    """A page before a viewer before a daemon's sockets: one browser for all tests of a module."""
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("needs Debian's chromium: `make system-packages` installs it")
+    folder = tmp_path_factory.mktemp("view")
+    daemon = FakeDaemon(folder)
+    viewer = Viewer(folder, daemon)
+    daemon.say()
+    daemon.start()
+    try:
+        viewer.start()
+        with sync_playwright() as playwright:
+            context = playwright.chromium.launch_persistent_context(
+                folder / "profile",
+                executable_path=chromium,
+                headless=True,
+                args=CHROMIUM_ARGUMENTS,
+                viewport={"width": 1024, "height": 700},
+            )
+            context.set_default_timeout(DEADLINE_S * 1000)
+            yield Browsed(context.pages[0], daemon, viewer)
+            context.close()
+    finally:
+        viewer.kill()
+        daemon.kill()

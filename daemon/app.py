@@ -38,6 +38,7 @@ from daemon.supervisor import Supervisor
 from daemon.topics import STALE_AFTER_PERIODS
 from drivers.eit_kit import EitKit
 from drivers.raw_input import Tap, no_tap
+from drivers.serial_port import LinkEvent
 
 # How often a start that was refused is tried again, and an end looked for.
 START_RETRY_S = 0.5
@@ -93,7 +94,15 @@ class Daemon:
         self._rig: Rig | None = None
         try:
             if config.robot is not None:
-                self._rig = Rig(config, self.publisher, self._clock, _sources(config), self._tare_to_the_end, self._tap)
+                self._rig = Rig(
+                    config,
+                    self.publisher,
+                    self._clock,
+                    _sources(config),
+                    self._tare_to_the_end,
+                    self.supervisor.deaths,
+                    self._tap,
+                )
             hear = self._rig.brain.hear if self._rig is not None else lambda _: None
             self._skin: SkinTask | None = None
             if config.skin is not None:
@@ -104,7 +113,7 @@ class Daemon:
         self._fingertips = {
             name: FingertipTask(
                 name,
-                _board(name, config.fingertips[name], self._tap(name)),
+                _board(config.fingertips[name], self._link_of(name), self._tap(name)),
                 estimator,
                 self.publisher,
                 self._clock,
@@ -153,6 +162,10 @@ class Daemon:
     def stop(self) -> None:
         """End `run` as soon as the tasks have ended."""
         self._stop.set()
+
+    async def start_experiment(self, path: Path) -> str | None:
+        """Begin an experiment, or return why it cannot be begun; raises UserError for a file that is none."""
+        return await self._begin(path)
 
     async def stopped(self) -> None:
         """Wait until somebody has asked for the end."""
@@ -231,6 +244,9 @@ class Daemon:
             structlog.get_logger().info("recorded", file=str(path))
         if self._recorder.failure:
             structlog.get_logger().error("the recording could not be finished", why=self._recorder.failure)
+
+    def _link_of(self, device: str) -> Callable[[LinkEvent], None]:
+        return self._rig.link_of(device) if self._rig is not None else partial(log_link, device)
 
     def _handlers(self) -> Mapping[str, Handler]:
         return {
@@ -352,13 +368,13 @@ def _recorder(
     return recorder
 
 
-def _board(name: str, config: Fingertip, tap: Tap) -> EitKit:
+def _board(config: Fingertip, on_event: Callable[[LinkEvent], None], tap: Tap) -> EitKit:
     return EitKit(
         path=config.device.path,
         serial_number=config.device.serial_number,
         zero_slots=ZERO_SLOTS,
         frame_period_s=config.frame_period_s,
-        on_event=partial(log_link, name),
+        on_event=on_event,
         tap=tap,
     )
 

@@ -167,6 +167,10 @@ class LoopConfig(ConfigModel):
         0.06, gt=0, le=5, description="the torque at a fixed angle moved by more: it slips or drifts"
     )
     wrist_speed_rad_per_s: float = Field(0.5, gt=0, le=3.14)
+    freshness_s: float = Field(0.1, ge=0, le=10, description="no torque that is younger counts as stale")
+    wrist_acceleration_rad_per_s2: float = Field(4.0, gt=0, le=1000, description="asked of the robot at each change")
+    angle_bandwidth_per_s: float = Field(5.0, gt=0, le=100, description="how fast the wrist closes in on an angle")
+    actuation_s: float = Field(0.02, ge=0, le=0.2, description="from sending a speed until the wrist's angle shows it")
     gain_margin: float = Field(2.0, ge=1, le=100)
     phase_margin_deg: float = Field(45.0, ge=0, le=90)
 
@@ -177,12 +181,21 @@ class RecordingConfig(ConfigModel):
     folder: Path = Field(description="made where it is not there; one daemon writes some 80 MB an hour")
 
 
+class Happening(ConfigModel):
+    """What befalls an emulated device in the course of an experiment."""
+
+    step: int = Field(ge=1, description="number of the experiment's step, from 1")
+    held_for_s: float = Field(0.0, ge=0, description="after its torque or angle has been held for so long")
+    say: str = Field(min_length=1, pattern=r"^[^\n]*$", description="a command of the emulator, see its --help")
+
+
 class Emulator(ConfigModel):
     """A device that is played by a process of its own, for demonstrations."""
 
     device: str
     arguments: tuple[str, ...] = ()
     synthetic: tuple[str, ...] = Field((), description="further arguments where no recording is played")
+    happenings: tuple[Happening, ...] = ()
 
 
 class DaemonConfig(ConfigModel):

@@ -5,6 +5,7 @@ from collections.abc import Awaitable, Callable, Mapping
 
 import numpy as np
 import structlog
+from scipy.spatial.transform import Rotation
 
 from daemon.clock import Clock
 from daemon.experiment.machine import Experiment
@@ -24,14 +25,13 @@ WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04)
 LONGEST_TICK_S = 0.02
 # Every fifth state is published, and speaks as the torque of the wrench: 25 of 125 a second.
 PUBLISH_EVERY = 5
-DECELERATION_RAD_PER_S2 = 4.0
 LINEAR_ACCELERATION_M_PER_S2 = 0.3
 # Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
 # take the first one's place.
 MOST_UNANSWERED = 1
 LOOP_STATE_PERIOD_S = 1.0
-# A motion begins within this time of its command, or it has not begun.
-MOTION_BEGINS_S = 2.0
+# A wrist that was told to stand rests within this time, or something else moves the arm.
+COMES_TO_REST_S = 2.0
 
 
 class LoopTask:
@@ -45,20 +45,25 @@ class LoopTask:
         take_zero: Callable[[], Awaitable[str]],
         publisher: Publisher,
         clock: Clock,
+        died: Callable[[], Mapping[str, str]] = dict,
+        acceleration_rad_per_s2: float = 4.0,
     ) -> None:
+        """Take what acts; `take_zero` tares every sensor, and `died` names the tasks that are gone, and why."""
         self._brain = brain
         self._robot = robot
         self._gripper = gripper
         self._take_zero = take_zero
         self._publisher = publisher
         self._clock = clock
+        self._died = died
+        self._acceleration_rad_per_s2 = acceleration_rad_per_s2
         self._states = 0
         self._unanswered: set[asyncio.Task[None]] = set()
         self._action: asyncio.Task[None] | None = None
         self._sent_rad_per_s = 0.0
         self._stopped = True
         self._told: tuple[object, ...] = ()
-        self._told_ns = 0
+        self._told_ns = self._told_hold = 0
         self._news = asyncio.Condition()
 
     async def drive(self) -> None:
@@ -69,6 +74,7 @@ class LoopTask:
                 state = await self._next_state()
                 now_ns = self._clock.now_ns()
                 self._brain.senses.late_s = max(0.0, (now_ns - began_ns) / 1e9 - LONGEST_TICK_S)
+                self._brain.senses.died = dict(self._died())
                 if state is not None:
                     self._sense(state)
                 self._carry_out(self._brain.tick(now_ns))
@@ -145,7 +151,7 @@ class LoopTask:
             if not self._stopped:
                 self._stopped = True
                 self._cancel_action()
-                self._send(Stop(DECELERATION_RAD_PER_S2))
+                self._send(Stop(self._acceleration_rad_per_s2))
             if orders.release and self._gripper is not None:
                 self._begin(self._gripper.release())
             return
@@ -156,7 +162,7 @@ class LoopTask:
         if speed == 0.0 and self._sent_rad_per_s == 0.0:
             return
         if len(self._unanswered) < MOST_UNANSWERED:
-            self._send(WristSpeed(speed, DECELERATION_RAD_PER_S2))
+            self._send(WristSpeed(speed, self._acceleration_rad_per_s2))
 
     def _send(self, command: WristSpeed | Stop) -> None:
         async def sent() -> None:
@@ -199,14 +205,33 @@ class LoopTask:
             case _:
                 raise TypeError(f"{action} is not carried out by devices")
 
+    async def _rest(self) -> str:
+        """Wait until the wrist has come to rest after the step before; return why it did not, or an empty text."""
+        try:
+            async with asyncio.timeout(COMES_TO_REST_S):
+                state = await self._robot.next_state()
+                while self._sent_rad_per_s or self._unanswered or not state.rests:
+                    state = await self._robot.next_state()
+        except TimeoutError:
+            return f"the arm did not come to rest within {COMES_TO_REST_S:g} s; see what moves it"
+        return ""
+
     async def _zero(self) -> str:
+        if why := await self._rest():
+            return why
         reply = await self._robot.send(ZeroForceTorque())
         return reply.refused if not reply.accepted else await self._take_zero()
 
     async def _move(self, action: MoveTo) -> str:
-        x, y, z, rx, ry, rz = action.pose_m_rad
+        if why := await self._rest():
+            return why
+        here = self._robot.state
+        if here is None:
+            return "the robot is not connected"
+        pose = action.pose_m_rad or along_tool(here.tcp_pose, action.along_tool_m)
+        x, y, z, rx, ry, rz = pose
         command = MoveLinear((x, y, z, rx, ry, rz), action.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)
-        before = self._robot.state.motion_id if self._robot.state is not None else 0
+        before = here.motion_id
         reply = await self._robot.send(command)
         if not reply.accepted:
             return reply.refused
@@ -221,12 +246,14 @@ class LoopTask:
         standing, experiment = self._brain.standing, self._brain.experiment
         key = (
             standing.phase,
-            standing.verdict.response,
+            tuple(trouble.event for trouble in standing.verdict.troubles),
             standing.turn.reasons,
             experiment and experiment.progress().step,
         )
-        if key == self._told and now_ns - self._told_ns < LOOP_STATE_PERIOD_S * 1e9:
+        held = experiment.wish.hold if experiment is not None else 0
+        if (key, held) == (self._told, self._told_hold) and now_ns - self._told_ns < LOOP_STATE_PERIOD_S * 1e9:
             return
+        self._told_hold = held
         if key != self._told:
             structlog.get_logger().info(
                 "loop", phase=standing.phase, doing=standing.doing, reasons=" ".join(standing.verdict.reasons)
@@ -243,6 +270,7 @@ class LoopTask:
         latest = self._brain.senses.torques.get(driving)
         controller = self._brain.controller
         believed = controller.state if controller is not None else None
+        found = self._brain.identified
         return LoopState(
             source="loop",
             t_mono_ns=now_ns,
@@ -250,6 +278,9 @@ class LoopTask:
             experiment=experiment.file.name if experiment is not None else "",
             step=progress.step if progress else 0,
             steps=progress.steps if progress else 0,
+            step_name=experiment.step.do if experiment is not None else "",
+            slices=experiment.file.slices or "" if experiment is not None else "",
+            hold=experiment.wish.hold if experiment is not None else 0,
             doing=standing.doing,
             progress=progress.share if progress else 0.0,
             remaining_s=progress.remaining_s if progress else 0.0,
@@ -258,6 +289,9 @@ class LoopTask:
             set_point_nm=believed.set_point_nm if believed else None,
             ramp_nm=believed.ramp_nm if believed else None,
             expected_nm=believed.torque_nm if believed else None,
+            stiffness_nm_per_rad=found.stiffness_nm_per_rad if found is not None else None,
+            delay_s=found.age_s + found.significant_lag_s if found is not None else None,
+            noise_nm=found.noise_nm if found is not None else None,
             speed_wanted_rad_per_s=standing.turn.speed_rad_per_s,
             speed_sent_rad_per_s=self._sent_rad_per_s,
             response=standing.verdict.response.name.lower().replace("_", " "),
@@ -270,6 +304,13 @@ class LoopTask:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+
+
+def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:
+    """Return the pose (x, y, z in m, rotation vector in rad) that lies so far along the tool's axis."""
+    x, y, z, *turned = pose
+    dx, dy, dz = Rotation.from_rotvec(turned).as_matrix()[:, 2] * distance_m
+    return (x + dx, y + dy, z + dz, *turned)
 
 
 def _message(state: RobotState) -> RobotStateMessage:

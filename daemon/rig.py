@@ -29,12 +29,19 @@ from drivers.robotiq.messages import GripperClient
 from drivers.robotiq.modbus_client import ModbusClient
 from drivers.robotiq.socket_client import SocketClient
 from drivers.robotiq.width import WidthCalibration
+from drivers.serial_port import LinkEvent
+from drivers.ur.client import LinkEvent as UrLinkEvent
 from drivers.ur.client import UrRobot
 from drivers.ur.settings import read_settings
 
 
 def make_load_cell(
-    config: LoadCellConfig, publisher: Publisher, clock: Clock, hear: Callable[[Torque], None], tap: Tap = no_tap
+    config: LoadCellConfig,
+    publisher: Publisher,
+    clock: Clock,
+    hear: Callable[[Torque], None],
+    on_event: Callable[[LinkEvent], None],
+    tap: Tap = no_tap,
 ) -> LoadCellTask:
     """Return the load cell's task; raises DriverError when its calibration cannot be used."""
     calibration = (
@@ -43,17 +50,13 @@ def make_load_cell(
         else LoadCalibration.of_torque_lines()
     )
     device = config.device
-    board = LoadCell(
-        calibration,
-        serial_number=device.serial_number,
-        path=device.path,
-        on_event=partial(log_link, LOAD_CELL),
-        tap=tap,
-    )
+    board = LoadCell(calibration, serial_number=device.serial_number, path=device.path, on_event=on_event, tap=tap)
     return LoadCellTask(board, publisher, clock, hear, config.rate_hz)
 
 
-def make_gripper(config: GripperConfig, publisher: Publisher, feel: Callable[[Hand], None]) -> GripperTask:
+def make_gripper(
+    config: GripperConfig, publisher: Publisher, feel: Callable[[Hand], None], on_event: Callable[[LinkEvent], None]
+) -> GripperTask:
     """Return the gripper's task; raises DriverError when its calibration cannot be used."""
     client: GripperClient
     if config.socket is not None:
@@ -68,7 +71,7 @@ def make_gripper(config: GripperConfig, publisher: Publisher, feel: Callable[[Ha
         if config.calibration is not None
         else WidthCalibration.nominal()
     )
-    return GripperTask(RobotiqGripper(client, calibration, on_event=partial(log_link, "gripper")), publisher, feel)
+    return GripperTask(RobotiqGripper(client, calibration, on_event=on_event), publisher, feel)
 
 
 def make_brain(config: LoopConfig, sources: Mapping[str, Source], required: tuple[str, ...]) -> Brain:
@@ -82,10 +85,14 @@ def make_brain(config: LoopConfig, sources: Mapping[str, Source], required: tupl
     )
     settings = WristSettings(
         speed_limit_rad_per_s=config.wrist_speed_rad_per_s,
+        angle_bandwidth_per_s=config.angle_bandwidth_per_s,
+        actuation_s=config.actuation_s,
         required=RequiredMargins(gain=config.gain_margin, phase_deg=config.phase_margin_deg),
     )
     wrists = {name: Wrist(source, settings, partial(tuned, tune)) for name, source in sources.items()}
-    watch = WatchSettings(disagreement_nm=config.disagreement_nm, jump_nm=config.jump_nm)
+    watch = WatchSettings(
+        disagreement_nm=config.disagreement_nm, jump_nm=config.jump_nm, freshness_s=config.freshness_s
+    )
     return Brain(wrists, watch, dict(sources), required)
 
 
@@ -99,9 +106,13 @@ class Rig:
         clock: Clock,
         fingertips: Mapping[str, Source],
         tare_fingertips: Callable[[], Awaitable[str]],
+        died: Callable[[], Mapping[str, str]],
         tap: Callable[[str], Tap] = lambda _: no_tap,
     ) -> None:
-        """Read the settings of every device; none is opened yet. `tap` gives what hears of a source's raw inputs."""
+        """Read the settings of every device; none is opened yet.
+
+        `died` names the daemon's dead tasks, and why; `tap` gives what hears of a source's raw inputs.
+        """
         if config.robot is None:
             raise ValueError("a rig has a robot")
         self._tare_fingertips = tare_fingertips
@@ -109,19 +120,39 @@ class Rig:
         sources = dict(fingertips)
         self.load_cell: LoadCellTask | None = None
         if config.load_cell is not None:
-            self.load_cell = make_load_cell(config.load_cell, publisher, clock, self._hear, tap(LOAD_CELL))
+            self.load_cell = make_load_cell(
+                config.load_cell, publisher, clock, self._hear, self.link_of(LOAD_CELL), tap(LOAD_CELL)
+            )
             sources[self.load_cell.source.name] = self.load_cell.source
         sources[WRENCH] = WRENCH_SOURCE
-        required = ("gripper",) if config.gripper is not None else ()
+        required = ("robot", "gripper") if config.gripper is not None else ("robot",)
         self.brain = make_brain(config.loop, sources, required)
         self.gripper = None
         if config.gripper is not None:
-            self.gripper = make_gripper(config.gripper, publisher, self._feel)
+            self.gripper = make_gripper(config.gripper, publisher, self._feel, self.link_of("gripper"))
         self.robot = UrRobot(
             read_settings(config.robot),
-            on_link=lambda event: log_event("robot", event.status == "up", event.sentence, repeated=event.losses > 1),
+            on_link=self._robot_link,
         )
-        self.loop = LoopTask(self.brain, self.robot, self.gripper, self.take_zero, publisher, clock)
+        self.loop = LoopTask(
+            self.brain,
+            self.robot,
+            self.gripper,
+            self.take_zero,
+            publisher,
+            clock,
+            died,
+            config.loop.wrist_acceleration_rad_per_s2,
+        )
+
+    def link_of(self, device: str) -> Callable[[LinkEvent], None]:
+        """Return what hears of a device that comes or goes: the log, and the loop, which stops at once."""
+
+        def heard(event: LinkEvent) -> None:
+            log_link(device, event)
+            self._come_or_gone(device, event.up, event.sentence)
+
+        return heard
 
     def tasks(self) -> Iterator[tuple[str, Callable[[], Awaitable[None]]]]:
         """Yield the name and the coroutine of every task."""
@@ -156,6 +187,17 @@ class Rig:
             return ""
         self.brain.stop("the operator said stop")
         return experiment.file.name
+
+    def _robot_link(self, event: UrLinkEvent) -> None:
+        up = event.status == "up"
+        log_event("robot", up, event.sentence, repeated=event.losses > 1)
+        self._come_or_gone("robot", up, event.sentence)
+
+    def _come_or_gone(self, device: str, up: bool, sentence: str) -> None:
+        if up:
+            self.brain.senses.lost.pop(device, None)
+        else:
+            self.brain.senses.lost[device] = sentence
 
     def _hear(self, torque: Torque) -> None:
         self.brain.hear(torque)

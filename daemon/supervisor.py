@@ -10,6 +10,8 @@ FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
 # A task that ran this long before it died had recovered: its next pause is short again.
 RECOVERED_AFTER_S = 60.0
+# Of what a task died of, so much is told on the wire and to the operator; the log has all of it.
+LONGEST_ERROR = 300
 
 
 def restart_pause_s(deaths_in_a_row: int) -> float:
@@ -40,6 +42,10 @@ class Supervisor:
         """The tasks that should run and do not: between a death and the next start."""
         return tuple(name for name, record in self.records.items() if not (record.alive or record.done))
 
+    def deaths(self) -> dict[str, str]:
+        """Return what each of them died of."""
+        return {name: self.records[name].last_error for name in self.dead}
+
     async def keep_running(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
         """Run `run()` until it returns; when it raises, tell it and start it again."""
         record = self.records.setdefault(name, TaskRecord(name))
@@ -54,7 +60,7 @@ class Supervisor:
                 deaths = 1 if loop.time() - started_s > RECOVERED_AFTER_S else deaths + 1
                 pause_s = restart_pause_s(deaths)
                 record.restarts += 1
-                record.last_error = f"{type(error).__name__}: {error}"
+                record.last_error = f"{type(error).__name__}: {error}"[:LONGEST_ERROR]
                 log.exception("the task died and is started again", pause_s=pause_s)
             else:
                 record.done = True

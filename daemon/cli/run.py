@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from daemon.cli.demonstration import Truth
     from daemon.config import Emulator
 
 # Long enough for an emulator to remove its port's link, short enough for a clean stop within a second.
@@ -22,7 +23,15 @@ EMULATOR_STOP_S = 0.5
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
     parser.add_argument("config", type=Path, help="a YAML file such as config/demo.yaml")
-    parser.add_argument("--show", action="store_true", help="print the estimates as they come")
+    parser.add_argument(
+        "--show", action="store_true", help="print the estimates as they come, and what happened at the end"
+    )
+    parser.add_argument(
+        "--slices",
+        type=Path,
+        metavar="DIR",
+        help="keep a slice of each held angle of a sweep, in torque_slices and diameter_slices for `reproduce`",
+    )
     parser.add_argument(
         "--json-log", action="store_true", default=None, help="log JSON lines (the default under systemd)"
     )
@@ -35,9 +44,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run until SIGINT, SIGTERM or `shearloop command stop`."""
     from daemon.app import run_daemon
+    from daemon.cli.demonstration import Happenings, Truth, print_summary
     from daemon.config import RecordingConfig, load_daemon_config
     from daemon.errors import UserError
     from daemon.logs import set_up_logging
+    from daemon.run_summary import RunSummary
+    from daemon.slices import SliceRecorder
 
     # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
@@ -51,6 +63,11 @@ def run(args: argparse.Namespace) -> int:
         from daemon.service.locked_memory import lock_memory
 
         lock_memory()
+    if config.robot is not None:
+        from daemon.service.priority import raise_priority
+
+        # Not an error where it is not allowed: late commands are seen and held by themselves.
+        raise_priority()
     checked_emulators(config.emulators, args.config)
     if args.recording is not None:
         from daemon.recordings import read_stream
@@ -59,8 +76,18 @@ def run(args: argparse.Namespace) -> int:
             if emulator.device == "eit-kit":
                 # Here, and not in the emulator's process alone: without its frames the daemon would wait for ever.
                 read_stream(args.recording, _side(emulator.arguments))
-    with _emulators(config.emulators, args.config.parent, args.recording):
-        asyncio.run(run_daemon(config, (_Show(),) if args.show else ()))
+    slices = SliceRecorder(args.slices) if args.slices is not None else None
+    listeners = () if slices is None else (slices,)
+    truth = Truth(config.emulators)
+    try:
+        with _emulators(config.emulators, args.config.parent, args.recording, truth) as processes:
+            happenings = Happenings(config.emulators, processes)
+            summary = RunSummary(print_summary, truth.torques, lambda: happenings.happened)
+            asyncio.run(run_daemon(config, (happenings, *listeners, *((_Show(), summary) if args.show else ()))))
+    finally:
+        truth.close()
+    if slices is not None:
+        print(f"{args.slices}: {slices.summary}")
     return 0
 
 
@@ -113,14 +140,18 @@ def _same_code() -> dict[str, str]:
 
 
 @contextmanager
-def _emulators(emulators: "tuple[Emulator, ...]", folder: Path, recording: Path | None) -> Iterator[None]:
+def _emulators(
+    emulators: "tuple[Emulator, ...]", folder: Path, recording: Path | None, truth: "Truth"
+) -> Iterator[list["subprocess.Popen[bytes]"]]:
     """Keep the configuration's emulated devices running, each as a process of its own."""
-    processes = []
+    processes: list[subprocess.Popen[bytes]] = []
     try:
         for emulator in emulators:
             played = emulator.synthetic
             if recording is not None and emulator.device == "eit-kit":
                 played = ("--recording", str(recording.resolve()))
+            if emulator.device == "rig":
+                played = (*played, *truth.arguments)
             command = [sys.executable, "-m", "daemon", "emulate", emulator.device, *emulator.arguments, *played]
             # Their standard input stays open and silent: a closed one would end them.
             processes.append(
@@ -128,7 +159,7 @@ def _emulators(emulators: "tuple[Emulator, ...]", folder: Path, recording: Path 
                     command, cwd=folder, env=_same_code(), stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
                 )
             )
-        yield
+        yield processes
     finally:
         for process in processes:
             process.terminate()

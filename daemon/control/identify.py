@@ -110,7 +110,8 @@ def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> I
             f"record for longer, and see why torques are missing"
         )
     t_mid_s, torque_nm = record.t_mid_s[used], record.torque_nm[used]
-    fits = [_fit(record, t_mid_s, torque_nm, window_s, float(lag)) for lag in _LAG_GRID_S]
+    angles = _Angles(record)
+    fits = [_fit(angles, t_mid_s, torque_nm, window_s, float(lag)) for lag in _LAG_GRID_S]
     best = min(fits, key=lambda fit: fit.squares)
     noise_nm = _noise(best.residuals)
     _refuse_bad(best, torque_nm, noise_nm, stiffness_share)
@@ -132,8 +133,8 @@ def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> I
     )
 
 
-def _fit(record: Record, t_mid_s: FloatArray, torque_nm: FloatArray, window_s: float, lag_s: float) -> _Fit:
-    angle = _mean_angle(record, t_mid_s - lag_s, window_s)
+def _fit(angles: "_Angles", t_mid_s: FloatArray, torque_nm: FloatArray, window_s: float, lag_s: float) -> _Fit:
+    angle = angles.mean(t_mid_s - lag_s, window_s)
     span = t_mid_s[-1] - t_mid_s[0]
     design = np.column_stack([angle, np.ones_like(angle), (t_mid_s - t_mid_s[-1]) / span + 1.0])
     coefficients = np.linalg.lstsq(design, torque_nm, rcond=None)[0]
@@ -143,21 +144,26 @@ def _fit(record: Record, t_mid_s: FloatArray, torque_nm: FloatArray, window_s: f
     return _Fit(lag_s, coefficients, covariance, residuals, angle)
 
 
-def _mean_angle(record: Record, middle_s: FloatArray, window_s: float) -> FloatArray:
-    steps = np.diff(record.angle_t_s)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (record.angle_rad[1:] + record.angle_rad[:-1]) * steps)])
-    half = max(0.5 * window_s, 1e-3)
-    # Beyond its ends the wrist is taken to rest, as it does before the first motion and after the last.
-    first, last = record.angle_t_s[0], record.angle_t_s[-1]
+class _Angles:
+    """The integral of the wrist's angle, formed once for all lags."""
 
-    def until(time_s: FloatArray) -> FloatArray:
-        inside = np.interp(time_s, record.angle_t_s, integral)
-        before, after = np.minimum(time_s - first, 0.0), np.maximum(time_s - last, 0.0)
-        total: FloatArray = inside + before * record.angle_rad[0] + after * record.angle_rad[-1]
+    def __init__(self, record: Record) -> None:
+        self._t_s, self._rad = record.angle_t_s, record.angle_rad
+        parts = 0.5 * (self._rad[1:] + self._rad[:-1]) * np.diff(self._t_s)
+        self._integral = np.concatenate([[0.0], np.cumsum(parts)])
+
+    def mean(self, middle_s: FloatArray, window_s: float) -> FloatArray:
+        """Return the mean angle (m,) over windows around m times."""
+        half = max(0.5 * window_s, 1e-3)
+        mean: FloatArray = (self._until(middle_s + half) - self._until(middle_s - half)) / (2.0 * half)
+        return mean
+
+    def _until(self, time_s: FloatArray) -> FloatArray:
+        # Beyond its ends the wrist is taken to rest, as it does before the first motion and after the last.
+        inside = np.interp(time_s, self._t_s, self._integral)
+        before, after = np.minimum(time_s - self._t_s[0], 0.0), np.maximum(time_s - self._t_s[-1], 0.0)
+        total: FloatArray = inside + before * self._rad[0] + after * self._rad[-1]
         return total
-
-    mean: FloatArray = (until(middle_s + half) - until(middle_s - half)) / (2.0 * half)
-    return mean
 
 
 def _noise(residuals: FloatArray) -> float:
@@ -223,8 +229,12 @@ def _actuation(record: Record) -> float:
     steps = np.diff(record.sent_t_s)
     travelled = np.concatenate([[0.0], np.cumsum(record.sent_rad_per_s[:-1] * steps)])
 
+    # A thousand moments tell the delay as well as all, and the loop waits meanwhile.
+    some = slice(None, None, max(1, record.angle_t_s.size // 1000))
+    at_s, angle_rad = record.angle_t_s[some], record.angle_rad[some]
+
     def misfit(delay_s: float) -> float:
-        difference = record.angle_rad - np.interp(record.angle_t_s - delay_s, record.sent_t_s, travelled)
+        difference = angle_rad - np.interp(at_s - delay_s, record.sent_t_s, travelled)
         return float(np.var(difference))
 
     return float(min(_ACTUATION_GRID_S, key=misfit))

@@ -41,7 +41,9 @@ def programme_of(step: "steps.Step", elapsed_s: Elapsed) -> Programme:
     """Return the program of one step; `elapsed_s()` is the experiment's own time in seconds."""
     match step:
         case steps.Approach() | steps.Retreat():
-            return _act(MoveTo(step.pose_m_rad, step.speed_m_per_s), "moving in a straight line")
+            return _act(
+                MoveTo(step.pose_m_rad, step.speed_m_per_s, step.along_tool_m or 0.0), "moving in a straight line"
+            )
         case steps.Grip():
             grip = GripTo(step.width_mm, step.speed_mm_per_s, step.force_n, step.expect_object)
             return _act(grip, "closing the gripper")
@@ -72,10 +74,10 @@ def _act(action: Action, doing: str) -> Programme:
             return
 
 
-def _wait(wrist: WristWish, wait_s: float, elapsed_s: Elapsed, doing: str) -> Programme:
+def _wait(wrist: WristWish, wait_s: float, elapsed_s: Elapsed, doing: str, hold: int = 0) -> Programme:
     end_s = elapsed_s() + wait_s
     while (left_s := end_s - elapsed_s()) > 0:
-        yield Wish(wrist, doing=f"{doing}, {left_s:.1f} s left")
+        yield Wish(wrist, doing=f"{doing}, {left_s:.1f} s left", hold=hold)
 
 
 def _go_to(angle_rad: float, speed_rad_per_s: float, doing: str) -> Programme:
@@ -101,7 +103,8 @@ def _twist(step: steps.Twist, elapsed_s: Elapsed) -> Programme:
             where = f"angle {number} of {len(angles_rad)}, repeat {repeat} of {step.repeats}"
             yield from _go_to(angle_rad, step.speed_rad_per_s, f"twisting to {angle_rad:.3f} rad: {where}")
             hold = GoTo(angle_rad, step.speed_rad_per_s)
-            yield from _wait(hold, step.hold_s, elapsed_s, f"holding {angle_rad:.3f} rad: {where}")
+            held = (repeat - 1) * len(angles_rad) + number
+            yield from _wait(hold, step.hold_s, elapsed_s, f"holding {angle_rad:.3f} rad: {where}", held)
             if step.return_to_start:
                 yield from _go_to(start_rad, step.speed_rad_per_s, f"returning: {where}")
 
@@ -113,7 +116,7 @@ def _hold_torque(step: steps.HoldTorque, elapsed_s: Elapsed) -> Programme:
         view = yield Wish(track, doing=f"bringing the torque to {step.torque_nm:+.3f} N·m")
         if view.torque_nm is not None and abs(view.torque_nm - step.torque_nm) <= near_nm:
             break
-    yield from _wait(track, step.hold_s, elapsed_s, f"holding {step.torque_nm:+.3f} N·m")
+    yield from _wait(track, step.hold_s, elapsed_s, f"holding {step.torque_nm:+.3f} N·m", 1)
 
 
 def _tighten(step: steps.Tighten) -> Programme:

@@ -3,7 +3,7 @@
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 MOST_ANGLES = 1000
 
@@ -55,11 +55,18 @@ class _Step(_Section):
 
 
 class Approach(_Step):
-    """Move the tool centre in a straight line to where it can grip."""
+    """Move the tool centre in a straight line to where it can grip: to a pose, or so far along the tool's axis."""
 
     do: Literal["approach"]
-    pose_m_rad: Pose
+    pose_m_rad: Pose | None = None
+    along_tool_m: Annotated[float, Field(ge=-0.5, le=0.5)] | None = None
     speed_m_per_s: Annotated[float, Field(gt=0, le=0.5)] = 0.1
+
+    @model_validator(mode="after")
+    def _one_end(self) -> "Approach":
+        if (self.pose_m_rad is None) == (self.along_tool_m is None):
+            raise ValueError("give either pose_m_rad or along_tool_m, and not both")
+        return self
 
 
 class Retreat(Approach):
@@ -158,4 +165,7 @@ class ExperimentFile(_Section):
         "right", description="the torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
     limits: Limits = Limits()
+    slices: Literal["torque", "diameter"] | None = Field(
+        None, description="what `shearloop run --slices DIR` keeps of each held angle; nothing by default"
+    )
     steps: Annotated[tuple[Step, ...], Field(min_length=1)]

@@ -38,10 +38,11 @@ WristWish: TypeAlias = Still | GoTo | Turn | Track
 
 @dataclass(frozen=True, slots=True)
 class MoveTo:
-    """Move the tool centre in a straight line."""
+    """Move the tool centre in a straight line: to a pose, or, without one, so far along the tool's own axis."""
 
-    pose_m_rad: tuple[float, ...]
+    pose_m_rad: tuple[float, ...] | None
     speed_m_per_s: float
+    along_tool_m: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,10 +99,11 @@ class Wish:
     """What the experiment wants now.
 
     An action is begun when it is first wished for; `number`, the step's, tells two equal actions apart. From the next
-    `View` on, `View.action` tells of it.
+    `View` on, `View.action` tells of it. `hold` numbers the angles or torques of a step while they are held, from 1.
     """
 
     wrist: WristWish = Still()
     action: Action | None = None
     doing: str = ""
     number: int = -1
+    hold: int = 0

@@ -6,6 +6,7 @@ A plain object without I/O or clock. Senses go in, `Orders` come out; what the o
 from dataclasses import dataclass
 
 from daemon.control.controller import TwistController
+from daemon.control.identify import Identified
 from daemon.experiment.machine import Experiment, Phase
 from daemon.experiment.steps import ExperimentFile, Limits
 from daemon.experiment.wishes import (
@@ -167,6 +168,11 @@ class Brain:
     def controller(self) -> TwistController | None:
         """Return the controller while a loop is closed."""
         return self._driving_wrist.controller
+
+    @property
+    def identified(self) -> Identified | None:
+        """Return what is known of the tool in the grip."""
+        return self._driving_wrist.identified
 
     @property
     def _driving_wrist(self) -> Wrist:

@@ -21,6 +21,8 @@ class WatchSettings:
 
     disagreement_nm: float = 0.05
     jump_nm: float = 0.08
+    # A sensor that is quicker than this is not silent yet where the computer was late.
+    freshness_s: float = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,16 +63,10 @@ def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: in
 def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
     source = watched.driving
     latest = senses.torques.get(source.name)
-    allowed_s = STALE_AFTER_PERIODS * source.period_s
-    if latest is None:
-        yield Trouble(Event.ESTIMATE_STALE, f"{source.name} has not measured anything yet")
-        return
-    age_s = (t_ns - latest.t_ns) / 1e9
-    if age_s > allowed_s:
-        yield Trouble(
-            Event.ESTIMATE_STALE,
-            f"the last torque of {source.name} came {age_s:.1f} s ago, {allowed_s:.1f} s are allowed",
-        )
+    for each in (source, *watched.supervising):
+        if why := _not_fresh(senses, each, settings, t_ns):
+            yield Trouble(Event.ESTIMATE_STALE, why)
+    if latest is None or _not_fresh(senses, source, settings, t_ns):
         return
     if latest.torque_nm is None:
         yield Trouble(Event.ESTIMATE_INVALID, f"{source.name} says: {latest.why or 'nothing'}")
@@ -82,6 +78,20 @@ def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int
         )
     for other in watched.supervising:
         yield from _disagreement(senses, source, other, settings.disagreement_nm, t_ns)
+
+
+def _not_fresh(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> str:
+    """Return why a source says nothing about the present, or the empty string."""
+    if source.name in senses.lost:
+        return f"{source.name} is gone: {senses.lost[source.name]}"
+    latest = senses.torques.get(source.name)
+    if latest is None:
+        return f"{source.name} has not measured anything yet"
+    age_s = (t_ns - latest.t_ns) / 1e9
+    allowed_s = max(STALE_AFTER_PERIODS * source.period_s, settings.freshness_s)
+    if age_s > allowed_s:
+        return f"the last torque of {source.name} came {age_s:.1f} s ago, {allowed_s:.1f} s are allowed"
+    return ""
 
 
 def _disagreement(senses: Senses, one: Source, other: Source, allowed_nm: float, t_ns: int) -> Iterator[Trouble]:

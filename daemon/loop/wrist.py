@@ -1,6 +1,7 @@
 """What the wrist does for each wish: a speed in rad/s, 125 times a second. No I/O; times are passed in."""
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -12,8 +13,8 @@ from daemon.control.tuning import RequiredMargins, refusal
 from daemon.experiment.wishes import GoTo, MeasureTool, Still, Track, Turn, WristWish
 from daemon.loop.senses import Source, Torque
 
-# How fast the wrist closes in on an angle, per second and per radian that is missing.
-ANGLE_BANDWIDTH_PER_S = 5.0
+# A loop that was away for longer than this does not know what it sent last.
+LONGEST_STEP_NS = 50_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,6 +23,10 @@ class WristSettings:
 
     speed_limit_rad_per_s: float = 0.5
     acceleration_limit_rad_per_s2: float = 2.0
+    # How fast the wrist closes in on an angle, per second and per radian that is missing.
+    angle_bandwidth_per_s: float = 5.0
+    # From sending a speed until the angle shows it: so long what was sent is counted as travelled already.
+    actuation_s: float = 0.02
     required: RequiredMargins = field(default_factory=RequiredMargins)
 
 
@@ -53,6 +58,10 @@ class Wrist:
         # A torque that is newer than the latest angle waits for the next one: it is compared with the angle it had.
         self._heard: list[Torque] = []
         self._measuring: IdentifyStep | None = None
+        # Speeds sent in the last `actuation_s`, each with when it was taken over and for how long it held.
+        self._under_way: deque[tuple[int, float, float]] = deque()
+        self._sent_rad_per_s = 0.0
+        self._turned_ns = 0
 
     @property
     def expected_nm(self) -> float | None:
@@ -70,6 +79,7 @@ class Wrist:
 
     def sent(self, speed_rad_per_s: float) -> None:
         """Tell what was really sent, after all clipping."""
+        self._sent_rad_per_s = speed_rad_per_s
         if self.controller is not None:
             self.controller.sent(speed_rad_per_s)
         if self._measuring is not None:
@@ -87,7 +97,7 @@ class Wrist:
             case Still():
                 return WristTurn()
             case GoTo(angle_rad, speed_rad_per_s):
-                return self._towards(origin_rad + angle_rad - wrist_rad, speed_rad_per_s)
+                return self._towards(origin_rad + angle_rad - wrist_rad - self._on_the_way_rad(t_ns), speed_rad_per_s)
             case Turn(speed_rad_per_s):
                 return self._bounded(speed_rad_per_s)
             case Track():
@@ -163,8 +173,19 @@ class Wrist:
         self._heard.clear()
         return WristTurn(self._bounded(command.speed_rad_per_s).speed_rad_per_s, tuple(map(str, command.reasons)))
 
+    def _on_the_way_rad(self, t_ns: int) -> float:
+        """Return how far the wrist will have turned by what was sent and does not show in its angle yet."""
+        passed_ns = t_ns - self._turned_ns
+        self._turned_ns = t_ns
+        if 0 < passed_ns <= LONGEST_STEP_NS:
+            self._under_way.append((t_ns, self._sent_rad_per_s, passed_ns / 1e9))
+        since_ns = t_ns - self._settings.actuation_s * 1e9
+        while self._under_way and self._under_way[0][0] <= since_ns:
+            self._under_way.popleft()
+        return sum(speed * held_s for _, speed, held_s in self._under_way)
+
     def _towards(self, missing_rad: float, speed_rad_per_s: float) -> WristTurn:
-        wanted = ANGLE_BANDWIDTH_PER_S * missing_rad
+        wanted = self._settings.angle_bandwidth_per_s * missing_rad
         return self._bounded(math.copysign(min(abs(wanted), speed_rad_per_s), missing_rad))
 
     def _bounded(self, speed_rad_per_s: float) -> WristTurn:

@@ -28,6 +28,7 @@ from drivers.ur.messages import (
     Message,
     MoveLinear,
     Phase,
+    Reading,
     Reply,
     Stop,
     WristSpeed,
@@ -60,9 +61,9 @@ class Pipe:
         os.set_blocking(stdin, False)
         os.set_blocking(stdout, False)
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait for input."""
-        select.select([self._in], [], [], timeout_s)
+    def wait(self, timeout_s: float) -> bool:
+        """Wait for input, and return whether there is any."""
+        return bool(select.select([self._in], [], [], timeout_s)[0])
 
     def receive(self) -> Iterator[tuple[int, Message]]:
         """Yield the messages that have arrived; `open` is False once the daemon is gone."""
@@ -159,12 +160,8 @@ def _fly(pipe: Pipe, settings: UrSettings, arm: "Arm") -> NoReturn:
         reading = arm.read()
         if not reading.connected or reading.age_ns > 3 * settings.state_timeout_s * 1e9:
             _fail(pipe, "lost", sentences.unfit(reading, settings.host, settings.state_timeout_s))
-        for number, command in _newest(pipe, pilot):
-            reply = pilot.request(number, command, reading, time.monotonic_ns())
-            if reply is not None:
-                pipe.send(reply, number)
-            if isinstance(command, Disconnect):
-                leaving_s = time.monotonic() + FAREWELL_S
+        if _obey(pipe, pilot, reading):
+            leaving_s = time.monotonic() + FAREWELL_S
         if not pipe.open and not leaving_s:
             pilot.request(0, Disconnect(), reading, time.monotonic_ns())
             leaving_s = time.monotonic() + FAREWELL_S
@@ -182,7 +179,22 @@ def _fly(pipe: Pipe, settings: UrSettings, arm: "Arm") -> NoReturn:
             _leave(EXIT_DONE)
         # A late cycle is not caught up with: two commands at once are no use to anyone.
         due_s = max(due_s + period_s, time.monotonic())
+        while pipe.open and not leaving_s and (left_s := due_s - time.monotonic()) > 0:
+            # A command is carried out when it comes: waiting for the next cycle would be a delay in the loop.
+            if pipe.wait(left_s) and _obey(pipe, pilot, arm.read()):
+                leaving_s = time.monotonic() + FAREWELL_S
         time.sleep(max(0.0, due_s - time.monotonic()))
+
+
+def _obey(pipe: Pipe, pilot: Pilot, reading: Reading) -> bool:
+    """Carry out what the daemon has sent; return whether it says to go."""
+    goes = False
+    for number, command in _newest(pipe, pilot):
+        reply = pilot.request(number, command, reading, time.monotonic_ns())
+        if reply is not None:
+            pipe.send(reply, number)
+        goes = goes or isinstance(command, Disconnect)
+    return goes
 
 
 def _newest(pipe: Pipe, pilot: Pilot) -> list[tuple[int, Command]]:

@@ -125,6 +125,11 @@ class Reading:
         return self.runtime_state == RUNTIME_PLAYING
 
     @property
+    def rests(self) -> bool:
+        """Whether every joint rests."""
+        return all(abs(speed) < REST_RAD_PER_S for speed in self.qd_rad_per_s)
+
+    @property
     def wrist_rad(self) -> float:
         """The angle of wrist 3, about which the tool twists."""
         return self.q_rad[5]
@@ -187,6 +192,9 @@ class Failed:
 
 
 Message = Command | Reply | RobotState | Configure | Heartbeat | Phase | Failed
+
+# Slower than this, a joint rests: below it lies the noise of a real arm's speed signal.
+REST_RAD_PER_S: Final = 2e-3
 
 # How long a cycle may take while recovering: the dashboard's client waits 2.5 s for an answer, the control client 3 s
 # for a ready program.

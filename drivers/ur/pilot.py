@@ -28,12 +28,12 @@ from drivers.ur.messages import (
     ZeroForceTorque,
 )
 from drivers.ur.recovery import CureArm, Outcome, Recovery
-from drivers.ur.settings import UrSettings
+from drivers.ur.settings import Six, UrSettings
 
-# Slower than this, a joint rests: below it lies the noise of a real arm's speed signal.
-REST_RAD_PER_S = 2e-3
 # How long a linear move may take beyond its nominal time before it is stopped.
 LINEAR_SLACK, LINEAR_SLACK_S = 1.5, 2.0
+# A linear move may be too short to be seen under way: who rests at its end (in m and rad) after so long has arrived.
+ARRIVED, ARRIVED_AFTER_S = 2e-3, 0.2
 
 
 class PilotArm(CureArm, Protocol):
@@ -73,8 +73,9 @@ class Pilot:
         self._asked: WristSpeed | Stop = Stop(0.0)
         self._speed_thread = False
         self._asked_ns = self._heard_ns = now_ns
-        self._deadline_ns = 0
+        self._deadline_ns = self._move_ns = 0
         self._move_seen = False
+        self._move_end: Six = (0.0,) * 6
         self._sent: WristSpeed | MoveLinear | Stop | None = None
         self._clipped: tuple[str, ...] = ()
         self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s, operator_asked=False)
@@ -178,7 +179,7 @@ class Pilot:
         why = self._blocked(reading)
         if not why and min(asked.speed_m_per_s, asked.acceleration_m_per_s2) <= 0:
             why = "A linear move needs a speed and an acceleration above 0."
-        if not why and not (self._motion in ("idle", "wrist") and _rests(reading)):
+        if not why and not (self._motion in ("idle", "wrist") and reading.rests):
             why = "The arm moves: stop it before a linear move."
         if why:
             return Reply(refused=why)
@@ -188,6 +189,7 @@ class Pilot:
         self._sent, self._clipped = sent, clipped
         self._deadline_ns = now_ns + int(1e9 * _longest_s(sent, reading))
         self._move_seen = False
+        self._move_ns, self._move_end = now_ns, sent.pose
         if not self._arm.move(sent):
             return self._not_taken(reading, "linear move")
         return Reply(sent=sent, clipped=clipped)
@@ -225,7 +227,7 @@ class Pilot:
 
     def _zero_wrench(self, reading: Reading) -> Reply:
         why = self._unfit(reading)
-        if not why and not (self._motion == "idle" and _rests(reading)):
+        if not why and not (self._motion == "idle" and reading.rests):
             why = "The wrench is zeroed only at rest: stop the arm first."
         if not why and not self._arm.zero_wrench():
             why = "The robot did not zero its force-torque sensor."
@@ -253,23 +255,27 @@ class Pilot:
         why = line_violation(reading, self._limits)
         if now_ns > self._deadline_ns:
             why = "the linear move did not end within its time"
-        if self._move_seen and not reading.moving_linearly:
+        if not reading.moving_linearly and (self._move_seen or self._is_there(reading, now_ns)):
             self._end("arrived")
         elif why:
             self._stop(reading, why)
             return
         self._arm.kick()
 
+    def _is_there(self, reading: Reading, now_ns: int) -> bool:
+        waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
+        return waited and reading.rests and math.dist(reading.tcp_pose, self._move_end) < ARRIVED
+
     def _keep_stopping(self, reading: Reading) -> None:
         if isinstance(self._asked, Stop) and self._speed_thread:
             deceleration = clip_stop(self._asked, reading, self._limits, self._settings.reaction_s)
             self._arm.wrist(WristSpeed(0.0, deceleration.deceleration_rad_per_s2))
-            if _rests(reading):
+            if reading.rests:
                 self._end_speed_thread()
                 self._motion = "idle"
             return
         self._arm.kick()
-        if not reading.moving_linearly and _rests(reading):
+        if not reading.moving_linearly and reading.rests:
             self._motion = "idle"
 
     def _stop(self, reading: Reading, why: str, stop: Stop | None = None) -> None:
@@ -327,10 +333,6 @@ class Pilot:
         if outcome is Outcome.DONE:
             self._held = ""
         return number, Reply(refused=recovery.why)
-
-
-def _rests(reading: Reading) -> bool:
-    return all(abs(speed) < REST_RAD_PER_S for speed in reading.qd_rad_per_s)
 
 
 def _longest_s(move: MoveLinear, reading: Reading) -> float:

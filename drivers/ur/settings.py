@@ -14,6 +14,14 @@ from drivers.errors import DriverError
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
 
+# rtde_control_interface.h of ur-rtde 1.6: UR_JOINT_VELOCITY_MAX and its neighbours.
+_CLIENT_BOUNDS = {
+    "wrist_speed_rad_per_s": 3.14,
+    "wrist_acceleration_rad_per_s2": 40.0,
+    "linear_speed_m_per_s": 3.0,
+    "linear_acceleration_m_per_s2": 150.0,
+}
+
 _CHECKED: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
 
 
@@ -76,6 +84,15 @@ class Limits:
     linear_acceleration_m_per_s2: Bound
     force_n: Bound
     torque_nm: Bound
+
+    def __post_init__(self) -> None:
+        """Refuse what ur-rtde would: it raises on a command beyond its own bounds, which would end the process."""
+        for name, largest in _CLIENT_BOUNDS.items():
+            bound = getattr(self, name)
+            # A stop brakes up to the hard limit of acceleration.
+            value = bound.hard if "acceleration" in name else bound.inner
+            if value > largest:
+                raise ValueError(f"{name}: {value:g} is more than ur-rtde takes, which is {largest:g}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 import numpy as np
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -70,6 +70,7 @@ def test_wrist_command_is_within_the_limits_and_tells_what_was_clipped(asked: Wr
         assert sent.rad_per_s == 0
 
 
+@settings(deadline=None)
 @given(
     st.lists(st.tuples(commands, st.integers(1, 60)), min_size=1, max_size=12),
     st.floats(-1.9, 1.9),

@@ -1,0 +1,94 @@
+"""What a demonstration adds to a run: what befalls the emulated rig, the truth about it, and the summary's end."""
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from subprocess import Popen
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from daemon.config import Emulator
+    from daemon.run_summary import Known
+
+RIG = "rig"
+
+
+class Truth:
+    """The file in which an emulated rig writes what is really so; removed with `close`."""
+
+    def __init__(self, emulators: "tuple[Emulator, ...]") -> None:
+        """Make room for it where a rig is emulated that does not write one anyway."""
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self.path: Path | None = None
+        if any(emulator.device == RIG and "--truth" not in emulator.arguments for emulator in emulators):
+            self._folder = tempfile.TemporaryDirectory(prefix="shearloop-")
+            self.path = Path(self._folder.name) / "truth.jsonl"
+
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """What the emulator is told."""
+        return () if self.path is None else ("--truth", str(self.path))
+
+    def torques(self) -> "Known | None":
+        """Return the true torque so far; None where nobody knows it."""
+        from daemon.run_summary import Known
+
+        if self.path is None or not self.path.exists():
+            return None
+        # The last line may be half written.
+        lines = self.path.read_text(encoding="utf-8").rpartition("\n")[0].splitlines()
+        rows = [(row["t_mono_ns"], row["torque_nm"]) for row in map(json.loads, lines)]
+        table = np.array(rows, dtype=float).reshape(-1, 2)
+        return Known(table[:, 0], table[:, 1])
+
+    def close(self) -> None:
+        """Remove the file."""
+        if self._folder is not None:
+            self._folder.cleanup()
+
+
+class Happenings:
+    """Says to the emulators what the configuration wants to befall them, at a step of the experiment."""
+
+    def __init__(self, emulators: "tuple[Emulator, ...]", processes: Sequence["Popen[bytes]"]) -> None:
+        """Take the emulators and their processes, in the same order."""
+        self._left = [
+            (happening, process)
+            for emulator, process in zip(emulators, processes, strict=True)
+            for happening in emulator.happenings
+        ]
+        self._since_ns: dict[int, int] = {}
+        self.happened: list[tuple[int, str]] = []
+
+    def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Look at `loop.state`, which comes once a second, whether it is time."""
+        if topic != "loop.state" or content["phase"] != "running" or not content["hold"]:
+            return
+        now_ns = content["t_mono_ns"]
+        since_ns = self._since_ns.setdefault(content["step"], now_ns)
+        due = [
+            entry
+            for entry in self._left
+            if entry[0].step == content["step"] and now_ns - since_ns >= entry[0].held_for_s * 1e9
+        ]
+        for happening, process in due:
+            self._left.remove((happening, process))
+            if process.stdin is not None and process.poll() is None:
+                process.stdin.write(f"{happening.say}\n".encode())
+                process.stdin.flush()
+                self.happened.append((time.monotonic_ns(), happening.say))
+
+
+def print_summary(lines: Sequence[str]) -> None:
+    """Print what happened; where nobody reads any more, the daemon goes on without."""
+    from daemon.logs import silence
+
+    try:
+        print("", *lines, "", sep="\n", flush=True)
+    except OSError:
+        silence(sys.stdout)

@@ -1,0 +1,101 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.run_summary import Known, RunSummary
+
+S = 1_000_000_000
+
+
+def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
+    return {
+        "t_mono_ns": round(t_s * S),
+        "source": "loop",
+        "phase": "running",
+        "experiment": "hold",
+        "driving": "right",
+        "step": 2,
+        "steps": 3,
+        "step_name": "hold_torque",
+        "hold": 0,
+        "doing": "",
+        "set_point_nm": 0.1,
+        "stiffness_nm_per_rad": 0.75,
+        "delay_s": 0.8,
+        "noise_nm": 0.012,
+        "response": "note",
+        "reasons": "",
+        **changes,
+    }
+
+
+def told(truth: Known | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
+    lines: list[str] = []
+    summary = RunSummary(lines.extend, lambda: truth, lambda: happened)
+    first = {"step": 1, "step_name": "identify", "set_point_nm": None}
+    for content in (loop_state(0, **first), loop_state(10), loop_state(14, hold=1), *more):
+        summary("loop.state", content)
+    for t_s in np.arange(14.0, 44.0, 0.5):
+        reading = {"source": "right", "t_mono_ns": round(t_s * S), "torque_nm": 0.098, "valid": True, "diameter_mm": 20}
+        summary("eit.estimate", reading)
+    summary("eit.estimate", {"source": "right", "t_mono_ns": 44 * S, "torque_nm": None, "valid": False})
+    summary("loop.state", loop_state(44, phase="done", hold=0))
+    return "\n".join(lines)
+
+
+def truth_that_falls_at(t_s: float, for_s: float) -> Known:
+    times = np.arange(0.0, 44.0, 0.1)
+    torque = np.where(times < 13.0, 0.0, 0.1) - 0.03 * ((times >= t_s) & (times < t_s + for_s))
+    return Known(times * S, torque)
+
+
+def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturbance() -> None:
+    text = told(truth_that_falls_at(26.0, 5.5), [(26 * S, "kick -0.03")])
+    assert "'hold' was done, after 44 s" in text
+    assert "stiffness 0.750 N·m/rad, delay 0.80 s" in text
+    assert "right      +0.0980 N·m on average" in text
+    # 5.5 of 30 s were out of the band.
+    assert "the truth  +0.0945 N·m on average, ± 0.0116, within ± 10% for 82% of the time" in text
+    assert "within ± 10% 3.0 s after the set point was given" in text
+    assert "disturbed after 12.0 s (kick -0.03): 0.030 N·m off, back within ± 10% after 5.5 s" in text
+    assert "1 of 61 torques of right were not valid" in text
+    assert "the wrist was never held" in text
+    assert "no command was refused" in text
+
+
+def test_without_a_truth_nothing_is_said_of_it() -> None:
+    assert "truth" not in told(None, [])
+
+
+def test_a_disturbance_that_is_not_overcome_is_said_to_be_none() -> None:
+    assert "not back by the end" in told(truth_that_falls_at(26.0, 100.0), [(26 * S, "kick")])
+
+
+def test_holds_and_refusals_are_counted_by_their_kind() -> None:
+    reason = "no new torque has come: the last came 1.5 s ago. Look at the cable."
+    text = told(
+        None,
+        [],
+        loop_state(20, phase="held", response="hold", reasons=reason),
+        loop_state(21.5),
+        loop_state(23, phase="held", response="hold", reasons=reason.replace("1.5", "1.7")),
+        loop_state(24, reasons="a command was refused: the robot is not connected."),
+    )
+    assert "held for 2.5 s in all: 2 times no new torque has come" in text
+    assert "1 times a command was refused: the robot is not connected." in text
+
+
+def test_an_experiment_that_was_stopped_says_why() -> None:
+    lines: list[str] = []
+    summary = RunSummary(lines.extend)
+    summary("loop.state", loop_state(0))
+    summary("loop.state", loop_state(5, phase="stopped", doing="the operator said stop"))
+    assert lines[:2] == ["What happened: 'hold' was STOPPED before its end, after 5 s.", "  the operator said stop"]
+
+
+@pytest.mark.parametrize("phase", ["done", "stopped", "idle"])
+def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase: str) -> None:
+    lines: list[str] = []
+    RunSummary(lines.extend)("loop.state", loop_state(0, phase=phase))
+    assert not lines

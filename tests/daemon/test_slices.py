@@ -1,0 +1,131 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from bank.channels import channels_of_line
+from daemon.errors import UserError
+from daemon.recordings import read_diameter_slices, read_line, read_torque_slices
+from daemon.slices import SliceRecorder
+
+S = 1_000_000_000
+PERIOD_S = 0.5
+
+
+def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
+    return {
+        "t_mono_ns": round(t_s * S),
+        "phase": "running",
+        "step_name": "twist",
+        "hold": 0,
+        "slices": "torque",
+        "driving": "load_cell",
+        **changes,
+    }
+
+
+class Sweep:
+    """What a daemon publishes while angles are held for five seconds each; the torque is in every channel."""
+
+    def __init__(self, folder: Path, slices: str = "torque", *, tared: bool = True) -> None:
+        self.recorder, self.t_s, self.slices = SliceRecorder(folder), 0.0, slices
+        self.rest = np.random.default_rng(0).uniform(0.05, 0.25, 1024)
+        if tared:
+            self._loop(step_name="tare")
+            self.frames(0.0, 4.0)
+            self._loop(step_name="grip")
+
+    def _loop(self, **changes: Any) -> None:
+        self.recorder("loop.state", loop_state(self.t_s, slices=self.slices, **changes))
+
+    def frames(self, torque_nm: float, for_s: float) -> None:
+        end_s = self.t_s + for_s
+        while self.t_s < end_s:
+            self.t_s += PERIOD_S
+            line = (self.rest + torque_nm).astype("<f4")
+            frame = {
+                "source": "right",
+                "t_mono_ns": round(self.t_s * S),
+                "channels": channels_of_line(line).astype("<f4").tobytes(),
+                "line": line.tobytes(),
+            }
+            self.recorder("eit.frame", frame)
+            torque = {"t_mono_ns": round(self.t_s * S), "torque_nm": torque_nm, "spike": False, "saturated": False}
+            self.recorder("load.torque", torque)
+
+    def hold(self, number: int, torque_nm: float, for_s: float = 5.0) -> None:
+        self._loop(hold=number)
+        self.frames(torque_nm, for_s)
+        self._loop()
+        self.frames(0.0, 1.0)
+
+    def gripped(self, diameter_mm: float) -> None:
+        self.recorder("gripper.state", {"diameter_mm": diameter_mm})
+
+    def done(self) -> None:
+        self._loop(phase="done")
+
+
+def test_each_hold_of_a_torque_sweep_becomes_a_slice_that_reproduce_reads(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path)
+    for number, torque_nm in enumerate((0.05, 0.1, 0.15), start=1):
+        sweep.hold(number, torque_nm)
+    sweep.done()
+    slices = read_torque_slices(tmp_path / "torque_slices")
+    np.testing.assert_allclose(slices.torque_nm, [0.05, 0.1, 0.15])
+    np.testing.assert_allclose(slices.differences, np.tile(slices.torque_nm[:, None], 896), atol=1e-6)
+    raw = read_line(tmp_path / "torque_slices" / "TorqueSlice.mat")
+    rest = read_line(tmp_path / "torque_slices" / "TorqueSliceHom.mat")
+    np.testing.assert_allclose(raw - rest, 0.15, atol=1e-6)
+    assert sweep.recorder.summary == "3 torque slices"
+
+
+def test_a_second_sweep_goes_on_where_the_first_ended(tmp_path: Path) -> None:
+    for diameter_mm in (10.2, 20.4):
+        sweep = Sweep(tmp_path, "diameter")
+        sweep.gripped(diameter_mm)
+        sweep.hold(1, 0.07)
+        sweep.hold(2, 0.07)
+        sweep.done()
+    slices = read_diameter_slices(tmp_path / "diameter_slices")
+    np.testing.assert_allclose(slices.diameter_mm, [10, 10, 20, 20])
+
+
+def test_a_hold_that_safety_interrupts_is_one_slice(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path)
+    sweep._loop(hold=1)
+    sweep.frames(0.1, 2.0)
+    sweep._loop(hold=1, phase="held")
+    sweep.frames(0.1, 1.0)
+    sweep._loop(hold=1)
+    sweep.frames(0.1, 2.0)
+    sweep._loop()
+    sweep.done()
+    assert sweep.recorder.written["torque"] == 1
+
+
+@pytest.mark.parametrize(
+    ("tared", "for_s", "why"), [(False, 5.0, "no `tare` step"), (True, 0.5, "fewer than 3 frames")]
+)
+def test_a_hold_that_yields_no_slice_is_counted_with_its_reason(
+    tmp_path: Path, tared: bool, for_s: float, why: str
+) -> None:
+    sweep = Sweep(tmp_path, tared=tared)
+    sweep.hold(1, 0.1, for_s)
+    sweep.done()
+    assert not sweep.recorder.written
+    assert why in sweep.recorder.summary
+
+
+def test_an_experiment_that_asks_for_no_slices_leaves_none(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path, "")
+    sweep.hold(1, 0.1)
+    sweep.done()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_said_so(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be made"):
+        SliceRecorder(tmp_path / "file" / "slices")

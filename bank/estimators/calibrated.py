@@ -12,7 +12,7 @@ from bank.channels import CHANNEL_TABLE_HASH
 from bank.errors import CalibrationError
 from bank.estimators.archive import read_archive, write_archive
 from bank.estimators.guard import DifferenceGuard, SideGuard
-from bank.estimators.memory import Memory, Moment, Motion
+from bank.estimators.memory import Memory, Motion
 from bank.estimators.physics import BestCell, Locator, NearestCell, Place, Registration
 from bank.estimators.reader import Reader
 from bank.estimators.values import BoolArray, Estimate, FloatArray, Kind, TactileFrame
@@ -139,19 +139,13 @@ class Tracker:
             )
         if self._memory is None:
             difference = np.abs(frame.channels)
-            return self._read(difference, None, frame.usable, float(frame.usable.mean()))
+            return self._read(difference, None, frame.usable)
         moment = self._memory.see(frame)
         if moment.why:
             return Estimate(valid=False, why=moment.why)
-        return self._read_moment(moment, frame.usable)
+        return self._read(moment.difference, self._memory.recent, moment.usable)
 
-    def _read_moment(self, moment: Moment, usable: BoolArray) -> Estimate:
-        assert self._memory is not None  # noqa: S101 - only called for raw frames
-        return self._read(moment.difference, self._memory.recent, usable, moment.usable_share)
-
-    def _read(
-        self, difference: FloatArray, recent: FloatArray | None, usable: BoolArray, usable_share: float
-    ) -> Estimate:
+    def _read(self, difference: FloatArray, recent: FloatArray | None, usable: BoolArray) -> Estimate:
         calibration = self.calibration
         refused: list[str] = []
         tasks = {"torque": (calibration.torque, "N·m"), "diameter": (calibration.diameter, "mm")}
@@ -176,7 +170,8 @@ class Tracker:
         values: dict[str, tuple[float, float]] = {}
         for name, task in wanted.items():
             features = columns_for(calibration.estimator, name, seen.features)
-            value, half = task.reader.read(features, usable_share)
+            value, half = task.reader.read(features, float(usable.mean()))
+            half *= 1.0 if task.guard is None else task.guard.widening(difference[0], usable[0])
             why = task.reader.refuse(value, features, name, tasks[name][1])
             refused += [reason for reason in why if reason not in refused]
             if not why:

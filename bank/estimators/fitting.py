@@ -153,7 +153,8 @@ def _torque_reader(calibration: Calibration, features: FloatArray, torque: Float
         torque,
         head,
         strengths=_MOTION_STRENGTHS if motion else _strengths(calibration.estimator),
-        limit_reach=motion,
+        # Places in the bank are within its grid; all else would follow a drift to wherever it leads.
+        limit_reach=calibration.estimator not in NEEDS_BANK,
     )
 
 

@@ -31,8 +31,14 @@ LARGEST_JUMPING_SHARE = 0.12
 LARGEST_UNUSABLE_SHARE = 0.25
 # Directions in which frames move while gripped or idle, which the grip's discriminant looks away from.
 _N_NUISANCE = 2
-# A difference is judged against those left out in turn, with this margin.
-_MISFIT_MARGIN, _LEAST_OUTLYING, _OUTLYING_NOISES = 2.0, 0.05, 5.0
+# A difference is judged against those left out in turn, with this margin. On the recorded slices the later ones stay
+# within 1.2 times of them; with twice as much, a third of a foreign frame mixed in passed for a torque.
+_MISFIT_MARGIN, _LEAST_OUTLYING, _OUTLYING_NOISES = 1.5, 0.05, 5.0
+# A channel that is off by more than this share of what it should read, beyond the common gain, has lost its electrode.
+# Recorded frames stay within 0.4, but for single channels while the grip closes.
+_LOST_SHARE = 0.6
+# No recorded frame has more than two channels at its largest value: so many are at an amplifier's rail.
+_FEWEST_AT_RAIL = 9
 _FOLDS, _LEAST_DIFFERENCES = 7, 8
 # Closing and opening take this many frames, and move the frame so much further than twisting under load.
 STEP_FRAMES, _STEP_MARGIN = 4, 1.25
@@ -103,6 +109,15 @@ class SideGuard:
             f"than {100 * LARGEST_DEVIATION:.0f} %; this is another fingertip or another gel, calibrate it"
         )
 
+    def lost(self, frame: FloatArray, usable: BoolArray) -> BoolArray:
+        """Return which (896,) channels read what neither grip nor twist explains: a lost electrode, a crossed wire."""
+        off = np.ones(N_CHANNELS, dtype=np.bool_)
+        for known in (self.idle, self.gripped):
+            judged = usable & (known > _WELL_ABOVE_NOISE_V)
+            gain = float(np.median(frame[judged] / known[judged])) if judged.any() else 0.0
+            off &= judged & (np.abs(frame - gain * known) > _LOST_SHARE * gain * known)
+        return off
+
     def idle_like(self, frame: FloatArray) -> bool:
         """Return whether a frame is nearer to the calibration's idle frame than to the gripped one."""
         known = np.isfinite(self.noise)
@@ -123,6 +138,12 @@ class SideGuard:
         """Return the share of usable channels that jump between two frames further than their noise explains."""
         limit = np.maximum(JUMP_NOISES * np.sqrt(2.0) * self.noise, JUMP_V)
         return float(np.mean(np.abs(frame - before)[usable] > limit[usable])) if usable.any() else 1.0
+
+
+def at_rail(channels: FloatArray) -> BoolArray:
+    """Return which (896,) channels share the frame's largest value with too many others to be chance: saturated."""
+    top = channels >= channels.max()
+    return top if np.count_nonzero(top) >= _FEWEST_AT_RAIL else np.zeros_like(top)
 
 
 def _discriminant(parts: list[FloatArray]) -> FloatArray:
@@ -224,6 +245,11 @@ class DifferenceGuard:
         v, x = self.directions[:, usable], (difference - self.mean)[usable]
         residual = (x - np.linalg.lstsq(v.T, x, rcond=None)[0] @ v) / self.noise
         return float((residual**2).mean()), float((np.abs(residual) > _OUTLYING_NOISES).mean())
+
+    def widening(self, difference: FloatArray, usable: BoolArray) -> float:
+        """Return by how much an interval grows because a difference is explained less well than those left out."""
+        familiar = self.largest_misfit / _MISFIT_MARGIN
+        return float(np.sqrt(max(self.misfit(difference, usable)[0] / familiar, 1.0)))
 
     def refuse(self, difference: FloatArray, usable: BoolArray) -> tuple[str, ...]:
         """Return the reasons against a (896,) difference, judged by its usable channels."""

@@ -12,12 +12,14 @@ from typing import Self
 
 import numpy as np
 
+from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
 from bank.estimators.guard import (
     LARGEST_JUMPING_SHARE,
     LARGEST_UNUSABLE_SHARE,
     STEP_FRAMES,
     SideGuard,
+    at_rail,
     channel_noise,
     steps,
 )
@@ -37,12 +39,20 @@ _LARGEST_BRIDGED = 3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """A frame that passed: channels (m, 896) with unusable ones filled in, differences to the idle frame, reasons."""
+    """A frame that passed: channels (m, 896) with unusable ones filled in, differences to the idle frame, reasons.
+
+    usable (m, 896) leaves out what the frame itself shows to be lost or saturated, beside what the board told.
+    """
 
     channels: FloatArray
     difference: FloatArray
     why: tuple[str, ...]
-    usable_share: float
+    usable: BoolArray
+
+    @property
+    def usable_share(self) -> float:
+        """The share of all channels that are usable."""
+        return float(self.usable.mean())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +105,7 @@ class Memory:
         self._t_s = -np.inf
         self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
         self._let_go = [False for _ in guards]
+        self._lost = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
 
     @property
     def recent(self) -> FloatArray | None:
@@ -106,34 +117,41 @@ class Memory:
         if frame.t_s - self._t_s > _LARGEST_GAP_S:
             self._forget()
         self._t_s = frame.t_s
-        why: list[str] = []
-        share = float(frame.usable.mean())
-        channels = self._filled(frame)
-        for layer, guard in enumerate(self._guards):
-            usable = frame.usable[layer]
-            unusable = 1.0 - float(usable.mean())
-            if unusable > LARGEST_UNUSABLE_SHARE:
-                why.append(
-                    f"{guard.side} fingertip: {100 * unusable:.0f} % of the channels are dead or saturated; look at "
-                    "the ribbon cable and the gel's contact with the electrodes"
-                )
-            elif reason := guard.foreign(channels[layer], usable):
-                why.append(reason)
-        disturbed = self._disturbed(channels, frame)
+        told = TactileFrame(
+            frame.t_s, frame.channels, frame.usable & ~np.array([at_rail(one) for one in frame.channels])
+        )
+        channels = self._filled(told)
+        why = [
+            reason
+            for layer, guard in enumerate(self._guards)
+            if (reason := _too_few(guard, told.usable[layer]) or guard.foreign(channels[layer], told.usable[layer]))
+        ]
+        # Channels that are lost for longer are left out; while they are being lost they count as jumping.
+        lost = np.array(
+            [guard.lost(*one) for guard, one in zip(self._guards, zip(channels, told.usable, strict=True), strict=True)]
+        )
+        disturbed = self._disturbed(channels, told.usable & ~(lost & self._lost))
+        self._lost = lost
+        frame = TactileFrame(frame.t_s, frame.channels, told.usable & ~lost)
+        if lost.any():
+            why = why or [text for i, guard in enumerate(self._guards) if (text := _too_few(guard, frame.usable[i]))]
+            channels = self._filled(frame)
         if why:
             self._forget()
-            return Moment(channels, np.zeros_like(channels), tuple(why), share)
+            return Moment(channels, np.zeros_like(channels), tuple(why), frame.usable)
         if disturbed:
-            return self._bridge(channels, disturbed, share)
+            return self._bridge(channels, disturbed, frame.usable)
         if self._before is None:
             self._before = channels
-            return Moment(channels, np.zeros_like(channels), ("there is no frame before to compare with",), share)
+            return Moment(
+                channels, np.zeros_like(channels), ("there is no frame before to compare with",), frame.usable
+            )
         self._refused, self._before = None, channels
         self._learn_baseline(channels)
         self._notice_release(channels)
-        return self._judged(channels, share)
+        return self._judged(channels, frame.usable)
 
-    def _judged(self, channels: FloatArray, share: float) -> Moment:
+    def _judged(self, channels: FloatArray, usable: BoolArray) -> Moment:
         assert self._baselines is not None  # noqa: S101 - set by _learn_baseline just before
         loose = [
             guard.side
@@ -144,15 +162,15 @@ class Memory:
         if loose:
             self._recent.clear()
             self._bridged.clear()
-            return Moment(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), share)
+            return Moment(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
         self._recent.append(channels)
         self._bridged.append(False)
         if self.recent is None:
             missing = (self._recent.maxlen or 0) - len(self._recent)
-            return Moment(channels, difference, (f"gripped too lately: {missing} more frames are needed",), share)
+            return Moment(channels, difference, (f"gripped too lately: {missing} more frames are needed",), usable)
         if sum(self._bridged) > _LARGEST_BRIDGED:
-            return Moment(channels, difference, ("too many of the last frames were disturbed",), share)
-        return Moment(channels, difference, (), share)
+            return Moment(channels, difference, ("too many of the last frames were disturbed",), usable)
+        return Moment(channels, difference, (), usable)
 
     def _notice_release(self, channels: FloatArray) -> None:
         self._passed.append(channels)
@@ -163,7 +181,7 @@ class Memory:
             if released is not None:
                 self._let_go[layer] = released
 
-    def _bridge(self, channels: FloatArray, disturbed: str, share: float) -> Moment:
+    def _bridge(self, channels: FloatArray, disturbed: str, usable: BoolArray) -> Moment:
         """Leave a disturbed frame out; when the next one agrees with it, the change is real and the past is not."""
         if self._refused is not None and all(
             guard.jumping_share(channels[i], self._refused[i], np.isfinite(guard.noise)) <= LARGEST_JUMPING_SHARE
@@ -177,13 +195,13 @@ class Memory:
             if self._recent:
                 self._recent.append(self._recent[-1])
                 self._bridged.append(True)
-        return Moment(channels, np.zeros_like(channels), (disturbed,), share)
+        return Moment(channels, np.zeros_like(channels), (disturbed,), usable)
 
-    def _disturbed(self, channels: FloatArray, frame: TactileFrame) -> str | None:
+    def _disturbed(self, channels: FloatArray, usable: BoolArray) -> str | None:
         if self._before is None:
             return None
         for layer, guard in enumerate(self._guards):
-            share = guard.jumping_share(channels[layer], self._before[layer], frame.usable[layer])
+            share = guard.jumping_share(channels[layer], self._before[layer], usable[layer])
             if share > LARGEST_JUMPING_SHARE:
                 return (
                     f"{guard.side} fingertip: {100 * share:.0f} % of the channels jumped since the frame before; "
@@ -222,6 +240,16 @@ class Memory:
         self._bridged.clear()
         self._before = self._refused = None
         self._passed.clear()
+
+
+def _too_few(guard: SideGuard, usable: BoolArray) -> str | None:
+    unusable = 1.0 - float(usable.mean())
+    if unusable <= LARGEST_UNUSABLE_SHARE:
+        return None
+    return (
+        f"{guard.side} fingertip: {100 * unusable:.0f} % of the channels are dead or saturated; look at the ribbon "
+        "cable and the gel's contact with the electrodes"
+    )
 
 
 def gripped_part(series: FrameSeries) -> tuple[slice, slice, slice]:

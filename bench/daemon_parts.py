@@ -1,0 +1,163 @@
+"""What the daemon's benches share: a board played by the bench itself, a daemon in a process, and what /proc tells."""
+
+import contextlib
+import os
+import pty
+import socket
+import statistics
+import subprocess
+import sys
+import time
+import tty
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+import zmq
+from numpy.typing import NDArray
+
+from bank.bank_file import Bank
+from bank.channels import line_of_channels
+from daemon.messages import decode
+
+READY_S = 30.0
+_TICKS_PER_S = os.sysconf("SC_CLK_TCK")
+
+
+class Board:
+    """An EIT-kit at the other end of a pseudo-terminal, whose lines the bench writes when it likes."""
+
+    def __init__(self, link: Path) -> None:
+        """Open a pseudo-terminal and name it by a link."""
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        link.unlink(missing_ok=True)
+        link.symlink_to(os.ttyname(self._slave))
+
+    def wait_for_start(self) -> None:
+        """Wait until the daemon has started the board."""
+        os.read(self._master, 16)
+
+    def send(self, line: bytes) -> int:
+        """Write a line, and return when its last byte was taken, on the monotonic clock."""
+        while line:
+            line = line[os.write(self._master, line) :]
+        return time.monotonic_ns()
+
+    def close(self) -> None:
+        """Close both ends."""
+        os.close(self._master)
+        os.close(self._slave)
+
+
+def lines(bank: Bank, n: int, n_idle: int = 10, seed: int = 0) -> list[bytes]:
+    """Return n lines of the board: idle ones, then contacts from all over the bank, with noise."""
+    random = np.random.default_rng(seed)
+    cells = np.argwhere(bank.valid)
+    # The board sends magnitudes up to 0.78 V; the bank's homogeneous voltages are larger, in units of their own.
+    volts = 0.3 * np.abs(bank.homogeneous) / np.abs(bank.homogeneous).max() + 0.02
+    scale = 0.3 / np.abs(bank.homogeneous).max()
+    found = []
+    for number in range(n):
+        signal = np.zeros(len(volts))
+        if number >= n_idle:
+            signal = scale * bank.signals[tuple(cells[random.integers(len(cells))])].astype(np.float64)
+            signal *= min(1.0, 0.25 / np.abs(signal).max())
+        found.append(_line(np.clip(volts + signal + random.normal(0, 0.002, len(volts)), 0.002, 0.77)))
+    return found
+
+
+def _line(channels: NDArray[np.float64]) -> bytes:
+    return b"".join(b"%.4f, " % value for value in line_of_channels(channels).tolist()) + b"\n"
+
+
+def configuration(folder: Path, bank: Path, names: Sequence[str], **fingertip: Any) -> Path:
+    """Write a configuration of fingertips whose boards are links in the folder, and return its path."""
+    path = folder / "daemon.yaml"
+    path.write_text(
+        yaml.safe_dump(
+            {
+                "publish": f"ipc://{folder}/publish",
+                "commands": f"ipc://{folder}/commands",
+                "fingertips": {
+                    name: {"device": {"path": str(folder / name)}, "bank": str(bank.resolve()), **fingertip}
+                    for name in names
+                },
+            }
+        )
+    )
+    return path
+
+
+@contextlib.contextmanager
+def daemon(config: Path, folder: Path) -> Iterator[tuple[int, float]]:
+    """Run a daemon in a process of its own; gives its process number and the seconds until it was ready."""
+    notify = folder / "notify"
+    notify.unlink(missing_ok=True)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
+        ready.bind(str(notify))
+        ready.settimeout(READY_S)
+        log = (folder / "daemon.log").open("wb")
+        begun = time.monotonic()
+        process = subprocess.Popen(
+            [sys.executable, "-m", "daemon", "run", str(config)],
+            env={**os.environ, "NOTIFY_SOCKET": str(notify)},
+            stderr=log,
+        )
+        try:
+            while b"READY=1" not in ready.recv(4096):
+                continue
+            yield process.pid, time.monotonic() - begun
+        finally:
+            process.terminate()
+            process.wait(READY_S)
+            log.close()
+
+
+@contextlib.contextmanager
+def subscription(folder: Path, topic: str) -> Iterator["zmq.Socket[bytes]"]:
+    """Subscribe to a topic of the daemon, with no bound on what waits."""
+    with zmq.Context() as context, context.socket(zmq.SUB) as subscriber:
+        subscriber.setsockopt(zmq.RCVHWM, 0)
+        subscriber.setsockopt(zmq.RCVTIMEO, 10_000)
+        subscriber.connect(f"ipc://{folder}/publish")
+        subscriber.setsockopt(zmq.SUBSCRIBE, topic.encode())
+        yield subscriber
+
+
+def received(subscriber: "zmq.Socket[bytes]") -> tuple[int, dict[str, Any]]:
+    """Return when the next message came, on the monotonic clock, and its content."""
+    _, payload = subscriber.recv_multipart()
+    return time.monotonic_ns(), decode(payload)
+
+
+def tree(pid: int) -> list[int]:
+    """Return a process and all that it has started."""
+    found = [pid]
+    for each in found:
+        for task in Path(f"/proc/{each}/task").glob("*/children"):
+            found += [int(child) for child in task.read_text().split()]
+    return found
+
+
+def cpu_s(pid: int) -> float:
+    """Return the processor time that a process has used."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
+
+
+def memory_mb(pid: int) -> dict[str, float]:
+    """Return the resident memory of a process, and its proportional share of what it shares with others."""
+    found = {}
+    for line in Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()[1:]:
+        key, value = line.split(":")
+        found[key] = int(value.split()[0]) / 1024
+    return {"resident": found["Rss"], "proportional": found["Pss"]}
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Return the median of some values, their quartiles, and how many there are."""
+    low, middle, high = statistics.quantiles(values, n=4)
+    return {"median": middle, "low": low, "high": high, "n": len(values)}

@@ -1,0 +1,222 @@
+"""How lean the daemon is: latency, losses, processor time, memory, and the time until it is ready.
+
+    python -m bench.daemon_speed --bank run/paper.bank --out run/daemon_speed.json [--rig-bank run/demo.bank]
+
+Each figure is measured on a daemon in a process of its own, through a pseudo-terminal and a subscriber's socket.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from bank.bank_file import Bank
+from bench.daemon_parts import (
+    Board,
+    configuration,
+    cpu_s,
+    daemon,
+    lines,
+    memory_mb,
+    received,
+    spread,
+    subscription,
+    tree,
+)
+
+REPEATS = 5
+# Between frames whose latency is measured: long enough for the daemon to be idle again.
+PAUSE_S = 0.03
+FLOOD_HZ = 500.0
+
+
+def latency(bank: Path, matching: str, n_frames: int) -> dict[str, Any]:
+    """Return the milliseconds from the last byte of a frame to its estimate at a subscriber."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        board = Board(folder / "right")
+        config = configuration(folder, bank, ["right"], matching=matching, frame_period_s=PAUSE_S)
+        with daemon(config, folder) as (_, ready_s), subscription(folder, "eit.estimate") as estimates:
+            board.wait_for_start()
+            sent: list[int] = []
+            taken, own = [], []
+            for line in lines(Bank.open(bank), n_frames + 10):
+                time.sleep(PAUSE_S)
+                sent.append(board.send(line))
+                arrived, content = received(estimates)
+                if content["k"] is not None:
+                    taken.append((arrived - sent[content["frame"]]) / 1e6)
+                    own.append(content["latency_s"] * 1e3)
+        board.close()
+    p50, p99 = np.percentile(taken, [50, 99])
+    return {"p50_ms": p50, "p99_ms": p99, "own_p50_ms": float(np.median(own)), "n": len(taken), "ready_s": ready_s}
+
+
+def flood(bank: Path, n_frames: int) -> dict[str, Any]:
+    """Return what becomes of frames that come five hundred times a second."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        board = Board(folder / "right")
+        config = configuration(folder, bank, ["right"], matching="zero_lag", frame_period_s=1 / FLOOD_HZ)
+        played = lines(Bank.open(bank), n_frames)
+        with daemon(config, folder) as (pid, _), subscription(folder, "eit.estimate") as estimates:
+            board.wait_for_start()
+            before = cpu_s(pid)
+            begun = time.monotonic()
+
+            def play() -> None:
+                for number, line in enumerate(played):
+                    time.sleep(max(0.0, begun + number / FLOOD_HZ - time.monotonic()))
+                    board.send(line)
+
+            player = threading.Thread(target=play)
+            player.start()
+            frames = [received(estimates)[1]["frame"] for _ in played]
+            took_s = time.monotonic() - begun
+            player.join()
+            busy = (cpu_s(pid) - before) / took_s
+        board.close()
+    return {
+        "asked_hz": FLOOD_HZ,
+        "estimates_hz": n_frames / took_s,
+        "lost": n_frames - len(set(frames)),
+        "in_order": frames == sorted(frames),
+        "cores_busy": busy,
+    }
+
+
+def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, Any]:
+    """Return processor time and memory with the whole emulated rig at its rated speeds, and with a shared bank."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        host = f"127.{os.getpid() >> 14 & 63 | 192}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
+        robot = yaml.safe_load(Path("config/demo_ur.yaml").read_text())
+        (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": host}))
+        fingertip = {"bank": str(bank.resolve()), "matching": "all_lags"}
+        content = {
+            "publish": f"ipc://{folder}/publish",
+            "commands": f"ipc://{folder}/commands",
+            "fingertips": {side: {"device": {"path": f"eit-{side}"}, **fingertip} for side in ("left", "right")},
+            "load_cell": {"device": {"path": "load-cell"}},
+            "robot": "ur.yaml",
+            "gripper": {"socket": {"host": host}},
+        }
+        config = folder / "daemon.yaml"
+        config.write_text(yaml.safe_dump(content))
+        with subprocess.Popen(
+            [
+                *(sys.executable, "-m", "daemon", "emulate", "rig", "--bank", str(rig_bank.resolve())),
+                *("--run-dir", str(folder), "--host", host, "--paper-sketch"),
+            ],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        ) as rig:
+            if rig.stdout is not None:
+                rig.stdout.readline()
+            try:
+                with daemon(config, folder) as (pid, ready_s), subscription(folder, "health") as health:
+                    until = time.monotonic() + 10
+                    while time.monotonic() < until:
+                        tasks = received(health)[1]["tasks"]
+                    before = {each: cpu_s(each) for each in tree(pid)}
+                    time.sleep(seconds)
+                    shares = {each: (cpu_s(each) - cpu) / seconds for each, cpu in before.items()}
+                    memory = {each: memory_mb(each) for each in before}
+                    tasks = received(health)[1]["tasks"]
+            finally:
+                rig.terminate()
+    children = [each for each in shares if each != pid]
+    return {
+        "ready_s": ready_s,
+        "cpu_share_of_one_core": shares[pid],
+        "cpu_share_of_the_robots_process": sum(shares[each] for each in children),
+        "memory_mb": memory[pid],
+        "memory_mb_of_the_robots_process": sum(memory[each]["resident"] for each in children),
+        "rates_hz": {task: facts.get("rate_hz") for task, facts in tasks.items() if facts.get("rate_hz")},
+    }
+
+
+def shared_bank(bank: Path) -> dict[str, Any]:
+    """Return the memory of two daemons on one bank, after each has matched frames from all over it."""
+    with tempfile.TemporaryDirectory() as one, tempfile.TemporaryDirectory() as other:
+        figures = []
+        boards, running = [], []
+        try:
+            for folder in (Path(one), Path(other)):
+                boards.append(Board(folder / "right"))
+                context = daemon(configuration(folder, bank, ["right"], frame_period_s=PAUSE_S), folder)
+                running.append((context, context.__enter__()[0]))
+                boards[-1].wait_for_start()
+            for board in boards:
+                for line in lines(Bank.open(bank), 60):
+                    board.send(line)
+            time.sleep(1.0)
+            figures = [memory_mb(pid) for _, pid in running]
+            mapped = [_mapped_mb(pid, bank) for _, pid in running]
+        finally:
+            for context, _ in running:
+                context.__exit__(None, None, None)
+            for board in boards:
+                board.close()
+    return {"processes": figures, "of_the_bank": mapped}
+
+
+def _mapped_mb(pid: int, bank: Path) -> dict[str, float]:
+    """Return how much of a bank is resident in a process, and how much of that it has for itself."""
+    found, inside = {"resident": 0.0, "private": 0.0}, False
+    for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
+        key, _, value = line.partition(":")
+        if " " in key:
+            inside = line.endswith(str(bank.resolve()))
+        elif inside and key == "Rss":
+            found["resident"] += int(value.split()[0]) / 1024
+        elif inside and key in ("Private_Clean", "Private_Dirty"):
+            found["private"] += int(value.split()[0]) / 1024
+    return found
+
+
+def command_s(*arguments: str) -> float:
+    """Return the seconds that a command takes."""
+    begun = time.monotonic()
+    subprocess.run([sys.executable, "-m", "daemon", *arguments], check=True, stdout=subprocess.DEVNULL)
+    return time.monotonic() - begun
+
+
+def main() -> None:
+    """Measure all and write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--bank", type=Path, required=True, help="the bank of the fingertips, of 100 × 100 cells")
+    parser.add_argument("--rig-bank", type=Path, help="what the emulated rig plays (default: the same)")
+    parser.add_argument("--frames", type=int, default=300, help="frames whose latency is measured")
+    parser.add_argument("--rated-s", type=float, default=30.0, help="seconds at rated speeds")
+    parser.add_argument("--only", nargs="+", choices=("help", "latency", "flood", "rated", "shared"))
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    found: dict[str, Any] = {"load_average": os.getloadavg()[0], "cores": os.cpu_count()}
+    wanted = args.only or ("help", "latency", "flood", "rated", "shared")
+    if "help" in wanted:
+        found["help_s"] = spread([command_s("--help") for _ in range(REPEATS)])
+    if "latency" in wanted:
+        found["latency"] = {each: latency(args.bank, each, args.frames) for each in ("all_lags", "zero_lag")}
+    if "flood" in wanted:
+        found["flood"] = flood(args.bank, 10 * args.frames)
+    if "rated" in wanted:
+        found["rated"] = rated(args.bank, args.rig_bank or args.bank, args.rated_s)
+    if "shared" in wanted:
+        found["shared"] = shared_bank(args.bank)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(found, indent=2) + "\n")
+    print(json.dumps(found, indent=2))
+
+
+if __name__ == "__main__":
+    main()

@@ -13,8 +13,7 @@ class Clock:
     def __init__(self) -> None:
         self._offset_ns = _measured_offset_ns()
 
-    @staticmethod
-    def now_ns() -> int:
+    def now_ns(self) -> int:
         """Return CLOCK_MONOTONIC in nanoseconds."""
         return time.monotonic_ns()
 

@@ -62,7 +62,7 @@ class FingertipTask:
         """Publish every frame that arrives and pass it on, until cancelled."""
         async with contextlib.aclosing(self._board.frames()) as frames:
             async for frame in frames:
-                self._publisher.publish(self._frame_message(frame))
+                self._publisher.publish(frame_message(self.name, frame))
                 await self._backlog.put(frame)
 
     async def estimate(self) -> None:
@@ -98,49 +98,19 @@ class FingertipTask:
             "backlog": self._backlog.qsize(),
         }
 
-    def _frame_message(self, frame: Frame) -> EitFrame:
-        return EitFrame(
-            source=self.name,
-            t_mono_ns=frame.t_mid_ns,
-            channels=frame.channels,
-            line=frame.raw,
-            frame=frame.seq,
-            age_s=(frame.t_arrival_ns - frame.t_mid_ns) / 1e9,
-            saturated=int(np.count_nonzero(frame.saturated)),
-            dead=int(np.count_nonzero(frame.dead)),
-            repeated=frame.repeated,
-        )
-
     def _publish(self, frame: Frame, reading: Reading) -> None:
-        match, torque, diameter = reading.match, reading.torque_nm, reading.diameter_mm
-        valid = reading.valid
+        torque = reading.torque_nm
+        now_ns = self._clock.now_ns()
         self._hear(
             Torque(
                 self.name,
                 torque.value if torque is not None else None,
                 "; ".join(reading.why),
                 frame.t_mid_ns - reading.lag_ns,
-                self._clock.now_ns(),
+                now_ns,
             )
         )
-        self._publisher.publish(
-            EitEstimate(
-                source=self.name,
-                t_mono_ns=frame.t_mid_ns,
-                torque_nm=torque.value if torque else None,
-                torque_low_nm=torque.low if torque else None,
-                torque_high_nm=torque.high if torque else None,
-                diameter_mm=diameter.value if diameter else None,
-                k=match.k if match else None,
-                sigma=match.sigma if match else None,
-                score=match.score if match else None,
-                runner_up=match.runner_up if match else None,
-                valid=valid,
-                why="; ".join(reading.why),
-                frame=frame.seq,
-                latency_s=(self._clock.now_ns() - frame.t_arrival_ns) / 1e9,
-            )
-        )
+        self._publisher.publish(estimate_message(self.name, frame, reading, now_ns))
 
     async def _publish_heatmap(self, frame: Frame, reading: Reading) -> None:
         """Publish all scores where somebody looks at them, at their own price: no estimate waits for them."""
@@ -163,3 +133,39 @@ class FingertipTask:
             model=self._estimator.model,
             frame=frame.seq,
         )
+
+
+def frame_message(name: str, frame: Frame) -> EitFrame:
+    """Return what is published of a frame."""
+    return EitFrame(
+        source=name,
+        t_mono_ns=frame.t_mid_ns,
+        channels=frame.channels,
+        line=frame.raw,
+        frame=frame.seq,
+        age_s=(frame.t_arrival_ns - frame.t_mid_ns) / 1e9,
+        saturated=int(np.count_nonzero(frame.saturated)),
+        dead=int(np.count_nonzero(frame.dead)),
+        repeated=frame.repeated,
+    )
+
+
+def estimate_message(name: str, frame: Frame, reading: Reading, now_ns: int) -> EitEstimate:
+    """Return what is published of a reading at now_ns."""
+    match, torque, diameter = reading.match, reading.torque_nm, reading.diameter_mm
+    return EitEstimate(
+        source=name,
+        t_mono_ns=frame.t_mid_ns,
+        torque_nm=torque.value if torque else None,
+        torque_low_nm=torque.low if torque else None,
+        torque_high_nm=torque.high if torque else None,
+        diameter_mm=diameter.value if diameter else None,
+        k=match.k if match else None,
+        sigma=match.sigma if match else None,
+        score=match.score if match else None,
+        runner_up=match.runner_up if match else None,
+        valid=reading.valid,
+        why="; ".join(reading.why),
+        frame=frame.seq,
+        latency_s=(now_ns - frame.t_arrival_ns) / 1e9,
+    )

@@ -34,7 +34,7 @@ class LoadCellTask:
         """Publish every sample and pass it on, until cancelled."""
         async with contextlib.aclosing(self._board.samples()) as samples:
             async for sample in samples:
-                self._publish(sample)
+                self._publisher.publish(load_message(sample))
                 self._hear(
                     Torque(
                         LOAD_CELL,
@@ -67,17 +67,17 @@ class LoadCellTask:
             self._zeroing = None
             self._zeroed.set_result("")
 
-    def _publish(self, sample: LoadSample) -> None:
-        self._publisher.publish(
-            LoadTorque(
-                source=LOAD_CELL,
-                t_mono_ns=sample.t_mid_ns,
-                torque_nm=sample.torque_nm,
-                raw=sample.raw,
-                saturated=sample.saturated,
-                spike=sample.spike,
-            )
-        )
+
+def load_message(sample: LoadSample) -> LoadTorque:
+    """Return what is published of a sample."""
+    return LoadTorque(
+        source=LOAD_CELL,
+        t_mono_ns=sample.t_mid_ns,
+        torque_nm=sample.torque_nm,
+        raw=sample.raw,
+        saturated=sample.saturated,
+        spike=sample.spike,
+    )
 
 
 def _why(sample: LoadSample) -> str:

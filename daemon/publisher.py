@@ -55,15 +55,25 @@ class Publisher:
         stream = (message.topic, message.source)
         content = wire_map(message, self._clock.unix_s(message.t_mono_ns), self._numbers[stream])
         self._numbers[stream] += 1
-        self._socket.send_multipart([message.topic.encode(), encode(content)], zmq.NOBLOCK)
+        self.forward(message.topic, content)
+
+    def forward(self, topic: str, content: dict[str, Any]) -> None:
+        """Send a message's map as it is, stamped and numbered already."""
+        self._socket.send_multipart([topic.encode(), encode(content)], zmq.NOBLOCK)
         self._hear_subscribers()
         for listener in self._listeners:
-            listener(message.topic, content)
+            listener(topic, content)
 
     def wanted(self, topic: str) -> bool:
         """Return whether any subscriber asks for this topic: what is dear to compute waits for that."""
         self._hear_subscribers()
         return any(topic.encode().startswith(beginning) for beginning in self._subscribed)
+
+    @property
+    def subscribed(self) -> bool:
+        """Whether anybody subscribes to anything."""
+        self._hear_subscribers()
+        return bool(self._subscribed)
 
     def close(self) -> None:
         """Close the socket; what is not yet sent is dropped."""

@@ -35,6 +35,13 @@ from drivers.ur.client import UrRobot
 from drivers.ur.settings import read_settings
 
 
+def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
+    """Return the load cell's calibration; raises DriverError when it cannot be used."""
+    if config.calibration is None:
+        return LoadCalibration.of_torque_lines()
+    return load_calibration(config.calibration, LoadCalibration)
+
+
 def make_load_cell(
     config: LoadCellConfig,
     publisher: Publisher,
@@ -44,11 +51,7 @@ def make_load_cell(
     tap: Tap = no_tap,
 ) -> LoadCellTask:
     """Return the load cell's task; raises DriverError when its calibration cannot be used."""
-    calibration = (
-        load_calibration(config.calibration, LoadCalibration)
-        if config.calibration is not None
-        else LoadCalibration.of_torque_lines()
-    )
+    calibration = load_cell_calibration(config)
     device = config.device
     board = LoadCell(calibration, serial_number=device.serial_number, path=device.path, on_event=on_event, tap=tap)
     return LoadCellTask(board, publisher, clock, hear, config.rate_hz)

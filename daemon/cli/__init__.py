@@ -27,6 +27,7 @@ COMMANDS = {
     "run": Command("daemon.cli.run", "run the daemon that a configuration describes"),
     "import": Command("daemon.cli.import_", "bring the paper's MATLAB streams into a recording"),
     "recording": Command("daemon.cli.recording", "look into recordings, repair them, and export them as tables"),
+    "replay": Command("daemon.cli.replay", "send a recording through the same estimators again, as if live"),
     "evaluate": Command("daemon.cli.evaluate", "judge a calibrated estimator on recordings or slices"),
     "chart": Command("bench.charts.command", "chart speed against accuracy, stability, and how much model is needed"),
     "check": Command("daemon.cli.check", "say whether a configuration and the files it names are in order"),

@@ -2,10 +2,10 @@
 
 import argparse
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from daemon.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from daemon.recording.summary import Summary
@@ -46,7 +46,7 @@ def _info(args: argparse.Namespace) -> int:
     from daemon.recording.summary import summarise
 
     for path in args.recordings:
-        with _bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
+        with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
             found = summarise(path, progress)
         print(json.dumps(found.as_map(), ensure_ascii=False) if args.json else _told(found))
     return 0
@@ -86,7 +86,7 @@ def _repair(args: argparse.Namespace) -> int:
     from daemon.recording.salvage import condition_of, repair
 
     size = condition_of(args.recording).size
-    with _bar(args.recording.name, size, "B") as progress:
+    with progress_bar(args.recording.name, size, "B") as progress:
         repaired = repair(args.recording, args.out, progress)
     condition = repaired.condition
     lost = [f"{condition.torn_bytes} torn bytes at the end"] if condition.torn_bytes else []
@@ -107,7 +107,7 @@ def _export(args: argparse.Namespace) -> int:
     topics = args.topic or sorted(topic for topic, count in there.items() if count)
     stem = args.recording.name.partition(".mcap")[0]
     out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")
-    with _bar(args.format, sum(there[topic] for topic in topics), "message") as progress:
+    with progress_bar(args.format, sum(there[topic] for topic in topics), "message") as progress:
         done = 0
 
         def count(step: int) -> None:
@@ -119,15 +119,3 @@ def _export(args: argparse.Namespace) -> int:
     for path in written:
         print(path)
     return 0
-
-
-@contextmanager
-def _bar(name: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-    """Show how far long work is, on a terminal; the function takes how much is done in all."""
-    from tqdm import tqdm
-
-    # tqdm's own watch on slow bars is a thread that outlives them.
-    tqdm.monitor_interval = 0
-    options: dict[str, Any] = {"unit_scale": True} if unit == "B" else {}
-    with tqdm(total=total, unit=unit, desc=name, disable=None, leave=False, **options) as bar:
-        yield lambda done: (bar.update(done - bar.n), None)[1]

@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
         with _emulators(config.emulators, args.config.parent, args.recording, truth) as processes:
             happenings = Happenings(config.emulators, processes)
             summary = RunSummary(print_summary, truth.torques, lambda: happenings.happened)
-            asyncio.run(run_daemon(config, (happenings, *listeners, *((_Show(), summary) if args.show else ()))))
+            asyncio.run(run_daemon(config, (happenings, *listeners, *((Show(), summary) if args.show else ()))))
     finally:
         truth.close()
     if slices is not None:
@@ -111,8 +111,8 @@ def _side(arguments: tuple[str, ...]) -> str | None:
     return None
 
 
-class _Show:
-    """Prints the estimates, as long as somebody reads them."""
+class Show:
+    """A listener that prints the estimates, as long as somebody reads them."""
 
     def __init__(self) -> None:
         self._read = True

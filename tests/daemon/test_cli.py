@@ -182,8 +182,8 @@ def test_an_emulator_or_a_recording_that_cannot_play_is_refused_before_anything_
 
 def test_estimates_that_nobody_reads_any_longer_do_not_kill_the_estimator() -> None:
     program = (
-        "import os, sys; from daemon.cli.run import _Show; read, write = os.pipe(); os.close(read); os.dup2(write, 1)\n"
-        "show, estimate = _Show(), {'timestamp': 0.0, 'source': 'right', 'valid': False, 'why': 'x'}\n"
+        "import os, sys; from daemon.cli.run import Show; read, write = os.pipe(); os.close(read); os.dup2(write, 1)\n"
+        "show, estimate = Show(), {'timestamp': 0.0, 'source': 'right', 'valid': False, 'why': 'x'}\n"
         "show('eit.estimate', estimate); show('eit.estimate', estimate)"
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)

@@ -1,0 +1,98 @@
+"""`shearloop replay REC`: a recording through the same parsers and estimators again, published as if live."""
+
+import argparse
+import asyncio
+import math
+import sys
+from contextlib import ExitStack, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from daemon.addresses import PUBLISH_ADDRESS
+
+if TYPE_CHECKING:
+    from daemon.config import DaemonConfig
+    from daemon.recording.recorded_run import RecordedRun
+    from daemon.recording.replay import Comparison
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("recording", type=Path, metavar="REC", help="made by `shearloop run --record` or imported")
+    parser.add_argument("--speed", default="1", metavar="N", help="times as fast as it happened, or max; default 1")
+    parser.add_argument("--publish", default=PUBLISH_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
+    parser.add_argument("--config", type=Path, help="instead of the configuration in the recording")
+    parser.add_argument("--wait", action="store_true", help="begin when somebody subscribes")
+    parser.add_argument("--show", action="store_true", help="print the estimates as they come")
+    parser.add_argument(
+        "--check", action="store_true", help="exit with status 1 where an estimate is not the recorded one, bit for bit"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay to the end, and say whether it came to the same."""
+    from daemon.config import load_daemon_config
+    from daemon.recording.identity import code_digest
+    from daemon.recording.recorded_run import RecordedRun
+
+    speed = parsed_speed(args.speed)
+    run = RecordedRun(args.recording)
+    with nullcontext(load_daemon_config(args.config)) if args.config else run.configuration() as config:
+        comparison = asyncio.run(_replayed(run, config, speed, args))
+    same_code = run.metadata.get("code_sha256") == code_digest()
+    for line in _told(comparison, same_code):
+        print(line, file=sys.stderr)
+    return 1 if args.check and comparison.different else 0
+
+
+def parsed_speed(text: str) -> float:
+    """Return a speed; UserError for what is neither a number above 0 nor max."""
+    from daemon.errors import UserError
+
+    if text == "max":
+        return math.inf
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = math.nan
+    if not 0 < speed < math.inf:
+        raise UserError(f"--speed must be a number above 0, or max, not {text!r}")
+    return speed
+
+
+async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, args: argparse.Namespace) -> "Comparison":
+    import zmq.asyncio
+
+    from daemon.cli.progress import progress_bar
+    from daemon.cli.run import Show
+    from daemon.publisher import Publisher
+    from daemon.recording.chain import Chain
+    from daemon.recording.replay import Replay, ReplayClock
+
+    clock = ReplayClock()
+    with ExitStack() as opened:
+        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), args.publish, clock)
+        opened.callback(publisher.close)
+        replay = Replay(run, Chain(config, run.tares(), publisher), publisher, clock)
+        if args.show:
+            publisher.listen(Show())
+        while args.wait and not publisher.subscribed:  # noqa: ASYNC110 - it is told when it is asked
+            await asyncio.sleep(0.05)
+        progress = opened.enter_context(progress_bar(run.path.name, run.messages, "message"))
+        await replay.play(speed, progress)
+        # What was sent last is still on its way.
+        await asyncio.sleep(0.1)
+    return replay.comparison
+
+
+def _told(comparison: "Comparison", same_code: bool) -> list[str]:
+    if not comparison.compared:
+        return ["The recording has no estimates to compare with."]
+    lines = []
+    for topic, count in sorted(comparison.compared.items()):
+        different = comparison.different[topic]
+        lines.append(f"{topic}: {count - different} of {count} are the same as recorded, bit for bit")
+    lines += comparison.examples
+    if comparison.different and not same_code:
+        lines.append("The recording was made by other code than this, whose results may be others.")
+    return lines

@@ -1,0 +1,57 @@
+"""The daemon's own parsers and estimators, told again what a recording says that they were told."""
+
+import asyncio
+from collections.abc import Mapping
+
+from bank.channels import ZERO_SLOTS
+from daemon.app import open_estimator
+from daemon.config import DaemonConfig
+from daemon.fingertip import estimate_message, frame_message
+from daemon.load_cell_task import LOAD_CELL, load_message
+from daemon.messages import EitEstimate, EitFrame, LoadTorque
+from daemon.publisher import Publisher
+from daemon.rig import load_cell_calibration
+from drivers.eit_line import Frame, LineParser
+from drivers.hx711 import LoadParser
+from drivers.raw_input import RawInput
+
+# What is made anew; everything else of a recording is sent as it was recorded.
+MADE_ANEW = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic)
+
+
+class Chain:
+    """Parsers and estimators of one configuration, fed one input at a time, so that nothing depends on the pace."""
+
+    def __init__(self, config: DaemonConfig, tares: Mapping[str, set[int]], publisher: Publisher) -> None:
+        """Open every file that is needed; raises BankError or UserError. `tares` is by source and frame number."""
+        self._publisher = publisher
+        self._tares = tares
+        self._estimators = {name: open_estimator(fingertip) for name, fingertip in config.fingertips.items()}
+        self._lines = {
+            name: LineParser(ZERO_SLOTS, nominal_period_ns=round(fingertip.frame_period_s * 1e9))
+            for name, fingertip in config.fingertips.items()
+        }
+        self._load = LoadParser(load_cell_calibration(config.load_cell)) if config.load_cell is not None else None
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The sources whose inputs are taken."""
+        return (*self._lines, *((LOAD_CELL,) if self._load is not None else ()))
+
+    async def take(self, source: str, told: RawInput) -> None:
+        """Publish all that an input leads to; an input of a source that is not configured leads to nothing."""
+        if source in self._lines:
+            for frame in self._lines[source].take(told):
+                self._publisher.publish(frame_message(source, frame))
+                await self._estimate(source, frame)
+        elif source == LOAD_CELL and self._load is not None:
+            for sample in self._load.take(told):
+                self._publisher.publish(load_message(sample))
+
+    async def _estimate(self, source: str, frame: Frame) -> None:
+        estimator = self._estimators[source]
+        if frame.seq in self._tares.get(source, ()):
+            estimator.tare()
+        reading = await asyncio.to_thread(estimator.update, frame)
+        # The recording's own time: how long it took then is in the recording, and here it took none of it.
+        self._publisher.publish(estimate_message(source, frame, reading, frame.t_arrival_ns))

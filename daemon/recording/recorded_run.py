@@ -1,0 +1,153 @@
+"""A recording as a run to be replayed: its configuration, and all that happened, in the order in which it happened."""
+
+import json
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
+from pydantic import ValidationError
+
+from bank.channels import N_LINE_VALUES
+from daemon.config import DaemonConfig
+from daemon.config_file import ConfigModel, mistakes
+from daemon.errors import UserError
+from daemon.recording.content import input_of
+from daemon.recording.export import topics_of
+from daemon.recording.schema import CLOCK_TOPIC, CONFIGURATION, FRAME_TOPIC, INPUT, METADATA, input_topic, schema_of
+from drivers.raw_input import InputKind, RawInput
+
+Model = TypeVar("Model", bound=ConfigModel)
+
+
+@dataclass(frozen=True, slots=True)
+class Happened:
+    """One message of a recording; of a raw input `told` is set, of a published message `topic` is the wire's."""
+
+    topic: str
+    t_mono_ns: int
+    content: Mapping[str, Any]
+    source: str = ""
+    told: RawInput | None = None
+
+
+class RecordedRun:
+    """One recording, closed. Raises UserError, naming the file, for one that cannot be replayed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.counts = topics_of(path)
+        with path.open("rb") as file:
+            reader = make_reader(file)
+            metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
+            self._attached = {one.name: one.data for one in reader.iter_attachments()}
+        if METADATA not in metadata:
+            raise UserError(f"{path} is an MCAP file, but not a recording of shearloop, and cannot be replayed")
+        self.metadata = metadata[METADATA]
+
+    @property
+    def has_inputs(self) -> bool:
+        """Whether the bytes themselves were recorded; a recording brought in from elsewhere has lines alone."""
+        return any(topic.startswith(f"{INPUT}.") and topic != CLOCK_TOPIC for topic in self.counts)
+
+    @property
+    def messages(self) -> int:
+        """How many messages are in it."""
+        return sum(self.counts.values())
+
+    @contextmanager
+    def configuration(self) -> Iterator[DaemonConfig]:
+        """Give the configuration that it was made with; the files that it names lie in a folder of their own."""
+        try:
+            content = json.loads(self._attached[CONFIGURATION])
+            config = DaemonConfig.model_validate(content)
+        except KeyError:
+            raise UserError(
+                f"{self.path} was not recorded by a daemon and has no configuration; give one with --config CONFIG"
+            ) from None
+        except ValidationError as error:
+            raise UserError(
+                f"{self.path}: its configuration is not one of this version: {mistakes(error, DaemonConfig)}; "
+                "give one with --config CONFIG"
+            ) from error
+        with tempfile.TemporaryDirectory(prefix="shearloop-replay-") as folder:
+            written: dict[Path, Path] = {}
+            for number, (name, data) in enumerate(self._attached.items()):
+                written[Path(name)] = Path(folder) / f"{number}-{Path(name).name}"
+                written[Path(name)].write_bytes(data)
+            yield _with_files(config, written)
+
+    def happenings(self) -> Iterator[Happened]:
+        """Yield everything in the order in which it was recorded."""
+        try:
+            with self.path.open("rb") as file:
+                reader = make_reader(file, validate_crcs=True)
+                # An imported recording has a side after the other; one made live is in order as it is.
+                ordered = reader.iter_messages(log_time_order=not self.has_inputs)
+                for number, (_, channel, message) in enumerate(ordered):
+                    yield from self._happened(channel.topic, json.loads(message.data), message.log_time, number)
+        except (McapError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise UserError(
+                f"{self.path} is damaged ({error!r}); `shearloop recording repair {self.path}` saves what is sound"
+            ) from error
+
+    def tares(self) -> dict[str, set[int]]:
+        """Return, by source, before which frames a zero was taken: it is asked for before the frames have come."""
+        found: dict[str, set[int]] = {}
+        if self.has_inputs:
+            for one in self.happenings():
+                if one.told is not None and one.told.kind is InputKind.TARE and one.told.data.isdigit():
+                    found.setdefault(one.source, set()).add(int(one.told.data))
+        return found
+
+    def _happened(self, topic: str, content: dict[str, Any], log_ns: int, number: int) -> Iterator[Happened]:
+        if topic == CLOCK_TOPIC:
+            yield Happened(topic, content["t_mono_ns"], content)
+        elif topic.startswith(f"{INPUT}."):
+            told = input_of(content)
+            yield Happened(topic, told.t_ns, content, topic.removeprefix(f"{INPUT}."), told)
+        elif self.has_inputs:
+            yield Happened(schema_of(topic), content["t_mono_ns"], content, content["source"])
+        elif topic.startswith(f"{FRAME_TOPIC}."):
+            yield from _line_as_input(topic.removeprefix(f"{FRAME_TOPIC}."), content)
+        else:
+            complete = {
+                "source": topic.partition(".")[0],
+                "raw": content.get("torque_nm"),
+                "saturated": False,
+                "spike": False,
+                **content,
+                "timestamp": log_ns / 1e9,
+                "t_mono_ns": log_ns,
+                "seq": number,
+            }
+            yield Happened(topic, log_ns, complete, complete["source"])
+
+
+def _line_as_input(side: str, content: Mapping[str, Any]) -> Iterator[Happened]:
+    """Yield a recorded line's values as the board sent them: four decimals, each followed by a comma and a space."""
+    values = np.asarray(content["line"], dtype=np.float64)
+    if values.shape != (N_LINE_VALUES,):
+        raise ValueError(f"a line of {values.size} values")
+    text = "".join(f"{value:.4f}, " for value in values.tolist()) + "\r\n"
+    t_ns = int(content["arrival_unix_ns"])
+    yield Happened(input_topic(side), t_ns, {}, side, RawInput(InputKind.DATA, t_ns, text.encode()))
+
+
+def _with_files(section: Model, written: Mapping[Path, Path]) -> Model:
+    """Return the configuration with the files as they were when it was recorded, whatever became of them since."""
+    changed: dict[str, object] = {}
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        if isinstance(value, Path):
+            changed[name] = written.get(value, value)
+        elif isinstance(value, ConfigModel):
+            changed[name] = _with_files(value, written)
+        elif isinstance(value, dict):
+            changed[name] = {key: _with_files(item, written) for key, item in value.items()}
+    return section.model_copy(update=changed)

@@ -1,0 +1,193 @@
+import asyncio
+import contextlib
+import json
+import math
+import os
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+import zmq.asyncio
+
+from daemon.app import Daemon
+from daemon.cli import main
+from daemon.config import DaemonConfig, load_daemon_config
+from daemon.publisher import Publisher
+from daemon.recording.chain import Chain
+from daemon.recording.importing import import_mat
+from daemon.recording.recorded_run import RecordedRun
+from daemon.recording.replay import Comparison, Replay, ReplayClock
+from daemon.request import request
+from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.test_run import recording
+
+Write = Callable[..., Path]
+# Of the real recording's estimates with the tests' bank: what they were when it was last looked at with care.
+REFERENCE = Path(__file__).parents[2] / "data" / "replayed_stream.json"
+RELATIVE = 1e-9
+
+
+async def replayed(
+    path: Path, speed: float, address: str, config: DaemonConfig | None = None
+) -> tuple[list[tuple[str, dict[str, Any]]], Comparison]:
+    """Return all that a replay publishes, and how it compares."""
+    run, clock, seen = RecordedRun(path), ReplayClock(), []
+    with contextlib.ExitStack() as opened:
+        config = config or opened.enter_context(run.configuration())
+        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), address, clock)
+        opened.callback(publisher.close)
+        publisher.listen(lambda topic, content: seen.append((topic, content)))
+        replay = Replay(run, Chain(config, run.tares(), publisher), publisher, clock)
+        await replay.play(speed)
+    return seen, replay.comparison
+
+
+def measured(messages: list[tuple[str, dict[str, Any]]]) -> list[tuple[str, dict[str, Any]]]:
+    """Return the messages without what says how long they took and how clocks were read."""
+    return [(t, {k: v for k, v in c.items() if k not in ("latency_s", "timestamp")}) for t, c in messages]
+
+
+@pytest.fixture
+def recorded(config: Write, tmp_path: Path) -> Callable[..., Path]:
+    """Run a daemon on an emulated board, with faults, a tare on the way and recording on; return the recording."""
+
+    async def record() -> list[dict[str, Any]]:
+        link, published = str(tmp_path / "eit-right"), []
+        faults = ["--fault", "wrong-count@5", "--fault", "unplug:0.3@12"]
+        with zmq.asyncio.Context() as context:
+            path = config(recording={"folder": "recordings"})
+            daemon = Daemon(load_daemon_config(path), context)
+            news = asyncio.Event()
+
+            def listen(topic: str, content: dict[str, Any]) -> None:
+                published.append((topic, content))
+                news.set()
+
+            async def until(frame: int) -> None:
+                while not any(t == "eit.estimate" and c["frame"] >= frame for t, c in published):
+                    news.clear()
+                    await news.wait()
+
+            daemon.publisher.listen(listen)
+            async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+                group.create_task(daemon.run())
+                play = ("--recording", str(recording(tmp_path, 60)), "--once", "--speed", "20", "--link", link)
+                async with shearloop("emulate", "eit-kit", *play, *faults, stdin=asyncio.subprocess.PIPE):
+                    await until(25)
+                    reply = await asyncio.to_thread(
+                        request, f"ipc://{tmp_path}/commands", {"command": "tare"}, DEADLINE_S
+                    )
+                    assert reply["ok"]
+                    await until(50)
+                daemon.stop()
+        return published
+
+    def run() -> tuple[Path, list[tuple[str, dict[str, Any]]]]:
+        published = asyncio.run(record())
+        (path,) = (tmp_path / "recordings").iterdir()
+        return path, published
+
+    return run
+
+
+def test_a_replay_is_what_was_recorded_bit_for_bit_at_any_speed(
+    recorded: Callable[..., Any], tmp_path: Path, tiny_calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, live = recorded()
+    # The recording holds the calibration that was used, whatever becomes of it.
+    kept = tiny_calibration.rename(tmp_path / "kept.yaml")
+    try:
+        _same_at_any_speed(path, live, tmp_path, capsys)
+    finally:
+        kept.rename(tiny_calibration)
+    # And what changed is found out.
+    changed = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    changed["fingertips"]["right"]["average_frames"] = 2
+    (tmp_path / "changed.yaml").write_text(yaml.safe_dump(changed))
+    arguments = ["replay", str(path), "--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--check"]
+    assert main([*arguments, "--config", str(tmp_path / "changed.yaml")]) == 1
+    assert "eit.estimate of right, number" in capsys.readouterr().err
+
+
+def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    address = f"ipc://{tmp_path}/replay"
+    fast, comparison = asyncio.run(replayed(path, math.inf, address))
+    assert comparison.compared["eit.frame"] > 50
+    assert comparison.compared["eit.estimate"] > 50
+    assert comparison.different == Counter(), comparison.examples
+    slow, _ = asyncio.run(replayed(path, 5.0, address))
+    assert measured(slow) == measured(fast)
+    assert [c["latency_s"] for t, c in slow if t == "eit.estimate"] == [0.0] * comparison.compared["eit.estimate"]
+    # And the same as what subscribers saw, but for messages under way when the daemon was stopped.
+    for topic in ("eit.frame", "eit.estimate"):
+        then = measured([one for one in live if one[0] == topic])
+        again = measured([one for one in fast if one[0] == topic])
+        assert again[: len(then)] == then
+    zeros = [c for t, c in fast if t == "eit.estimate" and c["why"].startswith("taking the homogeneous frame, 1 of")]
+    assert len(zeros) == 2, "the operator's tare is replayed"
+    assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
+    told = capsys.readouterr().err
+    assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in told
+
+
+def test_a_real_recording_gives_the_estimates_that_it_gave(shared: Path, config: Write, tmp_path: Path) -> None:
+    """Guards parser, frame clock, baseline and matching. Renew: run with SHEARLOOP_RENEW=1, and say why it changed."""
+    path = tmp_path / "stream.mcap"
+    folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
+    import_mat([folder / "device1.mat", folder / "device3.mat"], path)
+    configured = load_daemon_config(config())
+    averaging = {"right": configured.fingertips["right"].model_copy(update={"average_frames": 5})}
+    configured = configured.model_copy(update={"fingertips": averaging})
+    messages, _ = asyncio.run(replayed(path, math.inf, f"ipc://{tmp_path}/replay", configured))
+    estimates = [content for topic, content in messages if topic == "eit.estimate"]
+    assert [content["frame"] for content in estimates] == list(range(832))
+    torques = [content for topic, content in messages if topic == "load.torque"]
+    assert len(torques) == 4882
+    seen = {
+        "valid": sum(content["valid"] for content in estimates),
+        "estimates": [
+            {key: content[key] for key in ("frame", "t_mono_ns", "k", "sigma", "score", "torque_nm", "why")}
+            for content in estimates[::52]
+        ],
+    }
+    if os.environ.get("SHEARLOOP_RENEW"):
+        REFERENCE.write_text(json.dumps(seen, indent=1))
+    reference = json.loads(REFERENCE.read_text())
+    assert seen["valid"] == reference["valid"]
+    for now, then in zip(seen["estimates"], reference["estimates"], strict=True):
+        assert now["frame"] == then["frame"]
+        assert now["why"] == then["why"]
+        # To a microsecond, and to what another processor's arithmetic may do.
+        assert now["t_mono_ns"] == pytest.approx(then["t_mono_ns"], abs=1000)
+        for key in ("k", "sigma", "score", "torque_nm"):
+            assert now[key] == (None if then[key] is None else pytest.approx(then[key], rel=RELATIVE)), key
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.mcap"], "nowhere.mcap: this recording cannot be read"),
+        (["{imported}"], "has no configuration; give one with --config"),
+        (["{imported}", "--speed", "0"], "--speed must be a number above 0, or max, not '0'"),
+        (["{imported}", "--speed", "fast"], "--speed must be a number above 0, or max, not 'fast'"),
+    ],
+)
+def test_mistakes_end_in_one_sentence(
+    arguments: list[str], message: str, mat_folder: Callable[..., Path], tmp_path: Path, capsys: Any
+) -> None:
+    import_mat([mat_folder()], tmp_path / "imported.mcap")
+    assert main(["replay", *(one.format(imported=tmp_path / "imported.mcap") for one in arguments)]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_what_is_not_a_number_goes_on_the_wire_as_it_went() -> None:
+    from daemon.recording.replay import wire_map_of
+
+    on_wire = wire_map_of({"seq": 3, "joints_rad": [1.5, None, 2.5], "why": ""})
+    assert on_wire["joints_rad_shape"] == [3]
+    np.testing.assert_array_equal(np.frombuffer(on_wire["joints_rad"], "<f4"), np.float32([1.5, np.nan, 2.5]))
+    assert on_wire["seq"] == 3

@@ -3,10 +3,10 @@
 `python -m bench.skin_loop --out DIR` lets the daemon's own loop (brain, identification, controller, estimator) drive
 the emulated skin in virtual time: 1 N is loaded, unloaded to 0.6 N and loaded again, each held for 20 s. What it
 tells: the width of the true force (peak to peak) over the last 12 s of each hold, against 2 μFₙ, the width of the
-friction's own band; and how far from the set point it is held. Over gains, normal forces, with and without the
-controller's deadband, with a normal force that is not the one configured, with a loop that is given a number where
-friction leaves a band, and with an estimator that knows nothing of friction. Numbers go to `skin_loop.json`, the
-chart to `skin_loop.png` and `.svg`.
+friction's own band; and how far from the set point it is held. Over gains and over delays, with normal forces, with
+and without the controller's deadband, with a normal force that is not the one configured, with a loop that is given a
+number where friction leaves a band, and with an estimator that knows nothing of friction: the worst of several noises
+each. Numbers go to `skin_loop.json`, the chart to `skin_loop.png` and `.svg`.
 """
 
 import argparse
@@ -43,6 +43,8 @@ Floats = NDArray[np.float64]
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
 # What a reading takes from the middle of its conversion to the controller, and a speed until the wrist has it.
 AGE_S, ACTUATION_TICKS = 0.06, 2
+# A reading of a quarter of a second ago is stale: the loop holds, and there is no loop any more.
+AGES_S = (0.02, 0.06, 0.1, 0.15, 0.2)
 RADIUS_MM, SET_POINTS_N = 15.0, (1.0, 0.6, 1.0)
 CALIBRATION = Path(__file__).parents[1] / "config" / "calibrations" / "skin_demo.yaml"
 SOURCE = Source(name=SKIN, period_s=SAMPLE_TICKS * TICK_S, sticks=True)
@@ -60,6 +62,7 @@ class Case:
     # Whether the estimator takes friction out, and whether the loop is told the band that friction leaves.
     knows_friction: bool = True
     band: bool = True
+    age_s: float = AGE_S
     seed: int = 0
     # Of each hold, of which the last three fifths count.
     hold_s: float = 20.0
@@ -95,7 +98,7 @@ class SkinLoop:
                 **{"gain_margin": 1.0, "phase_margin_deg": 0.0},
             }
         )
-        self._band, self._hold_s = case.band, case.hold_s
+        self._band, self._hold_s, self._age_s = case.band, case.hold_s, case.age_s
         self.brain = make_brain(config, {SKIN: replace(SOURCE, sticks=case.band)}, ())
         self._speeds = deque([0.0] * ACTUATION_TICKS)
         self._angle_rad = 0.0
@@ -160,7 +163,7 @@ class SkinLoop:
         self.skin.rest(SOURCE.period_s)
         noise = self._random.normal(0.0, NOISE_V / 0.125, 2)
         r1, r2 = (ohm * (1.0 + error) for ohm, error in zip(self.skin.resistances_ohm(), noise, strict=True))
-        now_ns, known_ns = self.t_ns, self.t_ns + round(AGE_S * 1e9)
+        now_ns, known_ns = self.t_ns, self.t_ns + round(self._age_s * 1e9)
         reading = self.estimator.update(SkinSample(r1, r2, 0.0, 0.0, 5e-3, now_ns, known_ns, self._samples))
         torque = skin_torque(reading, RADIUS_MM * 1e-3, now_ns, known_ns)
         if not self._band:
@@ -203,58 +206,99 @@ def judge(case: Case, calibration: SkinCalibration) -> tuple[Held, SkinLoop]:
     return Held(case, width_n, offset_n, bound_n, phase), loop
 
 
+# The whole range that a configuration may ask for: with 1 each reading is believed outright.
 GAINS = (0.05, 0.15, 0.5, 1.0)
 NORMALS_N = (0.5, 1.0, 2.0)
+SEEDS = 3
+KINDS = (
+    *(Case(name=f"Fn = {n:g} N", normal_n=n) for n in NORMALS_N),
+    Case(name="Fn = 1 N, no deadband", deadband_nm=0.0),
+    Case(name="Fn = 2 N, configured as 1 N", normal_n=2.0, configured_n=1.0),
+    Case(name="Fn = 1 N, loop not told the band", band=False),
+    Case(name="Fn = 1 N, friction ignored", knows_friction=False, band=False),
+)
 
 
-def cases() -> list[Case]:
-    """Return all that is measured."""
-    kinds = [
-        *(Case(name=f"Fn = {n:g} N", normal_n=n) for n in NORMALS_N),
-        Case(name="Fn = 1 N, no deadband", deadband_nm=0.0),
-        Case(name="Fn = 2 N, configured as 1 N", normal_n=2.0, configured_n=1.0),
-        Case(name="Fn = 1 N, loop not told the band", band=False),
-        Case(name="Fn = 1 N, friction ignored", knows_friction=False, band=False),
+def over_gains() -> list[Case]:
+    """Return every kind of case at every gain."""
+    return [replace(kind, kp=kp, seed=10 * seed) for seed, kind in enumerate(KINDS) for kp in GAINS]
+
+
+def over_delays() -> list[Case]:
+    """Return loops that are told the band and not, at the usual and the highest gain, with older and older readings."""
+    told = Case(name="told the band")
+    not_told = Case(name="not told the band", band=False)
+    return [
+        replace(kind, name=f"{kind.name}, kp = {kp:g}", kp=kp, age_s=age_s)
+        for kind in (told, not_told)
+        for kp in (0.5, 1.0)
+        for age_s in AGES_S
     ]
-    return [replace(kind, kp=kp, seed=seed) for seed, kind in enumerate(kinds) for kp in GAINS]
 
 
-def draw(found: list[Held], loop: SkinLoop, out: Path) -> None:
-    """Draw the run of one case, and width and offset of all over the gain."""
+def worst(case: Case, calibration: SkinCalibration) -> Held:
+    """Return the widest oscillation and the largest offset over several noises; or the run that broke off."""
+    found = [judge(replace(case, seed=case.seed + seed), calibration)[0] for seed in range(SEEDS)]
+    broken = next((held for held in found if math.isnan(held.width_n)), None)
+    if broken is not None:
+        return broken
+    width_n, offset_n = max(held.width_n for held in found), max(held.offset_n for held in found)
+    return replace(found[0], width_n=width_n, offset_n=offset_n)
+
+
+def draw(gains: list[Held], delays: list[Held], loop: SkinLoop, out: Path) -> None:
+    """Draw the run of one case, width and offset of all over the gain, and the width over the delay."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(10.5, 7.0), layout="constrained")
-    grid = figure.add_gridspec(2, 2)
-    over, left, right = (figure.add_subplot(place) for place in (grid[0, :], grid[1, 0], grid[1, 1]))
-    time_s = np.arange(len(loop.truth_n)) * TICK_S
-    over.plot(time_s, loop.truth_n, color="#1f4e79", lw=1.2, label="true shear force")
-    estimate = np.array(loop.estimate_n[: len(time_s)])
-    over.plot(time_s[: len(estimate)], estimate, color="#c44e52", lw=0.9, label="estimate")
-    over.plot(time_s, loop.set_point_n, color="#888888", lw=1, ls="--", label="set point")
-    over.set(
-        title="Zero, identification, and three holds (Fn = 1 N, kp = 0.5)", xlabel="time, s", ylabel="shear force, N"
-    )
-    over.legend(loc="upper left", fontsize=8)
-    names = list(dict.fromkeys(held.case.name for held in found))
-    for axes, value, title in (
-        (left, lambda held: held.width_n / held.bound_n, "width of the oscillation / 2 μFn"),
-        (right, lambda held: held.offset_n / held.bound_n, "distance from the set point / 2 μFn"),
-    ):
-        _curves(axes, found, names, value)
+    figure = Figure(figsize=(12.0, 7.5), layout="constrained")
+    grid = figure.add_gridspec(2, 3, height_ratios=(1.0, 1.3))
+    over = figure.add_subplot(grid[0, :])
+    width, offset, delay = (figure.add_subplot(grid[1, i]) for i in range(3))
+    _run(over, loop)
+    bound = "2 μFn"
+    _curves(width, gains, lambda case: case.kp, lambda held: held.width_n / held.bound_n)
+    width.set(title="Limit cycle over the gain", xlabel="gain kp", ylabel=f"peak to peak / {bound}")
+    _curves(offset, gains, lambda case: case.kp, lambda held: held.offset_n / held.bound_n)
+    offset.set(title="Accuracy over the gain", xlabel="gain kp", ylabel=f"mean distance from the set point / {bound}")
+    for axes in (width, offset):
+        axes.set_xscale("log")
+        axes.set_xticks(GAINS, [f"{kp:g}" for kp in GAINS])
+        axes.minorticks_off()
+    _curves(delay, delays, lambda case: case.age_s, lambda held: held.width_n / held.bound_n)
+    delay.set_xticks(AGES_S, [f"{age_s:g}" for age_s in AGES_S])
+    delay.set(title="Limit cycle over the delay", xlabel="age of a reading, s", ylabel=f"peak to peak / {bound}")
+    for axes in (width, delay, offset):
+        axes.set_ylim(-0.05, max(1.2, axes.get_ylim()[1]))
         axes.axhline(1.0, color="black", lw=1, ls=":")
-        axes.set(xlabel="gain kp", ylabel=title, xscale="log", ylim=(-0.05, None))
-    left.legend(fontsize=7)
-    for axes in (over, left, right):
+    for axes in (width, delay):
+        axes.axhspan(-0.05, 1.0, color="#55a868", alpha=0.08, lw=0)
+        axes.annotate(f"allowed: up to {bound}", (0.02, 0.96), xycoords=("axes fraction", "data"), fontsize=8, va="top")
+    handles, labels = width.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+    delay.legend(fontsize=8)
+    for axes in (over, width, offset, delay):
         axes.grid(alpha=0.25)
     for suffix in ("png", "svg"):
-        figure.savefig(out / f"skin_loop.{suffix}", dpi=150)
+        figure.savefig(out / f"skin_loop.{suffix}", dpi=130)
 
 
-def _curves(axes: "Axes", found: list[Held], names: list[str], value: Callable[[Held], float]) -> None:
-    for name, marker in zip(names, "os^Dvx*", strict=False):
+def _run(axes: "Axes", loop: SkinLoop) -> None:
+    time_s = np.arange(len(loop.truth_n)) * TICK_S
+    estimate = np.array(loop.estimate_n[: len(time_s)])
+    axes.plot(time_s, loop.truth_n, color="#1f4e79", lw=1.2, label="true shear force")
+    axes.plot(time_s[: len(estimate)], estimate, color="#c44e52", lw=0.9, label="estimate")
+    axes.plot(time_s, loop.set_point_n, color="#888888", lw=1, ls="--", label="set point")
+    axes.set(
+        title="Zero, identification, and three holds (Fn = 1 N, kp = 0.5)", xlabel="time, s", ylabel="shear force, N"
+    )
+    axes.legend(loc="upper left", fontsize=8)
+
+
+def _curves(axes: "Axes", found: list[Held], over: Callable[[Case], float], value: Callable[[Held], float]) -> None:
+    for name, marker in zip(dict.fromkeys(held.case.name for held in found), "os^Dvx*", strict=False):
         mine = [held for held in found if held.case.name == name]
         axes.plot(
-            [held.case.kp for held in mine], [value(held) for held in mine], marker=marker, ms=4, lw=1, label=name
+            [over(held.case) for held in mine], [value(held) for held in mine], marker=marker, ms=5, lw=1, label=name
         )
 
 
@@ -265,18 +309,24 @@ def main() -> None:
     out: Path = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     calibration = load_calibration(CALIBRATION)
+    gains, delays = (_measured(cases, calibration) for cases in (over_gains(), over_delays()))
+    shown = judge(Case(name="shown"), calibration)[1]
+    document = json.dumps([asdict(held) for held in (*gains, *delays)], indent=1)
+    (out / "skin_loop.json").write_text(document + "\n", encoding="utf-8")
+    draw(gains, delays, shown, out)
+
+
+def _measured(cases: list[Case], calibration: SkinCalibration) -> list[Held]:
     found = []
-    for case in cases():
-        held, _ = judge(case, calibration)
+    for case in cases:
+        held = worst(case, calibration)
         found.append(held)
         print(
-            f"{case.name:30} kp {case.kp:5.2f}   width {held.width_n:.4f} N of {held.bound_n:.2f} allowed   "
-            f"offset {held.offset_n:.4f} N   {held.phase}",
+            f"{case.name:34} kp {case.kp:4.2f}  age {case.age_s:4.2f} s   width {held.width_n:.4f} N of "
+            f"{held.bound_n:.2f} allowed   offset {held.offset_n:.4f} N   {held.phase}",
             flush=True,
         )
-    shown = judge(Case(name="shown"), calibration)[1]
-    (out / "skin_loop.json").write_text(json.dumps([asdict(held) for held in found], indent=1) + "\n", encoding="utf-8")
-    draw(found, shown, out)
+    return found
 
 
 if __name__ == "__main__":

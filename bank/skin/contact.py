@@ -24,6 +24,10 @@ Floats = NDArray[np.float64]
 
 # Random starts at a friction of 1 take up to about 45 steps, a step of loading 3 to 25.
 MAX_STEPS = 200
+# Thick skins, nearly incompressible ones and a friction of 1 sometimes need another start.
+RESTARTS = 6
+# Rounds of relaxation before one; each costs as much as a Newton step or two.
+SWEEPS = 20
 # Of the largest contact force: about a thousand roundings.
 TOLERANCE = 1e-11
 # Below this fraction of a step Φ does not fall: two pieces of it pass the step to and fro.
@@ -112,14 +116,35 @@ def solve_contact(
     `compliance` (2n, 2n) mm/N, `displacement` (2n,) mm without contact, `along_before` (n,) mm at the last
     increment, `start` (2n,) N. Raises ContactError where no solution is found.
     """
+    if not (np.isfinite(displacement).all() and np.isfinite(start).all()):
+        raise ContactError("The skin is loaded with what is no number; give its normal and shear force in N.")
     problem = _Problem(compliance, displacement, along_before, friction)
-    force, weight = start, 0
+    rng = np.random.default_rng(0)
+    force, steps, found = _newton(problem, start)
+    for attempt in range(RESTARTS):
+        if found:
+            break
+        # The guesses go round in a circle: begin where each node has met its own conditions, or somewhere else.
+        start = rng.normal(0.0, abs(force).max(), len(force)) if attempt % 2 else problem.relaxed(force)
+        force, more, found = _newton(problem, start)
+        steps += more
+    if not found:
+        raise ContactError(
+            f"The contact of the skin did not converge in {steps} steps at a friction of {friction}; "
+            "apply the load in smaller steps."
+        )
+    return force, steps
+
+
+def _newton(problem: "_Problem", force: Floats) -> tuple[Floats, int, bool]:
+    """Return the forces that one start leads to, the steps taken, and whether they meet the conditions."""
+    weight = 0
     residual, guess = problem.residual(force, WEIGHTS[weight])
     smallest = np.finfo(np.float64).tiny
     for step in range(MAX_STEPS):
         size = np.linalg.norm(residual)
         if size <= max(TOLERANCE * abs(force).max(), smallest):
-            return force, step
+            return force, step, True
         towards = problem.solve(guess) - force
         length = 1.0
         while length >= SHORTEST_STEP:
@@ -131,10 +156,7 @@ def solve_contact(
             length, weight = 1.0, (weight + 1) % len(WEIGHTS)
             new_residual, new_guess = problem.residual(force + towards, WEIGHTS[weight])
         force, residual, guess = force + length * towards, new_residual, new_guess
-    raise ContactError(
-        f"The contact of the skin did not converge in {MAX_STEPS} steps at a friction of {friction}; "
-        "apply the load in smaller steps."
-    )
+    return force, MAX_STEPS, False
 
 
 class _Guess(NamedTuple):
@@ -164,6 +186,21 @@ class _Problem:
         wanted = np.concatenate([pressing, np.clip(trial[n:], -bound, bound)])
         slipping = np.sign(trial[n:]) * (abs(trial[n:]) >= bound)
         return force - wanted, _Guess(trial[:n] > 0, slipping)
+
+    def relaxed(self, force: Floats) -> Floats:
+        """Return the forces after some rounds in which each node in turn meets its own conditions (Gauss-Seidel)."""
+        n, force = self.n, force.copy()
+        for _ in range(SWEEPS):
+            for node in range(n):
+                force[node] = max(self._alone(force, node, 0.0), 0.0)
+                bound = self.friction * force[node]
+                force[n + node] = min(max(self._alone(force, n + node, self.along_before[node]), -bound), bound)
+        return force
+
+    def _alone(self, force: Floats, row: int, before_mm: float) -> float:
+        """Return the component of the forces that, all others given, moves its node back to where it was."""
+        moved_mm = self.compliance[row] @ force + self.displacement[row] - before_mm
+        return float(force[row] - self.stiffness[row] * moved_mm)
 
     def solve(self, guess: _Guess) -> Floats:
         """Return the forces of a guess: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n."""

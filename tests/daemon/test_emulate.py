@@ -171,7 +171,7 @@ async def test_without_recording_and_bank_the_demos_fingertip_is_twisted() -> No
         (("--recording", "absent.mat", "--speed", "0"), "--speed 0 is not above 0"),
         (("--recording", "absent.mat", "--fault", "nan"), "--fault nan names no frame; write NAME@FRAME"),
         (("--recording", "absent.mat", "--fault", "explode@3"), "there is no fault 'explode'"),
-        (("--recording", "absent.mat", "--link", "/nowhere/eit"), "--link /nowhere/eit cannot be made"),
+        (("--recording", "absent.mat", "--link", "/dev/null/eit"), "--link /dev/null/eit cannot be made"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_status_two(

@@ -112,7 +112,7 @@ async def test_source_and_scanner_are_played_alone_too() -> None:
         (["skin", "--sweep-n", "1", "--robot", "127.0.0.1"], "leave --sweep-n or --robot out"),
         (["skin", "--speed", "0"], "--speed 0 is not above 0"),
         (["skin", "--source-port", "70000"], "--source-port 70000 is no port"),
-        (["skin-daq", "--link", "/nowhere/daq"], "--link /nowhere/daq cannot be made"),
+        (["skin-daq", "--link", "/dev/null/daq"], "--link /dev/null/daq cannot be made"),
     ],
 )
 def test_mistakes_on_the_command_line_are_sentences(

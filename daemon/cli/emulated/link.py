@@ -10,9 +10,15 @@ def add_link(parser: argparse.ArgumentParser) -> None:
 
 
 def checked_link(link: Path | None) -> Path | None:
-    """Return the path for the link; UserError when none can be made there."""
+    """Return the path for the link, its folder made; UserError when none can be made there."""
     from daemon.errors import UserError
 
-    if link is not None and (not link.parent.is_dir() or (link.exists() and not link.is_symlink())):
-        raise UserError(f"--link {link} cannot be made: it needs a folder, and a name that no file has")
+    if link is None:
+        return None
+    try:
+        link.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--link {link} cannot be made: {error.strerror}; choose another folder") from error
+    if link.exists() and not link.is_symlink():
+        raise UserError(f"--link {link} cannot be made: a file has this name; choose another")
     return link

@@ -10,7 +10,17 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from bank.channels import N_CHANNELS
-from bank.compression import COARSE_RANK, ROUNDING, CompressedBank, FloatArray, Indices, Single, column, columns
+from bank.compression import (
+    COARSE_RANK,
+    ROUNDING,
+    SEED_LEVEL,
+    CompressedBank,
+    FloatArray,
+    Indices,
+    Single,
+    column,
+    columns,
+)
 
 Mask = NDArray[np.bool_]
 
@@ -96,10 +106,11 @@ class AllLagsBounds:
         parts = fft.irfft(fft.rfft(frame.astype(np.float32), len(_LAGS)) * spectra, len(_LAGS))
         before = np.concatenate([[0.0], np.cumsum(frame * frame)[:-1]])
         self._columns = columns(parts, np.concatenate([1.0 - before, before]))
-        self._bound_groups(self._reached_at_0() - _SLACK)
+        self._groups = bank.levels[SEED_LEVEL].rows
+        self._bound_first(self._reached_at_0() - _SLACK)
         n_seeds = min(_SEED_LAGS, len(self._lags))
         self._seed_lags = self._lags[np.argpartition(self._highest, -n_seeds)[-n_seeds:]]
-        self._estimates = _products(bank.groups[:, :-2], self._columns[:-2, self._seed_lags])
+        self._estimates = _products(self._groups[:, :-2], self._columns[:-2, self._seed_lags])
 
     def seed(self, around: Neighbourhood | None) -> tuple[int, FloatArray] | None:
         """Return a cell outside a neighbourhood that is likely to score high, and the (1, 896) frame at its lag.
@@ -121,18 +132,27 @@ class AllLagsBounds:
     def left(self, score: float) -> Left:
         """Return the cells that may have a score, or a higher one.
 
-        Groups are bounded first, then the cells of those that are left, at the lags that are left, at both ranks.
+        Groups are bounded first, then their parts, then the cells of those that are left, at the lags that are left.
         """
         if score < self._bounded_down_to:
-            self._bound_groups(score)
+            self._bound_first(score)
         bank, least = self._bank, score - ROUNDING
         chosen = self._highest >= least
         lags = self._lags[chosen]
-        groups = (self._group_bounds[chosen] >= least).any(axis=0)
-        cells = np.flatnonzero(groups.take(bank.group_of))
+        alive = (self._first_bounds[chosen] >= least).any(axis=0)
+        for level in bank.levels[1:]:
+            groups = np.flatnonzero(alive.take(level.part_of))
+            if len(groups) * len(lags) > _MOST_BOUNDS:
+                reach = np.ones((1, len(groups)), dtype=np.bool_)
+            else:
+                reach = _products(level.rows.take(groups, axis=0), self._columns[:, lags]) >= least
+                lags = lags[reach.any(axis=1)]
+            alive = np.zeros(len(level.rows), dtype=np.bool_)
+            alive[groups] = reach.any(axis=0)
+        cells = np.flatnonzero(alive.take(bank.group_of))
         if len(cells) * len(lags) <= _MOST_BOUNDS:
-            alive = _products(bank.coarse.take(cells, axis=0), self._columns[:, lags]) >= least
-            cells, lags = cells[alive.any(axis=0)], lags[alive.any(axis=1)]
+            reach = _products(bank.coarse.take(cells, axis=0), self._columns[:, lags]) >= least
+            cells, lags = cells[reach.any(axis=0)], lags[reach.any(axis=1)]
         frames = self._frames(lags)
         if len(cells) * len(lags) > _MOST_BOUNDS:
             return Left(cells, np.full(len(cells), np.inf, dtype=np.float32), frames)
@@ -142,19 +162,19 @@ class AllLagsBounds:
     def _reached_at_0(self) -> float:
         """Return a score that some cell surely has at lag 0."""
         at_0 = self._columns[:, 0]
-        cell = self._best_of(self._bank.members[np.argmax(self._bank.groups[:, :-2] @ at_0[:-2])], 0)
+        cell = self._best_of(self._bank.members[np.argmax(self._groups[:, :-2] @ at_0[:-2])], 0)
         row = self._bank.coarse[cell]
         return float(row[:-2] @ at_0[:-2] - row[-1] * at_0[-1])
 
     def _best_of(self, cells: Indices, lag: int) -> int:
         return int(cells[np.argmax(self._bank.coarse[cells, :-2] @ self._columns[:-2, lag])])
 
-    def _bound_groups(self, score: float) -> None:
-        """Bound the groups at all lags at which any cell may reach a score."""
+    def _bound_first(self, score: float) -> None:
+        """Bound the first level's groups at all lags at which any cell may reach a score."""
         self._bounded_down_to = score
         self._lags = np.flatnonzero(self._bank.widest @ self._columns[-2:] >= score - ROUNDING)
-        self._group_bounds = _products(self._bank.groups, self._columns[:, self._lags])
-        self._highest = self._group_bounds.max(axis=1)
+        self._first_bounds = _products(self._bank.levels[0].rows, self._columns[:, self._lags])
+        self._highest = self._first_bounds.max(axis=1)
 
     def _frames(self, lags: Indices) -> FloatArray:
         return self._padded.take(N_CHANNELS + _LAGS[lags, None] + _CHANNELS)

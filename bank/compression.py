@@ -11,10 +11,10 @@ row (c, e, ρ) with a column (g, ‖g‖, t), and many bounds are one matrix pro
 
 import heapq
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import count
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,10 @@ Indices = NDArray[np.int64]
 # Numbers per cell: few to find the neighbourhood, more to tell its cells apart.
 COARSE_RANK = 24
 FINE_RANK = 96
-# Cells are bounded in groups first, of at least so many cells on average.
-_N_GROUPS = 512
+# Cells are bounded in groups first, those in groups of theirs, of at least so many cells on average.
+_N_GROUPS = (256, 1024, 2048)
+# The level whose groups are small enough to look for a high score in.
+SEED_LEVEL = 1
 _LEAST_CELLS = 4
 # What a group is split for: its radius, and its ρ times a usual t.
 _USUAL_T = 0.5
@@ -42,20 +44,28 @@ ROUNDING = 2e-5
 _SQUARE_ROUNDING = 4e-6
 
 
+class Level(NamedTuple):
+    """Groups of cells: their rows (m, r + 2), and the group of the level before, (m,), that each is a part of."""
+
+    rows: Single
+    part_of: Indices
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedBank:
     """Rows of bounds, from coarse to fine; a bound is a row times a column of `columns`.
 
     basis (R, 896), its first directions the most important; fine (n, R + 2) and coarse (n, r + 2) rows of the n cells;
-    groups (m, r + 2) rows of sets of cells, and widest (2,) the (e, ρ) of all cells around 0. Cell i belongs to group
-    group_of[i]; members[j] are the cells of group j, and centres[j] is the one nearest to its centre. estimators (r, n)
-    and left_out (n,) are coarse again, its c and ρ, in the order of memory that suits products with all cells.
+    levels of groups from few to many, and widest (2,) the (e, ρ) of all cells around 0. Cell i belongs to group
+    group_of[i] of the last level; members[j] are the cells of group j of SEED_LEVEL, and centres[j] is the one nearest
+    to its centre. estimators (r, n) and left_out (n,) are coarse again, its c and ρ, in the order of memory that suits
+    products with all cells.
     """
 
     basis: Single
     fine: Single
     coarse: Single
-    groups: Single
+    levels: tuple[Level, ...]
     widest: Single
     group_of: Indices
     members: tuple[Indices, ...]
@@ -76,15 +86,20 @@ def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
     basis = ascending[:, ::-1]
     numbers = np.vstack([part @ basis for part in parts()])
     coarse = _rows_of_cells(numbers[:, :COARSE_RANK])
-    members = _partition(coarse, min(_N_GROUPS, n // _LEAST_CELLS))
-    group_of = np.empty(n, dtype=np.int64)
-    for group, cells in enumerate(members):
-        group_of[cells] = group
+    group_of = np.zeros(n, dtype=np.int64)
+    levels = []
+    partitions = _partitions(coarse, [min(size, n // _LEAST_CELLS) for size in _N_GROUPS])
+    for groups in partitions:
+        part_of = np.array([group_of[cells[0]] for cells in groups])
+        levels.append(Level(np.array([_bounding(coarse[cells]) for cells in groups]), part_of))
+        for group, cells in enumerate(groups):
+            group_of[cells] = group
+    members = partitions[SEED_LEVEL]
     return CompressedBank(
         basis=np.ascontiguousarray(basis.T, dtype=np.float32),
         fine=_rows_of_cells(numbers),
         coarse=coarse,
-        groups=np.array([_bounding(coarse[cells]) for cells in members]),
+        levels=tuple(levels),
         widest=np.array([np.linalg.norm(coarse[:, :-2], axis=1).max(), coarse[:, -1].max()], dtype=np.float32),
         group_of=group_of,
         members=tuple(members),
@@ -131,11 +146,11 @@ def _bounding(cells: Single) -> Single:
     return np.array([*centre, radius, cells[:, -1].max()], dtype=np.float32)
 
 
-def _partition(cells: Single, n_groups: int) -> list[Indices]:
-    """Split the cells into groups, fewer where cells are alike.
+def _partitions(cells: Single, sizes: Sequence[int]) -> list[list[Indices]]:
+    """Split the cells into groups, as many as each of the rising sizes says, or fewer where cells are alike.
 
     The group of the widest bound is split in two, between the cell farthest from its centre and the one farthest from
-    that.
+    that; so every group is a part of one of the partition before.
     """
     order = count()
 
@@ -145,15 +160,18 @@ def _partition(cells: Single, n_groups: int) -> list[Indices]:
         return -width, next(order), chosen
 
     heap = [entry(np.arange(len(cells)))]
-    while len(heap) < n_groups and heap[0][0] < 0:
-        _, _, chosen = heapq.heappop(heap)
-        points = cells[chosen, :-2]
-        one = points[np.argmax(_distances(points, points.mean(axis=0)))]
-        other = points[np.argmax(_distances(points, one))]
-        nearer = (points - (one + other) / 2) @ (one - other) > 0
-        heapq.heappush(heap, entry(chosen[nearer]))
-        heapq.heappush(heap, entry(chosen[~nearer]))
-    return [chosen for _, _, chosen in heap]
+    found = []
+    for size in sizes:
+        while len(heap) < size and heap[0][0] < 0:
+            _, _, chosen = heapq.heappop(heap)
+            points = cells[chosen, :-2]
+            one = points[np.argmax(_distances(points, points.mean(axis=0)))]
+            other = points[np.argmax(_distances(points, one))]
+            nearer = (points - (one + other) / 2) @ (one - other) > 0
+            heapq.heappush(heap, entry(chosen[nearer]))
+            heapq.heappush(heap, entry(chosen[~nearer]))
+        found.append([chosen for _, _, chosen in heap])
+    return found
 
 
 def _central(cells: Single, chosen: Indices) -> int:

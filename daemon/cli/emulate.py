@@ -5,7 +5,9 @@ A device is a module in `daemon.cli.emulated` with `configure(parser)` and `run(
 
 import argparse
 import importlib
-from typing import NamedTuple
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple, NoReturn
 
 
 class Device(NamedTuple):
@@ -34,6 +36,34 @@ def configure(parser: argparse.ArgumentParser) -> None:
     for name, device in DEVICES.items():
         module = importlib.import_module(device.module)
         module.configure(devices.add_parser(name, help=device.summary, description=f"Play {device.summary}."))
+
+
+class _Refusing(argparse.ArgumentParser):
+    """Raises UserError where a parser would end the program."""
+
+    def error(self, message: str) -> NoReturn:
+        from daemon.errors import UserError
+
+        raise UserError(message)
+
+    def exit(self, _status: int = 0, message: str | None = None) -> NoReturn:
+        self.error(message or "`--help` is no argument for a device that is to play")
+
+
+def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> argparse.Namespace:
+    """Return what a device's arguments, as a configuration in `folder` gives them, mean.
+
+    Raises UserError for arguments that its command would not take, and for a bank that is not there.
+    """
+    from daemon.errors import UserError
+
+    parser = _Refusing(prog=device, allow_abbrev=False)
+    importlib.import_module(DEVICES[device].module).configure(parser)
+    args = parser.parse_args(arguments)
+    bank = getattr(args, "bank", None)
+    if bank is not None and not (folder / bank).exists():
+        raise UserError(f"--bank {bank}: there is no such file; make it with `shearloop bank build`")
+    return args
 
 
 def run(args: argparse.Namespace) -> int:

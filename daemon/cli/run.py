@@ -92,8 +92,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def checked_emulators(emulators: "tuple[Emulator, ...]", config: Path) -> None:
-    """Raise UserError for an emulator of a device that there is none of."""
-    from daemon.cli.emulate import DEVICES
+    """Raise UserError for an emulator of a device that there is none of, or with arguments that it does not take."""
+    from daemon.cli.emulate import DEVICES, checked_arguments
     from daemon.errors import UserError
 
     for number, emulator in enumerate(emulators):
@@ -101,6 +101,10 @@ def checked_emulators(emulators: "tuple[Emulator, ...]", config: Path) -> None:
             raise UserError(
                 f"{config}: `emulators[{number}].device` is {emulator.device!r}; there are {', '.join(DEVICES)}"
             )
+        try:
+            checked_arguments(emulator.device, (*emulator.arguments, *emulator.synthetic), config.parent)
+        except UserError as error:
+            raise UserError(f"{config}: `emulators[{number}].arguments`: {emulator.device}: {error}") from error
 
 
 def _side(arguments: tuple[str, ...]) -> str | None:

@@ -176,6 +176,17 @@ def test_an_emulator_or_a_recording_that_cannot_play_is_refused_before_anything_
     unknown = str(config(emulators=[{"device": "eit-kitt"}]))
     for command in ("check", "run"):
         assert "`emulators[0].device` is 'eit-kitt'; there are eit-kit" in mistake(capsys, command, unknown)
+    for arguments, part in (
+        (["--bank", "b"], "--bank b: there is no such file; make it with `shearloop bank build`"),
+        (["--speed", "fast"], "argument --speed: invalid float value: 'fast'"),
+        (["--sped", "2"], "unrecognized arguments: --sped 2"),
+        (["--help"], "`--help` is no argument"),
+    ):
+        wrong = str(config(emulators=[{"device": "eit-kit", "arguments": arguments}]))
+        for command in ("check", "run"):
+            said = mistake(capsys, command, wrong)
+            assert "`emulators[0].arguments`: eit-kit: " in said
+            assert part in said
     known = str(config(emulators=[{"device": "eit-kit"}]))
     assert "the recording cannot be read" in mistake(capsys, "run", known, "--recording", str(tmp_path / "none.mat"))
 

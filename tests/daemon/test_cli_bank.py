@@ -76,6 +76,30 @@ def test_solve_writes_the_absolute_voltages(folder, tmp_path):
     assert np.linalg.norm(voltages) > 1
 
 
+def test_solve_leaves_what_was_there_whole_until_the_voltages_are_written(folder, tmp_path, monkeypatch, capsys):
+    out, link = tmp_path / "v.npy", tmp_path / "link.npy"
+    out.write_text("an earlier result")
+    link.symlink_to(out)
+    solve = [*("bank", "solve", "--mesh", f"{folder}/tip.yaml", "--model", "gaussian_derivative", "--k", "1.5")]
+    solve += ["--sigma", "1.1", "--out", f"{link}"]
+
+    def full(file, _voltages):
+        file.write(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(np, "save", full)
+        assert main(solve) == 2
+    assert "No space left on device" in capsys.readouterr().err
+    assert out.read_text() == "an earlier result"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["link.npy", "v.npy"]
+    assert main(solve) == 0
+    assert np.load(out).shape == (896,)
+    assert link.is_symlink()
+    assert main([*solve[:-1], f"{tmp_path}"]) == 2
+    assert "Is a directory" in capsys.readouterr().err
+
+
 def test_solve_on_the_papers_mesh_gives_the_voltages_of_eidors(shared, tmp_path):
     with np.load(shared / "reference" / "eidors_forward.npz") as archive:
         k, sigma, expected = (archive[f"gaussian_derivative_random_{name}"][2] for name in ("k", "sigma", "v"))

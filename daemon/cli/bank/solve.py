@@ -24,6 +24,7 @@ def run(args: argparse.Namespace) -> int:
     from bank.models import conductivity
     from daemon.bank_config import load_geometry
     from daemon.errors import UserError
+    from daemon.replaced import replaced
 
     mesh = load_geometry(args.mesh)
     try:
@@ -31,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     except ConductivityError as error:
         raise UserError(f"--model {args.model} --k {args.k:g} --sigma {args.sigma:g}: {error}") from error
     try:
-        with args.out.open("wb") as file:
+        with replaced(args.out) as file:
             np.save(file, voltages)
     except OSError as error:
         raise UserError(

@@ -1,6 +1,7 @@
 """Where the daemon is found when nothing else is said, and which addresses are safe without keys."""
 
 import ipaddress
+import socket
 from urllib.parse import urlsplit
 
 PUBLISH_ADDRESS = "tcp://127.0.0.1:7761"
@@ -47,3 +48,17 @@ def open_to_the_network(address: str, key: str) -> str:
         f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
         "tcp://127.0.0.1:7761, or add `curve` with keys made by `shearloop keys`"
     )
+
+
+def stop_address(address: str) -> str:
+    """Return where `stop` is heard without a key: the address itself, or the open socket of a daemon on the network."""
+    open_address = open_stop_address(address)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.setblocking(False)
+        try:
+            probe.connect("\0" + open_address.removeprefix("ipc://@"))
+        except BlockingIOError:
+            return open_address
+        except OSError:
+            return address
+    return open_address

@@ -57,18 +57,21 @@ def make_load_cell(
     return LoadCellTask(board, publisher, clock, hear, config.rate_hz)
 
 
+def make_gripper_client(config: GripperConfig) -> GripperClient:
+    """Return the way to the gripper; nothing is opened yet."""
+    if config.socket is not None:
+        return SocketClient(config.socket.host, config.socket.port)
+    if config.modbus is not None:
+        path = str(config.modbus.path) if config.modbus.path is not None else None
+        return ModbusClient(serial_number=config.modbus.serial_number, path=path)
+    raise ValueError("a gripper has a way in")
+
+
 def make_gripper(
     config: GripperConfig, publisher: Publisher, feel: Callable[[Hand], None], on_event: Callable[[LinkEvent], None]
 ) -> GripperTask:
     """Return the gripper's task; raises DriverError when its calibration cannot be used."""
-    client: GripperClient
-    if config.socket is not None:
-        client = SocketClient(config.socket.host, config.socket.port)
-    elif config.modbus is not None:
-        path = str(config.modbus.path) if config.modbus.path is not None else None
-        client = ModbusClient(serial_number=config.modbus.serial_number, path=path)
-    else:
-        raise ValueError("a gripper has a way in")
+    client = make_gripper_client(config)
     calibration = (
         load_calibration(config.calibration, WidthCalibration)
         if config.calibration is not None

@@ -37,6 +37,8 @@ COMMANDS = {
     "calibrate": Command("daemon.cli.calibrate", "calibrate the load cell or the gripper, step by step"),
     "emulate": Command("daemon.cli.emulate", "play a device, byte for byte, on a port of its own"),
     "bank": Command("daemon.cli.bank", "solve, build, inspect and draw banks of simulated signals"),
+    "doctor": Command("daemon.cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
+    "ports": Command("daemon.cli.ports", "list the serial ports with their serial numbers"),
     "keys": Command("daemon.cli.keys", "make the keys for daemon and clients on a network"),
     "install": Command("daemon.cli.install", "make the daemon a service of this computer"),
     "uninstall": Command("daemon.cli.uninstall", "take the service away again"),

@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from daemon.addresses import COMMAND_ADDRESS, needs_keys
-from daemon.cli.connection import add_connection, client_keys, stop_address
+from daemon.addresses import COMMAND_ADDRESS, needs_keys, stop_address
+from daemon.cli.connection import add_connection, client_keys
 
 COMMANDS = {
     "tare": "take the zero of fingertips and skin anew, nothing gripped",

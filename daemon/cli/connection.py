@@ -2,11 +2,10 @@
 
 import argparse
 import os
-import socket
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.addresses import needs_keys, open_stop_address
+from daemon.addresses import needs_keys
 
 if TYPE_CHECKING:
     from daemon.keys import ClientKeys
@@ -48,17 +47,3 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
                 f"{args.connect} is not on this machine, and there is no key {path}: {cure}, or give {option}"
             )
     return ClientKeys(load_key_pair(key), load_public_key(server_key))
-
-
-def stop_address(address: str) -> str:
-    """Return where `stop` is heard without a key: the address itself, or the open socket of a daemon on the network."""
-    open_address = open_stop_address(address)
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.setblocking(False)
-        try:
-            probe.connect("\0" + open_address.removeprefix("ipc://@"))
-        except BlockingIOError:
-            return open_address
-        except OSError:
-            return address
-    return open_address

@@ -46,9 +46,6 @@ class _Refusing(argparse.ArgumentParser):
 
         raise UserError(message)
 
-    def exit(self, _status: int = 0, message: str | None = None) -> NoReturn:
-        self.error(message or "`--help` is no argument for a device that is to play")
-
 
 def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> argparse.Namespace:
     """Return what a device's arguments, as a configuration in `folder` gives them, mean.
@@ -57,7 +54,7 @@ def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> ar
     """
     from daemon.errors import UserError
 
-    parser = _Refusing(prog=device, allow_abbrev=False)
+    parser = _Refusing(prog=device, allow_abbrev=False, add_help=False)
     importlib.import_module(DEVICES[device].module).configure(parser)
     args = parser.parse_args(arguments)
     bank = getattr(args, "bank", None)

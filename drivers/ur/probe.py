@@ -34,10 +34,10 @@ def probe(host: str, timeout_s: float) -> str:
     try:
         with socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection:
             connection.sendall(_HEADER.pack(3, _CONTROLLER_VERSION))
-            answer = _receive(connection, _CONTROLLER_VERSION)
+            answer = receive(connection, _CONTROLLER_VERSION)
             version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
             connection.sendall(_HEADER.pack(5, _PROTOCOL) + b"\x00\x02")
-            accepted = _receive(connection, _PROTOCOL)[:1] == b"\x01"
+            accepted = receive(connection, _PROTOCOL)[:1] == b"\x01"
     except TimeoutError as error:
         raise ProbeError("silent", sentences.silent(host, timeout_s, "greeting it")) from error
     except (OSError, struct.error) as error:
@@ -47,7 +47,8 @@ def probe(host: str, timeout_s: float) -> str:
     return version
 
 
-def _receive(connection: socket.socket, kind: int) -> bytes:
+def receive(connection: socket.socket, kind: int) -> bytes:
+    """Return the next RTDE package of a kind; raises OSError where none comes among the first twenty."""
     for _ in range(_OTHER_PACKAGES):
         size, got = _HEADER.unpack(_exactly(connection, _HEADER.size))
         payload = _exactly(connection, size - _HEADER.size)

@@ -180,7 +180,7 @@ def test_an_emulator_or_a_recording_that_cannot_play_is_refused_before_anything_
         (["--bank", "b"], "--bank b: there is no such file; make it with `shearloop bank build`"),
         (["--speed", "fast"], "argument --speed: invalid float value: 'fast'"),
         (["--sped", "2"], "unrecognized arguments: --sped 2"),
-        (["--help"], "`--help` is no argument"),
+        (["--help"], "unrecognized arguments: --help"),
     ):
         wrong = str(config(emulators=[{"device": "eit-kit", "arguments": arguments}]))
         for command in ("check", "run"):

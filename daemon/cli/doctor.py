@@ -1,0 +1,54 @@
+"""`shearloop doctor`: walks through everything that a person who is stuck would check."""
+
+import argparse
+from pathlib import Path
+
+MARKS = {"good": "ok   ", "note": "note ", "trouble": "WRONG"}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `doctor`."""
+    parser.add_argument("config", type=Path, nargs="?", help="the configuration, for files and devices")
+    parser.add_argument(
+        "--seconds",
+        type=float,
+        default=6.0,
+        metavar="S",
+        help="how long to listen to the devices (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--geometry", type=Path, metavar="FILE", help="the fingertip's geometry, to hold its bank against"
+    )
+    parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Examine and tell; status 1 when something is wrong."""
+    import json
+    import math
+    from dataclasses import asdict
+
+    from daemon.doctor.examination import examine
+    from daemon.errors import UserError
+    from daemon.logs import set_up_logging
+
+    if not (math.isfinite(args.seconds) and 0 < args.seconds <= 600):
+        raise UserError(f"--seconds {args.seconds:g} is not a time to listen; give seconds above 0, up to 600")
+    set_up_logging(level=40)
+    findings = []
+    for finding in examine(args.config, args.seconds, args.geometry):
+        findings.append(finding)
+        if args.json:
+            continue
+        print(f"{MARKS[finding.state]} {finding.subject}: {finding.found}", flush=True)
+        if finding.means:
+            print(f"        it means: {finding.means}")
+        if finding.next_step:
+            print(f"        next: {finding.next_step}", flush=True)
+    wrong = sum(finding.state == "trouble" for finding in findings)
+    if args.json:
+        print(json.dumps([asdict(finding) for finding in findings], ensure_ascii=False))
+    else:
+        notes = sum(finding.state == "note" for finding in findings)
+        print(f"{len(findings)} things were looked at: {wrong} wrong, {notes} to note")
+    return 1 if wrong else 0

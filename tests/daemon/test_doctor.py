@@ -1,0 +1,192 @@
+"""`shearloop doctor` and `ports`: every finding says what was found, what it means, and the next step."""
+
+import asyncio
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import yaml
+
+from daemon.cli import main
+from daemon.doctor import machine
+from daemon.doctor.devices import channels_finding, rate_finding
+from daemon.doctor.examination import examine
+from daemon.doctor.files import bank_finding, keys_finding
+from daemon.doctor.finding import Finding, from_sentence
+from daemon.doctor.live import task_finding
+from daemon.keys import make_key_pair
+from daemon.subscriber import messages
+from tests.daemon.conftest import DEADLINE_S, shearloop
+
+Write = Callable[..., Path]
+HOST = "127.0.0.43"
+SPEED = 8
+
+
+@pytest.fixture
+def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
+    """A whole rig whose boards are SPEED times as fast; its gripper is on the robot's address."""
+    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": HOST}))
+    device = {"path": "eit-right"}
+    return config(
+        fingertips={"right": {"device": device, "bank": str(tiny_bank), "frame_period_s": 0.5412 / SPEED}},
+        load_cell={"device": {"path": "load-cell"}, "rate_hz": 5.0},
+        robot="ur.yaml",
+        gripper={"socket": {"host": HOST}},
+    )
+
+
+async def examined(path: Path, seconds: float) -> dict[str, Finding]:
+    findings = await asyncio.to_thread(lambda: list(examine(path, seconds)))
+    for finding in findings:
+        assert finding.found
+        assert bool(finding.means) == bool(finding.next_step) == (finding.state != "good"), finding
+    return {finding.subject: finding for finding in findings}
+
+
+async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, tiny_bank: Path) -> None:
+    found = await examined(rig_config, 0.1)
+    assert "There is no serial port" in found["port of right"].found
+    assert "switched on" in found["robot"].next_step
+    assert found["bank of right"].state == "good"
+    assert found["calibration of right"].found == "none is configured"
+    options = ("--bank", str(tiny_bank), "--run-dir", str(rig_config.parent), "--host", HOST, "--speed", str(SPEED))
+    async with shearloop("emulate", "rig", *options, stdin=asyncio.subprocess.PIPE) as rig:
+        assert rig.stdout is not None
+        assert rig.stdin is not None
+        assert (await rig.stdout.readline()).startswith(b"rig ready")
+        found = await examined(rig_config, 1.5)
+        for subject in ("port of right", "channels of right", "robot", "robot's registers"):
+            assert found[subject].state == "good", found[subject]
+        # How near a busy computer comes to it is not the question here.
+        assert f"{SPEED / 0.5412:.3g} configured" in found["rate of right"].found
+        assert found["channels of right"].found.startswith("0 saturated and 0 dead of 896 in ")
+        assert found["remote control"].state == "good"
+        # The board sends more often than the configuration says.
+        assert found["rate of load_cell"].state == "note"
+        assert "5 configured" in found["rate of load_cell"].found
+        rig.stdin.write(b"registers-in-use\nlocal-control\n")
+        assert b"obeyed" in await rig.stdout.readline()
+        assert b"obeyed" in await rig.stdout.readline()
+        found = await examined(rig_config, 0.1)
+        assert found["robot's registers"].found == "in use"
+        assert "remote control, top right" in found["remote control"].next_step
+        rig.stdin.write(b"normal\n")
+        async with shearloop("run", str(rig_config)):
+            published = messages(f"ipc://{rig_config.parent}/publish", ["robot.state"], DEADLINE_S)
+            await asyncio.to_thread(next, published)
+            published.close()
+            found = await examined(rig_config, 2.0)
+            assert found["daemon"].found.startswith("one answers")
+            for subject in ("task right", "task robot", "channels of right"):
+                assert found[subject].state == "good", found[subject]
+            for subject, configured in (("eit.frame right", f"{SPEED / 0.5412:.3g}"), ("robot.state robot", "25")):
+                assert f"a second, {configured} configured" in found[f"rate of {subject}"].found
+            assert found["rate of load.torque load_cell"].state == "note"
+
+
+def test_a_configuration_that_is_wrong_ends_the_examination(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", str(tmp_path / "no.yaml")]) == 1
+    said = capsys.readouterr().out
+    assert "WRONG configuration" in said
+    assert "next: " in said
+    assert main(["doctor", str(tmp_path / "no.yaml"), "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)[-1]["subject"] == "configuration"
+    assert main(["doctor", "--seconds", "nan"]) == 2
+
+
+def test_the_clock() -> None:
+    assert machine.clock_finding(1e9, 0).state == "trouble"
+    assert machine.clock_finding(1.8e9, 5).state == "note"
+    assert machine.clock_finding(1.8e9, 0).state == "good"
+    assert machine.clock_state() in range(-1, 6)
+
+
+def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for free, state in ((1e8, "trouble"), (1e9, "note"), (1e11, "good")):
+        monkeypatch.setattr(machine.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        assert machine.disk_finding(tmp_path / "not/yet/there").state == state
+
+
+@pytest.mark.parametrize(
+    ("facts", "state", "part"),
+    [
+        ({"alive": True, "errors": {}}, "good", "alive"),
+        ({"alive": False, "restarts": 3, "last_error": "ValueError: x"}, "trouble", "dead, 3 restarts"),
+        ({"alive": True, "connected": False, "last_loss": "unplugged"}, "trouble", "not connected"),
+        ({"alive": True, "restarts": 1, "last_error": "x"}, "note", "1 restarts"),
+        ({"alive": True, "connected": True, "errors": {"nan": 2}}, "note", "2 × nan"),
+    ],
+)
+def test_a_task_is_judged_by_what_it_counts(facts: dict[str, Any], state: str, part: str) -> None:
+    finding = task_finding("right", facts)
+    assert finding.state == state
+    assert part in finding.found
+
+
+def test_rates_and_channels() -> None:
+    assert rate_finding("rate", None, 1.85).state == "trouble"
+    assert rate_finding("rate", 1.9, 1.85).state == "good"
+    assert "frame_period_s 1.0000" in rate_finding("rate", 1.0, 1.85).next_step
+    assert channels_finding("right", 0, 0, 9).state == "good"
+    assert "bridges" in channels_finding("right", 2, 0, 9).next_step
+    assert "one electrode" in channels_finding("right", 0, 28, 9).next_step
+
+
+def test_a_bank_of_another_geometry_is_told(config: Write) -> None:
+    from daemon.config import load_daemon_config
+
+    fingertip = load_daemon_config(config()).fingertips["right"]
+    assert bank_finding("right", fingertip).state == "good"
+    other = bank_finding("right", fingertip, Path("config/fingertips/paper.yaml"))
+    assert (other.state, "of another fingertip" in other.means) == ("trouble", True)
+    assert bank_finding("right", fingertip, Path("no.yaml")).state == "trouble"
+
+
+def test_a_secret_key_that_others_can_read_is_told(tmp_path: Path) -> None:
+    from daemon.config import CurveConfig
+
+    _, secret = make_key_pair(tmp_path, "server")
+    (tmp_path / "clients").mkdir()
+    curve = CurveConfig(server_key=secret, clients=tmp_path / "clients")
+    assert "nobody could connect" in keys_finding(curve, {}).found
+    make_key_pair(tmp_path / "clients", "ada")
+    assert keys_finding(curve, {"publish": "tcp://0.0.0.0:1"}).found == "ada may connect to tcp://0.0.0.0:1"
+    assert keys_finding(curve, {}).state == "note"
+    secret.chmod(0o644)
+    assert "mode 644" in keys_finding(curve, {}).found
+    assert keys_finding(None, {}).state == "good"
+
+
+def test_an_error_sentence_becomes_a_finding_with_its_cure() -> None:
+    finding = from_sentence("bank", "a.bank: it is cut off; build it anew.", "nothing")
+    assert (finding.found, finding.next_step) == ("a.bank: it is cut off", "build it anew")
+    assert from_sentence("x", "oh no", "nothing").next_step
+
+
+def port(**changes: Any) -> Any:
+    fields = {"device": "/dev/null", "serial_number": "12345670", "vid": 0x16C0, "pid": 0x0483, "description": "USB"}
+    return SimpleNamespace(**{**fields, **changes})
+
+
+def test_ports_are_listed_with_what_a_configuration_names_them_by(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    there: list[Any] = []
+    monkeypatch.setattr("daemon.ports.sorted", lambda ports: ports, raising=False)
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: there)
+    assert main(["ports"]) == 0
+    assert "no serial port is there" in capsys.readouterr().out
+    there += [port(), port(serial_number=None, vid=0x1A86, pid=0x7523), port(device="/dev/ttyS0", vid=None, pid=None)]
+    assert main(["ports", "--json"]) == 0
+    first, second = json.loads(capsys.readouterr().out)
+    assert first["named_by"] == '{serial_number: "12345670"}'
+    assert (first["likely"], first["usb"], first["trouble"]) == ("EIT-kit (Teensy)", "16c0:0483", "")
+    assert second["named_by"] == "{path: /dev/null}"
+    there[:] = [port(device="/dev/gone")]
+    assert main(["ports"]) == 0
+    assert "sudo usermod -aG dialout" in capsys.readouterr().out

@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 # Many small solves: one BLAS thread each, on every machine.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install install-dev system-packages demo test lint format clean
+.PHONY: install install-dev system-packages demo docs test lint format clean
 
 # What running and drawing take; the tools of the tests and the static checks come with `install-dev`.
 install: $(VENV)/.installed
@@ -49,6 +49,10 @@ lint: install-dev
 format: install-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# The pages that are written from the code.
+docs: install
+	$(BIN)/python -m daemon.handbook
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -1,0 +1,138 @@
+"""The generated pages say what the code says, and the programs in them run."""
+
+import asyncio
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zmq
+
+from daemon.clock import Clock
+from daemon.handbook.pages import ROOT, pages
+from daemon.handbook.sentences import raised, split, told
+from daemon.handbook.troubleshooting_page import CURES, SECTIONS, cure_of, troubleshooting_page
+from daemon.messages import EitEstimate, EitFrame
+from daemon.publisher import Publisher
+from daemon.safety import TABLE
+from daemon.topics import TOPICS
+from tests.daemon.conftest import DEADLINE_S
+
+WRITTEN = {path.name: text for path, text in pages(ROOT).items()}
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_page_is_what_the_code_says(name: str) -> None:
+    found = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    assert found == WRITTEN[name], f"docs/{name} is out of date: run `make docs` and commit it"
+
+
+def test_every_topic_and_key_is_told_of() -> None:
+    for topic, kind in TOPICS.items():
+        assert f"### `{topic}`" in WRITTEN["messages.md"]
+        for key in (item.name for item in dataclasses.fields(kind)):
+            assert f"| `{key}` |" in WRITTEN["messages.md"]
+
+
+def test_every_row_of_the_safety_table_is_told_of() -> None:
+    for rule in TABLE.values():
+        for page in ("safety.md", "troubleshooting.md"):
+            assert rule.cure in WRITTEN[page]
+
+
+def test_every_sentence_is_listed_once_and_has_a_cure() -> None:
+    rows = [line for line in WRITTEN["troubleshooting.md"].splitlines() if line.startswith("| ")]
+    said = [row.split(" | ")[0] for row in rows if not row.startswith(("| what is said", "| event"))]
+    assert len(said) > 300
+    assert len(set(said)) > 0.98 * len(said), "a sentence may come in two sections with two cures, but seldom"
+    assert all(row.split(" | ")[-1].strip(" |") for row in rows)
+
+
+def test_sentences_are_found_in_the_source(tmp_path: Path) -> None:
+    module = tmp_path / "module.py"
+    module.write_text(
+        '"""Not this one, it is documentation."""\n'
+        "def judge(left, name):\n"
+        '    """Nor this one, it is documentation."""\n'
+        "    if left:\n"
+        '        raise UserError(f"{name!r} has " "gone; plug it in again")\n'
+        '    raise TypeError("this is for programmers alone")\n'
+        "def why(port):\n"
+        '    return f"the port {port.path} says nothing"\n'
+    )
+    (gone,) = raised(module)
+    assert (gone.said, gone.cure) == ("‹name› has gone", "plug it in again")
+    assert [sentence.said for sentence in told(module)] == ["the port ‹path› says nothing"]
+    section = SECTIONS[0]
+    assert cure_of(gone, section) == "Plug it in again."
+    assert cure_of(split("it must be above 0"), section) == "Give what the sentence asks for."
+    assert cure_of(split("it is so"), section) == section.otherwise
+
+
+def test_no_cure_is_for_a_sentence_that_there_is_none_of() -> None:
+    page = troubleshooting_page(ROOT)
+    assert [words for words, cure in CURES if cure not in page] == []
+
+
+async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
+    program = (ROOT / "docs/examples/subscriber.py").read_text()
+    address = f"ipc://{tmp_path}/publish"
+    script = tmp_path / "subscriber.py"
+    script.write_text(program.replace("tcp://127.0.0.1:7761", address))
+    frame = EitFrame(
+        source="right",
+        t_mono_ns=1,
+        channels=np.full(896, 0.5),
+        line=np.zeros(1024),
+        frame=1,
+        age_s=0.3,
+        saturated=0,
+        dead=0,
+        repeated=False,
+    )
+    estimate = EitEstimate(
+        source="right",
+        t_mono_ns=1,
+        torque_nm=0.125,
+        torque_low_nm=0.1,
+        torque_high_nm=0.15,
+        diameter_mm=None,
+        k=1.0,
+        sigma=1.0,
+        score=0.9,
+        runner_up=0.5,
+        valid=True,
+        why="",
+        frame=1,
+        latency_s=0.01,
+    )
+    with zmq.Context() as context:
+        publisher = Publisher(context, address, Clock())
+        process = await asyncio.create_subprocess_exec(sys.executable, str(script), stdout=subprocess.PIPE)
+        try:
+            async with asyncio.timeout(DEADLINE_S):
+                assert process.stdout is not None
+                seen = asyncio.create_task(process.stdout.readline())
+                while not seen.done():
+                    # Until it has subscribed.
+                    publisher.publish(estimate)
+                    await asyncio.wait([seen], timeout=0.05)
+                assert b"right 0.125 " in seen.result()
+                publisher.publish(frame)
+                while b"right 0.5" not in await process.stdout.readline():
+                    pass
+        finally:
+            process.kill()
+            await process.communicate()
+            await asyncio.sleep(0)
+            publisher.close()
+
+
+@pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
+def test_a_subscriber_is_about_a_dozen_lines(name: str) -> None:
+    lines = (ROOT / "docs/examples" / name).read_text().splitlines()
+    code = [line for line in lines if line.strip() and not line.lstrip().startswith(("//", "%", '"""', "#", "import"))]
+    assert len(code) <= 15
+    assert "eit." in "".join(code)

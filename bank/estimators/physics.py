@@ -120,7 +120,8 @@ def register(idle: FloatArray, homogeneous: FloatArray) -> Registration:
 class NearestCell:
     """The improved match: no lags, the numbering found once, smoothed alike, a mean of cells that fit nearly alike."""
 
-    def __init__(self, bank: Bank, registration: Registration) -> None:
+    def __init__(self, bank: Bank, registration: Registration, *, mean_of_alike: bool = True) -> None:
+        self._coarse = _COARSE if mean_of_alike else -np.inf
         self._grids = (bank.k_grid, bank.sigma_grid)
         self._valid = np.asarray(bank.valid).ravel()
         signals = np.abs(bank.signals.reshape(-1, N_CHANNELS)[self._valid][:, registration.model_channels()])
@@ -138,7 +139,7 @@ class NearestCell:
         heatmap = scores.reshape(len(self._grids[0]), len(self._grids[1]))
         row, column = (int(i) for i in np.unravel_index(int(np.argmax(heatmap)), heatmap.shape))
         best = float(heatmap[row, column])
-        if (drop := _drop(heatmap, row, column)) <= _COARSE:
+        if (drop := _drop(heatmap, row, column)) <= self._coarse:
             width = max(_NEARLY, _RESOLVED * drop)
             k, sigma, amplitude = self._mean_place(scores[self._cells], best, norm, width)
         else:

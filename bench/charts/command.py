@@ -6,6 +6,7 @@ from pathlib import Path
 
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
+    "stability": "every estimator as faults grow: bias, spread, valid and false-valid share; continuity",
 }
 
 
@@ -45,7 +46,10 @@ def run(args: argparse.Namespace) -> int:
         import matplotlib as _  # noqa: F401 - so that its absence is told before anything is measured
     except ModuleNotFoundError as error:
         raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
-    charts: dict[str, Callable[[argparse.Namespace], list[Path]]] = {"speed-accuracy": _speed_accuracy}
+    charts: dict[str, Callable[[argparse.Namespace], list[Path]]] = {
+        "speed-accuracy": _speed_accuracy,
+        "stability": _stability,
+    }
     for path in charts[args.name](args):
         print(path)
     return 0
@@ -67,3 +71,12 @@ def _speed_accuracy(args: argparse.Namespace) -> list[Path]:
         args.out,
         args.rounds,
     )
+
+
+def _stability(args: argparse.Namespace) -> list[Path]:
+    from bench.charts.sources import bank_of, mesh_of, splits
+    from bench.charts.stability_chart import chart
+
+    scratch, mesh = args.out / "banks", mesh_of(args.mesh)
+    bank = bank_of(args.bank, mesh, scratch)
+    return chart(splits(args.recordings, args.split, scratch), bank, mesh, scratch, args.out)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bank.bank_file import Bank
 from bank.channels import N_CHANNELS, channels_of_line
@@ -17,6 +18,8 @@ from daemon.recording.series import part_of, read_series
 from daemon.reproduce.banks import OWN_FINGERTIP, Grid, cached_bank
 from daemon.synthetic import Synthesiser, TwistProgramme
 
+Floats = NDArray[np.float64]
+
 # Frames before the judged part of a stream that fill the memory of an estimator that has one.
 WARM_UP_FRAMES = 15
 # The bank of a chart where none is named: config/banks/demo.yaml's.
@@ -24,7 +27,7 @@ GRID = Grid(np.linspace(2.9, 4.1, 50), np.linspace(0.9, 2.3, 50))
 MESH_SIZE_CM = 0.2
 # Synthetic frames come from a finer mesh than the bank they are matched with, from cells between that bank's.
 _PLAYED_GRID = Grid(np.linspace(3.07, 3.47, 5), np.linspace(1.03, 1.99, 17))
-_PLAYED_MESH_SIZE_CM = 0.14
+PLAYED_MESH_SIZE_CM = 0.14
 _PERIOD_S = 0.5412
 _LARGEST_NM = 0.14
 _AVERAGED_FRAMES = 9
@@ -81,27 +84,39 @@ def sigma_of(torque_nm: float) -> float:
     return 1.9 - 0.7 * torque_nm / _LARGEST_NM
 
 
+def torque_of(sigma: float) -> float:
+    """Return the torque in N·m that belongs to a σ in cm in synthetic frames, also beyond those that occur."""
+    return _LARGEST_NM * (1.9 - sigma) / 0.7
+
+
 def played_bank(scratch: Path) -> Bank:
     """Return the bank that synthetic frames are made from."""
-    mesh = own_fingertip(_PLAYED_MESH_SIZE_CM).mesh()
+    mesh = own_fingertip(PLAYED_MESH_SIZE_CM).mesh()
     return cached_bank("played", _PLAYED_GRID, mesh, scratch, 1, lambda *_: None)
+
+
+def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> Floats:
+    """Return the mean of nine frames, (896,) in volts, as the paper's slices are smoothed over time."""
+    lines = [synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
+    return np.asarray(np.mean([channels_of_line(line) for line in lines], axis=0))
+
+
+def homogeneous_of(synthesiser: Synthesiser) -> Floats:
+    """Return the homogeneous frame that synthetic slices of this seed are differences to, if asked for first."""
+    return mean_frame(synthesiser, 3.2, 1.5, 0.0)
 
 
 def synthetic_slices(scratch: Path, seed: int = 0) -> FrameSeries:
     """Return 49 differences as the paper's slices are: five repeats of ten torques, means of nine frames."""
     synthesiser, rng = Synthesiser(played_bank(scratch), seed=seed), np.random.default_rng((seed, 1))
 
-    def mean(k: float, sigma: float, grip: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-        lines = [synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
-        return np.asarray(np.mean([channels_of_line(line) for line in lines], axis=0))
-
-    homogeneous = mean(3.2, 1.5, 0.0)
+    homogeneous = homogeneous_of(synthesiser)
     levels = np.tile(np.linspace(0.01, _LARGEST_NM, 10), 5)[1:]
     torque = np.clip(levels + rng.normal(0.0, 0.003, len(levels)), 0.0, _LARGEST_NM)
     # Every repeat the tool sits a little elsewhere in the grip, a little more firmly.
     repeat = np.arange(1, 50) // 10
     frames = [
-        np.abs(mean(3.2 + 0.03 * r, sigma_of(nm), 1.0 + 0.03 * r) - homogeneous)
+        np.abs(mean_frame(synthesiser, 3.2 + 0.03 * r, sigma_of(nm), 1.0 + 0.03 * r) - homogeneous)
         for r, nm in zip(repeat, torque, strict=True)
     ]
     t_s = np.arange(49.0)

@@ -1,0 +1,175 @@
+"""Estimators where methods fail: bias, spread, valid and false-valid share of each, as a fault grows."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.bank_file import Bank
+from bank.errors import BankError
+from bank.estimators import Calibration, Estimate, FrameSeries, Name, Physics, TactileFrame, Tracker, fit
+from bank.estimators.guard import channel_noise
+from bench.charts.faults import FAULTS, Fault, Scene, Spoilt, scene_of
+from bench.charts.sources import Split
+
+Floats = NDArray[np.float64]
+# Of valid estimates one in twenty may miss its 95 % interval; an estimator that is wrong so often says it is right
+# when it is not: it breaks silently.
+BROKEN_SHARE = 0.2
+# Frames of a stream that are judged: enough for a twist and a half.
+_MOST_FRAMES = 180
+_DRAWS = 3
+_LOADED_SHARE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """Errors at one strength of a fault: bias and spread in N·m of valid estimates, None without any; shares of all.
+
+    false_valid is the share of frames that are called valid although the truth is outside the 95 % interval.
+    """
+
+    level: float
+    bias_nm: float | None
+    spread_nm: float | None
+    valid: float
+    false_valid: float
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One estimator through one sweep; breaks_at is the first level at which it is silently wrong too often."""
+
+    fault: str
+    unit: str
+    estimator: str
+    levels: tuple[Level, ...]
+    breaks_at: float | None
+
+
+def curve(fault: str, unit: str, estimator: str, levels: Iterable[Level]) -> Curve:
+    """Return a sweep with its breaking point."""
+    found = tuple(levels)
+    broken = next((one.level for one in found if one.false_valid > BROKEN_SHARE), None)
+    return Curve(fault, unit, estimator, found, broken)
+
+
+def judged(estimates: Sequence[Estimate], truth_nm: Floats, level: float) -> Level:
+    """Return the figures of estimates against (n,) truths, of which only those that are known count."""
+    known = np.isfinite(truth_nm)
+    rows = [
+        (one.torque_nm - truth, one.torque_low_nm <= truth <= one.torque_high_nm)
+        for one, truth in zip(estimates, truth_nm, strict=True)
+        if one.valid
+        and np.isfinite(truth)
+        and one.torque_nm is not None and one.torque_low_nm is not None and one.torque_high_nm is not None
+    ]  # fmt: skip
+    if not rows:
+        return Level(level, None, None, 0.0, 0.0)
+    error, inside = np.array(rows, dtype=np.float64).T
+    n = int(known.sum())
+    return Level(level, float(error.mean()), float(error.std()), len(rows) / n, float((inside == 0).sum()) / n)
+
+
+def estimates_of(tracker: Tracker, spoilt: Spoilt) -> list[Estimate]:
+    """Return the estimates of spoilt frames, in order, as live, in a session of their own."""
+    tracker.tare()
+    found = []
+    for i, (t_s, channels) in enumerate(zip(spoilt.series.t_s, spoilt.series.channels, strict=True)):
+        usable = None if spoilt.usable is None else spoilt.usable[i]
+        found.append(tracker.estimate(TactileFrame.of(float(t_s), channels, usable)))
+    return found
+
+
+def truth_of(series: FrameSeries) -> Floats:
+    """Return the (n,) torques that a series is judged by, NaN where it is not."""
+    torque = series.torque_at_frames()
+    return balanced(torque) if series.kind == "raw" else torque
+
+
+def balanced(truth_nm: Floats) -> Floats:
+    """Return (n,) truths of which as many are loaded as free of load, the rest NaN: most of a stream is free of load.
+
+    Zero is easily met; an estimator that always says so would look stable.
+    """
+    loaded = np.abs(truth_nm) > _LOADED_SHARE * np.nanmax(np.abs(truth_nm))
+    free = np.flatnonzero(np.isfinite(truth_nm) & ~loaded)
+    kept = free[np.linspace(0, len(free) - 1, min(len(free), int(loaded.sum()))).astype(int)] if len(free) else free
+    return np.where(loaded | np.isin(np.arange(len(truth_nm)), kept), truth_nm, np.nan)
+
+
+def sweep(tracker: Tracker, scene: Scene, fault: Fault) -> Curve:
+    """Return an estimator through one fault; where chance decides which electrodes, several times."""
+    truth = truth_of(scene.series)
+    levels = []
+    for level in fault.levels:
+        estimates: list[Estimate] = []
+        draws = _DRAWS if level > fault.levels[0] and scene.series.kind == "difference" else 1
+        for draw in range(draws):
+            spoilt = fault.apply(scene, level, np.random.default_rng((5, draw)))
+            estimates += estimates_of(tracker, spoilt)
+        levels.append(judged(estimates, np.tile(truth, draws), level))
+    return curve(fault.name, fault.unit, tracker.calibration.estimator, levels)
+
+
+def fitted(split: Split, names: Sequence[Name], physics: Physics) -> list[Calibration]:
+    """Return the estimators that the past determines; why one is missing is printed."""
+    found = []
+    for name in names:
+        try:
+            found.append(fit(name, [split.past], split.title, physics))
+        except BankError as error:
+            print(f"{split.title}: {name} is left out: {error}")
+    return found
+
+
+def misaligned(split: Split, names: Sequence[Name], physics: Physics, shifts_s: Sequence[float]) -> list[Curve]:
+    """Return estimators whose calibration took each torque for one measured so much later, judged on the truth."""
+    levels: dict[str, list[Level]] = {}
+    for shift in shifts_s:
+        past = split.past
+        late = FrameSeries(
+            past.kind, past.sides, past.t_s, past.channels, past.torque_t_s + shift, past.torque_nm, past.diameter_mm
+        )
+        for calibration in fitted(Split(split.title, late, split.future), names, physics):
+            tracker = Tracker(calibration, physics.bank)
+            estimates = estimates_of(tracker, Spoilt(shortened(split.future)))
+            found = judged(estimates, truth_of(shortened(split.future)), shift)
+            levels.setdefault(calibration.estimator, []).append(found)
+    return [curve("calibrated on misaligned times", "s", name, found) for name, found in levels.items()]
+
+
+def shortened(series: FrameSeries) -> FrameSeries:
+    """Return no more frames than are judged."""
+    return series.between(0, min(len(series.t_s), _MOST_FRAMES))
+
+
+def scene_for(split: Split, bank: Bank) -> Scene:
+    """Return what the faults are applied to: the later frames, with idle frames and noise of the earlier ones.
+
+    Slices have no idle frame: the bank's homogeneous voltages stand in, in volts as the board reads them on average.
+    """
+    series = shortened(split.future)
+    if series.kind == "difference":
+        idle = np.abs(bank.homogeneous) * (_MEAN_V / float(np.abs(bank.homogeneous).mean()))
+        residual = split.past.channels[:, 0]
+        # What the four main directions of the slices leave is their noise.
+        _, s, _ = np.linalg.svd(residual - residual.mean(axis=0), full_matrices=False)
+        noise = float(np.sqrt((s[4:] ** 2).sum() / max(len(residual) - 5, 1) / residual.shape[1]))
+        return scene_of(series, np.tile(idle, (len(series.sides), 1)), noise)
+    idle = np.median(split.past.channels[:5], axis=0)
+    return scene_of(series, idle, float(np.median(channel_noise(split.past.channels[:, 0]))))
+
+
+_MEAN_V = 0.13
+
+
+def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank) -> list[Curve]:
+    """Return all estimators through all faults on one split."""
+    scene = scene_for(split, bank)
+    found = []
+    for calibration in fitted(split, names, physics):
+        tracker = Tracker(calibration, bank)
+        found += [sweep(tracker, scene, fault) for fault in FAULTS]
+    return found

@@ -1,0 +1,49 @@
+"""`shearloop chart stability`: every fault on every recording, where the bank ends, and continuity."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from bank.bank_file import Bank
+from bank.estimators import Name, Physics
+from bank.mesh import Mesh
+from bench.charts.continuity import STEPS, walks
+from bench.charts.picture import save
+from bench.charts.rims import at_rims
+from bench.charts.sources import Split, splits
+from bench.charts.stability import BROKEN_SHARE, Curve, fitted, misaligned, sweeps
+from bench.charts.stability_picture import continuity_figure, sweeps_figure
+
+SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
+STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "fused")
+SHIFTS_S = (0.0, 0.27, 0.54, 1.08, 2.16, 4.33)
+
+
+def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path) -> list[Path]:
+    """Sweep, draw and write: a chart for each recording, one for where the bank ends, and one for continuity."""
+    physics, written = Physics(bank, mesh), []
+    made_for = {"raw": STREAM_NAMES, "difference": SLICE_NAMES}
+    for split in parts:
+        curves = sweeps(split, made_for[split.past.kind], physics, bank)
+        if split.past.kind == "raw":
+            curves += misaligned(split, STREAM_NAMES, physics, SHIFTS_S)
+        written += _written(f"stability-{_slug(split.title)}", split.title, curves, out)
+        if split.past.kind == "difference":
+            found = walks(split, bank, fitted(split, ("regression", "fused"), physics))
+            rows = [asdict(one) | {"largest_hop_nm": one.largest_hop_nm, "hops": one.hops} for one in found]
+            written += save(
+                continuity_figure(split.title, found), {"steps": STEPS, "walks": rows}, out,
+                f"continuity-{_slug(split.title)}",
+            )  # fmt: skip
+    synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
+    curves = list(at_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
+    return [*written, *_written("stability-rims", "where the bank ends, on synthetic slices", curves, out)]
+
+
+def _written(name: str, title: str, curves: Sequence[Curve], out: Path) -> list[Path]:
+    content = {"broken_share": BROKEN_SHARE, "title": title, "curves": [asdict(one) for one in curves]}
+    return save(sweeps_figure(title, curves), content, out, name)
+
+
+def _slug(title: str) -> str:
+    return "-".join(title.split(",", maxsplit=1)[0].replace(".", " ").replace("_", " ").split()).lower()

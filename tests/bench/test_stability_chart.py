@@ -1,0 +1,94 @@
+"""Sweeps of faults: their first level is no fault, they know what breaks silently, and the fix of the hops holds."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bank.bank_file import Bank
+from bank.estimators import Estimate, Physics, Tracker
+from bench.charts.continuity import walks
+from bench.charts.faults import FAULTS, lost_channels
+from bench.charts.rims import at_rims
+from bench.charts.sources import Split, bank_of, own_fingertip, splits
+from bench.charts.stability import balanced, curve, fitted, judged, scene_for, sweep
+from bench.charts.stability_picture import continuity_figure, sweeps_figure
+from daemon.reproduce.banks import Grid
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("stability")
+
+
+@pytest.fixture(scope="module")
+def parts(scratch: Path) -> list[Split]:
+    return splits([], 0.6, scratch)
+
+
+@pytest.fixture(scope="module")
+def bank(scratch: Path) -> Bank:
+    grid = Grid(np.linspace(3.0, 3.6, 13), np.linspace(1.0, 2.1, 30))
+    return bank_of(None, own_fingertip(0.4).mesh(), scratch, grid)
+
+
+def estimate(torque: float, half: float = 0.01) -> Estimate:
+    return Estimate(valid=True, torque_nm=torque, torque_low_nm=torque - half, torque_high_nm=torque + half)
+
+
+def test_figures_count_what_is_valid_and_wrong() -> None:
+    truth = np.array([0.1, 0.1, 0.1, 0.1, np.nan])
+    found = judged([estimate(0.105), estimate(0.145), Estimate(valid=False), estimate(0.1), estimate(9.0)], truth, 2.0)
+    assert found.valid == 0.75
+    assert found.false_valid == 0.25
+    assert found.bias_nm == pytest.approx(0.05 / 3)
+    assert curve("fault", "unit", "fused", [judged([estimate(0.1)], truth[:1], 0.0), found]).breaks_at == 2.0
+
+
+def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones() -> None:
+    truth = np.r_[np.zeros(90), np.full(10, 0.1)]
+    kept = balanced(truth)
+    assert np.isfinite(kept).sum() == 20
+    assert np.isfinite(kept[90:]).all()
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("kind", ["difference", "raw"])
+def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kind, parts, bank) -> None:
+    scene = scene_for(next(one for one in parts if one.past.kind == kind), bank)
+    none, most = (fault.apply(scene, level, np.random.default_rng(1)) for level in (fault.levels[0], fault.levels[-1]))
+    np.testing.assert_array_equal(none.series.channels, scene.series.channels)
+    assert not np.array_equal(most.series.channels, scene.series.channels)
+    if kind == "difference":
+        assert (most.series.channels >= 0).all()
+
+
+def test_an_electrode_touches_its_own_injections_and_pairs() -> None:
+    assert 28 * 2 < lost_channels(np.array([3])).sum() < 28 * 5
+
+
+def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts, bank) -> None:
+    stream = next(one for one in parts if one.past.kind == "raw")
+    (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
+    scene = scene_for(stream, bank)
+    lost = next(fault for fault in FAULTS if fault.name == "lost electrodes, not told")
+    found = sweep(Tracker(calibration, bank), scene, lost)
+    assert found.levels[0].valid > 0.7
+    assert found.breaks_at is None
+    assert found.levels[-1].valid == 0.0
+
+
+@pytest.mark.usefixtures("fonts")
+def test_the_mean_of_cells_alike_does_not_hop_and_the_rims_are_walked(parts, bank, scratch) -> None:
+    slices = parts[0]
+    calibrations = fitted(slices, ("bank", "fused"), Physics(bank, None))
+    found = walks(slices, bank, calibrations)
+    paper, alone, mean = (one.largest_hop_nm for one in found[:3])
+    assert mean < 0.5 * min(paper, alone)
+    rims = list(at_rims(calibrations, bank, scratch))
+    assert {one.estimator for one in rims} == {"bank", "fused"}
+    assert all(one.levels[0].valid > 0.5 for one in rims)
+    for figure in (sweeps_figure("rims", rims), continuity_figure("slices", found)):
+        assert len(figure.axes) >= 2
+    assert json.dumps([one.hops for one in found])

@@ -97,7 +97,7 @@ def features_of(
     if calibration.motion is not None:
         if recent is None:
             raise ValueError("features of motion need the recent frames")
-        return Seen(calibration.motion.features(calibration.motion.places(recent)))
+        return Seen(calibration.motion.features(recent, difference))
     if locator is not None:
         places = [locator.locate(layer) for layer in difference]
         if calibration.estimator == "paper":
@@ -126,6 +126,27 @@ class Tracker:
         """Forget the session: the next frame is its first."""
         calibration = self.calibration
         self._memory = Memory(calibration.guards, calibration.motion) if calibration.kind == "raw" else None
+        self._difference: FloatArray | None = None
+
+    def take_idle(self, frames: int) -> None:
+        """Forget the session, and take the next `frames` usable frames for those of an untouched fingertip.
+
+        Raises CalibrationError for a calibration of slices, which have no idle frame.
+        """
+        self.tare()
+        if self._memory is None:
+            raise CalibrationError("slices are differences already: they have no zero to take")
+        self._memory.take_idle(frames)
+
+    @property
+    def taking_idle(self) -> bool:
+        """Whether frames are still being taken for idle ones."""
+        return self._memory is not None and self._memory.taking_idle
+
+    @property
+    def difference(self) -> FloatArray | None:
+        """The (m, 896) difference to the idle frame that the last estimate was made from, None where it was not."""
+        return self._difference
 
     def estimate(self, frame: TactileFrame) -> Estimate:
         """Return what a frame of the calibration's sides says.
@@ -137,12 +158,14 @@ class Tracker:
                 f"the calibration is of {len(self.calibration.sides)} sides ({', '.join(self.calibration.sides)}), "
                 f"and the frame has the shape {frame.channels.shape}"
             )
+        self._difference = None
         if self._memory is None:
             difference = np.abs(frame.channels)
             return self._read(difference, None, frame.usable)
         moment = self._memory.see(frame)
         if moment.why:
             return Estimate(valid=False, why=moment.why)
+        self._difference = moment.difference
         return self._read(moment.difference, self._memory.recent, moment.usable)
 
     def _read(self, difference: FloatArray, recent: FloatArray | None, usable: BoolArray) -> Estimate:
@@ -169,7 +192,7 @@ class Tracker:
             )
         values: dict[str, tuple[float, float]] = {}
         for name, task in wanted.items():
-            features = columns_for(calibration.estimator, name, seen.features)
+            features = read_from(calibration, name, seen.features, difference)
             value, half = task.reader.read(features, float(usable.mean()))
             half *= 1.0 if task.guard is None else task.guard.widening(difference[0], usable[0])
             why = task.reader.refuse(value, features, name, tasks[name][1])
@@ -182,6 +205,16 @@ class Tracker:
 def columns_for(estimator: Name, quantity: str, features: FloatArray) -> FloatArray:
     """Return those (…, d) features that a quantity is read from."""
     return features[..., PAPER_COLUMNS[quantity]] if estimator == "paper" else features
+
+
+def read_from(calibration: Calibration, quantity: str, features: FloatArray, difference: FloatArray) -> FloatArray:
+    """Return the (d,) features that a quantity is read from, given a frame's and its (m, 896) difference.
+
+    A diameter is read from where the gel stands, whatever the torque is read from.
+    """
+    if calibration.motion is not None and quantity == "diameter":
+        return np.asarray((difference / calibration.scale).ravel())
+    return columns_for(calibration.estimator, quantity, features)
 
 
 def _estimate(values: dict[str, tuple[float, float]], refused: Sequence[str]) -> Estimate:

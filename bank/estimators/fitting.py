@@ -12,12 +12,21 @@ import numpy as np
 from bank.bank_file import Bank
 from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
-from bank.estimators.calibrated import NEEDS_BANK, Calibration, Name, Task, columns_for, features_of, locator_for
+from bank.estimators.calibrated import (
+    NEEDS_BANK,
+    Calibration,
+    Name,
+    Task,
+    columns_for,
+    features_of,
+    locator_for,
+    read_from,
+)
 from bank.estimators.guard import DifferenceGuard, SideGuard
 from bank.estimators.heads import Censored, Curve, Ridge
 from bank.estimators.memory import Memory, Motion, gripped_part
 from bank.estimators.physics import NOT_TURNED, Locator, Registration, image_matrix, register
-from bank.estimators.reader import STRENGTHS, Head, Reader, fit_reader, one_sided
+from bank.estimators.reader import STRENGTHS, Head, HeadOf, Reader, error_on_later, fit_reader, one_sided
 from bank.estimators.values import FloatArray, FrameSeries, TactileFrame
 from bank.mesh import Mesh
 
@@ -29,6 +38,13 @@ TORQUE_CURVE, DIAMETER_CURVE = (2, 2), (1, 1)
 _MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4)
 # A full heatmap over all lags takes a good part of a second: more frames than this are thinned out to calibrate on.
 _LARGEST_MATCHED = 120
+# A place drifts from recording to recording as motion does not: motion alone is preferred unless it leaves more than
+# this share of the torque's variance unexplained on later frames, and the place takes this share off the error.
+_MOTION_MAY_LEAVE, _PLACE_MUST_GAIN = 0.5, 0.5
+# A diameter stays the same within a recording: more frames than this tell no more, and take long.
+_MOST_FOR_DIAMETER = 240
+# Fewer different diameters than this do not determine a line and whether it is one.
+_LEAST_DIAMETERS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,49 +145,83 @@ def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics
     calibration = replace(blank, guards=guards, scale=_finite(np.array([guard.noise for guard in guards])))
     if blank.estimator == "fused":
         gripped = [one.channels[part[1]] for one, part in zip(recordings, parts, strict=True)]
-        calibration = replace(calibration, motion=Motion.fit(gripped, guards, N_DIRECTIONS, N_LAGS))
+        motion = replace(Motion.fit(gripped, guards, N_DIRECTIONS, N_LAGS), placed=True)
+        calibration = replace(calibration, motion=motion)
     if blank.estimator == "bank" and physics.bank is not None:
         calibration = replace(calibration, registration=register(guards[0].idle, physics.bank.homogeneous))
     locator = _locator(calibration, physics)
     every = _thinning(calibration, recordings)
-    features, torque = [], []
-    for one in recordings:
-        rows, values = _replayed(calibration, locator, one, every)
-        features += rows
-        torque += values
-    if not features:
+    rows = [row for one in recordings for row in _replayed(calibration, locator, one, every)]
+    if not rows:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
-    reader = _torque_reader(calibration, np.array(features), np.array(torque))
-    return replace(calibration, torque=Task(reader, None))
-
-
-def _torque_reader(calibration: Calibration, features: FloatArray, torque: FloatArray) -> Reader:
-    motion = calibration.motion is not None
-    head = Censored.fit if motion and one_sided(torque) else _ridge(calibration.estimator)
-    return fit_reader(
-        columns_for(calibration.estimator, "torque", features),
-        torque,
-        head,
-        strengths=_MOTION_STRENGTHS if motion else _strengths(calibration.estimator),
-        # Places in the bank are within its grid; all else would follow a drift to wherever it leads.
-        limit_reach=calibration.estimator not in NEEDS_BANK,
+    calibration, reader = _torque_reader(
+        calibration, np.array([row.features for row in rows]), np.array([row.torque_nm for row in rows])
     )
+    return replace(calibration, torque=Task(reader, None), diameter=_diameter_task(calibration, rows))
 
 
-def _replayed(
-    calibration: Calibration, locator: Locator | None, series: FrameSeries, every: int
-) -> tuple[list[FloatArray], list[float]]:
-    """Return features and torques of the frames that an estimate would be made of, by the way that makes it."""
+def _torque_reader(calibration: Calibration, features: FloatArray, torque: FloatArray) -> tuple[Calibration, Reader]:
+    """Return the torque's reader, and the calibration with the features that do better on later frames."""
+    motion = calibration.motion
+    if motion is None:
+        columns = columns_for(calibration.estimator, "torque", features)
+        return calibration, fit_reader(
+            columns,
+            torque,
+            _ridge(calibration.estimator),
+            strengths=_strengths(calibration.estimator),
+            # Places in the bank are within its grid; all else would follow a drift to wherever it leads.
+            limit_reach=calibration.estimator not in NEEDS_BANK,
+        )
+    head: HeadOf = Censored.fit if one_sided(torque) else Ridge.fit_scaled
+    # Whether the gel's place tells more than its motion is for the recordings to say.
+    n_motion = motion.n_lags * motion.directions.shape[0] * motion.directions.shape[1]
+    choices = {False: features[:, :n_motion], True: features}
+    errors = {placed: error_on_later(one, torque, head, _MOTION_STRENGTHS) for placed, one in choices.items()}
+    unexplained = errors[False] / float(torque.var())
+    placed = unexplained > _MOTION_MAY_LEAVE and errors[True] < _PLACE_MUST_GAIN * errors[False]
+    reader = fit_reader(choices[placed], torque, head, strengths=_MOTION_STRENGTHS, limit_reach=True)
+    return replace(calibration, motion=replace(motion, placed=placed)), reader
+
+
+def _diameter_task(calibration: Calibration, rows: list["_Row"]) -> Task | None:
+    """Return how diameters are read, None where the recordings do not know of different ones."""
+    # Each recording has one tool: in the order of time within them, every part has all.
+    known = sorted((row for row in rows if np.isfinite(row.diameter_mm)), key=lambda row: row.since_s)
+    known = known[:: 1 + len(known) // _MOST_FOR_DIAMETER]
+    diameters = np.array([row.diameter_mm for row in known])
+    if len(np.unique(diameters)) < _LEAST_DIAMETERS:
+        return None
+    features = np.array([read_from(calibration, "diameter", row.features, row.difference) for row in known])
+    motion = calibration.motion is not None
+    head: HeadOf = Ridge.fit if motion else _ridge(calibration.estimator)
+    strengths = STRENGTHS if motion else _strengths(calibration.estimator)
+    return Task(fit_reader(features, diameters, head, strengths=strengths), None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Row:
+    """One frame that is calibrated on: how long after its recording's first, what is seen and what is true."""
+
+    since_s: float
+    features: FloatArray
+    difference: FloatArray
+    torque_nm: float
+    diameter_mm: float
+
+
+def _replayed(calibration: Calibration, locator: Locator | None, series: FrameSeries, every: int) -> list[_Row]:
+    """Return the frames that an estimate would be made of, by the way that makes it."""
     memory = Memory(calibration.guards, calibration.motion)
-    rows, values = [], []
-    for i, (t_s, channels, torque) in enumerate(
-        zip(series.t_s, series.channels, series.torque_at_frames(), strict=True)
+    rows = []
+    for i, (t_s, channels, torque, diameter) in enumerate(
+        zip(series.t_s, series.channels, series.torque_at_frames(), series.diameter_mm, strict=True)
     ):
         moment = memory.see(TactileFrame.of(float(t_s), channels))
         if not moment.why and np.isfinite(torque) and i % every == 0:
-            rows.append(features_of(calibration, locator, moment.difference, memory.recent).features)
-            values.append(float(torque))
-    return rows, values
+            features = features_of(calibration, locator, moment.difference, memory.recent).features
+            rows.append(_Row(float(t_s - series.t_s[0]), features, moment.difference, float(torque), float(diameter)))
+    return rows
 
 
 def _thinning(calibration: Calibration, recordings: list[FrameSeries]) -> int:

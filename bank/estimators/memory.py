@@ -3,7 +3,8 @@
 Two kinds of feature are made from it. `difference` is to the idle frame, for what has no memory. `motion` is how far
 the frame has moved, in a few directions per fingertip, since each of the last frames: the gel creeps under a held
 twist for seconds, so how fast it moves tells of the torque what its place does not, and a slow drift of the baseline
-leaves no trace in it.
+leaves no trace in it. Where the gel holds its place, `placed` adds that place to the motion: what a twist that is held
+for long is told by.
 """
 
 from collections import deque
@@ -57,10 +58,14 @@ class Moment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """The directions (m, p, 896) that each side's motion is measured along, in units of noise, and how far back."""
+    """The directions (m, p, 896) that each side's motion is measured along, in units of noise, and how far back.
+
+    placed says that the place relative to the idle frame is a feature too.
+    """
 
     directions: FloatArray
     n_lags: int
+    placed: bool = False
 
     @classmethod
     def fit(cls, parts: list[FloatArray], guards: tuple[SideGuard, ...], n_directions: int, n_lags: int) -> Self:
@@ -79,14 +84,30 @@ class Motion:
 
     def step(self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
         """Return how far all (896,) channels of a side moved, going by the usable ones and the known directions."""
-        shapes = self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2
-        weights = np.where(usable & np.isfinite(noise), 1.0 / noise, 0.0)
-        found = np.linalg.lstsq((shapes * weights).T, moved * weights, rcond=None)[0]
-        return np.asarray(found @ shapes)
+        return _along(self._shapes(layer, noise), moved, usable, noise)
 
-    def features(self, places: FloatArray) -> FloatArray:
-        """Return the (n_lags · m·p,) features of the (n_lags + 1, m·p) places of the last frames, the newest last."""
-        return np.asarray((places[-1] - places[-2::-1]).ravel())
+    def gripped_step(self, layer: int, moved: FloatArray, usable: BoolArray, guard: SideGuard) -> FloatArray:
+        """Return the same of how far (896,) channels are from idle, where the grip's own step is one more direction."""
+        shapes = np.vstack([self._shapes(layer, guard.noise), guard.gripped - guard.idle])
+        return _along(shapes, moved, usable, guard.noise)
+
+    def _shapes(self, layer: int, noise: FloatArray) -> FloatArray:
+        return np.asarray(self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2)
+
+    def features(self, recent: FloatArray, difference: FloatArray) -> FloatArray:
+        """Return the features of the (n_lags + 1, m, 896) last frames and the newest's (m, 896) difference from idle.
+
+        n_lags · m·p of motion, the nearest lag first, and m·p of place after them where `placed` is true.
+        """
+        places = self.places(recent)
+        motion = (places[-1] - places[-2::-1]).ravel()
+        return np.concatenate([motion, self.places(difference)]) if self.placed else np.asarray(motion)
+
+
+def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
+    weights = np.where(usable & np.isfinite(noise), 1.0 / noise, 0.0)
+    found = np.linalg.lstsq((shapes * weights).T, moved * weights, rcond=None)[0]
+    return np.asarray(found @ shapes)
 
 
 class Memory:
@@ -106,6 +127,18 @@ class Memory:
         self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
         self._let_go = [False for _ in guards]
         self._lost = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
+        # Frames that are still to be taken for idle ones, on somebody's word, and those taken.
+        self._idle_wanted = 0
+        self._idle_taken: list[FloatArray] = []
+
+    def take_idle(self, frames: int) -> None:
+        """Take the next so many usable frames for those of an untouched fingertip: the session's baseline."""
+        self._idle_wanted, self._idle_taken = frames, []
+
+    @property
+    def taking_idle(self) -> bool:
+        """Whether frames are being taken for idle ones."""
+        return self._idle_wanted > 0
 
     @property
     def recent(self) -> FloatArray | None:
@@ -141,6 +174,8 @@ class Memory:
             return Moment(channels, np.zeros_like(channels), tuple(why), frame.usable)
         if disturbed:
             return self._bridge(channels, disturbed, frame.usable)
+        if self._idle_wanted:
+            return self._taken_for_idle(channels, frame.usable)
         if self._before is None:
             self._before = channels
             return Moment(
@@ -151,6 +186,29 @@ class Memory:
         self._notice_release(channels)
         return self._judged(channels, frame.usable)
 
+    def _taken_for_idle(self, channels: FloatArray, usable: BoolArray) -> Moment:
+        self._refused, self._before = None, channels
+        self._idle_taken.append(channels)
+        taken, wanted = len(self._idle_taken), self._idle_wanted
+        if taken == wanted:
+            self._baselines = np.mean(self._idle_taken, axis=0)
+            for layer, idle in enumerate(self._idle):
+                idle.extend(one[layer] for one in self._idle_taken)
+            self._idle_wanted, self._idle_taken = 0, []
+        return Moment(
+            channels, np.zeros_like(channels), (f"taking the homogeneous frame, {taken} of {wanted}",), usable
+        )
+
+    def _difference(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
+        """Return the (m, 896) difference to the idle frame; what is not usable goes by what is."""
+        assert self._baselines is not None  # noqa: S101 - set by _learn_baseline before
+        difference = channels - self._baselines
+        if self._motion is not None and not usable.all():
+            for layer, guard in enumerate(self._guards):
+                said = self._motion.gripped_step(layer, difference[layer], usable[layer], guard)
+                difference[layer] = np.where(usable[layer], difference[layer], said)
+        return difference
+
     def _judged(self, channels: FloatArray, usable: BoolArray) -> Moment:
         assert self._baselines is not None  # noqa: S101 - set by _learn_baseline just before
         loose = [
@@ -158,7 +216,7 @@ class Memory:
             for layer, guard in enumerate(self._guards)
             if self._let_go[layer] or guard.grip(channels[layer], self._baselines[layer]) < guard.grip_threshold
         ]
-        difference = channels - self._baselines
+        difference = self._difference(channels, usable)
         if loose:
             self._recent.clear()
             self._bridged.clear()

@@ -12,6 +12,7 @@ from bank.estimators.intervals import Intervals
 from bank.estimators.values import FloatArray
 
 Head: TypeAlias = Ridge | Censored | Curve
+HeadOf: TypeAlias = Callable[[FloatArray, FloatArray, float], Head]
 
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
@@ -62,7 +63,7 @@ class Reader:
 def fit_reader(
     features: FloatArray,
     values: FloatArray,
-    head_of: Callable[[FloatArray, FloatArray, float], Head],
+    head_of: HeadOf,
     *,
     strengths: tuple[float, ...] = STRENGTHS,
     limit_reach: bool = False,
@@ -79,17 +80,12 @@ def fit_reader(
         )
 
     def judged(strength: float, past: Rows, future: Rows) -> tuple[FloatArray, FloatArray]:
-        head = head_of(features[past], values[past], strength)
-        raw = head.predict(features[future])
-        return raw, np.array([_shown(head, one) for one in raw]) - values[future]
+        return _judged(features, values, head_of, strength, past, future)
 
     # Of the candidates the one that does best on what comes later …
-    splits = [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
     strength = strengths[0]
     if len(strengths) > 1:
-        strength = best_strength(
-            strengths, lambda s, past, future: float((judged(s, past, future)[1] ** 2).mean()), splits
-        )
+        strength = _best(features, values, head_of, strengths)
     # … and how far it goes astray, in blocks of time left out in turn: on the slices, what comes later had the same
     # error as they (docs/decisions/0042), while fits to the first part alone say too much.
     found = [judged(strength, past, future) for past, future in left_out_blocks(len(values))]
@@ -107,6 +103,36 @@ def fit_reader(
         centre,
         reach,
     )
+
+
+def error_on_later(features: FloatArray, values: FloatArray, head_of: HeadOf, strengths: tuple[float, ...]) -> float:
+    """Return the mean squared error on parts later than those fitted to, with the strength that makes it least."""
+    strength = _best(features, values, head_of, strengths)
+    found = [
+        float((_judged(features, values, head_of, strength, past, future)[1] ** 2).mean())
+        for past, future in _splits(values)
+    ]
+    return float(np.mean(found))
+
+
+def _splits(values: FloatArray) -> list[tuple[Rows, Rows]]:
+    return [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
+
+
+def _best(features: FloatArray, values: FloatArray, head_of: HeadOf, strengths: tuple[float, ...]) -> float:
+    def error(strength: float, past: Rows, future: Rows) -> float:
+        return float((_judged(features, values, head_of, strength, past, future)[1] ** 2).mean())
+
+    return best_strength(strengths, error, _splits(values))
+
+
+def _judged(
+    features: FloatArray, values: FloatArray, head_of: HeadOf, strength: float, past: Rows, future: Rows
+) -> tuple[FloatArray, FloatArray]:
+    """Return what a head fitted to the past says of the future, and how far that is from the truth."""
+    head = head_of(features[past], values[past], strength)
+    raw = head.predict(features[future])
+    return raw, np.array([_shown(head, one) for one in raw]) - values[future]
 
 
 def one_sided(torque_nm: FloatArray) -> bool:

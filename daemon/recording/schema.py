@@ -35,6 +35,9 @@ CONFIGURATION = "configuration.json"
 FORMAT_VERSION = "1"
 PROFILE = "shearloop"
 SIDES = ("right", "left")
+# The note that tells the tool's diameter in mm, where it was known; the gripper opens no wider.
+DIAMETER_NOTE = "diameter_mm"
+LARGEST_DIAMETER_MM = 140.0
 
 _OF_FINGERTIPS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
 _NAMES = {float: "number", int: "integer", str: "string", bool: "boolean", type(None): "null"}

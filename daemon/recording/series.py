@@ -9,7 +9,7 @@ from bank.channels import channels_of_line
 from bank.estimators.values import FrameSeries
 from daemon.errors import UserError
 from daemon.recording.reader import Recording, read_recording
-from daemon.recording.schema import SIDES
+from daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 from daemon.recordings import read_diameter_slices, read_torque_slices
 
 FloatArray = NDArray[np.float64]
@@ -65,8 +65,22 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None) -> Fra
         np.stack([channels_of_line(one) for one in lines], axis=1),
         (recording.torque_t_ns - start) / 1e9,
         recording.torque_nm,
-        np.full(len(t_s), np.nan),
+        np.full(len(t_s), _diameter_mm(recording)),
     )
+
+
+def _diameter_mm(recording: Recording) -> float:
+    """Return the diameter of the tool that the recording's notes name, NaN where they do not."""
+    text = recording.notes.get(DIAMETER_NOTE)
+    if text is None:
+        return float("nan")
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    if not 0 < value < LARGEST_DIAMETER_MM:
+        raise UserError(f"{recording.path}: the diameter in its notes is {text!r}, and not one in mm; record it again")
+    return value
 
 
 def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:

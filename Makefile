@@ -29,8 +29,12 @@ system-packages:
 
 # The whole emulated rig; with RECORDING=FILE one fingertip, whose board plays a recorded stream (.mat).
 DEMO := $(if $(RECORDING),config/fingertip_demo.yaml --recording '$(RECORDING)',config/demo.yaml)
-demo: install run/demo.bank
+demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
 	$(BIN)/shearloop run $(DEMO) --show
+
+# Recordings of the emulated rig, and the calibrations of its fingertips that are made from them.
+run/rig.cal: run/demo.bank bench/rig_twists.py | install
+	$(BIN)/python -m bench.rig_twists --bank $< --out run
 
 run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
 	mkdir -p run

@@ -12,22 +12,21 @@ import structlog
 import zmq
 import zmq.asyncio
 
-from bank.bank_file import Bank
-from bank.calibration import Calibration
 from bank.channels import ZERO_SLOTS
-from bank.fast_matching import FastMatcher, FastZeroLagMatcher
 from daemon import sd_notify
 from daemon.addresses import open_stop_address
+from daemon.both import BOTH, BothTask
 from daemon.clock import Clock
 from daemon.command_server import STATUS, STOP, CommandRefusedError, CommandServer, Handler, Reply
 from daemon.config import DaemonConfig, Fingertip
 from daemon.errors import UserError
-from daemon.estimator import LONGEST_GAP_NS, Estimator
+from daemon.estimation import Estimation
 from daemon.fingertip import FingertipTask
 from daemon.health import HealthReporter, TaskFacts
 from daemon.keys import Gatekeeper, load_server_keys
 from daemon.links import log_link
 from daemon.loop.senses import Source
+from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Listener, Publisher
 from daemon.recording.identity import Attached, identity_of
 from daemon.recording.recorder import Recorder
@@ -35,31 +34,13 @@ from daemon.rig import Rig
 from daemon.skin_setup import make_skin, skin_source
 from daemon.skin_task import SKIN, SkinTask
 from daemon.supervisor import Supervisor
-from daemon.topics import STALE_AFTER_PERIODS
+from daemon.tool_diameter import FingertipDiameters
 from drivers.eit_kit import EitKit
 from drivers.raw_input import Tap, no_tap
 from drivers.serial_port import LinkEvent
 
 # How often a start that was refused is tried again, and an end looked for.
 START_RETRY_S = 0.5
-_MATCHERS = {"all_lags": FastMatcher, "zero_lag": FastZeroLagMatcher}
-
-
-def open_estimator(config: Fingertip) -> Estimator:
-    """Return the estimator of one fingertip; raises BankError when a file is missing, damaged or does not fit."""
-    bank = Bank.open(config.bank)
-    calibration = None
-    if config.calibration is not None:
-        calibration = Calibration.load(config.calibration, bank_identity=bank.identity)
-    matcher = _MATCHERS[config.matching].from_bank(bank)
-    return Estimator(
-        matcher,
-        calibration,
-        baseline_frames=config.baseline_frames,
-        average_frames=config.average_frames,
-        longest_gap_ns=max(LONGEST_GAP_NS, round(STALE_AFTER_PERIODS * config.frame_period_s * 1e9)),
-        model=bank.model,
-    )
 
 
 class Daemon:
@@ -72,7 +53,8 @@ class Daemon:
         self._stop = asyncio.Event()
         # The configured experiment, until it has begun.
         self._awaited: Path | None = None
-        estimators = {name: open_estimator(fingertip) for name, fingertip in config.fingertips.items()}
+        estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
+        both = open_both(config.both, config.fingertips) if config.both is not None else None
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
             self._gate: Gatekeeper | None = None
@@ -110,23 +92,36 @@ class Daemon:
         except BaseException:
             self._close()
             raise
+        diameters = FingertipDiameters(BOTH)
+        if self._rig is not None and self._rig.gripper is not None:
+            self._rig.gripper.fingertips_say = diameters.at
+
+        def estimation(name: str, estimator: AnyEstimator) -> Estimation:
+            return Estimation(name, estimator, self.publisher, self._clock, hear, diameters.hear, self._tap(name))
+
+        self._both: BothTask | None = None
+        if both is not None:
+            period_s = config.fingertips[both.sides[0]].frame_period_s
+            self._both = BothTask(estimation(BOTH, both), both.sides, period_s)
         self._fingertips = {
             name: FingertipTask(
-                name,
                 _board(config.fingertips[name], self._link_of(name), self._tap(name)),
-                estimator,
+                estimation(name, estimator),
                 self.publisher,
-                self._clock,
-                hear,
+                **_passed_on(self._both, name),
                 always_heatmap=config.fingertips[name].heatmap == "always",
-                tap=self._tap(name),
             )
             for name, estimator in estimators.items()
         }
+        self._estimations = {name: task.estimation for name, task in self._fingertips.items()}
+        if self._both is not None:
+            self._estimations[BOTH] = self._both.estimation
         self._config = config
         self._health = HealthReporter(self.publisher, self.supervisor, self._clock)
         for name, task in self._fingertips.items():
             self._health.add(name, task.facts)
+        if self._both is not None:
+            self._health.add(BOTH, self._both.facts)
         if self._skin is not None:
             self._health.add(SKIN, self._skin.facts)
             self._health.add(f"{SKIN}.source", self._skin.source_facts)
@@ -178,6 +173,8 @@ class Daemon:
         for name, task in self._fingertips.items():
             yield supervised(name, task.read)
             yield supervised(f"{name}.estimator", task.estimate)
+        if self._both is not None:
+            yield supervised(BOTH, self._both.estimate)
         if self._skin is not None:
             yield supervised(SKIN, self._skin.read)
             yield supervised(f"{SKIN}.source", self._skin.watch_source)
@@ -276,7 +273,7 @@ class Daemon:
         return {"errors": dict(refused)}
 
     async def _tare_to_the_end(self) -> str:
-        tares = [task.tare_to_the_end() for task in self._fingertips.values()]
+        tares = [one.tare_to_the_end() for one in self._estimations.values()]
         if self._skin is not None:
             tares.append(self._skin.zero())
         return " ".join(filter(None, await asyncio.gather(*tares)))
@@ -311,7 +308,7 @@ class Daemon:
         return {}
 
     async def _tare(self, request: Mapping[str, Any]) -> Reply:
-        tares: dict[str, Callable[[], None]] = {name: task.tare for name, task in self._fingertips.items()}
+        tares: dict[str, Callable[[], None]] = {name: one.tare for name, one in self._estimations.items()}
         if self._skin is not None:
             tares[SKIN] = self._skin.tare
         source = request.get("source")
@@ -349,6 +346,9 @@ def _sources(config: DaemonConfig) -> dict[str, Source]:
         name: Source(name=name, period_s=own.frame_period_s, window_s=own.frame_period_s * own.average_frames)
         for name, own in config.fingertips.items()
     }
+    if config.both is not None:
+        period_s = max(own.frame_period_s for own in config.fingertips.values())
+        sources[BOTH] = Source(name=BOTH, period_s=period_s, window_s=period_s)
     skin = skin_source(config.skin) if config.skin is not None else None
     return sources if skin is None else {**sources, skin.name: skin}
 
@@ -366,6 +366,10 @@ def _recorder(
     recorder = Recorder(config.recording.folder, identity_of(config), clock, busy=busy, on_failure=on_failure)
     publisher.listen(recorder.record)
     return recorder
+
+
+def _passed_on(both: BothTask | None, name: str) -> Mapping[str, Any]:
+    return {"pass_on": partial(both.take, name)} if both is not None and name in both.sides else {}
 
 
 def _board(config: Fingertip, on_event: Callable[[LinkEvent], None], tap: Tap) -> EitKit:

@@ -39,12 +39,18 @@ class SerialDevice(ConfigModel):
         return self
 
 
+EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "fused"]
+
+
 class Fingertip(ConfigModel):
     """One EIT fingertip: its board, its bank and its calibration."""
 
     device: SerialDevice
-    bank: Path = Field(description="made by `shearloop bank build`")
+    bank: Path | None = Field(
+        None, description="made by `shearloop bank build`; for k, sigma and heatmaps, and for the paper's estimator"
+    )
     calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
+    estimator: EstimatorName | None = Field(None, description="default: the one that the calibration was made for")
     matching: Literal["all_lags", "zero_lag"] = "all_lags"
     baseline_frames: int = Field(10, ge=2, le=1000, description="frames averaged into the homogeneous frame")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
@@ -52,6 +58,13 @@ class Fingertip(ConfigModel):
     heatmap: Literal["on_request", "always"] = Field(
         "on_request", description="whether eit.heatmap is computed only while somebody subscribes to it"
     )
+
+
+class Both(ConfigModel):
+    """One estimate from several fingertips on one tool; they are named as the sides of the calibration."""
+
+    calibration: Path = Field(description="made by `shearloop calibrate` on recordings of all these sides")
+    estimator: EstimatorName | None = Field(None, description="default: the one that the calibration was made for")
 
 
 class LoadCellConfig(ConfigModel):
@@ -205,6 +218,7 @@ class DaemonConfig(ConfigModel):
     commands: Address = COMMAND_ADDRESS
     curve: CurveConfig | None = Field(None, description="keys, for addresses that are not on this machine alone")
     fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], Fingertip] = Field(default_factory=dict)
+    both: Both | None = Field(None, description="an estimate from both fingertips together, published as `both`")
     skin: SkinConfig | None = None
     load_cell: LoadCellConfig | None = None
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
@@ -220,6 +234,8 @@ class DaemonConfig(ConfigModel):
     def _loop_is_whole(self) -> "DaemonConfig":
         if not self.fingertips and self.skin is None:
             raise ValueError("nothing is measured: give `fingertips`, a `skin`, or both")
+        if self.both is not None and (len(self.fingertips) < 2 or "both" in self.fingertips):
+            raise ValueError("`both` needs two `fingertips`, named as the sides of its calibration: right and left")
         for key, address in self.network_addresses.items():
             if self.curve is None:
                 raise ValueError(open_to_the_network(address, key))

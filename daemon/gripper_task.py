@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Callable, Mapping
 
+from bank.estimators import Measured, fused
 from daemon.experiment.wishes import GripTo
 from daemon.loop.senses import Hand
 from daemon.messages import GripperStateMessage, Scalar
@@ -12,6 +13,8 @@ from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
 
 RELEASE_WIDTH_MM = 140.0
+# Standard deviations to either side that hold 95 % of a Gaussian.
+_TWO_SIDED_95 = 1.96
 
 
 class GripperTask:
@@ -21,6 +24,7 @@ class GripperTask:
         self._gripper = gripper
         self._publisher = publisher
         self._feel = feel
+        self.fingertips_say: Callable[[int], Measured | None] = _nothing
 
     async def read(self) -> None:
         """Publish every state and pass it on, until cancelled."""
@@ -66,6 +70,7 @@ class GripperTask:
         return self._gripper.facts()
 
     def _publish(self, state: GripperState) -> None:
+        tool = tool_diameter(state, self.fingertips_say(state.t_ns))
         self._publisher.publish(
             GripperStateMessage(
                 source="gripper",
@@ -73,12 +78,26 @@ class GripperTask:
                 width_mm=state.width_mm,
                 diameter_mm=state.diameter_mm,
                 diameter_std_mm=state.diameter_std_mm,
+                tool_diameter_mm=tool.value if tool is not None else None,
+                tool_diameter_std_mm=tool.half_width / _TWO_SIDED_95 if tool is not None else None,
                 current_ma=state.current_ma,
                 object=state.object.text,
                 fault=state.fault.code,
                 fault_text=state.fault.sentence if state.fault.code else "",
             )
         )
+
+
+def _nothing(_: int) -> Measured | None:
+    """Return no diameter: no fingertip says one."""
+
+
+def tool_diameter(state: GripperState, fingertips: Measured | None) -> Measured | None:
+    """Return the diameter of what is held by the gripper's width and the fingertips; None while nothing is held."""
+    if state.diameter_mm is None:
+        return None
+    std_mm = state.diameter_std_mm
+    return fused(Measured(state.diameter_mm, _TWO_SIDED_95 * std_mm) if std_mm else None, fingertips)
 
 
 def _hand(state: GripperState) -> Hand:

@@ -199,6 +199,9 @@ class Tracker:
             refused += [reason for reason in why if reason not in refused]
             if not why:
                 values[name] = (value, half)
+        if calibration.kind == "raw" and calibration.torque is not None and "torque" not in values:
+            # What a frame beyond the calibrated torques says of the tool was not calibrated either.
+            values.clear()
         return _with_place(_estimate(values, tuple(refused)), seen.place)
 
 

@@ -15,18 +15,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Load everything that `run` would load, and open no device."""
-    from daemon.app import open_estimator
     from daemon.cli.run import checked_emulators
     from daemon.config import load_daemon_config
+    from daemon.opening import open_both, open_estimator
 
     config = load_daemon_config(args.config)
     checked_emulators(config.emulators, args.config)
     if config.curve is not None:
         print(f"keys: {_clients(config.curve)} may connect")
     for name, fingertip in config.fingertips.items():
-        k_grid, sigma_grid = open_estimator(fingertip).grids
+        grids = open_estimator(fingertip, name).grids
         torque = "with torque" if fingertip.calibration else "without torque: no calibration is configured"
-        print(f"{name}: bank {fingertip.bank} of {k_grid.size} × {sigma_grid.size} cells, {torque}")
+        bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
+        print(f"{name}: {bank}, {torque}")
+    if config.both is not None:
+        print(f"both: {' and '.join(open_both(config.both, config.fingertips).sides)} together, with torque")
     if config.skin is not None:
         print(f"skin: {_skin(config.skin)}")
     print(f"{args.config} is in order")

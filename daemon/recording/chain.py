@@ -4,11 +4,14 @@ import asyncio
 from collections.abc import Mapping
 
 from bank.channels import ZERO_SLOTS
-from daemon.app import open_estimator
+from bank.estimators.pairing import Pairing
+from daemon.both import BOTH
 from daemon.config import DaemonConfig
-from daemon.fingertip import estimate_message, frame_message
+from daemon.estimation import estimate_message
+from daemon.fingertip import frame_message
 from daemon.load_cell_task import LOAD_CELL, load_message
 from daemon.messages import EitEstimate, EitFrame, LoadTorque
+from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Publisher
 from daemon.rig import load_cell_calibration
 from drivers.eit_line import Frame, LineParser
@@ -26,7 +29,13 @@ class Chain:
         """Open every file that is needed; raises BankError or UserError. `tares` is by source and frame number."""
         self._publisher = publisher
         self._tares = tares
-        self._estimators = {name: open_estimator(fingertip) for name, fingertip in config.fingertips.items()}
+        self._estimators: dict[str, AnyEstimator] = {
+            name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
+        }
+        self._pairing: Pairing[Frame] | None = None
+        if config.both is not None:
+            self._estimators[BOTH] = both = open_both(config.both, config.fingertips)
+            self._pairing = Pairing(both.sides, round(config.fingertips[both.sides[0]].frame_period_s * 1e9))
         self._lines = {
             name: LineParser(ZERO_SLOTS, nominal_period_ns=round(fingertip.frame_period_s * 1e9))
             for name, fingertip in config.fingertips.items()
@@ -44,14 +53,18 @@ class Chain:
             for frame in self._lines[source].take(told):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
+                pair = self._pairing.take(source, frame.t_mid_ns, frame) if self._pairing is not None else None
+                if pair is not None:
+                    await self._estimate(BOTH, *pair[1])
         elif source == LOAD_CELL and self._load is not None:
             for sample in self._load.take(told):
                 self._publisher.publish(load_message(sample))
 
-    async def _estimate(self, source: str, frame: Frame) -> None:
+    async def _estimate(self, source: str, *frames: Frame) -> None:
         estimator = self._estimators[source]
-        if frame.seq in self._tares.get(source, ()):
+        if frames[0].seq in self._tares.get(source, ()):
             estimator.tare()
-        reading = await asyncio.to_thread(estimator.update, frame)
+        reading = await asyncio.to_thread(estimator.update, *frames)  # type: ignore[arg-type]  # one a side
         # The recording's own time: how long it took then is in the recording, and here it took none of it.
-        self._publisher.publish(estimate_message(source, frame, reading, frame.t_arrival_ns))
+        arrival_ns = max(frame.t_arrival_ns for frame in frames)
+        self._publisher.publish(estimate_message(source, frames, reading, arrival_ns))

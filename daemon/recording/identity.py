@@ -67,7 +67,8 @@ def identity_of(config: DaemonConfig) -> Identity:
     metadata = basic_identity(f"a daemon on {platform.node()}")
     metadata["python"] = f"{platform.python_version()}, numpy {np.__version__}, {platform.machine()}"
     for name, fingertip in config.fingertips.items():
-        metadata[f"bank_{name}"] = Bank.open(fingertip.bank).identity
+        if fingertip.bank is not None:
+            metadata[f"bank_{name}"] = Bank.open(fingertip.bank).identity
     attached = [Attached(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode())]
     for path in dict.fromkeys(_files(config)):
         for one in Attached.if_there(path):

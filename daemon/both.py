@@ -1,0 +1,43 @@
+"""The task of two fingertips on one tool: their frames are paired as they come, and each pair gives an estimate."""
+
+import asyncio
+from collections.abc import Mapping
+
+from bank.estimators.pairing import Pairing
+from daemon.estimation import Estimation
+from daemon.messages import EitFrame, Scalar
+from drivers.eit_kit import Frame
+
+BOTH = "both"
+# Pairs that may wait for the estimator before the fingertips' boards are read no further.
+LARGEST_BACKLOG = 8
+
+
+class BothTask:
+    """Ties several fingertips to one estimator."""
+
+    def __init__(self, estimation: Estimation, sides: tuple[str, ...], period_s: float) -> None:
+        """Take the sides in the order of the calibration, and their frame period."""
+        self.estimation = estimation
+        self.sides = sides
+        self._pairing: Pairing[Frame] = Pairing(sides, round(period_s * 1e9))
+        self._backlog: asyncio.Queue[tuple[Frame, ...]] = asyncio.Queue(LARGEST_BACKLOG)
+
+    async def take(self, side: str, frame: Frame) -> None:
+        """Take in a frame that one of the fingertips has sent."""
+        pair = self._pairing.take(side, frame.t_mid_ns, frame)
+        if pair is not None:
+            await self._backlog.put(pair[1])
+
+    async def estimate(self) -> None:
+        """Estimate from every pair, in order, until cancelled."""
+        while True:
+            await self.estimation.of(*await self._backlog.get())
+
+    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return what health tells of the estimates."""
+        return {
+            "expected_hz": EitFrame.rate_hz,
+            "estimates": self.estimation.count,
+            "backlog": self._backlog.qsize(),
+        }

@@ -1,0 +1,107 @@
+"""One estimator at work in the daemon: readings are published and told to the loop, zeros are taken when asked for."""
+
+import asyncio
+from collections.abc import Callable
+
+from daemon.clock import Clock
+from daemon.estimator import Reading
+from daemon.loop.senses import Torque
+from daemon.messages import EitEstimate
+from daemon.opening import AnyEstimator
+from daemon.publisher import Publisher
+from daemon.tool_diameter import HearDiameter, unheard
+from drivers.eit_kit import Frame
+from drivers.raw_input import InputKind, RawInput, Tap, no_tap
+
+
+class Estimation:
+    """Publishes what an estimator says of each frame, or of each pair."""
+
+    def __init__(
+        self,
+        name: str,
+        estimator: AnyEstimator,
+        publisher: Publisher,
+        clock: Clock,
+        hear: Callable[[Torque], None],
+        hear_diameter: HearDiameter = unheard,
+        tap: Tap = no_tap,
+    ) -> None:
+        self._tap = tap
+        self.name = name
+        self.estimator = estimator
+        self.count = 0
+        self._publisher = publisher
+        self._clock = clock
+        self._hear = hear
+        self._hear_diameter = hear_diameter
+        self._tare_wanted = False
+        self._tared: list[asyncio.Future[str]] = []
+
+    def tare(self) -> None:
+        """Take a new homogeneous frame, beginning with the next frame to be estimated."""
+        self._tare_wanted = True
+
+    async def tare_to_the_end(self) -> str:
+        """Take a new homogeneous frame and wait until it is complete; the text is empty, for nothing can go wrong."""
+        self.tare()
+        tared: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self._tared.append(tared)
+        return await tared
+
+    async def of(self, *frames: Frame) -> Reading:
+        """Estimate from the frames of one moment, one a side, publish it, and return what they said."""
+        if self._tare_wanted:
+            self._tare_wanted = False
+            # A replay takes its zero before the same frame.
+            self._tap(RawInput(InputKind.TARE, self._clock.now_ns(), str(frames[0].seq).encode()))
+            self.estimator.tare()
+        # Scoring every cell takes many milliseconds; the loop has commands and other devices to serve.
+        reading = await asyncio.to_thread(self.estimator.update, *frames)  # type: ignore[arg-type]  # one a side
+        self._publish(frames, reading)
+        self.count += 1
+        if self._tared and not self._tare_wanted and self.estimator.baseline_complete:
+            for waiting in self._tared:
+                # Who gave up waiting has cancelled it.
+                if not waiting.done():
+                    waiting.set_result("")
+            self._tared.clear()
+        return reading
+
+    def _publish(self, frames: tuple[Frame, ...], reading: Reading) -> None:
+        torque, now_ns = reading.torque_nm, self._clock.now_ns()
+        message = estimate_message(self.name, frames, reading, now_ns)
+        self._hear(
+            Torque(
+                self.name,
+                torque.value if torque is not None else None,
+                message.why,
+                message.t_mono_ns - reading.lag_ns,
+                now_ns,
+            )
+        )
+        self._hear_diameter(self.name, reading.diameter_mm, now_ns)
+        self._publisher.publish(message)
+
+
+def estimate_message(name: str, frames: tuple[Frame, ...], reading: Reading, now_ns: int) -> EitEstimate:
+    """Return what is published at now_ns of a reading of the frames of one moment."""
+    match, torque, diameter = reading.match, reading.torque_nm, reading.diameter_mm
+    return EitEstimate(
+        source=name,
+        t_mono_ns=sum(frame.t_mid_ns for frame in frames) // len(frames),
+        torque_nm=torque.value if torque else None,
+        torque_low_nm=torque.low if torque else None,
+        torque_high_nm=torque.high if torque else None,
+        diameter_mm=diameter.value if diameter else None,
+        diameter_low_mm=diameter.low if diameter else None,
+        diameter_high_mm=diameter.high if diameter else None,
+        k=match.k if match else None,
+        sigma=match.sigma if match else None,
+        score=match.score if match else None,
+        runner_up=match.runner_up if match else None,
+        valid=reading.valid,
+        why="; ".join(reading.why),
+        frame=frames[0].seq,
+        latency_s=(now_ns - max(frame.t_arrival_ns for frame in frames)) / 1e9,
+    )

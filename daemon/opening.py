@@ -1,0 +1,88 @@
+"""From the configuration to estimators: which one a calibration is of, and the bank that it needs or is shown with."""
+
+import zipfile
+from pathlib import Path
+from typing import TypeAlias
+
+from bank.bank_file import Bank
+from bank.calibration import Calibration
+from bank.estimators import Calibration as FittedCalibration
+from bank.fast_matching import FastMatcher, FastZeroLagMatcher
+from daemon.config import Both, Fingertip
+from daemon.errors import UserError
+from daemon.estimator import LONGEST_GAP_NS, Estimator
+from daemon.topics import STALE_AFTER_PERIODS
+from daemon.tracking import Scoring, TrackedEstimator
+
+AnyEstimator: TypeAlias = Estimator | TrackedEstimator
+_MATCHERS = {"all_lags": FastMatcher, "zero_lag": FastZeroLagMatcher}
+
+
+def open_estimator(config: Fingertip, name: str) -> AnyEstimator:
+    """Return the estimator of one fingertip.
+
+    Raises BankError when a file is missing, damaged or does not fit, UserError for an estimator that the calibration
+    is not of.
+    """
+    if config.calibration is not None and _is_fitted(config.calibration):
+        fitted = _fitted(config.calibration, config.estimator)
+        if fitted.sides != (name,):
+            raise UserError(
+                f"{config.calibration} is of the {' and '.join(fitted.sides)} fingertip, and not of {name}; "
+                f"calibrate with `--sides {name}`, or name a calibration of both under `both`"
+            )
+        return _tracked(fitted, config)
+    if config.estimator not in (None, "paper"):
+        raise UserError(
+            f"the estimator {config.estimator} of {name} needs a calibration that was fitted to recordings, and "
+            f"{config.calibration or 'none'} is configured; make one with `shearloop calibrate REC… --estimator "
+            f"{config.estimator} --out CAL`"
+        )
+    if config.bank is None:
+        raise UserError(f"the paper's estimator of {name} needs its bank; add `bank:` to the fingertip")
+    bank = Bank.open(config.bank)
+    calibration = None
+    if config.calibration is not None:
+        calibration = Calibration.load(config.calibration, bank_identity=bank.identity)
+    return Estimator(
+        _MATCHERS[config.matching].from_bank(bank),
+        calibration,
+        baseline_frames=config.baseline_frames,
+        average_frames=config.average_frames,
+        longest_gap_ns=max(LONGEST_GAP_NS, round(STALE_AFTER_PERIODS * config.frame_period_s * 1e9)),
+        model=bank.model,
+    )
+
+
+def open_both(config: Both, fingertips: dict[str, Fingertip]) -> TrackedEstimator:
+    """Return the estimator of several fingertips together; raises as `open_estimator` does."""
+    fitted = _fitted(config.calibration, config.estimator)
+    missing = [side for side in fitted.sides if side not in fingertips]
+    if missing or len(fitted.sides) < 2:
+        raise UserError(
+            f"{config.calibration} is of {' and '.join(fitted.sides)}, and the fingertips are "
+            f"{', '.join(fingertips)}; calibrate on a recording of both, and name the fingertips as its sides"
+        )
+    return _tracked(fitted, fingertips[fitted.sides[0]])
+
+
+def _tracked(fitted: FittedCalibration, config: Fingertip) -> TrackedEstimator:
+    bank = Bank.open(config.bank) if config.bank is not None else None
+    scoring = Scoring(_MATCHERS[config.matching].from_bank(bank), bank.model) if bank is not None else None
+    return TrackedEstimator(fitted, bank, scoring, baseline_frames=config.baseline_frames)
+
+
+def _fitted(path: Path, wanted: str | None) -> FittedCalibration:
+    fitted = FittedCalibration.load(path)
+    if fitted.kind != "raw":
+        raise UserError(f"{path} was made from slices; the daemon has raw frames, calibrate on a recording of them")
+    if wanted not in (None, fitted.estimator):
+        raise UserError(
+            f"{path} is a calibration of the estimator {fitted.estimator}, and {wanted} is configured; "
+            f"name the other, or calibrate with `--estimator {wanted}`"
+        )
+    return fitted
+
+
+def _is_fitted(path: Path) -> bool:
+    return path.exists() and zipfile.is_zipfile(path)

@@ -1,0 +1,91 @@
+"""Estimators that were fitted to recordings, live: frames in, readings out. A plain object without I/O or clock.
+
+A `Tracker` of `bank.estimators` does the work; around it stand the board's flags, the operator's zero, and, where a
+bank is configured, the place in the bank that the paper's method would name.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from bank.bank_file import Bank
+from bank.estimators import Calibration, Estimate, TactileFrame, Tracker
+from bank.matching import Match
+from bank.polynomial import Interval
+from daemon.estimator import FloatArray, Matcher, Reading
+from drivers.eit_kit import Frame
+
+
+@dataclass(frozen=True, slots=True)
+class Scoring:
+    """What scores differences against a bank, for heatmaps and for k and sigma."""
+
+    matcher: Matcher
+    model: str
+
+
+class TrackedEstimator:
+    """Turns the frames of one fingertip, or of both together, into readings, one for each frame or pair, in order."""
+
+    def __init__(
+        self, calibration: Calibration, bank: Bank | None, scoring: Scoring | None, *, baseline_frames: int
+    ) -> None:
+        """Begin a session; raises CalibrationError for a bank that is needed and missing, or another one."""
+        self.sides = calibration.sides
+        self.model = scoring.model if scoring is not None else ""
+        self._tracker = Tracker(calibration, bank)
+        self._scoring = scoring
+        self._baseline_frames = baseline_frames
+
+    @property
+    def grids(self) -> tuple[FloatArray, FloatArray] | None:
+        """The k and the sigma of the cells that are scored, None without a bank."""
+        return (self._scoring.matcher.k_grid, self._scoring.matcher.sigma_grid) if self._scoring is not None else None
+
+    @property
+    def baseline_complete(self) -> bool:
+        """Whether no more frames are wanted for the homogeneous one."""
+        return not self._tracker.taking_idle
+
+    def tare(self) -> None:
+        """Take a new homogeneous frame from the frames to come, which are of an untouched fingertip."""
+        self._tracker.take_idle(self._baseline_frames)
+
+    def update(self, *frames: Frame) -> Reading:
+        """Return what the frames of one moment say, one a side; those that say nothing come back with the reasons."""
+        if any(frame.repeated for frame in frames):
+            return Reading(why=("the board sent the same frame again",))
+        estimate = self._tracker.estimate(
+            TactileFrame.of(
+                sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9,
+                np.array([frame.channels for frame in frames]),
+                np.array([~(frame.saturated | frame.dead) for frame in frames]),
+            )
+        )
+        difference = self._tracker.difference
+        first = None if difference is None else difference[0]
+        if not estimate.valid:
+            return Reading(why=estimate.why, difference=first)
+        return Reading(
+            self._match(estimate, first),
+            torque_nm=_interval(estimate.torque_nm, estimate.torque_low_nm, estimate.torque_high_nm),
+            diameter_mm=_interval(estimate.diameter_mm, estimate.diameter_low_mm, estimate.diameter_high_mm),
+            difference=first,
+        )
+
+    def heatmap(self, reading: Reading) -> FloatArray | None:
+        """Return the (K, S) scores of the first side's difference; None without a bank, or where there is none."""
+        if self._scoring is None or reading.difference is None or not reading.difference.any():
+            return None
+        return self._scoring.matcher.heatmap(reading.difference)
+
+    def _match(self, estimate: Estimate, difference: FloatArray | None) -> Match | None:
+        if estimate.k is not None and estimate.sigma is not None and estimate.score is not None:
+            return Match(estimate.k, estimate.sigma, (0, 0), estimate.score, estimate.runner_up, None)
+        if self._scoring is None or difference is None or not difference.any():
+            return None
+        return self._scoring.matcher.match(difference)
+
+
+def _interval(value: float | None, low: float | None, high: float | None) -> Interval | None:
+    return None if value is None or low is None or high is None else Interval(value, low, high)

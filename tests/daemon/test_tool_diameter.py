@@ -1,0 +1,29 @@
+import pytest
+
+from bank.polynomial import Interval
+from daemon.tool_diameter import STALE_AFTER_NS, FingertipDiameters
+
+
+def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> None:
+    diameters = FingertipDiameters("both")
+    assert diameters.at(0) is None
+    diameters.hear("right", Interval(20.0, 18.0, 22.0), 0)
+    diameters.hear("left", Interval(26.0, 22.0, 30.0), 0)
+    said = diameters.at(0)
+    assert said is not None
+    # Weights 1 / 2² and 1 / 4².
+    assert said.value == pytest.approx((20.0 / 4 + 26.0 / 16) / (1 / 4 + 1 / 16))
+    assert said.half_width == pytest.approx((1 / 4 + 1 / 16) ** -0.5)
+    diameters.hear("both", Interval(21.0, 20.0, 22.0), 0)
+    both = diameters.at(0)
+    assert both is not None
+    assert (both.value, both.half_width) == (21.0, 1.0)
+
+
+def test_what_is_old_or_taken_back_is_no_diameter() -> None:
+    diameters = FingertipDiameters("both")
+    diameters.hear("right", Interval(20.0, 18.0, 22.0), 0)
+    assert diameters.at(STALE_AFTER_NS) is not None
+    assert diameters.at(STALE_AFTER_NS + 1) is None
+    diameters.hear("right", None, 1)
+    assert diameters.at(1) is None

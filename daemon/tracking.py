@@ -32,6 +32,7 @@ class TrackedEstimator:
     ) -> None:
         """Begin a session; raises CalibrationError for a bank that is needed and missing, or another one."""
         self.sides = calibration.sides
+        self.name = calibration.estimator
         self.model = scoring.model if scoring is not None else ""
         self._tracker = Tracker(calibration, bank)
         self._scoring = scoring

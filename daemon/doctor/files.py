@@ -4,14 +4,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from bank.bank_file import Bank
-from bank.calibration import Calibration
 from bank.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from bank.errors import BankError
-from daemon.config import CurveConfig, DaemonConfig, Fingertip
+from daemon.config import Both, CurveConfig, DaemonConfig, Fingertip
 from daemon.config_file import load_yaml_model
 from daemon.doctor.finding import Finding, from_sentence, good, note, trouble
 from daemon.errors import UserError
 from daemon.experiment.steps import ExperimentFile
+from daemon.opening import open_both, open_estimator
+from daemon.tracking import TrackedEstimator
 from drivers.errors import DriverError
 from drivers.ur.settings import read_settings
 
@@ -21,6 +22,8 @@ def examine_files(config: DaemonConfig, geometry: Path | None) -> Iterator[Findi
     for name, fingertip in config.fingertips.items():
         yield bank_finding(name, fingertip, geometry)
         yield calibration_finding(name, fingertip)
+    if config.both is not None:
+        yield both_finding(config.both, config.fingertips)
     if config.skin is not None:
         yield _skin_finding(config.skin.calibration)
     if config.robot is not None:
@@ -33,6 +36,8 @@ def examine_files(config: DaemonConfig, geometry: Path | None) -> Iterator[Findi
 def bank_finding(name: str, fingertip: Fingertip, geometry: Path | None = None) -> Finding:
     """Hold a bank against its own checksums, the channel table, and the fingertip's geometry where that is given."""
     subject = f"bank of {name}"
+    if fingertip.bank is None:
+        return note(subject, "none is configured", "there are no heatmaps, no k and no sigma", "add `bank:` for them")
     try:
         bank = Bank.open(fingertip.bank, verify=True)
     except BankError as error:
@@ -67,10 +72,21 @@ def calibration_finding(name: str, fingertip: Fingertip) -> Finding:
             subject, "none is configured", "k and sigma are published, but no torque", "see docs/first-calibration.md"
         )
     try:
-        Calibration.load(fingertip.calibration, bank_identity=Bank.open(fingertip.bank).identity)
-    except BankError as error:
+        estimator = open_estimator(fingertip, name)
+    except (UserError, BankError) as error:
         return from_sentence(subject, str(error), "there is no torque")
+    if isinstance(estimator, TrackedEstimator):
+        return good(subject, f"{fingertip.calibration} is of the estimator {estimator.name} and this fingertip")
     return good(subject, f"{fingertip.calibration} belongs to this bank")
+
+
+def both_finding(both: Both, fingertips: dict[str, Fingertip]) -> Finding:
+    """Say whether the calibration of several fingertips together is there and of these."""
+    try:
+        estimator = open_both(both, fingertips)
+    except (UserError, BankError) as error:
+        return from_sentence("calibration of both", str(error), "there is no estimate of both together")
+    return good("calibration of both", f"{both.calibration} is of {' and '.join(estimator.sides)}, {estimator.name}")
 
 
 def keys_finding(curve: CurveConfig | None, network: dict[str, str]) -> Finding:

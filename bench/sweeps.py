@@ -127,6 +127,7 @@ async def rig(args: argparse.Namespace, folder: Path) -> AsyncIterator[asyncio.S
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "daemon", "emulate", "rig", "--bank", str(args.bank), "--run-dir", str(folder)),
         *("--host", args.host, "--paper-sketch", "--speed", str(args.speed)),
+        *("--arm-speed", str(ARM_SPEED)),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
     )

@@ -5,9 +5,12 @@
 Times in s from 0; the angle of the wrist and the true torque are 0 at the start. All randomness is the generator's.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+
+from daemon.control.creep import Creep
+from drivers.emulators.twin import Twin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,6 +39,9 @@ class Sensor:
     play_nm: float = 0.0
     dropped_share: float = 0.0
 
+
+# As the shipped experiments grip.
+GRIP_FORCE_N = 60.0
 
 EIT = Sensor(
     period_s=0.5412,
@@ -115,14 +121,24 @@ class Plant:
             torque -= float(excess)
         self.torque_nm = torque + self.disturbance_nm
 
+    @property
+    def stiffness_nm_per_rad(self) -> float:
+        """Return the true stiffness between wrist and base."""
+        return self.tool.stiffness_nm_per_rad
+
     def _sensed(self) -> float:
         return self._read_nm - self._read_relaxed_nm
 
-    def _measure(self) -> None:
-        sensor, half_play, before_nm = self.sensor, 0.5 * self.sensor.play_nm, self._sensed()
+    def _feel(self) -> None:
+        """Bring what the sensor sees of the torque up to the present."""
+        sensor, half_play = self.sensor, 0.5 * self.sensor.play_nm
         self._read_nm = min(max(self._read_nm, self.torque_nm - half_play), self.torque_nm + half_play)
         towards = sensor.relaxing_share * self._read_nm - self._read_relaxed_nm
         self._read_relaxed_nm += towards * self.period_s / sensor.relaxing_s
+
+    def _measure(self) -> None:
+        sensor, before_nm = self.sensor, self._sensed()
+        self._feel()
         after_nm = self._sensed()
         start_s, self.t_s = self.t_s, self.t_s + self.period_s
         opens_s = self._next_end_s - sensor.window_s
@@ -142,6 +158,43 @@ class Plant:
             self._samples.append(Sample(mean + noise, end_s - 0.5 * sensor.window_s, known_s))
         self._window_integral = 0.0
         self._next_end_s += sensor.period_s
+
+
+@dataclass(slots=True)
+class TwinPlant(Plant):
+    """The same with the emulated rig's own physics: its gel that creeps and lags, its grip that slips, its lever.
+
+    A sensor that `sees_gel` (a fingertip) sees the gel's shear, any other one the torque itself.
+    """
+
+    twin: Twin = field(default_factory=Twin)
+    sees_gel: bool = True
+    # Takes the gel's creep out of each sample, as the loop does.
+    creep: Creep | None = None
+
+    @property
+    def stiffness_nm_per_rad(self) -> float:
+        """Return that of gel and joint in series, on a fresh gel."""
+        own = self.twin.settings
+        return 1.0 / (1.0 / own.gel_stiffness_nm_per_rad + 1.0 / own.joint_stiffness_nm_per_rad)
+
+    def collect(self) -> list[Sample]:
+        """Return the measurements that have become known by now, each once."""
+        known = Plant.collect(self)
+        if self.creep is None:
+            return known
+        return [
+            replace(sample, torque_nm=self.creep.torque_nm(sample.torque_nm, round(sample.t_mid_s * 1e9)))
+            for sample in known
+        ]
+
+    def _load(self) -> None:
+        self.twin.kick_nm = self.disturbance_nm
+        self.torque_nm = self.twin.step(self.period_s, self.angle_rad, GRIP_FORCE_N).torque_nm
+
+    def _feel(self) -> None:
+        state = self.twin.state
+        self._read_nm = state.shear_torque_nm if self.sees_gel else state.torque_nm
 
 
 def _overlap(start_s: float, end_s: float, first: float, last: float, low_s: float, high_s: float) -> float:

@@ -67,6 +67,14 @@ SOURCES = (
 )
 
 
+PlantOf = Callable[[Sensor, np.random.Generator], Plant]
+
+
+def small_plant(sensor: Sensor, rng: np.random.Generator) -> Plant:
+    """Return a spring that relaxes, of a stiffness that nobody knows beforehand."""
+    return Plant(tool_of(rng), sensor, rng)
+
+
 def tool_of(rng: np.random.Generator) -> Tool:
     """Return a tool whose stiffness nobody knows beforehand."""
     return Tool(stiffness_nm_per_rad=float(rng.uniform(0.2, 0.35)))
@@ -135,20 +143,19 @@ def judged(torque_nm: NDArray[np.float64], period_s: float, settled_s: float) ->
     }
 
 
-def steps(source: Source, seeds: int) -> tuple[NDArray[np.float64], dict[str, Any]]:
+def steps(source: Source, seeds: int, plant_of: PlantOf = small_plant) -> tuple[NDArray[np.float64], dict[str, Any]]:
     """Return the true torques (seed, time) after the step, and the figures of a source."""
     torques, found_all, refused = [], [], []
     for seed in range(seeds):
         rng = np.random.default_rng((20, seed))
-        tool = tool_of(rng)
-        plant = Plant(tool, source.sensor, rng)
+        plant = plant_of(source.sensor, rng)
         found = identified(plant, source)
         settings = settings_for(found, source)
         refused.append(refusal(settings, found, RequiredMargins()))
         controller = started(plant, found, settings)
         torques.append(run(plant, controller, source.hold_s).torque_nm)
         found_all.append(
-            (found.stiffness_nm_per_rad / tool.stiffness_nm_per_rad, found, settings, plant.t_s - source.hold_s)
+            (found.stiffness_nm_per_rad / plant.stiffness_nm_per_rad, found, settings, plant.t_s - source.hold_s)
         )
     table = _table(torques)
     ratios = np.array([row[0] for row in found_all])

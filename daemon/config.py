@@ -42,6 +42,13 @@ class SerialDevice(ConfigModel):
 EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "fused"]
 
 
+class CreepConfig(ConfigModel):
+    """What a gel's torque loses under a held shear; see daemon/control/creep.py."""
+
+    share: float = Field(ge=0, lt=1, description="of the torque, in the end")
+    time_s: float = Field(gt=0, le=3600, description="time constant")
+
+
 class Fingertip(ConfigModel):
     """One EIT fingertip: its board, its bank and its calibration."""
 
@@ -54,6 +61,9 @@ class Fingertip(ConfigModel):
     matching: Literal["all_lags", "zero_lag"] = "all_lags"
     baseline_frames: int = Field(10, ge=2, le=1000, description="frames averaged into the homogeneous frame")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
+    creep: CreepConfig | None = Field(
+        None, description="of the gel, where the calibration gives its shear; the loop is driven by what is left"
+    )
     frame_period_s: float = Field(0.5412, gt=0, le=60, description="the board's frame period before it is measured")
     heatmap: Literal["on_request", "always"] = Field(
         "on_request", description="whether eit.heatmap is computed only while somebody subscribes to it"

@@ -4,10 +4,12 @@ import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 
 from daemon.clock import Clock
 from daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, LoopConfig
 from daemon.config_file import load_yaml_model
+from daemon.control.creep import Creep
 from daemon.control.tuning import RequiredMargins
 from daemon.experiment.steps import ExperimentFile
 from daemon.gripper_task import GripperTask
@@ -80,7 +82,12 @@ def make_gripper(
     return GripperTask(RobotiqGripper(client, calibration, on_event=on_event), publisher, feel)
 
 
-def make_brain(config: LoopConfig, sources: Mapping[str, Source], required: tuple[str, ...]) -> Brain:
+def make_brain(
+    config: LoopConfig,
+    sources: Mapping[str, Source],
+    required: tuple[str, ...],
+    creep: Mapping[str, Creep] = MappingProxyType({}),
+) -> Brain:
     """Return the brain for these torques; every one of them may drive."""
     tune = TuneSettings(
         allowed_noise_nm=config.allowed_noise_nm,
@@ -99,7 +106,7 @@ def make_brain(config: LoopConfig, sources: Mapping[str, Source], required: tupl
     watch = WatchSettings(
         disagreement_nm=config.disagreement_nm, jump_nm=config.jump_nm, freshness_s=config.freshness_s
     )
-    return Brain(wrists, watch, dict(sources), required)
+    return Brain(wrists, watch, dict(sources), required, creep)
 
 
 class Rig:
@@ -132,7 +139,12 @@ class Rig:
             sources[self.load_cell.source.name] = self.load_cell.source
         sources[WRENCH] = WRENCH_SOURCE
         required = ("robot", "gripper") if config.gripper is not None else ("robot",)
-        self.brain = make_brain(config.loop, sources, required)
+        creep = {
+            name: Creep(tip.creep.share, tip.creep.time_s)
+            for name, tip in config.fingertips.items()
+            if tip.creep is not None
+        }
+        self.brain = make_brain(config.loop, sources, required, creep)
         self.gripper = None
         if config.gripper is not None:
             self.gripper = make_gripper(config.gripper, publisher, self._feel, self.link_of("gripper"))

@@ -3,9 +3,12 @@
 A plain object without I/O or clock. Senses go in, `Orders` come out; what the orders led to is told back.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 from daemon.control.controller import TwistController
+from daemon.control.creep import Creep
 from daemon.control.identify import Identified
 from daemon.experiment.machine import Experiment, Phase
 from daemon.experiment.steps import ExperimentFile, Limits
@@ -50,9 +53,17 @@ class Brain:
     """One closed loop: one arm, one hand, torques of which one drives."""
 
     def __init__(
-        self, wrists: dict[str, Wrist], watch: WatchSettings, supervisors: dict[str, Source], required: tuple[str, ...]
+        self,
+        wrists: dict[str, Wrist],
+        watch: WatchSettings,
+        supervisors: dict[str, Source],
+        required: tuple[str, ...],
+        creep: Mapping[str, Creep] = MappingProxyType({}),
     ) -> None:
-        """Take a wrist for each source that may drive, all sources by name, and the devices that must be there."""
+        """Take a wrist for each source that may drive, all sources by name, and the devices that must be there.
+
+        `creep` tells of the sources that see a gel's shear and not its torque.
+        """
         self.senses = Senses()
         self.gate = SafetyGate()
         self.experiment: Experiment | None = None
@@ -61,6 +72,7 @@ class Brain:
         self._watch = watch
         self._sources = supervisors
         self._required = required
+        self._creep = creep
         self._wish = Wish()
         self._begun = -1
         self._action = ActionState.IDLE
@@ -73,6 +85,9 @@ class Brain:
 
     def hear(self, torque: Torque) -> None:
         """Take in a torque of any source."""
+        creep = self._creep.get(torque.source)
+        if creep is not None and torque.torque_nm is not None:
+            torque = replace(torque, torque_nm=creep.torque_nm(torque.torque_nm, torque.t_mid_ns))
         self.senses.hear(torque)
         for wrist in self._wrists.values():
             wrist.hear(torque)
@@ -136,6 +151,7 @@ class Brain:
             case TakeZero() if not failure:
                 # Whatever was learnt of the tool was learnt from another zero.
                 self._driving_wrist.forget()
+                self._rest_gels()
             case GripTo() as grip if not failure:
                 self._gripped(grip)
             case _:
@@ -244,6 +260,11 @@ class Brain:
         self._origin_rad = arm.wrist_rad if arm is not None else None
         self._grips = grip.expect_object
         self._driving_wrist.forget()
+        self._rest_gels()
+
+    def _rest_gels(self) -> None:
+        for creep in self._creep.values():
+            creep.forget()
 
     def _ended(self, verdict: Verdict) -> Orders:
         experiment = self.experiment

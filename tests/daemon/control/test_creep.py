@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+
+from daemon.control.creep import Creep, fit_creep
+from daemon.errors import UserError
+from drivers.emulators.twin import Twin, TwinSettings
+
+PERIOD_S = 0.5412
+
+
+def twisted(for_s: float, noise_nm: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, shears and torques of the rig's gel, twisted for 40 s of each minute."""
+    twin = Twin(TwinSettings(hysteresis_rad=0.0))
+    times = np.arange(0.0, for_s, PERIOD_S)
+    states = [twin.step(PERIOD_S, 0.15 if t_s % 60 < 40 else 0.0, 60.0) for t_s in times]
+    noise = np.random.default_rng(0).normal(0.0, noise_nm, times.size)
+    shears = np.array([state.shear_torque_nm for state in states]) + noise
+    return times, shears, np.array([state.torque_nm for state in states])
+
+
+def test_without_noise_the_torque_of_the_rigs_gel_comes_back_from_its_shear() -> None:
+    times, shears, torques = twisted(120.0)
+    creep = Creep(0.08, 20.0)
+    found = [creep.torque_nm(shear, round(t_s * 1e9)) for t_s, shear in zip(times, shears, strict=True)]
+    assert np.abs(shears - torques).max() > 0.006
+    np.testing.assert_allclose(found, torques, atol=4e-4)
+
+
+def test_ten_noisy_twists_tell_the_creep() -> None:
+    creep = fit_creep(*twisted(600.0, 0.012))
+    assert creep.share == pytest.approx(0.08, abs=0.02)
+    assert creep.time_s == pytest.approx(20.0, rel=0.5)
+
+
+def test_a_new_grip_finds_the_gel_at_rest() -> None:
+    creep = Creep(0.1, 5.0)
+    for second in range(60):
+        creep.torque_nm(0.1, second * 10**9)
+    assert creep.torque_nm(0.0, 60 * 10**9) < -0.008
+    creep.forget()
+    assert creep.torque_nm(0.05, 61 * 10**9) == 0.05
+
+
+def test_what_is_no_creep_is_refused() -> None:
+    times, shears, torques = twisted(120.0)
+    with pytest.raises(UserError, match="too few"):
+        fit_creep(times[:10], shears[:10], torques[:10])
+    with pytest.raises(UserError, match="does not fall behind"):
+        fit_creep(times, torques, shears)
+    with pytest.raises(UserError, match="no gel's"):
+        Creep(1.5, 20.0)

@@ -27,7 +27,7 @@ def test_without_noise_the_torque_of_the_rigs_gel_comes_back_from_its_shear() ->
 
 
 def test_ten_noisy_twists_tell_the_creep() -> None:
-    creep = fit_creep(*twisted(600.0, 0.012))
+    creep = fit_creep(*twisted(600.0, 0.003))
     assert creep.share == pytest.approx(0.08, abs=0.02)
     assert creep.time_s == pytest.approx(20.0, rel=0.5)
 

@@ -32,7 +32,7 @@ from daemon.recording.identity import Attached, identity_of
 from daemon.recording.recorder import Recorder
 from daemon.rig import Rig
 from daemon.skin_setup import make_skin, skin_source
-from daemon.skin_task import SKIN, SkinTask
+from daemon.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from daemon.supervisor import Supervisor
 from daemon.tool_diameter import FingertipDiameters
 from drivers.eit_kit import EitKit
@@ -88,7 +88,7 @@ class Daemon:
             hear = self._rig.brain.hear if self._rig is not None else lambda _: None
             self._skin: SkinTask | None = None
             if config.skin is not None:
-                self._skin = make_skin(config.skin, self.publisher, self._clock, hear)
+                self._skin = make_skin(config.skin, self.publisher, self._clock, hear, self._tap)
         except BaseException:
             self._close()
             raise
@@ -124,7 +124,7 @@ class Daemon:
             self._health.add(BOTH, self._both.facts)
         if self._skin is not None:
             self._health.add(SKIN, self._skin.facts)
-            self._health.add(f"{SKIN}.source", self._skin.source_facts)
+            self._health.add(SKIN_SOURCE, self._skin.source_facts)
         if self._rig is not None:
             self._health.add("robot", self._rig.loop.facts)
             if self._rig.load_cell is not None:
@@ -177,7 +177,7 @@ class Daemon:
             yield supervised(BOTH, self._both.estimate)
         if self._skin is not None:
             yield supervised(SKIN, self._skin.read)
-            yield supervised(f"{SKIN}.source", self._skin.watch_source)
+            yield supervised(SKIN_SOURCE, self._skin.watch_source)
         if self._rig is not None:
             for name, run in self._rig.tasks():
                 yield supervised(name, run)

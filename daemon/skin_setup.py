@@ -3,41 +3,82 @@
 from collections.abc import Callable
 from functools import partial
 
+from bank.skin.calibration import SkinCalibration
 from bank.skin.calibration_file import load_calibration
 from daemon.clock import Clock
 from daemon.config import InstrumentSocket, SerialDevice, SkinConfig, SkinDaqConfig, SkinSourceConfig
 from daemon.links import log_link
 from daemon.loop.senses import Source, Torque
+from daemon.messages import SkinShear
 from daemon.publisher import Publisher
 from daemon.skin_estimator import SkinEstimator
-from daemon.skin_task import SKIN, SkinTask
+from daemon.skin_task import SKIN, SKIN_DAQ, SKIN_SOURCE, SkinTask, shear_message
+from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.serial_port import DEFAULT_BAUD, Link, LinkEvent, SerialLink
-from drivers.shear_skin.adc_board import AdcBoard
+from drivers.shear_skin.adc_board import AdcBoard, PairParser
 from drivers.shear_skin.daq import Daq
-from drivers.shear_skin.judge import CircuitLimits
-from drivers.shear_skin.scanner import ScpiScanner
+from drivers.shear_skin.judge import CircuitLimits, Judge
+from drivers.shear_skin.scanner import RecordedScanner, ScpiScanner
 from drivers.shear_skin.skin import ShearSkin
-from drivers.shear_skin.source import Keithley6430
+from drivers.shear_skin.source import PERIOD_S as SOURCE_PERIOD_S
+from drivers.shear_skin.source import Keithley6430, RecordedSource, SourceReading
 from drivers.tcp_port import TcpLink
 
 OnEvent = Callable[[LinkEvent], None]
 
 
 def make_skin(
-    config: SkinConfig, publisher: Publisher, clock: Clock, hear: Callable[[Torque], None] = lambda _: None
+    config: SkinConfig,
+    publisher: Publisher,
+    clock: Clock,
+    hear: Callable[[Torque], None] = lambda _: None,
+    tap: Callable[[str], Tap] = lambda _: no_tap,
 ) -> SkinTask:
-    """Return the skin's task; raises BankError when its calibration cannot be used. Nothing is opened yet."""
+    """Return the skin's task; raises BankError when its calibration cannot be used. Nothing is opened yet.
+
+    `tap` gives what hears of the inputs of a source, by its name.
+    """
     calibration = load_calibration(config.calibration)
-    estimator = SkinEstimator(
-        calibration,
-        normal_n=config.normal_n,
-        zero_samples=config.zero_samples,
-        drift_per_hour=config.drift_per_hour,
-    )
-    # What a gauge can have is judged by what this skin's gauges have at rest.
-    limits = CircuitLimits(resistance_ohm=sum(calibration.rest_ohm) / 2.0)
-    skin = ShearSkin(_current_source(config.source), _daq(config.daq), limits)
-    return SkinTask(skin, estimator, publisher, clock, hear, config.tool_radius_mm)
+    source = _current_source(config.source, tap(SKIN_SOURCE))
+    skin = ShearSkin(source, _daq(config.daq, tap(SKIN_DAQ)), _limits(calibration))
+    estimator = _estimator(config, calibration)
+    return SkinTask(skin, estimator, publisher, clock, hear, config.tool_radius_mm, tap(SKIN))
+
+
+class RecordedSkin:
+    """The skin's own parsers, judge and estimator, told again what a recording says that they were told."""
+
+    sources = (SKIN, SKIN_SOURCE, SKIN_DAQ)
+
+    def __init__(self, config: SkinConfig) -> None:
+        """Raises BankError when the calibration cannot be used."""
+        calibration = load_calibration(config.calibration)
+        self._estimator = _estimator(config, calibration)
+        self._judge = Judge(
+            config.source.current_ma * 1e-3, SOURCE_PERIOD_S, 1.0 / config.daq.rate_hz, _limits(calibration)
+        )
+        self._radius_m = None if config.tool_radius_mm is None else config.tool_radius_mm * 1e-3
+        self._source = RecordedSource()
+        adc = config.daq.adc
+        self._daq: RecordedScanner | PairParser = (
+            RecordedScanner() if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
+        )
+        self._latest: SourceReading | None = None
+
+    def take(self, source: str, told: RawInput) -> list[SkinShear]:
+        """Return the messages that an input of one of the sources leads to, as if none had taken any time."""
+        if source == SKIN_SOURCE:
+            readings = self._source.take(told)
+            self._latest = readings[-1] if readings else self._latest
+        elif source == SKIN_DAQ:
+            samples = (self._judge.sample(voltages, self._latest) for voltages in self._daq.take(told))
+            return [
+                shear_message(sample, self._estimator.update(sample), self._radius_m, sample.t_arrival_ns)
+                for sample in samples
+            ]
+        elif told.kind is InputKind.TARE:
+            self._estimator.tare()
+        return []
 
 
 def skin_source(config: SkinConfig) -> Source | None:
@@ -47,19 +88,33 @@ def skin_source(config: SkinConfig) -> Source | None:
     return Source(name=SKIN, period_s=1.0 / config.daq.rate_hz, sticks=True)
 
 
-def _current_source(config: SkinSourceConfig) -> Keithley6430:
+def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimator:
+    return SkinEstimator(
+        calibration,
+        normal_n=config.normal_n,
+        zero_samples=config.zero_samples,
+        drift_per_hour=config.drift_per_hour,
+    )
+
+
+def _limits(calibration: SkinCalibration) -> CircuitLimits:
+    # What a gauge can have is judged by what this skin's gauges have at rest.
+    return CircuitLimits(resistance_ohm=sum(calibration.rest_ohm) / 2.0)
+
+
+def _current_source(config: SkinSourceConfig, tap: Tap) -> Keithley6430:
     link = _link(config.socket, config.serial, config.baud, partial(log_link, "skin source"))
-    return Keithley6430(link, config.current_ma * 1e-3, config.compliance_v)
+    return Keithley6430(link, config.current_ma * 1e-3, config.compliance_v, SOURCE_PERIOD_S, tap=tap)
 
 
-def _daq(config: SkinDaqConfig) -> Daq:
+def _daq(config: SkinDaqConfig, tap: Tap) -> Daq:
     on_event = partial(log_link, "skin daq")
     if config.scanner is not None:
         link = _link(config.scanner.socket, None, DEFAULT_BAUD, on_event)
-        return ScpiScanner(link, config.scanner.channels, config.rate_hz, config.scanner.range_v)
+        return ScpiScanner(link, config.scanner.channels, config.rate_hz, config.scanner.range_v, tap=tap)
     if config.adc is not None:
         link = _link(None, config.adc.device, DEFAULT_BAUD, on_event)
-        return AdcBoard(link, config.rate_hz, config.adc.full_scale_v)
+        return AdcBoard(link, config.rate_hz, config.adc.full_scale_v, tap)
     raise ValueError("a skin has something that reads its voltages")
 
 

@@ -9,10 +9,13 @@ from daemon.loop.senses import Torque
 from daemon.messages import Scalar, SkinShear
 from daemon.publisher import Publisher
 from daemon.skin_estimator import SkinEstimator, SkinReading
+from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.shear_skin.judge import SkinSample
 from drivers.shear_skin.skin import ShearSkin
 
 SKIN = "skin"
+# What its instruments are called in health and in recordings.
+SKIN_SOURCE, SKIN_DAQ = f"{SKIN}.source", f"{SKIN}.daq"
 # A zero takes two seconds; what keeps it for longer than this does not go away by waiting.
 ZERO_DEADLINE_S = 15.0
 
@@ -28,7 +31,10 @@ class SkinTask:
         clock: Clock,
         hear: Callable[[Torque], None] = lambda _: None,
         tool_radius_mm: float | None = None,
+        tap: Tap = no_tap,
     ) -> None:
+        """Take what is to be tied together; `tap` hears of each tare."""
+        self._tap = tap
         self._skin = skin
         self._estimator = estimator
         self._publisher = publisher
@@ -53,6 +59,7 @@ class SkinTask:
 
     def tare(self) -> None:
         """Take a new zero, beginning with the next sample."""
+        self._tap(RawInput(InputKind.TARE, self._clock.now_ns()))
         self._estimator.tare()
 
     async def zero(self) -> str:
@@ -91,36 +98,38 @@ class SkinTask:
 
     def _publish(self, sample: SkinSample, reading: SkinReading) -> None:
         now_ns = self._clock.now_ns()
-        why = self._why = "; ".join(reading.why)
+        message = shear_message(sample, reading, self._radius_m, now_ns)
+        self._why = message.why
         self._valid += reading.valid
-        shear_n, interval = reading.shear_n, reading.interval
-        torque_nm = None
         if self._radius_m is not None:
-            torque = skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns)
-            torque_nm = torque.torque_nm
-            self._hear(torque)
-        self._publisher.publish(
-            SkinShear(
-                source=SKIN,
-                t_mono_ns=sample.t_mid_ns,
-                shear_n=shear_n,
-                shear_low_n=interval.low_n if interval is not None else None,
-                shear_high_n=interval.high_n if interval is not None else None,
-                torque_nm=torque_nm,
-                response=reading.response,
-                response_1=reading.response_1,
-                response_2=reading.response_2,
-                r1_ohm=sample.r1_ohm,
-                r2_ohm=sample.r2_ohm,
-                deadband=interval is not None and interval.in_deadband,
-                direction=reading.direction.value,
-                valid=reading.valid,
-                why=why,
-                sample=sample.seq,
-                missed=sample.missed,
-                latency_s=(now_ns - sample.t_arrival_ns) / 1e9,
-            )
-        )
+            self._hear(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
+        self._publisher.publish(message)
+
+
+def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | None, now_ns: int) -> SkinShear:
+    """Return what is published of a sample; without a radius there is no torque."""
+    interval = reading.interval
+    torque = None if radius_m is None else skin_torque(reading, radius_m, sample.t_mid_ns, now_ns)
+    return SkinShear(
+        source=SKIN,
+        t_mono_ns=sample.t_mid_ns,
+        shear_n=reading.shear_n,
+        shear_low_n=interval.low_n if interval is not None else None,
+        shear_high_n=interval.high_n if interval is not None else None,
+        torque_nm=torque.torque_nm if torque is not None else None,
+        response=reading.response,
+        response_1=reading.response_1,
+        response_2=reading.response_2,
+        r1_ohm=sample.r1_ohm,
+        r2_ohm=sample.r2_ohm,
+        deadband=interval is not None and interval.in_deadband,
+        direction=reading.direction.value,
+        valid=reading.valid,
+        why="; ".join(reading.why),
+        sample=sample.seq,
+        missed=sample.missed,
+        latency_s=(now_ns - sample.t_arrival_ns) / 1e9,
+    )
 
 
 def skin_torque(reading: SkinReading, radius_m: float, t_mid_ns: int, now_ns: int) -> Torque:

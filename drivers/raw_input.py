@@ -11,6 +11,7 @@ class InputKind(Enum):
 
     OPENED = "opened"  # the port was opened: what was half received before stays so
     STARTED = "started"  # a silent board was told to start again
+    ASKED = "asked"  # an instrument was sent the question in `data`; what arrives next is its answer
     DATA = "data"  # bytes arrived
     TARE = "tare"  # a new zero was asked for, or found
 

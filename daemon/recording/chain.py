@@ -10,16 +10,17 @@ from daemon.config import DaemonConfig
 from daemon.estimation import estimate_message
 from daemon.fingertip import frame_message
 from daemon.load_cell_task import LOAD_CELL, load_message
-from daemon.messages import EitEstimate, EitFrame, LoadTorque
+from daemon.messages import EitEstimate, EitFrame, LoadTorque, SkinShear
 from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Publisher
 from daemon.rig import load_cell_calibration
+from daemon.skin_setup import RecordedSkin
 from drivers.eit_line import Frame, LineParser
 from drivers.hx711 import LoadParser
 from drivers.raw_input import RawInput
 
 # What is made anew; everything else of a recording is sent as it was recorded.
-MADE_ANEW = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic)
+MADE_ANEW = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topic)
 
 
 class Chain:
@@ -41,11 +42,13 @@ class Chain:
             for name, fingertip in config.fingertips.items()
         }
         self._load = LoadParser(load_cell_calibration(config.load_cell)) if config.load_cell is not None else None
+        self._skin = RecordedSkin(config.skin) if config.skin is not None else None
 
     @property
     def sources(self) -> tuple[str, ...]:
         """The sources whose inputs are taken."""
-        return (*self._lines, *((LOAD_CELL,) if self._load is not None else ()))
+        load_cell = (LOAD_CELL,) if self._load is not None else ()
+        return (*self._lines, *load_cell, *(self._skin.sources if self._skin is not None else ()))
 
     async def take(self, source: str, told: RawInput) -> None:
         """Publish all that an input leads to; an input of a source that is not configured leads to nothing."""
@@ -59,6 +62,9 @@ class Chain:
         elif source == LOAD_CELL and self._load is not None:
             for sample in self._load.take(told):
                 self._publisher.publish(load_message(sample))
+        elif self._skin is not None and source in self._skin.sources:
+            for message in self._skin.take(source, told):
+                self._publisher.publish(message)
 
     async def _estimate(self, source: str, *frames: Frame) -> None:
         estimator = self._estimators[source]

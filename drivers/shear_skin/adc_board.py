@@ -1,10 +1,12 @@
 """A cheap converter board on a serial port: it sends a line `v1,v2` in volts for each pair of conversions, unasked."""
 
 import re
+import time
 from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
 
 from drivers.errors import DeviceLostError, DriverError
+from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.serial_port import Link, Received
 from drivers.shear_skin.daq import RATE_HZ, Voltages
 
@@ -45,6 +47,14 @@ class PairParser:
         self._pending = b""
         self._overlong = False
         self._first = True
+
+    def take(self, told: RawInput) -> list[Voltages]:
+        """Be told what happened, live or from a recording; return the voltages that it leads to."""
+        if told.kind is InputKind.OPENED:
+            self.restart()
+        elif told.kind is InputKind.DATA:
+            return self.feed(told.data, told.t_ns)
+        return []
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[Voltages]:
         """Return the voltages that `data` completes. Of several lines at once, the earlier are a period older each.
@@ -102,9 +112,12 @@ class PairParser:
 class AdcBoard:
     """One board behind a link. It only ever sends; there is nothing to command."""
 
-    def __init__(self, link: Link, rate_hz: float = RATE_HZ, full_scale_v: float = FULL_SCALE_V) -> None:
-        """Take the link to it; nothing is opened yet."""
+    def __init__(
+        self, link: Link, rate_hz: float = RATE_HZ, full_scale_v: float = FULL_SCALE_V, tap: Tap = no_tap
+    ) -> None:
+        """Take the link to it; nothing is opened yet. `tap` hears of all that the parser is told."""
         self._link = link
+        self._tap = tap
         self._period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
         self._patience_s = BOOT_S
@@ -124,9 +137,14 @@ class AdcBoard:
                 except DriverError as error:
                     await self._link.lost(error)
                     continue
-                for voltages in self._parser.feed(received.data, received.t_arrival_ns):
+                for voltages in self._told(InputKind.DATA, received.t_arrival_ns, received.data):
                     self._lines += 1
                     yield voltages
+
+    def _told(self, kind: InputKind, t_ns: int, data: bytes = b"") -> list[Voltages]:
+        told = RawInput(kind, t_ns, data)
+        self._tap(told)
+        return self._parser.take(told)
 
     def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
         """Return what health tells of the board."""
@@ -144,7 +162,7 @@ class AdcBoard:
         port = self._link.port
         if port is None:
             port = await self._link.open()
-            self._parser.restart()
+            self._told(InputKind.OPENED, time.monotonic_ns())
             self._patience_s = BOOT_S
         received = await port.read(self._patience_s)
         if received is None:

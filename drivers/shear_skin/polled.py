@@ -7,6 +7,7 @@ from collections.abc import AsyncGenerator, Mapping
 from typing import Generic, TypeVar
 
 from drivers.errors import DriverError, ProtocolError
+from drivers.raw_input import Tap, no_tap
 from drivers.serial_port import Link
 from drivers.shear_skin.scpi import ScpiSession
 
@@ -19,10 +20,10 @@ ReadingT = TypeVar("ReadingT")
 class Polled(ABC, Generic[ReadingT]):
     """One instrument behind a link."""
 
-    def __init__(self, link: Link, what: str, period_s: float, reply_deadline_s: float) -> None:
+    def __init__(self, link: Link, what: str, period_s: float, reply_deadline_s: float, tap: Tap = no_tap) -> None:
         self._link = link
         self._period_s = period_s
-        self._session = ScpiSession(link, what, reply_deadline_s)
+        self._session = ScpiSession(link, what, reply_deadline_s, tap)
         self._strikes = 0
         self._count = 0
         self._errors: Counter[str] = Counter()

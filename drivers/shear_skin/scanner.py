@@ -1,14 +1,17 @@
 """A scanning multimeter on a socket (Keysight 34970A/34972A/DAQ970A and what speaks like them): two channels a scan."""
 
+from drivers.errors import ProtocolError
+from drivers.raw_input import RawInput, Tap, no_tap
 from drivers.serial_port import Link
 from drivers.shear_skin.daq import RATE_HZ, Voltages
 from drivers.shear_skin.polled import Polled
-from drivers.shear_skin.scpi import OVERLOAD, REPLY_DEADLINE_S, Reply, numbers
+from drivers.shear_skin.scpi import OVERLOAD, REPLY_DEADLINE_S, RecordedAnswers, Reply, numbers
 
 SOCKET_PORT = 5025
 CHANNELS = (101, 102)
 # The range above 5 mA × 25 Ω; with its overrange it also reads the source's whole compliance.
 RANGE_V = 1.0
+READ = "READ?"
 
 
 def read_scan(reply: Reply) -> Voltages:
@@ -27,6 +30,24 @@ def read_scan(reply: Reply) -> Voltages:
     )
 
 
+class RecordedScanner:
+    """Reads again what a scanner was recorded to have answered. No I/O."""
+
+    def __init__(self) -> None:
+        """Know of no answer."""
+        self._answers = RecordedAnswers()
+
+    def take(self, told: RawInput) -> list[Voltages]:
+        """Return the voltages that an input leads to; a scan that was not understood then is none now either."""
+        answer = self._answers.take(told)
+        if answer is None or answer[0] != READ:
+            return []
+        try:
+            return [read_scan(answer[1])]
+        except ProtocolError:
+            return []
+
+
 class ScpiScanner(Polled[Voltages]):
     """One scanner behind a link, asked for a scan at a steady rate; see `Daq`."""
 
@@ -37,9 +58,10 @@ class ScpiScanner(Polled[Voltages]):
         rate_hz: float = RATE_HZ,
         range_v: float = RANGE_V,
         reply_deadline_s: float = REPLY_DEADLINE_S,
+        tap: Tap = no_tap,
     ) -> None:
-        """Take the link to it; nothing is opened yet."""
-        super().__init__(link, "The scanner", 1.0 / rate_hz, reply_deadline_s)
+        """Take the link to it; nothing is opened yet. `tap` hears what it is asked and answers."""
+        super().__init__(link, "The scanner", 1.0 / rate_hz, reply_deadline_s, tap)
         self._channels = f"(@{channels[0]},{channels[1]})"
         self._range_v = range_v
 
@@ -56,4 +78,4 @@ class ScpiScanner(Polled[Voltages]):
         return name
 
     async def _read(self) -> Voltages:
-        return read_scan(await self._session.ask("READ?"))
+        return read_scan(await self._session.ask(READ))

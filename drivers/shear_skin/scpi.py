@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from time import monotonic_ns
 
 from drivers.errors import DeviceLostError, ProtocolError
+from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.serial_port import Link, Port
 
 # A reading of five elements is 70 characters long; what is longer without an end is no reply.
@@ -63,6 +64,23 @@ class Reply:
     t_arrival_ns: int
 
 
+class RecordedAnswers:
+    """Pairs the questions and answers of a recording again. No I/O."""
+
+    def __init__(self) -> None:
+        """Know of no question."""
+        self._query, self._asked_ns = "", 0
+
+    def take(self, told: RawInput) -> tuple[str, Reply] | None:
+        """Return the question and its reply, once it is there."""
+        if told.kind is InputKind.ASKED:
+            self._query, self._asked_ns = told.data.decode("latin-1"), told.t_ns
+        elif told.kind is InputKind.DATA and self._query:
+            query, self._query = self._query, ""
+            return query, Reply(told.data.decode("latin-1"), self._asked_ns, told.t_ns)
+        return None
+
+
 def numbers(text: str, count: int, what: str) -> list[float]:
     """Return the comma-separated numbers of a reply; ProtocolError when it has not exactly so many."""
     parts = text.split(",")
@@ -74,8 +92,9 @@ def numbers(text: str, count: int, what: str) -> list[float]:
 class ScpiSession:
     """Questions and commands over a link that may break; after a failure the link is to be closed by `lost`."""
 
-    def __init__(self, link: Link, what: str, deadline_s: float = REPLY_DEADLINE_S) -> None:
-        """Take the link, and what the instrument is called in sentences."""
+    def __init__(self, link: Link, what: str, deadline_s: float = REPLY_DEADLINE_S, tap: Tap = no_tap) -> None:
+        """Take the link, and what the instrument is called in sentences; `tap` hears questions and their answers."""
+        self._tap = tap
         self._link = link
         self._what = what
         self._deadline_s = deadline_s
@@ -113,7 +132,11 @@ class ScpiSession:
         self._waiting.clear()
         asked_ns = monotonic_ns()
         await self.tell(query)
-        return await self._next(asked_ns, query)
+        reply = await self._next(asked_ns, query)
+        # Both together: a question without an answer says nothing.
+        self._tap(RawInput(InputKind.ASKED, asked_ns, query.encode()))
+        self._tap(RawInput(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
+        return reply
 
     async def ask_until(self, query: str, answer: str, deadline_s: float) -> None:
         """Read past replies to older questions until a query is answered so; DeviceLostError when that never comes."""

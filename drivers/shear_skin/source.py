@@ -7,9 +7,10 @@ Voltage and current are both measured: the current of a source that sits in comp
 from dataclasses import dataclass
 
 from drivers.errors import DeviceLostError, DriverError, ProtocolError
+from drivers.raw_input import RawInput, Tap, no_tap
 from drivers.serial_port import Link
 from drivers.shear_skin.polled import Polled
-from drivers.shear_skin.scpi import NOT_A_NUMBER, REPLY_DEADLINE_S, numbers
+from drivers.shear_skin.scpi import NOT_A_NUMBER, REPLY_DEADLINE_S, RecordedAnswers, Reply, numbers
 
 MODELS = ("MODEL 6430", "MODEL 24")
 # The factory's rate of the RS-232 interface.
@@ -21,6 +22,7 @@ COMPLIANCE_V = 1.0
 PERIOD_S = 0.5
 # A reading that was under way and its reply take some tenths of a second; whoever stops the daemon waits for this.
 SWITCH_OFF_S = 1.0
+OUTPUT, READ = ":OUTP?", ":READ?"
 # The status word (manual, page 17-47).
 _OVERFLOW, _COMPLIANCE, _OVERVOLTAGE, _RANGE_COMPLIANCE = 1 << 0, 1 << 3, 1 << 4, 1 << 16
 
@@ -46,6 +48,39 @@ def read_elements(text: str, t_ns: int) -> SourceReading:
     return SourceReading(t_ns, True, voltage_v, current_a, compliance=bool(word & bad))
 
 
+def read_reply(query: str, reply: Reply) -> SourceReading | None:
+    """Return the reading in the reply to OUTPUT or READ; None where the output is on and its reading is still to come.
+
+    Raises ProtocolError for a reply that answers neither.
+    """
+    if query == READ:
+        return read_elements(reply.text, reply.t_arrival_ns)
+    if reply.text == "0":
+        return SourceReading(reply.t_arrival_ns, output_on=False)
+    if reply.text != "1":
+        raise ProtocolError(f"The current source sent {reply.text[:60]!r} where 0 or 1 was to be expected.")
+    return None
+
+
+class RecordedSource:
+    """Reads again what a source was recorded to have answered. No I/O."""
+
+    def __init__(self) -> None:
+        """Know of no answer."""
+        self._answers = RecordedAnswers()
+
+    def take(self, told: RawInput) -> list[SourceReading]:
+        """Return the readings that an input leads to; one that was not understood then leads to none now either."""
+        answer = self._answers.take(told)
+        if answer is None or answer[0] not in (OUTPUT, READ):
+            return []
+        try:
+            reading = read_reply(*answer)
+        except ProtocolError:
+            return []
+        return [] if reading is None else [reading]
+
+
 class Keithley6430(Polled[SourceReading]):
     """One source behind a link: set up, switched on, and read until it is no longer wanted; then switched off."""
 
@@ -56,9 +91,10 @@ class Keithley6430(Polled[SourceReading]):
         compliance_v: float = COMPLIANCE_V,
         period_s: float = PERIOD_S,
         reply_deadline_s: float = REPLY_DEADLINE_S,
+        tap: Tap = no_tap,
     ) -> None:
-        """Take the link to it; nothing is opened yet."""
-        super().__init__(link, "The current source", period_s, reply_deadline_s)
+        """Take the link to it; nothing is opened yet. `tap` hears what it is asked and answers."""
+        super().__init__(link, "The current source", period_s, reply_deadline_s, tap)
         self.current_a = current_a
         self.compliance_v = compliance_v
         self._was_reset = False
@@ -89,12 +125,10 @@ class Keithley6430(Polled[SourceReading]):
         return name
 
     async def _read(self) -> SourceReading:
-        on = await self._session.ask(":OUTP?")
-        if on.text == "0":
-            return SourceReading(on.t_arrival_ns, output_on=False)
-        if on.text != "1":
-            raise ProtocolError(f"The current source sent {on.text[:60]!r} where 0 or 1 was to be expected.")
-        reply = await self._session.ask(":READ?")
+        off = read_reply(OUTPUT, await self._session.ask(OUTPUT))
+        if off is not None:
+            return off
+        reply = await self._session.ask(READ)
         return read_elements(reply.text, reply.t_arrival_ns)
 
     async def _leave(self) -> None:
@@ -104,7 +138,7 @@ class Keithley6430(Polled[SourceReading]):
         try:
             # Twice: whoever was interrupted in the middle of a command has left its beginning on the line.
             await self._session.tell(":OUTP OFF", ":OUTP OFF")
-            await self._session.ask_until(":OUTP?", "0", SWITCH_OFF_S)
+            await self._session.ask_until(OUTPUT, "0", SWITCH_OFF_S)
             self._may_be_on = False
         except DriverError as error:
             self._errors["not switched off"] += 1

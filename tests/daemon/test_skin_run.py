@@ -85,7 +85,9 @@ ADC = {"adc": {"device": {"path": "skin-daq"}}}
 
 
 @contextlib.asynccontextmanager
-async def played(folder: Path, *, socket: bool = False, **changes: Any) -> AsyncIterator[Played]:
+async def played(
+    folder: Path, *, socket: bool = False, daemon: dict[str, Any] | None = None, **changes: Any
+) -> AsyncIterator[Played]:
     skin = SyntheticSkin()
     places: dict[str, str] = {}
     ready = asyncio.Semaphore(0)
@@ -109,8 +111,8 @@ async def played(folder: Path, *, socket: bool = False, **changes: Any) -> Async
         host, port = places["daq"].split(":")
         daq = {"scanner": {"socket": {"host": host, "port": int(port)}}}
     try:
-        async with running(written(folder, {"skin": section(daq, **changes)})) as daemon:
-            yield Played(daemon, skin, instruments, f"ipc://{folder}/commands")
+        async with running(written(folder, {**(daemon or {}), "skin": section(daq, **changes)})) as run:
+            yield Played(run, skin, instruments, f"ipc://{folder}/commands")
     finally:
         playing.cancel()
         await asyncio.wait([playing])

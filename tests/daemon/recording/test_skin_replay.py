@@ -1,0 +1,63 @@
+"""The skin recorded by a running daemon, with faults and tares, and replayed from its raw inputs."""
+
+import asyncio
+import math
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.cli import main
+from daemon.recording.export import topics_of
+from tests.daemon.recording.test_replay import measured, replayed
+from tests.daemon.test_skin_run import played
+
+
+async def recorded(folder: Path, *, socket: bool) -> list[tuple[str, dict[str, Any]]]:
+    """Return what a daemon published while a skin was loaded, tared and ill-treated, all of it recorded."""
+    published: list[tuple[str, dict[str, Any]]] = []
+    async with played(folder, socket=socket, daemon={"recording": {"folder": "recordings"}}) as bench:
+        bench.daemon.publisher.listen(lambda topic, content: published.append((topic, content)))
+        await bench.valid()
+        for number in range(20):
+            bench.skin.push(0.8 * number / 19)
+            await bench.shear.get()
+        await bench.until(lambda content: content["valid"] and content["shear_n"] > 0.6)
+        bench.instruments.command("open 1")
+        await bench.says("gauge 1 is open")
+        bench.instruments.command("normal")
+        await bench.valid()
+        bench.skin.push(0.0)
+        await bench.until(lambda content: content["valid"] and abs(content["response"]) < 0.01)
+        bench.fresh()
+        assert (await bench.command("tare", source="skin"))["ok"]
+        await bench.says("taking the zero")
+        bench.instruments.command("daq unplug 0.05")
+        await bench.until(lambda content: content["missed"] > 3)
+        bench.instruments.command("daq normal")
+        bench.fresh()
+        await bench.valid()
+    return published
+
+
+@pytest.mark.parametrize("socket", [False, True])
+def test_the_skin_s_raw_inputs_give_the_same_forces_again(
+    tmp_path: Path, socket: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    live = asyncio.run(recorded(tmp_path, socket=socket))
+    (path,) = (tmp_path / "recordings").iterdir()
+    assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(topics_of(path))
+    address = f"ipc://{tmp_path}/replay"
+    again, comparison = asyncio.run(replayed(path, math.inf, address))
+    assert comparison.different == Counter(), comparison.examples
+    assert comparison.compared["skin.shear"] > 50
+    then, now = (measured([one for one in run if one[0] == "skin.shear"]) for run in (live, again))
+    begin = next(i for i, (_, content) in enumerate(now) if content["sample"] == then[0][1]["sample"])
+    assert now[begin : begin + len(then)] == then
+    reasons = {content["why"].split(",")[0] for _, content in now}
+    assert {"", "taking the zero"} <= reasons
+    assert any("gauge 1 is open" in why for why in reasons)
+    assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
+    count = comparison.compared["skin.shear"]
+    assert f"skin.shear: {count} of {count} are the same as recorded" in capsys.readouterr().err

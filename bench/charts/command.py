@@ -7,6 +7,7 @@ from pathlib import Path
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
     "stability": "every estimator as faults grow: bias, spread, valid and false-valid share; continuity",
+    "scene": "how much model, bank and board the recording's own noise asks for",
 }
 
 
@@ -49,6 +50,7 @@ def run(args: argparse.Namespace) -> int:
     charts: dict[str, Callable[[argparse.Namespace], list[Path]]] = {
         "speed-accuracy": _speed_accuracy,
         "stability": _stability,
+        "scene": _scene,
     }
     for path in charts[args.name](args):
         print(path)
@@ -80,3 +82,10 @@ def _stability(args: argparse.Namespace) -> list[Path]:
     scratch, mesh = args.out / "banks", mesh_of(args.mesh)
     bank = bank_of(args.bank, mesh, scratch)
     return chart(splits(args.recordings, args.split, scratch), bank, mesh, scratch, args.out)
+
+
+def _scene(args: argparse.Namespace) -> list[Path]:
+    from bench.charts.scene import chart
+    from bench.charts.sources import splits
+
+    return chart(splits(args.recordings, args.split, args.out / "banks"), args.out)

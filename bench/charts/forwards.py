@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bank.batch_forward import BatchForwardModel
 from bank.forward import ForwardModel
 from bank.mesh import Mesh
-from bank.models import conductivity
+from bank.models import Conductivities, conductivity
 from bench.charts.sources import own_fingertip
 
 Floats = NDArray[np.float64]
@@ -19,6 +20,7 @@ CELLS = ((3.2, 1.2), (3.3, 1.9), (2.2, 1.0), (1.4, 1.4), (0.8, 2.5), (4.0, 3.5))
 DIRECT_SIZES_CM = (0.4, 0.2, 0.1, 0.05)
 # Errors fall in proportion to the mesh size: two fine meshes tell where they go (Richardson).
 CONVERGED_SIZES_CM = (0.04, 0.025)
+BATCH, BATCHES = "batch of cells", 8
 # Measured with warm caches, EIDORS on the paper's mesh of 4882 triangles: its voltages the direct solve gives to 1e-9.
 EIDORS_CELL_S, PYEIT_CELL_S, PAPER_TRIANGLES = 0.034, 0.244, 4882
 
@@ -48,6 +50,11 @@ class _Solver:
     solve: Callable[[], Floats]
     truth: Floats
 
+    @property
+    def times(self) -> int:
+        """How often one call solves all cells."""
+        return BATCHES if self.family.startswith(BATCH) else 1
+
 
 def forwards(
     rounds: int,
@@ -65,20 +72,19 @@ def forwards(
     for size in sizes_cm:
         own = own_fingertip(size).mesh()
         solvers.append(_Solver(f"direct, {size:g} cm", "direct", own, direct(own), truth))
+        solvers.append(_Solver(f"batch, {size:g} cm", BATCH, own, batch(own), truth))
     if mesh is not None:
         once = mesh.refined()
-        solvers.append(
-            _Solver(
-                "direct, --mesh", "direct, the given mesh", mesh, direct(mesh), converged(once, once.refined(), 2.0)
-            )
-        )
+        given = converged(once, once.refined(), 2.0)
+        solvers.append(_Solver("direct, --mesh", "direct, the given mesh", mesh, direct(mesh), given))
+        solvers.append(_Solver("batch, --mesh", f"{BATCH}, the given mesh", mesh, batch(mesh), given))
     times: dict[str, list[float]] = {one.name: [] for one in solvers}
     found = []
     for turn in range(rounds):
         for one in solvers:
             begun = time.perf_counter()
             signals = one.solve()
-            times[one.name].append(1e3 * (time.perf_counter() - begun) / len(CELLS))
+            times[one.name].append(1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.times))
             if turn == rounds - 1:
                 own_ms = times[one.name]
                 found.append(
@@ -94,6 +100,16 @@ def forwards(
         Solved("EIDORS 3.10 (cited)", "EIDORS", PAPER_TRIANGLES, eidors, eidors, eidors, alike.error, cited=True),
         Solved("pyEIT (cited)", "pyEIT", PAPER_TRIANGLES, pyeit, pyeit, pyeit, None, cited=True),
     ]
+
+
+def batch(mesh: Mesh) -> Callable[[], Floats]:
+    """Return what solves the same signals all at once, as `bank build` does."""
+    model, of = BatchForwardModel(mesh), Conductivities(mesh)
+    (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
+    # Sixteen cells go through the elimination together; six alone would pay for all of them.
+    cells = np.array([of.of(MODEL, k, s) for k, s in CELLS])
+    many = np.resize(np.arange(len(CELLS)), BATCHES * len(CELLS))
+    return lambda: (model.voltages(cells[many]) - homogeneous)[: len(CELLS)]
 
 
 def direct(mesh: Mesh) -> Callable[[], Floats]:

@@ -41,6 +41,7 @@ class Split:
     title: str
     past: FrameSeries
     future: FrameSeries
+    whole: FrameSeries
 
 
 def own_fingertip(mesh_size_cm: float) -> Fingertip:
@@ -65,7 +66,7 @@ def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
     if not named:
         named = [("synthetic slices", synthetic_slices(scratch)), ("synthetic stream", synthetic_stream(scratch))]
     return [
-        Split(f"{name}, {KINDS[series.kind]}, first {share:.0%}", *_parted(series, share))
+        Split(f"{name}, {KINDS[series.kind]}, first {share:.0%}", *_parted(series, share), series)
         for name, series in named
         if series.torque_t_s.size and not np.isfinite(series.diameter_mm).any()
     ]

@@ -1,7 +1,7 @@
 """Estimators where methods fail: bias, spread, valid and false-valid share of each, as a fault grows."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from bank.estimators import Calibration, Estimate, FrameSeries, Name, Physics, T
 from bank.estimators.guard import channel_noise
 from bench.charts.faults import FAULTS, Fault, Scene, Spoilt, scene_of
 from bench.charts.sources import Split
+from daemon.scene import residual_noise
 
 Floats = NDArray[np.float64]
 # Of valid estimates one in twenty may miss its 95 % interval; an estimator that is wrong so often says it is right
@@ -129,10 +130,8 @@ def misaligned(split: Split, names: Sequence[Name], physics: Physics, shifts_s: 
     levels: dict[str, list[Level]] = {}
     for shift in shifts_s:
         past = split.past
-        late = FrameSeries(
-            past.kind, past.sides, past.t_s, past.channels, past.torque_t_s + shift, past.torque_nm, past.diameter_mm
-        )
-        for calibration in fitted(Split(split.title, late, split.future), names, physics):
+        late = replace(past, torque_t_s=past.torque_t_s + shift)
+        for calibration in fitted(replace(split, past=late), names, physics):
             tracker = Tracker(calibration, physics.bank)
             estimates = estimates_of(tracker, Spoilt(shortened(split.future)))
             found = judged(estimates, truth_of(shortened(split.future)), shift)
@@ -153,10 +152,7 @@ def scene_for(split: Split, bank: Bank) -> Scene:
     series = shortened(split.future)
     if series.kind == "difference":
         idle = np.abs(bank.homogeneous) * (_MEAN_V / float(np.abs(bank.homogeneous).mean()))
-        residual = split.past.channels[:, 0]
-        # What the four main directions of the slices leave is their noise.
-        _, s, _ = np.linalg.svd(residual - residual.mean(axis=0), full_matrices=False)
-        noise = float(np.sqrt((s[4:] ** 2).sum() / max(len(residual) - 5, 1) / residual.shape[1]))
+        noise = residual_noise(split.past.channels[:, 0])
         return scene_of(series, np.tile(idle, (len(series.sides), 1)), noise)
     idle = np.median(split.past.channels[:5], axis=0)
     return scene_of(series, idle, float(np.median(channel_noise(split.past.channels[:, 0]))))

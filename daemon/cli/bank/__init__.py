@@ -9,6 +9,7 @@ if TYPE_CHECKING:
 
 _ACTIONS = {
     "build": "build a bank, or go on with one whose build was interrupted",
+    "design": "say how much bank a recording's noise asks for, as a configuration for `build`",
     "info": "check a bank's checksums and say what it is of",
     "plot": "draw a bank's signals, and the conductivities of the five models",
     "solve": "solve for the 896 voltages of one conductivity",
@@ -16,7 +17,7 @@ _ACTIONS = {
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the four actions and their arguments."""
+    """Add the actions and their arguments."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     for name, summary in _ACTIONS.items():
         action = actions.add_parser(name, help=summary, description=summary)

@@ -1,0 +1,308 @@
+"""How much model a scene needs: the coarsest of everything whose added error stays below a third of the noise.
+
+All errors are relative L2 errors of a difference frame, in units of the measured noise of one frame: a step adds
+little while it is below a third, since errors add as squares (√(1 + 1/9) = 1.05). Torque is read from how frames change
+with it, so for channels and injections it is the torque's standard deviation by generalised least squares that may
+grow by that much.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from bank.errors import CalibrationError
+from bank.fingertip import Fingertip
+from bank.forward import ForwardModel
+from bank.model_scores import Setting, searched_settings
+from bank.models import MODELS, conductivity
+
+Floats = NDArray[np.float64]
+
+# The share of the noise that each choice may add.
+ALLOWED = 1.0 / 3.0
+CHANNEL_S = 0.6e-3
+MESH_SIZES_CM = (0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.05)
+COUNTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 150)
+RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+CHANNEL_COUNTS = (8, 16, 32, 64, 112, 168, 224, 336, 448, 672, 896)
+# Parameters of each model beside the amplitude: the step has no width.
+PARAMETERS = {name: 1 if model.sigma_unit == "not used" else 2 for name, model in MODELS.items()}
+_FOLDS = 8
+# Linear elements: errors fall in proportion to the mesh size, and two fine meshes tell where they go.
+_FINE_CM = (0.05, 0.035)
+_N_DRIFT = 2
+_LEAST_FRAMES = 8
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What was measured: (n, 896) differences in volts, the noise of one frame in volts, torque (n,) or None."""
+
+    differences: Floats
+    noise_v: float
+    torque_nm: Floats | None
+
+    def __post_init__(self) -> None:
+        """Refuse too little."""
+        if len(self.differences) < _LEAST_FRAMES:
+            raise CalibrationError(
+                f"{len(self.differences)} gripped frames are too few to judge a model by; record {_LEAST_FRAMES}"
+            )
+
+    @property
+    def relative_noise(self) -> float:
+        """The noise as a share of the differences, both as RMS."""
+        return self.noise_v / float(np.sqrt((self.differences**2).mean()))
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One setting: the error it adds in units of the noise, and what it costs, in words."""
+
+    setting: float
+    added: float
+    cost: str
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Settings from coarse to fine, and the coarsest that is good enough; the finest where none is."""
+
+    name: str
+    unit: str
+    steps: tuple[Step, ...]
+
+    @property
+    def chosen(self) -> Step:
+        """The coarsest step that adds at most a third of the noise."""
+        return next((step for step in self.steps if step.added <= ALLOWED), self.steps[-1])
+
+    @property
+    def next_step(self) -> Step | None:
+        """The step after the chosen one, None where that is the finest."""
+        after = self.steps.index(self.chosen) + 1
+        return self.steps[after] if after < len(self.steps) else None
+
+    @property
+    def enough(self) -> bool:
+        """Whether the chosen step is good enough."""
+        return self.chosen.added <= ALLOWED
+
+
+@dataclass(frozen=True, slots=True)
+class Supported:
+    """A model against the data: error of held-out channels relative to the frame, its standard error, BIC per frame.
+
+    The error is that of predictions for injections that k, σ and amplitude were not fitted to; `penalised` adds to it
+    what its parameters would explain of pure noise.
+    """
+
+    model: str
+    parameters: int
+    error: float
+    standard_error: float
+    penalised: float
+    bic: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """The choices for a scene; k and sigma (low, high) in cm are where the frames lie, with a margin."""
+
+    relative_noise: float
+    models: tuple[Supported, ...]
+    model: str
+    k_range: tuple[float, float]
+    sigma_range: tuple[float, float]
+    mesh: Choice
+    k_count: Choice
+    sigma_count: Choice
+    rank: Choice
+    channels: Choice
+    injections: Choice
+
+
+def designed(scene: Scene, fingertip: Fingertip) -> Design:
+    """Return the choices for a scene on this fingertip. Raises BankError for a geometry that cannot be solved on."""
+    mesh = replace(fingertip, mesh_size_cm=0.2).mesh()
+    forward = ForwardModel(mesh)
+    signals = {name: _signals(forward, name, searched_settings(name, mesh.height_cm)) for name in MODELS}
+    models = tuple(_supported(scene, name, signals[name][1]) for name in MODELS)
+    model = min(models, key=lambda one: one.penalised).model
+    settings, own = signals[model]
+    k_range, sigma_range = _ranges(scene, settings, own)
+    middle = Setting(sum(k_range) / 2, sum(sigma_range) / 2)
+    noise = scene.relative_noise
+    return Design(
+        noise, models, model, k_range, sigma_range,
+        _mesh_choice(fingertip, model, middle, noise),
+        _count_choice(forward, model, k_range, lambda k: Setting(k, middle.sigma), noise, "k"),
+        _count_choice(forward, model, sigma_range, lambda s: Setting(middle.k, s), noise, "sigma"),
+        _rank_choice(forward, model, k_range, sigma_range, noise),
+        *_board_choices(scene),
+    )  # fmt: skip
+
+
+def _signals(forward: ForwardModel, model: str, settings: Sequence[Setting]) -> tuple[list[Setting], Floats]:
+    """Return those settings that are positive everywhere, and their (m, 896) magnitudes."""
+    homogeneous, kept, found = forward.homogeneous(), [], []
+    for setting in settings:
+        cell = conductivity(forward.mesh, model, *setting)
+        if cell.min() > 0:
+            kept.append(setting)
+            found.append(np.abs(forward.voltages(cell) - homogeneous))
+    return kept, np.array(found)
+
+
+def _fit(frames: Floats, signals: Floats) -> tuple[Floats, Floats]:
+    """Return (n, m) amplitudes of the best multiples of (m, d) signals for (n, d) frames, and the squares left."""
+    energy = (signals**2).sum(axis=1)
+    amplitude = frames @ signals.T / energy
+    return amplitude, (frames**2).sum(axis=1)[:, None] - amplitude**2 * energy
+
+
+def _supported(scene: Scene, model: str, signals: Floats) -> Supported:
+    """Judge a model on injections that its parameters were not fitted to."""
+    frames, injection = np.abs(scene.differences), CHANNELS[:, 0]
+    left = np.zeros(len(frames))
+    for fold in range(_FOLDS):
+        out = injection % _FOLDS == fold
+        amplitude, squares = _fit(frames[:, ~out], signals[:, ~out])
+        best = squares.argmin(axis=1)
+        predicted = amplitude[np.arange(len(frames)), best][:, None] * signals[best][:, out]
+        left += ((frames[:, out] - predicted) ** 2).sum(axis=1)
+    share = left / (frames**2).sum(axis=1)
+    whole = _fit(frames, signals)[1].min(axis=1)
+    p = PARAMETERS[model] + 1
+    bic = N_CHANNELS * np.log(whole / N_CHANNELS) + p * np.log(N_CHANNELS)
+    error = float(np.sqrt(share.mean()))
+    return Supported(
+        model, p, error, float(share.std() / np.sqrt(len(share)) / (2 * error)),
+        float(np.sqrt(share.mean() * (1 + p * np.log(N_CHANNELS) / N_CHANNELS))), float(bic.mean()),
+    )  # fmt: skip
+
+
+def _ranges(
+    scene: Scene, settings: Sequence[Setting], signals: Floats
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return where the frames lie, with the distance to the next searched setting as margin."""
+    best = _fit(np.abs(scene.differences), signals)[1].argmin(axis=1)
+    found = []
+    for values, every in (
+        (np.array([settings[i][axis] for i in best]), np.unique([s[axis] for s in settings])) for axis in (0, 1)
+    ):
+        low, high = np.quantile(values, [0.02, 0.98])
+        below, above = every[every < low], every[every > high]
+        found.append((float(below[-1] if len(below) else 0.8 * low), float(above[0] if len(above) else 1.2 * high)))
+    return found[0], found[1]
+
+
+def _off(one: Floats, other: Floats) -> float:
+    """Return how far two magnitudes are apart in shape, relative L2: the amplitude is free."""
+    amplitude = float(one @ other / (other @ other))
+    return float(np.linalg.norm(one - amplitude * other) / np.linalg.norm(one))
+
+
+def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float) -> Choice:
+    def solved(size: float) -> tuple[Floats, int]:
+        mesh = replace(fingertip, mesh_size_cm=size).mesh()
+        return _signals(ForwardModel(mesh), model, [place])[1][0], len(mesh.triangles)
+
+    coarse, fine = (solved(size)[0] for size in _FINE_CM)
+    truth = fine + (fine - coarse) / (_FINE_CM[0] / _FINE_CM[1] - 1.0)
+    steps = []
+    for size in MESH_SIZES_CM:
+        signal, triangles = solved(size)
+        steps.append(Step(size, _off(truth, signal) / noise, f"{triangles} triangles"))
+    return Choice("mesh size", "cm", tuple(steps))
+
+
+def _count_choice(
+    forward: ForwardModel,
+    model: str,
+    ends: tuple[float, float],
+    at: Callable[[float], Setting],
+    noise: float,
+    name: str,
+) -> Choice:
+    """Choose how many cells lie between the ends: the error is that of a frame half-way between two cells."""
+    homogeneous = forward.homogeneous()
+
+    def signal(value: float) -> Floats:
+        return np.abs(forward.voltages(conductivity(forward.mesh, model, *at(value))) - homogeneous)
+
+    steps = []
+    for count in COUNTS:
+        spacing = (ends[1] - ends[0]) / (count - 1)
+        # Half a cell to either side of places all over the range; the worst of them counts.
+        places = np.linspace(ends[0] + spacing, ends[1] - spacing, 4)
+        added = max(_off(signal(v), signal(v + spacing / 2)) for v in places.tolist())
+        steps.append(Step(count, added / noise, f"{spacing:.3g} cm apart"))
+    return Choice(f"cells along {name}", "cells", tuple(steps))
+
+
+def _rank_choice(
+    forward: ForwardModel, model: str, k: tuple[float, float], sigma: tuple[float, float], noise: float
+) -> Choice:
+    grid = [Setting(a, b) for a in np.linspace(*k, 9).tolist() for b in np.linspace(*sigma, 9).tolist()]
+    signals = _signals(forward, model, grid)[1]
+    signals /= np.linalg.norm(signals, axis=1, keepdims=True)
+    squares = np.linalg.svd(signals, compute_uv=False) ** 2
+    steps = [
+        Step(rank, float(np.sqrt(squares[rank:].sum() / squares.sum())) / noise, f"{4 * rank} bytes a cell, of 3584")
+        for rank in RANKS
+    ]
+    return Choice("rank of the bank", "numbers a cell", tuple(steps))
+
+
+def _board_choices(scene: Scene) -> tuple[Choice, Choice]:
+    """Choose channels and injections by the torque's standard deviation, from the frames' own change with torque.
+
+    The frames' slope over torque, their drift about it and their noise are those of the recording; without a known
+    torque the main direction in which the frames vary stands for it.
+    """
+    frames = np.abs(scene.differences)
+    centred = frames - frames.mean(axis=0)
+    if scene.torque_nm is not None and np.ptp(scene.torque_nm) > 0:
+        torque = scene.torque_nm - scene.torque_nm.mean()
+        slope = centred.T @ torque / float(torque @ torque)
+        residual = centred - np.outer(torque, slope)
+    else:
+        u, s, vt = np.linalg.svd(centred, full_matrices=False)
+        slope, residual = s[0] * vt[0], centred - np.outer(u[:, 0] * s[0], vt[0])
+    _, s, vt = np.linalg.svd(residual, full_matrices=False)
+    drift = vt[:_N_DRIFT].T * (s[:_N_DRIFT] / np.sqrt(max(len(frames) - 2, 1)))
+
+    def spread(channels: NDArray[np.int64]) -> float:
+        """Return the standard deviation of a torque read from these channels."""
+        b, v = slope[channels] / scene.noise_v, drift[channels] / scene.noise_v
+        inner = np.linalg.inv(np.eye(_N_DRIFT) + v.T @ v)
+        information = float(b @ b - (b @ v) @ inner @ (v.T @ b))
+        return float(1.0 / np.sqrt(max(information, 1e-300)))
+
+    everything = np.arange(N_CHANNELS)
+    least = spread(everything)
+
+    def added(channels: NDArray[np.int64]) -> float:
+        return float(np.sqrt(max((spread(channels) / least) ** 2 - 1.0, 0.0)))
+
+    order = np.argsort(-np.abs(slope), kind="stable")
+    channels = [Step(n, added(order[:n]), _rate(n)) for n in CHANNEL_COUNTS]
+    injection = CHANNELS[:, 0]
+    taken: list[int] = []
+    steps = []
+    while len(taken) < N_ELECTRODES:
+        rest = [one for one in range(N_ELECTRODES) if one not in taken]
+        taken.append(min(rest, key=lambda one: spread(np.flatnonzero(np.isin(injection, [*taken, one])))))
+        chosen = np.flatnonzero(np.isin(injection, taken))
+        steps.append(
+            Step(len(taken), added(chosen), f"{_rate(len(chosen))}; injections {', '.join(map(str, sorted(taken)))}")
+        )
+    return Choice("channels", "of 896", tuple(channels)), Choice("injections", "of 32", tuple(steps))
+
+
+def _rate(channels: int) -> str:
+    return f"{1.0 / (channels * CHANNEL_S):.2f} frames/s at {1e3 * CHANNEL_S:g} ms a channel"

@@ -1,0 +1,33 @@
+"""`shearloop bank design RECORDING`: the least bank that its noise asks for, as YAML for `bank build`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("recording", type=Path, metavar="RECORDING", help="a recording (.mcap) or a folder of slices")
+    parser.add_argument(
+        "--fingertip", type=Path, metavar="FILE", help="the fingertip's measures (default: the paper's)"
+    )
+    parser.add_argument("--side", metavar="SIDE", help="side of the recording to design for (default: its first)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write the YAML there (default: print it)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Design, and print or write what `bank build --config` takes."""
+    from daemon.errors import UserError
+    from daemon.scene import design_yaml, designed_for
+
+    fingertip, design = designed_for(args.recording, args.fingertip, args.side)
+    text = design_yaml(design, fingertip, args.recording)
+    if args.out is None:
+        print(text, end="")
+        return 0
+    try:
+        args.out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{args.out}: the design cannot be written: {error.strerror}") from error
+    print(f"Build it: shearloop bank build --config {args.out} --out FILE", file=sys.stderr)
+    return 0

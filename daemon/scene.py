@@ -1,0 +1,101 @@
+"""From a recording to a design of the bank it asks for, and to the YAML that `bank build` takes."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.design import ALLOWED, Choice, Design, Scene, designed
+from bank.estimators.guard import channel_noise
+from bank.estimators.memory import gripped_part
+from bank.estimators.values import FrameSeries
+from daemon.bank_config import FingertipConfig
+from daemon.config_file import load_yaml_model
+from daemon.errors import UserError
+from daemon.recording.series import read_series
+from daemon.reproduce.banks import OWN_FINGERTIP
+
+# Main directions in which slices of one contact vary; what they leave is noise.
+_N_DIRECTIONS = 4
+
+
+def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> tuple[Path, Design]:
+    """Return the fingertip's file and the design; raises UserError and BankError for what cannot be used."""
+    path = fingertip or OWN_FINGERTIP
+    series = [one for one in read_series(recording) if one.torque_t_s.size]
+    if not series:
+        raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
+    one = series[0] if side is None else series[0].of_sides((side,))
+    return path, designed(scene_of(one), load_yaml_model(path, FingertipConfig).fingertip())
+
+
+def scene_of(series: FrameSeries) -> Scene:
+    """Return the differences of the first side while gripped, their noise, and the torque beside them."""
+    torque = series.torque_at_frames()
+    if series.kind == "difference":
+        frames = series.channels[:, 0]
+        return Scene(frames, residual_noise(frames), torque if np.isfinite(torque).all() else None)
+    idle, gripped, _ = gripped_part(series)
+    frames = series.channels[gripped, 0]
+    # A recording that begins gripped has no idle frame: its first frame stands in.
+    before = series.channels[idle, 0] if idle.stop > 0 else series.channels[:1, 0]
+    noise = channel_noise(frames)
+    known = np.isfinite(torque[gripped])
+    return Scene(
+        (frames - np.median(before, axis=0))[known], float(np.median(noise[np.isfinite(noise)])), torque[gripped][known]
+    )
+
+
+def residual_noise(frames: NDArray[np.float64]) -> float:
+    """Return the noise in volts of (n, 896) differences: what their main directions leave."""
+    s = np.linalg.svd(frames - frames.mean(axis=0), compute_uv=False)
+    freedom = max(len(frames) - 1 - _N_DIRECTIONS, 1)
+    return float(np.sqrt((s[_N_DIRECTIONS:] ** 2).sum() / freedom / frames.shape[1]))
+
+
+def design_yaml(design: Design, fingertip: Path, recording: Path) -> str:
+    """Return the design as a bank's configuration, what else it says as comments."""
+    k, sigma = (
+        f"{{low: {low:.4g}, high: {high:.4g}, count: {count.chosen.setting:.0f}}}"
+        for (low, high), count in ((design.k_range, design.k_count), (design.sigma_range, design.sigma_count))
+    )
+    rows = [
+        f"# Designed for {recording}: the coarsest that adds at most {ALLOWED:.0%} of its noise, which is",
+        f"# {design.relative_noise:.1%} of a difference frame. `shearloop bank build --config` takes this file.",
+        *(f"# {line}" for line in model_lines(design)),
+        *(f"# {line}" for line in choice_lines(design)),
+        f"fingertip: {fingertip.resolve()}",
+        f"mesh_size_cm: {design.mesh.chosen.setting:g}",
+        f"model: {design.model}",
+        f"k: {k}",
+        f"sigma: {sigma}",
+    ]
+    return "\n".join(rows) + "\n"
+
+
+def model_lines(design: Design) -> list[str]:
+    """Return what the data says of each model, the best first."""
+    ranked = sorted(design.models, key=lambda one: one.penalised)
+    return [
+        f"{one.model}: {one.penalised:.1%} ± {one.standard_error:.1%} of a frame unexplained on injections left out"
+        for one in ranked
+    ]
+
+
+def choices_of(design: Design) -> tuple[Choice, ...]:
+    """Return all choices in the order of a table."""
+    return (design.mesh, design.k_count, design.sigma_count, design.rank, design.channels, design.injections)
+
+
+def choice_lines(design: Design) -> list[str]:
+    """Return each choice with what it adds, and what the next step would buy."""
+    found = []
+    for one in choices_of(design):
+        step, after = one.chosen, one.next_step
+        text = f"{one.name}: {step.setting:g} {one.unit} ({step.cost}) adds {step.added:.2f} of the noise"
+        if not one.enough:
+            text += ", more than a third: the finest tried"
+        elif after is not None:
+            text += f"; {after.setting:g} would add {after.added:.2f}"
+        found.append(text)
+    return found

@@ -28,7 +28,7 @@ CHARTED: Mapping[str, tuple[str, ...]] = {
     "eit.estimate": ("torque_nm", "torque_low_nm", "torque_high_nm", "valid"),
     "load.torque": ("torque_nm", "spike"),
     "skin.shear": ("shear_n", "shear_low_n", "shear_high_n", "torque_nm", "valid"),
-    "loop.state": ("ramp_nm",),
+    "loop.state": ("ramp_nm", "phase"),
 }
 _ENVELOPE = frozenset({"timestamp", "t_mono_ns", "seq", "source"})
 

@@ -6,16 +6,21 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
+import aiohttp
 import numpy as np
 import pytest
 import yaml
 import zmq.asyncio
+from aiohttp import web
 
 from bank.bank_file import Bank
 from bank.calibration import Calibration
 from daemon.app import Daemon
 from daemon.config import load_daemon_config
 from daemon.request import request
+from daemon.view.bridge import Bridge, Place
+from daemon.view.latest import Latest
+from daemon.view.server import make_app
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 HOST = "127.0.0.41"
@@ -141,6 +146,50 @@ async def test_a_tool_is_gripped_twisted_and_released(rig_config: Path, tiny_ban
     assert max(valid) == pytest.approx(max(torques), abs=0.03)
     wrench = max(abs(message["wrist_torque_nm"]) for message in watcher.seen["robot.state"])
     assert wrench == pytest.approx(max(torques), rel=0.1)
+
+
+@asynccontextmanager
+async def served_page(folder: Path) -> AsyncIterator[str]:
+    """Serve the live view's page before the daemon of this folder, and yield its address."""
+    place = Place(f"ipc://{folder}/publish", f"ipc://{folder}/commands")
+    with zmq.asyncio.Context() as context:
+        bridge = Bridge(context, place, Latest(3.6))
+        runner = web.AppRunner(make_app(bridge, "secret", {}, place.publish), access_log=None)
+        await runner.setup()
+        await web.TCPSite(runner, "127.0.0.1", 0).start()
+        try:
+            yield f"http://127.0.0.1:{runner.addresses[0][1]}"
+        finally:
+            await runner.cleanup()
+            bridge.close()
+
+
+async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(
+    rig_config: Path, tiny_bank: Path, tmp_path: Path
+) -> None:
+    twist = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.02, "hold_s": 60.0}
+    async with (
+        running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command),
+        served_page(tmp_path) as page,
+        aiohttp.ClientSession() as http,
+    ):
+        await started(command, experiment(tmp_path, twist))
+        await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.01)
+        async with http.post(f"{page}/commands/pause") as refused:
+            assert refused.status == 403
+        assert watcher.seen["loop.state"][-1]["phase"] == "running"
+        async with http.post(f"{page}/stop") as reply:
+            assert await reply.json() == {"ok": True, "stopped": "test"}
+        told = watcher.seen["robot.state"][-1]["seq"]
+        still = await watcher.until(
+            "robot.state", lambda state: state["seq"] > told and abs(state["wrist_speed_rad_per_s"]) < 1e-3
+        )
+        later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 10)
+        assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)
+        assert (await watcher.until("loop.state", lambda state: state["phase"] == "stopped"))["doing"]
+        async with http.post(f"{page}/stop") as again:
+            assert await again.json() == {"ok": True, "stopped": ""}, "and the daemon goes on"
+        await watcher.until("robot.state", lambda state: state["seq"] > later["seq"])
 
 
 async def test_a_protective_stop_ends_the_experiment_and_is_unlocked_on_the_operators_word(

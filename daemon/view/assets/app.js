@@ -3,7 +3,7 @@
 import { TimeChart } from "./chart.js";
 import { Controls } from "./controls.js";
 import { Link } from "./link.js";
-import { FingertipPanel, gripperPanel, healthPanel, loopPanel, robotPanel, shearPanel, torquePanel } from "./panels.js";
+import { FingertipPanel, gripperPanel, healthPanel, loopPanel, robotPanel, shearPanel, torquePanel, wantedNow } from "./panels.js";
 import { Series } from "./series.js";
 import { age, byId, number, put } from "./text.js";
 
@@ -34,7 +34,7 @@ const takers = {
     }, gap("eit.estimate"));
   },
   "load.torque": (said) => torques.add(said.timestamp, { load: said.spike ? null : said.torque_nm }, gap("load.torque")),
-  "loop.state": (said) => torques.add(said.timestamp, { wanted: said.ramp_nm }, gap("loop.state")),
+  "loop.state": (said) => torques.add(said.timestamp, { wanted: wantedNow(said) }, gap("loop.state")),
   "skin.shear": (said) => {
     forces.add(said.timestamp, {
       shear: unlessInvalid(said, said.shear_n),

@@ -8,6 +8,11 @@ const ROBOT_MODES = { "-1": "no controller", 0: "disconnected", 1: "confirm safe
 const SAFETY_MODES = { 1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "system emergency stop", 7: "robot emergency stop", 8: "violation", 9: "fault", 10: "validate joint", 11: "undefined" };
 const MARK_OLD_AFTER_S = 1;
 
+// Phases in which something is wanted; an experiment that has ended wants nothing, whatever it last said.
+const ACTIVE = new Set(["running", "paused", "held"]);
+
+export const wantedNow = (loop) => (ACTIVE.has(loop.phase) ? loop.ramp_nm : null);
+
 const mode = (names, n) => `${names[n] ?? "unknown"} (${n})`;
 
 export function markAge(panel, link, message) {
@@ -33,7 +38,7 @@ export function torquePanel(link) {
   put(byId("torque-now"), valid ? number(said.torque_nm, 4, "N·m", { signed: true }) : "–");
   put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? interval(said.torque_low_nm, said.torque_high_nm, 4) : "");
   warn(byId("torque-why"), said && !valid ? `no estimate: ${said.why}` : "");
-  const wanted = loop && !link.isOld(loop) ? loop.content : {};
+  const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop.content : {};
   put(byId("wanted"), number(wanted.ramp_nm, 4, "N·m", { signed: true }));
   put(byId("set-point"), wanted.set_point_nm == null ? "" : `set point ${number(wanted.set_point_nm, 3, "", { signed: true })}`);
   loadFigure(link);
@@ -110,8 +115,8 @@ export class FingertipPanel {
 
   mapText(heatmap, said) {
     const [rows, columns] = heatmap.content.scores.shape;
-    const late = said.frame !== undefined && said.frame !== heatmap.content.frame ? `, of frame ${heatmap.content.frame}` : "";
-    put(this.part("map-text"), `scores of ${rows} k × ${columns} σ, ✕ maximum, ○ runner-up${late}`);
+    const late = said.frame !== undefined && said.frame !== heatmap.content.frame ? `, frame ${heatmap.content.frame}` : "";
+    put(this.part("map-text"), `scores of ${rows} k × ${columns} σ${late}`);
     const cell = (peak) => (peak ? `row ${peak[0]}, column ${peak[1]}` : "none");
     this.part("map").setAttribute("aria-label", `heatmap of ${rows} by ${columns} cells; maximum at ${cell(heatmap.peaks?.best)}, runner-up at ${cell(heatmap.peaks?.runner_up)}`);
   }
@@ -122,6 +127,7 @@ export class FingertipPanel {
 export function shearPanel(link) {
   const message = link.get("skin.shear");
   show(byId("shear"), message !== undefined);
+  document.querySelector("main").classList.toggle("with-shear", message !== undefined);
   markAge(byId("shear"), link, message);
   if (!message) return;
   const said = message.content;
@@ -216,9 +222,10 @@ export function loopPanel(link) {
   const reasons = current?.reasons ?? "";
   // What stopped it stands below, with its cure.
   put(byId("phase-doing"), current?.phase === "stopped" && reasons ? "" : current?.doing ?? "");
-  const share = current?.progress ?? 0;
+  const underWay = Boolean(current?.steps) && (ACTIVE.has(current.phase) || current.phase === "done");
+  const share = underWay ? current.progress : 0;
   if (byId("progress").value !== share) byId("progress").value = share;
-  put(byId("progress-text"), current?.steps ? `${Math.round(100 * share)} %, about ${Math.round(current.remaining_s)} s left` : "");
+  put(byId("progress-text"), underWay ? `${Math.round(100 * share)} %, about ${Math.round(current.remaining_s)} s left` : "");
   show(byId("holding"), reasons !== "");
   if (reasons === "") return;
   const stop = current.response.startsWith("stop");

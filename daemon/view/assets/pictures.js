@@ -103,7 +103,7 @@ function levels(pen, conductivity, tip, x0, w, yOf) {
       pen.lineTo(x0 + w, y);
       pen.stroke();
       pen.setLineDash([]);
-      if (Math.abs(y - labelledAt) > 16) {
+      if (Math.abs(y - labelledAt) > 16 && Math.min(y - yOf(tip.height_cm), yOf(0) - y) > 9) {
         label(pen, level.toFixed(1), x0 + w / 2, y, "center");
         labelledAt = y;
       }

@@ -53,6 +53,9 @@ class FakeDaemon:
                 stderr=subprocess.DEVNULL,
             )
 
+    def check(self) -> None:
+        assert self._process is None or self._process.poll() is None, "the daemon's sockets have died"
+
     def kill(self) -> None:
         if self._process is not None:
             self._process.kill()
@@ -111,6 +114,7 @@ class Browsed:
 
     def open(self, *, token: bool = False) -> Page:
         """Open the page anew, with or without the token, and wait until it is live."""
+        self.daemon.check()
         self.page.goto("about:blank")
         self.page.goto(self.viewer.url_with_token if token else self.viewer.url)
         if not token and self.page.evaluate("sessionStorage.length"):

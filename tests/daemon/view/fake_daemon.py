@@ -4,7 +4,9 @@ What is changed in the messages stands in a file beside the sockets; what was as
 """
 
 import asyncio
+import dataclasses
 import json
+import os
 import sys
 import threading
 from collections.abc import Callable, Mapping
@@ -178,6 +180,12 @@ MESSAGES: Mapping[str, Mapping[str, Any]] = {
 COMMANDS = ("tare", "start", "pause", "resume", "unlock", "stop")
 
 
+def made(given: Mapping[str, Any]) -> Message:
+    """Return the message of these values; keys that the page does not show are left empty."""
+    kind: type[Message] = given["kind"]
+    return kind(**{item.name: given.get(item.name) for item in dataclasses.fields(kind)})
+
+
 def said(folder: Path) -> list[Message]:
     """Return what is to be said now: all MESSAGES with their changes, without those that are changed to nothing."""
     changed = json.loads((folder / "changed").read_text())["messages"]
@@ -185,22 +193,24 @@ def said(folder: Path) -> list[Message]:
     messages = []
     for name, given in MESSAGES.items():
         if name not in changed or changed[name] is not None:
-            content = {**given, **changed.get(name, {})}
-            kind: type[Message] = content.pop("kind")
-            messages.append(kind(t_mono_ns=now_ns, **content))
+            messages.append(made({"t_mono_ns": now_ns, **given, **changed.get(name, {})}))
     return messages
 
 
 def pump(folder: Path) -> None:
     """Say everything again and again."""
-    with zmq.Context() as context:
-        publisher = Publisher(context, f"ipc://{folder}/publish", Clock())
-        never, turn = threading.Event(), 0
+    context = zmq.Context()
+    publisher = Publisher(context, f"ipc://{folder}/publish", Clock())
+    never, turn = threading.Event(), 0
+    try:
         while not never.wait(PUMP_S):
             turn += 1
             for message in said(folder):
                 if turn % SLOW_TURNS == 0 or message.topic not in SLOW:
                     publisher.publish(message)
+    finally:
+        # Half a daemon would keep every test waiting for its deadline.
+        os._exit(1)
 
 
 async def serve(folder: Path) -> None:

@@ -125,9 +125,13 @@ def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> 
 
 
 def test_the_heatmap_has_k_upwards_and_sigma_to_the_right_and_shades_rise_evenly(browsed: Browsed) -> None:
+    # Large enough that the marks cover little of it.
+    browsed.page.set_viewport_size({"width": 1920, "height": 1080})
     browsed.open()
     browsed.until(".fingertip .map-text", "100 k × 100 σ")
+    browsed.page.wait_for_function("() => document.querySelector('.map').width > 150")
     lightness = browsed.page.evaluate(LIGHTNESS)
+    browsed.page.set_viewport_size({"width": 1024, "height": 700})
     assert lightness["best"] > 2 * lightness["other"]
     assert lightness["best"] > 2 * lightness["lower"]
     assert lightness["blank"] == 0
@@ -176,6 +180,8 @@ def test_a_fault_of_robot_and_gripper_stands_in_its_panel(browsed: Browsed) -> N
             "#gripper-fault": "fault 11: overheated",
             "#holding-title": "Stopped: stop and keep grip",
             "#phase-doing": "",
+            "#wanted": "–",
+            "#progress-text": "",
         }
     )
 
@@ -317,6 +323,11 @@ def test_a_viewer_that_is_lost_is_told_and_what_comes_back_is_new(browsed: Brows
     browsed.until("#torque-now", "\u22120.0321 N·m")
     page.wait_for_selector("#shear", state="hidden")
     browsed.until_old(0)
+    # Without a skin the panels stand otherwise.
+    page.set_viewport_size({"width": 1280, "height": 800})
+    found = page.evaluate(LAYOUT)
+    page.set_viewport_size({"width": 1024, "height": 700})
+    assert (found["spilt"], len(found["panels"])) == ([], 5)
 
 
 def test_no_daemon_is_told_with_what_to_do(browsed: Browsed) -> None:

@@ -9,6 +9,7 @@ import json
 import os
 import sys
 import threading
+import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -189,7 +190,7 @@ def made(given: Mapping[str, Any]) -> Message:
 def said(folder: Path) -> list[Message]:
     """Return what is to be said now: all MESSAGES with their changes, without those that are changed to nothing."""
     changed = json.loads((folder / "changed").read_text())["messages"]
-    now_ns = Clock.now_ns()
+    now_ns = Clock().now_ns()
     messages = []
     for name, given in MESSAGES.items():
         if name not in changed or changed[name] is not None:
@@ -208,7 +209,8 @@ def pump(folder: Path) -> None:
             for message in said(folder):
                 if turn % SLOW_TURNS == 0 or message.topic not in SLOW:
                     publisher.publish(message)
-    finally:
+    except BaseException:  # noqa: BLE001 - told, and the end of the process
+        traceback.print_exc()
         # Half a daemon would keep every test waiting for its deadline.
         os._exit(1)
 

@@ -22,6 +22,8 @@ CENSORED_SHARE = 0.02
 _LEAST_SIGMA_SHARE = 0.01
 _EM_ROUNDS = 100
 N_BLOCKS = 5
+# Terms beyond the linear one are held back as by so many frames that do not have them.
+_CURVATURE = 3.0
 # The paper's own number: with so many of the 896 channels its regression was four fifths as good as with all.
 N_RANKED = 272
 
@@ -115,12 +117,14 @@ def _below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]
 class Curve:
     """Frames as a polynomial of the value, coefficients (degree + 1, q), with drift along `drift` (r, q) and noise.
 
-    Of a frame's d channels only the q `channels` count that go best with the value: the others bring more drift.
+    Of a frame's d channels only the q `channels` count that go best with the value: the others bring more drift. Each
+    is in units of its own `spread` (q,) about the curve, drawn half towards that of all.
 
     The value of a frame minimises (x − curve)ᵀ Σ⁻¹ (x − curve), Σ = driftᵀ diag(drift_variance) drift + noise² I.
     """
 
     channels: NDArray[np.int64]
+    spread: FloatArray
     coefficients: FloatArray
     drift: FloatArray
     drift_variance: FloatArray
@@ -131,9 +135,15 @@ class Curve:
     high: float
 
     @classmethod
-    def fit(cls, frames: FloatArray, values: FloatArray, degree: int, n_drift: int, curvature: float = 3.0) -> Self:
-        """Fit to (n, d) frames of (n,) values; `curvature` holds the terms beyond the linear one back, in frames."""
+    def fit(cls, frames: FloatArray, values: FloatArray, degree: int, n_drift: int, memory: float = np.inf) -> Self:
+        """Fit to (n, d) frames of (n,) values in time order.
+
+        The terms beyond the linear one are held back as by three frames without them. A frame that is `memory` frames
+        older counts 1/e as much: what comes next is more like what was last.
+        """
         n = len(values)
+        weights = np.exp((np.arange(n) - (n - 1)) / memory)
+        weights *= n / weights.sum()
         centre, scale = float(values.mean()), float(values.std())
         distinct = len(np.unique(values))
         if distinct <= degree or n < degree + n_drift + 3 or scale == 0:
@@ -141,19 +151,20 @@ class Curve:
                 f"{n} frames at {distinct} distinct values do not determine a curve of degree {degree} and its noise; "
                 f"record at least {degree + n_drift + 3}"
             )
-        channels = np.sort(ranked_channels(frames, values)[:N_RANKED])
-        frames = frames[:, channels]
-        powers = np.vander((values - centre) / scale, degree + 1, increasing=True)
-        penalty = np.diag([0.0, 0.0] + [curvature] * (degree - 1))
-        coefficients: FloatArray = np.linalg.solve(powers.T @ powers + penalty, powers.T @ frames).astype(np.float64)
-        _, s, vt = np.linalg.svd(frames - powers @ coefficients, full_matrices=False)
+        z = (values - centre) / scale
+        spread = _spread_about_parabola(frames, z, weights)
+        channels = np.sort(ranked_channels(frames / spread, values)[:N_RANKED])
+        frames, spread = (frames / spread)[:, channels], spread[channels]
+        coefficients = _polynomial(frames, z, weights, degree)
+        residuals = frames - np.vander(z, degree + 1, increasing=True) @ coefficients
+        _, s, vt = np.linalg.svd(residuals * np.sqrt(weights)[:, None], full_matrices=False)
         freedom = n - degree - 1
         noise = float(np.sqrt((s[n_drift:freedom] ** 2).sum() / (freedom - n_drift) / frames.shape[1]))
         if noise == 0:
             raise CalibrationError("the frames have no noise at all: this is no recording of a real board")
         span = float(np.ptp(values))
         return cls(
-            channels, coefficients, vt[:n_drift], s[:n_drift] ** 2 / freedom, noise, centre, scale,
+            channels, spread, coefficients, vt[:n_drift], s[:n_drift] ** 2 / freedom, noise, centre, scale,
             float(values.min()) - 0.5 * span, float(values.max()) + 0.5 * span,
         )  # fmt: skip
 
@@ -164,7 +175,7 @@ class Curve:
     def estimate(self, frame: FloatArray, usable: BoolArray | None = None) -> float:
         """Return a (d,) frame's value; channels that are not usable are left out."""
         keep = np.ones(len(self.channels), dtype=np.bool_) if usable is None else usable[self.channels]
-        b, v, x = self.coefficients[:, keep], self.drift[:, keep], frame[self.channels[keep]]
+        b, v, x = self.coefficients[:, keep], self.drift[:, keep], (frame[self.channels] / self.spread)[keep]
         inner = np.linalg.inv(np.diag(self.noise**2 / self.drift_variance) + v @ v.T)
 
         def whitened(rows: FloatArray) -> FloatArray:
@@ -175,6 +186,24 @@ class Curve:
         powers = np.vander((grid - self.centre) / self.scale, len(b), increasing=True)
         cost = np.einsum("ij,jk,ik->i", powers, gram, powers) - 2 * powers @ projection
         return _refined(grid, cost)
+
+
+def _polynomial(frames: FloatArray, z: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
+    """Return the (degree + 1, d) weighted coefficients of (n, d) frames over (n,) values of unit spread."""
+    powers = np.vander(z, degree + 1, increasing=True)
+    penalty = np.diag([0.0, 0.0] + [_CURVATURE] * (degree - 1))
+    return np.asarray(
+        np.linalg.solve(powers.T @ (powers * weights[:, None]) + penalty, powers.T @ (frames * weights[:, None]))
+    )
+
+
+def _spread_about_parabola(frames: FloatArray, z: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the (d,) root mean square of each channel about its parabola, half of it from the median of all."""
+    degree = min(2, len(np.unique(z)) - 1)
+    residuals = frames - np.vander(z, degree + 1, increasing=True) @ _polynomial(frames, z, weights, degree)
+    squares = (residuals**2 * weights[:, None]).mean(axis=0)
+    # A channel that never changed brings no infinity: half is everybody's.
+    return np.asarray(np.sqrt(0.5 * squares + 0.5 * np.median(squares) + np.finfo(np.float64).tiny))
 
 
 def _refined(grid: FloatArray, cost: FloatArray) -> float:

@@ -85,6 +85,8 @@ def _estimate(t_ns: int, turn: int, torque_nm: float) -> Iterator[Message]:
         torque_low_nm=torque_nm - 0.02,
         torque_high_nm=torque_nm + 0.02,
         diameter_mm=20.0,
+        diameter_low_mm=18.0,
+        diameter_high_mm=22.0,
         k=3.6,
         sigma=1.6 + torque_nm,
         score=0.9,

@@ -3,13 +3,13 @@
 import { TimeChart } from "./chart.js";
 import { Controls } from "./controls.js";
 import { Link } from "./link.js";
-import { FingertipPanel, gripperPanel, healthPanel, loopPanel, robotPanel, shearPanel, torquePanel, wantedNow } from "./panels.js";
+import { estimatesFirst, FingertipPanel, gripperPanel, healthPanel, isFingertip, loopPanel, robotPanel, shearPanel, torquePanel, wantedNow } from "./panels.js";
 import { Series } from "./series.js";
 import { age, byId, number, put } from "./text.js";
 
 const REDRAWS_PER_S = 30;
 // Estimates are drawn in shapes that differ, and in blues and browns of different lightness.
-const TIPS = [{ stroke: "#0b4f8a", fill: "#0b4f8a33" }, { stroke: "#8a4b00", fill: "#8a4b0033", hollow: true }];
+const TIPS = [{ stroke: "#0b4f8a", fill: "#0b4f8a33" }, { stroke: "#8a4b00", fill: "#8a4b0033", hollow: true }, { stroke: "#4a4a4a", fill: "#4a4a4a33", dash: [2, 4] }];
 
 // Stop works before anything else is known.
 new Controls();
@@ -48,8 +48,14 @@ const takers = {
 const link = new Link(settings, (message) => takers[message.topic]?.(message.content));
 
 function chartLines() {
-  const lines = link.sources("eit.estimate").map((source, i) => ({
-    name: source, low: `${source} low`, high: `${source} high`, label: `estimate of ${source}, with its 95 % interval`, points: true, ...TIPS[i % TIPS.length],
+  // The estimate that drives the loop has its interval drawn; others are points alone.
+  const sources = estimatesFirst(link).filter((source) => torques.columns.get(source)?.some((value) => value != null));
+  const lines = sources.slice(0, TIPS.length).map((source, i) => ({
+    ...TIPS[i],
+    name: source,
+    points: true,
+    label: i === 0 ? `estimate of ${source}, with its 95 % interval` : `estimate of ${source}`,
+    ...(i === 0 ? { low: `${source} low`, high: `${source} high` } : { fill: undefined, width: 1 }),
   }));
   if (link.get("load.torque")) lines.push({ name: "load", label: "load cell", stroke: "#10212e", width: 1.5 });
   if (link.get("skin.shear")?.content.torque_nm != null || torques.columns.get("skin")?.some((value) => value != null)) {
@@ -60,7 +66,7 @@ function chartLines() {
 }
 
 function fingertips() {
-  const sources = link.sources("eit.estimate");
+  const sources = link.sources("eit.estimate").filter((source) => isFingertip(link, source));
   for (const [source, panel] of tips) {
     if (!sources.includes(source)) {
       panel.remove();

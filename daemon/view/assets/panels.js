@@ -24,11 +24,23 @@ export function markAge(panel, link, message) {
   else put(badge, link.ageOf(message) > MARK_OLD_AFTER_S ? `${age(link.ageOf(message))} ago` : "");
 }
 
+// The sources of estimates, the one that drives the loop first, then the one of both fingertips.
+export function estimatesFirst(link) {
+  const driving = link.get("loop.state")?.content.driving;
+  const rank = (source) => (source === driving ? 0 : source === "both" ? 1 : 2);
+  return link.sources("eit.estimate").sort((one, other) => rank(one) - rank(other));
+}
+
+// Whether an estimate is of one fingertip with a gel to draw, and not of two together.
+export function isFingertip(link, source) {
+  return source !== "both" || link.get("eit.heatmap", source) !== undefined;
+}
+
 // Torque, what is wanted, load cell and diameter. The estimate that drives the loop comes first.
 export function torquePanel(link) {
   const loop = link.get("loop.state");
   const driving = loop?.content.driving;
-  const estimate = link.get("eit.estimate", driving) ?? link.get("eit.estimate");
+  const estimate = link.get("eit.estimate", estimatesFirst(link)[0]);
   const skin = link.get("skin.shear");
   const shown = estimate ?? skin;
   markAge(byId("torque"), link, shown);
@@ -60,7 +72,9 @@ function diameterFigure(link, estimate) {
   const seen = estimate && !link.isOld(estimate) && estimate.content.valid ? estimate.content.diameter_mm : null;
   const held = gripper && !link.isOld(gripper) ? gripper.content.diameter_mm : null;
   put(byId("diameter"), number(seen, 1, "mm"));
-  put(byId("diameter-note"), held == null ? "" : `gripper ${number(held, 1, "mm")}`);
+  const { diameter_low_mm: low, diameter_high_mm: high } = estimate?.content ?? {};
+  const spread = seen == null || low == null ? "" : `${number(low, 1)} to ${number(high, 1)}`;
+  put(byId("diameter-note"), [spread, held == null ? "" : `gripper ${number(held, 1, "mm")}`].filter(Boolean).join(", "));
 }
 
 export class FingertipPanel {

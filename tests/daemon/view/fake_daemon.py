@@ -59,6 +59,8 @@ MESSAGES: Mapping[str, Mapping[str, Any]] = {
         "torque_low_nm": 0.07123,
         "torque_high_nm": 0.12629,
         "diameter_mm": 20.43,
+        "diameter_low_mm": 18.21,
+        "diameter_high_mm": 22.65,
         "k": 3.514,
         "sigma": 1.627,
         "score": 0.93412,
@@ -191,11 +193,13 @@ def said(folder: Path) -> list[Message]:
     """Return what is to be said now: all MESSAGES with their changes, without those that are changed to nothing."""
     changed = json.loads((folder / "changed").read_text())["messages"]
     now_ns = Clock().now_ns()
-    messages = []
-    for name, given in MESSAGES.items():
-        if name not in changed or changed[name] is not None:
-            messages.append(made({"t_mono_ns": now_ns, **given, **changed.get(name, {})}))
-    return messages
+    # A name that MESSAGES has not is one more estimate.
+    given = {**dict.fromkeys(changed, MESSAGES["estimate"]), **MESSAGES}
+    return [
+        made({"t_mono_ns": now_ns, **values, **changed.get(name, {})})
+        for name, values in given.items()
+        if changed.get(name, {}) is not None
+    ]
 
 
 def pump(folder: Path) -> None:

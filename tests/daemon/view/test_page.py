@@ -78,7 +78,7 @@ def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> 
         "#set-point": f"set point {signed(said['loop']['set_point_nm'], 3)}",
         "#load-torque": f"{signed(load['torque_nm'], 4)} N·m",
         "#diameter": f"{estimate['diameter_mm']:.1f} mm",
-        "#diameter-note": f"gripper {said['gripper']['diameter_mm']:.1f} mm",
+        "#diameter-note": "18.2 to 22.6, gripper 19.7 mm",
         ".fingertip .score": f"{estimate['score']:.4f}",
         ".fingertip .runner-up": f"{estimate['runner_up']:.4f}",
         ".fingertip .k": f"{estimate['k']:.3f} cm",
@@ -342,3 +342,21 @@ def test_no_daemon_is_told_with_what_to_do(browsed: Browsed) -> None:
     browsed.until("#answer", "STOP NOT CONFIRMED: no daemon answered")
     browsed.daemon.start()
     browsed.until("#link-state", "● live")
+
+
+def test_two_fingertips_and_the_estimate_of_both(browsed: Browsed) -> None:
+    page = browsed.open()
+    browsed.daemon.say(
+        loop={"driving": "both"},
+        left={"source": "left", "torque_nm": None, "valid": False, "why": "no calibration is configured"},
+        both={"source": "both", "torque_nm": 0.0876, "k": None, "sigma": None, "score": None, "runner_up": None},
+    )
+    browsed.until("#torque-source", "estimate of both, drives the loop")
+    browsed.until("#torque-now", "+0.0876 N·m")
+    browsed.until("#torque-legend", "estimate of both, with its 95 % interval")
+    panels = page.locator(".fingertip .name").all_inner_texts()
+    assert sorted(panels) == ["left", "right"], "both together are no gel"
+    browsed.until(".fingertip[data-source=left] .invalid", "no calibration is configured")
+    assert page.evaluate(LAYOUT)["spilt"] == []
+    browsed.viewer.kill()
+    browsed.viewer.start()

@@ -5,12 +5,15 @@ Trehan et al. 2025, equations (1) to (5).
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bank.errors import ModelError
-from bank.mesh import Mesh
+
+if TYPE_CHECKING:
+    from bank.mesh import Mesh
 
 Values = NDArray[np.float64]
 
@@ -80,7 +83,7 @@ def averaging_points() -> NDArray[np.float64]:
     return (3.0 * np.array(steps) + 1.0) / (3 * n)
 
 
-def conductivity(mesh: Mesh, model: str, k: float, sigma: float) -> NDArray[np.float64]:
+def conductivity(mesh: "Mesh", model: str, k: float, sigma: float) -> NDArray[np.float64]:
     """Return the (T,) conductivity of a mesh's triangles: 1 + the mean of f over the triangle's averaging points.
 
     It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
@@ -92,7 +95,7 @@ def conductivity(mesh: Mesh, model: str, k: float, sigma: float) -> NDArray[np.f
 class Conductivities:
     """What `conductivity` returns, to the bit, for many parameters on one mesh: triangles alike are averaged once."""
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: "Mesh") -> None:
         """Find the triangles whose corners have the same heights."""
         corners = mesh.nodes[:, 1][mesh.triangles]
         _, first, self._alike = np.unique(corners, axis=0, return_index=True, return_inverse=True)
@@ -105,12 +108,12 @@ class Conductivities:
         return values
 
 
-def _averaging_heights(mesh: Mesh) -> Values:
+def _averaging_heights(mesh: "Mesh") -> Values:
     heights: Values = mesh.nodes[:, 1][mesh.triangles] @ averaging_points().T
     return heights
 
 
-def _centre(mesh: Mesh) -> float:
+def _centre(mesh: "Mesh") -> float:
     return float((mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2)
 
 

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+
+# Not scipy.stats, which costs the daemon 40 MB and half of its start.
+from scipy.special import chdtri
 
 # Beyond such a change while the zero is taken, the skin was touched or a gauge drifts (the paper's noise: 1e-4).
 MOST_TREND = 1e-3
@@ -100,7 +102,7 @@ class ZeroTaker:
     def _zero(self, ohm: NDArray[np.float64]) -> Zero:
         r1_ohm, r2_ohm = ohm.mean(axis=0).tolist()
         # A few samples may find the noise small by chance: the upper end of what it may be is taken.
-        bound = math.sqrt((len(ohm) - 1) / float(chi2.ppf(0.05, len(ohm) - 1)))
+        bound = math.sqrt((len(ohm) - 1) / float(chdtri(len(ohm) - 1, 0.95)))
         noise = max(bound * float(np.std(ohm[:, 0] / r1_ohm - ohm[:, 1] / r2_ohm, ddof=1)), LEAST_NOISE)
         # What the zero was short of rest, if the skin has not changed since it was calibrated, every response lacks.
         change = abs(_log_ratio(r1_ohm, r2_ohm) - _log_ratio(*self._rest_ohm))

@@ -6,6 +6,7 @@ calibration will be judged on.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +29,9 @@ from bank.estimators.memory import Memory, Motion, gripped_part
 from bank.estimators.physics import NOT_TURNED, Locator, Registration, image_matrix, register
 from bank.estimators.reader import STRENGTHS, Head, HeadOf, Reader, error_on_later, fit_reader, one_sided
 from bank.estimators.values import FloatArray, FrameSeries, TactileFrame
-from bank.mesh import Mesh
+
+if TYPE_CHECKING:
+    from bank.mesh import Mesh
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
 N_DIRECTIONS, N_LAGS = 4, 12
@@ -54,7 +57,7 @@ class Physics:
     """What was known beforehand: the bank, and the mesh that an image is reconstructed on."""
 
     bank: Bank | None = None
-    mesh: Mesh | None = None
+    mesh: "Mesh | None" = None
 
 
 def fit(name: Name, recordings: Sequence[FrameSeries], source: str, physics: Physics | None = None) -> Calibration:

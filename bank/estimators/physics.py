@@ -8,7 +8,7 @@ NOSER prior (Cheney et al. 1990).
 """
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -16,8 +16,9 @@ from bank.bank_file import Bank
 from bank.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from bank.estimators.values import FloatArray
 from bank.fast_matching import FastMatcher
-from bank.forward import ForwardModel
-from bank.mesh import Mesh
+
+if TYPE_CHECKING:
+    from bank.mesh import Mesh
 
 # The paper's window along the channels: nine long, standard deviation 9/5.
 _WINDOW = np.exp(-0.5 * (np.arange(-4, 5) / 1.8) ** 2)
@@ -166,12 +167,15 @@ class NearestCell:
         return k, sigma, float(weights @ np.log(norm * scores[near] / self._norms[near]))
 
 
-def image_matrix(mesh: Mesh, smoothing: float = 0.05) -> FloatArray:
+def image_matrix(mesh: "Mesh", smoothing: float = 0.05) -> FloatArray:
     """Return the (p, 896) matrix from a difference of voltages to the change of p pixels' log conductivity.
 
     One Gauss–Newton step with J by central differences of whole pixels, and NOSER's prior: (JᵀJ + smoothing · mean ·
     diag(JᵀJ))⁻¹ Jᵀ. Pixels are squares of the mesh's bounding box with at least one triangle.
     """
+    # Here, and not above: what only fitting needs costs the daemon neither memory nor time to start.
+    from bank.forward import ForwardModel
+
     model = ForwardModel(mesh)
     centres = mesh.nodes[mesh.triangles].mean(axis=1)
     low, high = mesh.nodes.min(axis=0), mesh.nodes.max(axis=0)

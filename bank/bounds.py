@@ -33,6 +33,12 @@ _SEED_LAGS = 8
 _SLACK = 0.01
 # More bounds than this (16 MB) are not computed: all cells and lags are left.
 _MOST_BOUNDS = 1 << 22
+# More than this take longer than about a millisecond.
+_QUICK_BOUNDS = 1 << 20
+
+
+class TakesLongError(Exception):
+    """There is more left to score than a few milliseconds are enough for, and no more were allowed."""
 
 
 class Left(NamedTuple):
@@ -96,11 +102,15 @@ class ZeroLagBounds:
 class AllLagsBounds:
     """Lags are left out first, then groups, then cells. Lags are numbered as in _LAGS.
 
-    spectra (r, 897) are the conjugate transforms of the basis's first directions, from `spectra_of`.
+    spectra (r, 897) are the conjugate transforms of the basis's first directions, from `spectra_of`. With `quick`,
+    `left` raises TakesLongError where little can be left out.
     """
 
-    def __init__(self, bank: CompressedBank, spectra: NDArray[np.complex64], frame: FloatArray) -> None:
+    def __init__(
+        self, bank: CompressedBank, spectra: NDArray[np.complex64], frame: FloatArray, *, quick: bool = False
+    ) -> None:
         self._bank = bank
+        self._quick = quick
         self._padded = np.zeros(3 * N_CHANNELS)
         self._padded[N_CHANNELS : 2 * N_CHANNELS] = frame
         parts = fft.irfft(fft.rfft(frame.astype(np.float32), len(_LAGS)) * spectra, len(_LAGS))
@@ -142,7 +152,7 @@ class AllLagsBounds:
         alive = (self._first_bounds[chosen] >= least).any(axis=0)
         for level in bank.levels[1:]:
             groups = np.flatnonzero(alive.take(level.part_of))
-            if len(groups) * len(lags) > _MOST_BOUNDS:
+            if not self._are_few(len(groups) * len(lags)):
                 reach = np.ones((1, len(groups)), dtype=np.bool_)
             else:
                 reach = _products(level.rows.take(groups, axis=0), self._columns[:, lags]) >= least
@@ -150,14 +160,19 @@ class AllLagsBounds:
             alive = np.zeros(len(level.rows), dtype=np.bool_)
             alive[groups] = reach.any(axis=0)
         cells = np.flatnonzero(alive.take(bank.group_of))
-        if len(cells) * len(lags) <= _MOST_BOUNDS:
+        if self._are_few(len(cells) * len(lags)):
             reach = _products(bank.coarse.take(cells, axis=0), self._columns[:, lags]) >= least
             cells, lags = cells[reach.any(axis=0)], lags[reach.any(axis=1)]
         frames = self._frames(lags)
-        if len(cells) * len(lags) > _MOST_BOUNDS:
+        if not self._are_few(len(cells) * len(lags)):
             return Left(cells, np.full(len(cells), np.inf, dtype=np.float32), frames)
         at_lags = columns(bank.basis @ frames.T.astype(np.float32), np.einsum("ij,ij->i", frames, frames))
         return Left(cells, _products(bank.fine.take(cells, axis=0), at_lags).max(axis=0), frames)
+
+    def _are_few(self, n_bounds: int) -> bool:
+        if self._quick and n_bounds > _QUICK_BOUNDS:
+            raise TakesLongError
+        return n_bounds <= _MOST_BOUNDS
 
     def _reached_at_0(self) -> float:
         """Return a score that some cell surely has at lag 0."""

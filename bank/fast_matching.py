@@ -10,7 +10,7 @@ from abc import abstractmethod
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, ZeroLagBounds, spectra_of
+from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, spectra_of
 from bank.compression import ROUNDING, Indices, compress
 from bank.errors import MatchingError
 from bank.matching import (
@@ -33,6 +33,8 @@ _ROUNDING_32 = 6e-5
 _FEW_LAGS = 128
 # With fewer cells, sorting them out in float32 costs more than scoring them.
 _FEW_CELLS = 48
+# Scoring more than this takes longer than about a millisecond.
+_QUICK_SCORES = 1 << 13
 
 
 class _Undecided(Exception):  # noqa: N818 - it is not an error
@@ -63,10 +65,22 @@ class _PruningMatcher(Matcher):
         except _Undecided:
             return super().match(difference)
 
-    @abstractmethod
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match: ...
+    def match_quickly(self, difference: ArrayLike) -> Match | None:
+        """Return what `match` returns, or None where that takes more than a few milliseconds.
 
-    def _settled(self, frame: FloatArray, left: Left, reached: float, seed: int = -1) -> tuple[int, float]:
+        Frames unlike any of the bank's may leave most of its cells to be scored, which takes half a second.
+        """
+        try:
+            return self._search(unit_magnitude(difference), runner_up=True, quick=True)
+        except (_Undecided, TakesLongError):
+            return None
+
+    @abstractmethod
+    def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match: ...
+
+    def _settled(
+        self, frame: FloatArray, left: Left, reached: float, seed: int = -1, *, quick: bool = False
+    ) -> tuple[int, float]:
         """Return the cell of the highest score, the lowest of those that tie, and the score.
 
         One of the cells that are left must reach the score `reached`: `seed`, where that is known.
@@ -75,6 +89,8 @@ class _PruningMatcher(Matcher):
         if likeliest != seed:
             reached = max(reached, self._score(likeliest, left.frames))
         cells = left.cells[left.bounds >= reached - ROUNDING]
+        if quick and (len(cells) * len(left.frames) > _QUICK_SCORES or len(left.frames) > _FEW_LAGS):
+            raise TakesLongError
         parts = [
             self._contenders(frame, cells[i : i + CHUNK_CELLS], left.frames, reached)
             for i in range(0, len(cells), CHUNK_CELLS)
@@ -134,9 +150,9 @@ class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
         self._numbers = np.full(valid.shape, len(self._cells))
         self._numbers[valid] = np.arange(len(self._cells))
 
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
+    def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match:
         bounds = ZeroLagBounds(self._bank, frame)
-        best = self._best(frame, bounds)
+        best = self._best(frame, bounds, quick)
         if best is None:
             raise MatchingError("no cell of the bank is valid")
         if not runner_up:
@@ -145,15 +161,15 @@ class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
         rows = slice(max(row - RUNNER_UP_RADIUS, 0), row + RUNNER_UP_RADIUS + 1)
         columns = slice(max(column - RUNNER_UP_RADIUS, 0), column + RUNNER_UP_RADIUS + 1)
         bounds.leave_out(self._numbers[rows, columns])
-        return self._match(best, self._best(frame, bounds))
+        return self._match(best, self._best(frame, bounds, quick))
 
-    def _best(self, frame: FloatArray, bounds: ZeroLagBounds) -> tuple[int, float] | None:
+    def _best(self, frame: FloatArray, bounds: ZeroLagBounds, quick: bool) -> tuple[int, float] | None:
         """Return the cell of the highest score among those not left out, and the score."""
         seed = bounds.seed()
         if seed is None:
             return None
         reached = self._score(seed, bounds.frames)
-        return self._settled(frame, bounds.left(reached), reached, seed)
+        return self._settled(frame, bounds.left(reached), reached, seed, quick=quick)
 
 
 class FastMatcher(_PruningMatcher, ReferenceMatcher):
@@ -164,21 +180,21 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
         super().__init__(signals, valid, k_grid, sigma_grid)
         self._spectra = spectra_of(self._bank)
 
-    def _search(self, frame: FloatArray, runner_up: bool) -> Match:
-        bounds = AllLagsBounds(self._bank, self._spectra, frame)
+    def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match:
+        bounds = AllLagsBounds(self._bank, self._spectra, frame, quick=quick)
         near, reached = self._reached(bounds, None)
         if not runner_up:
-            return self._match(self._settled(frame, bounds.left(reached), reached), None)
+            return self._match(self._settled(frame, bounds.left(reached), reached, quick=quick), None)
         # What is outside at twice the radius is outside of the peak of every cell in this one's peak.
         far, least = self._reached(bounds, self._around(near, 2 * RUNNER_UP_RADIUS))
         left = bounds.left(min(reached, least))
-        best = self._settled(frame, left, reached)
+        best = self._settled(frame, left, reached, quick=quick)
         peak = self._around(best[0], RUNNER_UP_RADIUS)
         if far >= 0 and not peak.lacks(np.array([far]))[0]:
             _, least = self._reached(bounds, peak)
             left = bounds.left(least)
         left = left.among(peak.lacks(left.cells))
-        return self._match(best, self._settled(frame, left, least) if len(left.cells) else None)
+        return self._match(best, self._settled(frame, left, least, quick=quick) if len(left.cells) else None)
 
     def _around(self, cell: int, radius: int) -> Neighbourhood:
         return Neighbourhood(self._row, self._column, cell, radius)

@@ -56,8 +56,11 @@ class Estimation:
             # A replay takes its zero before the same frame.
             self._tap(RawInput(InputKind.TARE, self._clock.now_ns(), str(frames[0].seq).encode()))
             self.estimator.tare()
-        # Scoring every cell takes many milliseconds; the loop has commands and other devices to serve.
-        reading = await asyncio.to_thread(self.estimator.update, *frames)  # type: ignore[arg-type]  # one a side
+        # Most frames take less than it costs to hand them to a thread; the others would keep commands and devices
+        # waiting.
+        reading: Reading | None = self.estimator.quickly(*frames)
+        if reading is None:
+            reading = await self._slowly(*frames)
         self._publish(frames, reading)
         self.count += 1
         if self._tared and not self._tare_wanted and self.estimator.baseline_complete:
@@ -67,6 +70,9 @@ class Estimation:
                     waiting.set_result("")
             self._tared.clear()
         return reading
+
+    async def _slowly(self, *frames: Frame) -> Reading:
+        return await asyncio.to_thread(self.estimator.update, *frames)  # type: ignore[arg-type]  # one a side
 
     def _publish(self, frames: tuple[Frame, ...], reading: Reading) -> None:
         torque, now_ns = reading.torque_nm, self._clock.now_ns()

@@ -4,7 +4,6 @@ This is the paper's way (Trehan et al. 2025, section 2): the difference to the h
 the bank, and the best cell's sigma and k become torque and diameter through the calibration.
 """
 
-from collections import deque
 from dataclasses import dataclass, replace
 from typing import Protocol, TypeAlias
 
@@ -42,6 +41,9 @@ class Matcher(Protocol):
 
     def match(self, difference: FloatArray) -> Match:
         """Return the best cell of a (896,) difference, and its runner-up."""
+
+    def match_quickly(self, difference: FloatArray) -> Match | None:
+        """Return the same, or None where that takes more than a few milliseconds."""
 
     def heatmap(self, difference: FloatArray) -> FloatArray:
         """Return the (k, sigma) scores of a (896,) difference, NaN at cells that are not valid."""
@@ -113,6 +115,14 @@ class Baseline:
         return np.asarray(np.sqrt(np.maximum(variance, _LEAST_NOISE_V**2)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Difference:
+    """The (896,) difference that is to be matched, and the frames that it is the mean of."""
+
+    difference: FloatArray
+    latest: tuple[Frame, ...]
+
+
 class Estimator:
     """Turns the frames of one fingertip into readings, one for each frame, in order."""
 
@@ -131,7 +141,8 @@ class Estimator:
         self._calibration = calibration
         self._baseline_frames = baseline_frames
         self._longest_gap_ns = longest_gap_ns
-        self._latest: deque[Frame] = deque(maxlen=average_frames)
+        self._latest: tuple[Frame, ...] = ()
+        self._average_frames = average_frames
         self.tare()
 
     @property
@@ -147,27 +158,46 @@ class Estimator:
     def tare(self) -> None:
         """Take a new homogeneous frame from the frames to come."""
         self._baseline = Baseline(self._baseline_frames)
-        self._latest.clear()
+        self._latest = ()
 
     def update(self, frame: Frame) -> Reading:
         """Return what the frame says; a frame that says nothing comes back with the reasons."""
+        found = self._difference(frame)
+        return found if isinstance(found, Reading) else self._read(found, self._matcher.match(found.difference))
+
+    def quickly(self, frame: Frame) -> Reading | None:
+        """Return what `update` returns, or None where that takes more than some milliseconds: then call `update`."""
+        found = self._difference(frame)
+        if isinstance(found, Reading):
+            return found
+        match = self._matcher.match_quickly(found.difference)
+        return None if match is None else self._read(found, match)
+
+    def _difference(self, frame: Frame) -> "_Difference | Reading":
+        """Return what is to be matched, or why there is nothing; only then the frame has been taken in."""
         trouble = _unusable(frame)
         if trouble:
             return Reading(why=trouble)
         if not self._baseline.complete:
             self._baseline.add(frame.channels)
             return Reading(why=(f"taking the homogeneous frame, {self._baseline.taken} of {self._baseline.wanted}",))
-        if self._latest and frame.t_mid_ns - self._latest[-1].t_mid_ns > self._longest_gap_ns:
-            self._latest.clear()
-        self._latest.append(frame)
-        difference = np.mean([latest.channels for latest in self._latest], axis=0) - self._baseline.homogeneous
-        noise = self._baseline.noise * np.sqrt(1.0 / len(self._latest) + 1.0 / self._baseline.taken)
+        before = self._latest
+        if before and frame.t_mid_ns - before[-1].t_mid_ns > self._longest_gap_ns:
+            before = ()
+        latest = (*before, frame)[-self._average_frames :]
+        difference = np.mean([each.channels for each in latest], axis=0) - self._baseline.homogeneous
+        noise = self._baseline.noise * np.sqrt(1.0 / len(latest) + 1.0 / self._baseline.taken)
         silent = signal_above_noise(difference, noise)
         if silent is not None:
+            self._latest = latest
             return Reading(why=(silent.why,))
-        match = self._matcher.match(difference)
-        middle_ns = sum(latest.t_mid_ns for latest in self._latest) // len(self._latest)
-        return replace(self._calibrated(match), difference=difference, lag_ns=frame.t_mid_ns - middle_ns)
+        return _Difference(difference, latest)
+
+    def _read(self, found: "_Difference", match: Match) -> Reading:
+        self._latest = latest = found.latest
+        middle_ns = sum(each.t_mid_ns for each in latest) // len(latest)
+        lag_ns = latest[-1].t_mid_ns - middle_ns
+        return replace(self._calibrated(match), difference=found.difference, lag_ns=lag_ns)
 
     def heatmap(self, reading: Reading) -> FloatArray | None:
         """Return the (K, S) scores of what a reading was made from, None where nothing was matched.

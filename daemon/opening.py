@@ -1,8 +1,10 @@
 """From the configuration to estimators: which one a calibration is of, and the bank that it needs or is shown with."""
 
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TypeAlias
+from weakref import WeakValueDictionary
 
 from bank.bank_file import Bank
 from bank.calibration import Calibration
@@ -15,7 +17,12 @@ from daemon.topics import STALE_AFTER_PERIODS
 from daemon.tracking import Scoring, TrackedEstimator
 
 AnyEstimator: TypeAlias = Estimator | TrackedEstimator
-_MATCHERS = {"all_lags": FastMatcher, "zero_lag": FastZeroLagMatcher}
+_MATCHERS: Mapping[str, type[FastMatcher | FastZeroLagMatcher]] = {
+    "all_lags": FastMatcher,
+    "zero_lag": FastZeroLagMatcher,
+}
+# Matchers in use, which keep no state between calls: fingertips of one bank share one, its memory and its start.
+_in_use: WeakValueDictionary[tuple[str, str], FastMatcher | FastZeroLagMatcher] = WeakValueDictionary()
 
 
 def open_estimator(config: Fingertip, name: str) -> AnyEstimator:
@@ -45,7 +52,7 @@ def open_estimator(config: Fingertip, name: str) -> AnyEstimator:
     if config.calibration is not None:
         calibration = Calibration.load(config.calibration, bank_identity=bank.identity)
     return Estimator(
-        _MATCHERS[config.matching].from_bank(bank),
+        _matcher(bank, config.matching),
         calibration,
         baseline_frames=config.baseline_frames,
         average_frames=config.average_frames,
@@ -68,8 +75,18 @@ def open_both(config: Both, fingertips: dict[str, Fingertip]) -> TrackedEstimato
 
 def _tracked(fitted: FittedCalibration, config: Fingertip) -> TrackedEstimator:
     bank = Bank.open(config.bank) if config.bank is not None else None
-    scoring = Scoring(_MATCHERS[config.matching].from_bank(bank), bank.model) if bank is not None else None
+    scoring = Scoring(_matcher(bank, config.matching), bank.model) if bank is not None else None
     return TrackedEstimator(fitted, bank, scoring, baseline_frames=config.baseline_frames)
+
+
+def _matcher(bank: Bank, matching: str) -> FastMatcher | FastZeroLagMatcher:
+    key = (f"{bank.identity} {bank.signals_sha256}", matching)
+    shared = _in_use.get(key)
+    if shared is not None:
+        return shared
+    matcher = _MATCHERS[matching].from_bank(bank)
+    _in_use[key] = matcher
+    return matcher
 
 
 def _fitted(path: Path, wanted: str | None) -> FittedCalibration:

@@ -52,6 +52,10 @@ class TrackedEstimator:
         """Take a new homogeneous frame from the frames to come, which are of an untouched fingertip."""
         self._tracker.take_idle(self._baseline_frames)
 
+    def quickly(self, *_frames: Frame) -> Reading | None:
+        """Return nothing: what a tracker takes is not known beforehand, and `update` belongs in a thread."""
+        return None
+
     def update(self, *frames: Frame) -> Reading:
         """Return what the frames of one moment say, one a side; those that say nothing come back with the reasons."""
         if any(frame.repeated for frame in frames):

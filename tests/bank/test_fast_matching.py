@@ -164,6 +164,26 @@ def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast) -> None
     np.testing.assert_array_equal(fast.heatmap(frame), slow.heatmap(frame))
 
 
+@pytest.mark.parametrize("fast", [fast for _, fast in PAIRS], ids=["all lags", "zero lag"])
+def test_a_quick_match_is_the_same_or_none(fast, monkeypatch) -> None:
+    frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(8).normal(size=N_CHANNELS))
+    for limit in ("_QUICK_SCORES", "_FEW_LAGS"):
+        monkeypatch.setattr(fast_matching, limit, 1 << 30)
+    assert fast.match_quickly(frame) == fast.match(frame)
+    monkeypatch.setattr(fast_matching, "_QUICK_SCORES", 0)
+    assert fast.match_quickly(frame) is None
+    monkeypatch.undo()
+    monkeypatch.setattr(fast_matching, "_ROUNDING_64", 2.0)
+    assert fast.match_quickly(frame) is None
+
+
+def test_a_frame_that_leaves_many_bounds_is_not_matched_quickly(monkeypatch) -> None:
+    _, fast = PAIRS[0]
+    frame = np.random.default_rng(9).random(N_CHANNELS)
+    monkeypatch.setattr(bounds, "_QUICK_BOUNDS", 10)
+    assert fast.match_quickly(frame) is None
+
+
 @both
 def test_what_cannot_be_matched_is_refused_alike(slow, fast) -> None:
     for frame, says in ((np.zeros(N_CHANNELS), "zero in all channels"), (np.full(N_CHANNELS, np.nan), "not finite")):

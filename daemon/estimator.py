@@ -5,6 +5,7 @@ the bank, and the best cell's sigma and k become torque and diameter through the
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -95,13 +96,16 @@ class Baseline:
         self._sum += deviation
         self._sum_of_squares += deviation**2
         self.taken += 1
+        # Asked for with every frame from now on.
+        self.__dict__.pop("homogeneous", None)
+        self.__dict__.pop("noise", None)
 
-    @property
+    @cached_property
     def homogeneous(self) -> FloatArray:
         """The mean of the frames taken, (896,) in volts."""
         return self._first + self._sum / self.taken
 
-    @property
+    @cached_property
     def noise(self) -> FloatArray:
         """The standard deviation of one frame, (896,) in volts, at least that of the converter's rounding.
 
@@ -185,7 +189,8 @@ class Estimator:
         if before and frame.t_mid_ns - before[-1].t_mid_ns > self._longest_gap_ns:
             before = ()
         latest = (*before, frame)[-self._average_frames :]
-        difference = np.mean([each.channels for each in latest], axis=0) - self._baseline.homogeneous
+        mean = frame.channels if len(latest) == 1 else np.mean([each.channels for each in latest], axis=0)
+        difference = mean - self._baseline.homogeneous
         noise = self._baseline.noise * np.sqrt(1.0 / len(latest) + 1.0 / self._baseline.taken)
         silent = signal_above_noise(difference, noise)
         if silent is not None:

@@ -212,15 +212,15 @@ async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
 ) -> None:
     from daemon.estimator import Estimator
 
-    update = Estimator.update
+    quickly = Estimator.quickly
     deaths = iter([True])
 
     def fragile(self: Estimator, frame: Any) -> Any:
         if frame.seq == 3 and next(deaths, False):
             raise RuntimeError("a bug")
-        return update(self, frame)
+        return quickly(self, frame)
 
-    monkeypatch.setattr(Estimator, "update", fragile)
+    monkeypatch.setattr(Estimator, "quickly", fragile)
     link = str(tmp_path / "eit-right")
     async with running(config()) as daemon:
         estimates = collector(daemon, "eit.estimate")

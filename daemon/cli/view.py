@@ -57,9 +57,9 @@ def run(args: argparse.Namespace) -> int:
     def ready(port: int) -> None:
         page = f"http://127.0.0.1:{port}/"
         if args.json:
-            print(json.dumps({"url": page, "url_with_token": f"{page}#token={token}", "token_file": str(path)}))
+            print(json.dumps({"url": page, "url_with_token": f"{page}#token={token}", "token_file": str(path)}), flush=True)
         else:
-            print(f"{page}#token={token}")
+            print(f"{page}#token={token}", flush=True)
             print(f"Without what follows the slash the page shows all and stops, but moves nothing. Token: {path}")
 
     asyncio.run(serve(place, args.port, token, fingertip, ready))

@@ -57,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
     def ready(port: int) -> None:
         page = f"http://127.0.0.1:{port}/"
         if args.json:
-            print(json.dumps({"url": page, "url_with_token": f"{page}#token={token}", "token_file": str(path)}), flush=True)
+            told = {"url": page, "url_with_token": f"{page}#token={token}", "token_file": str(path)}
+            # At once: who reads it through a pipe waits for it.
+            print(json.dumps(told), flush=True)
         else:
             print(f"{page}#token={token}", flush=True)
             print(f"Without what follows the slash the page shows all and stops, but moves nothing. Token: {path}")

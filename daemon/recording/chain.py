@@ -15,6 +15,7 @@ from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Publisher
 from daemon.rig import load_cell_calibration
 from daemon.skin_setup import RecordedSkin
+from daemon.skin_task import SKIN
 from drivers.eit_line import Frame, LineParser
 from drivers.hx711 import LoadParser
 from drivers.raw_input import RawInput
@@ -49,6 +50,12 @@ class Chain:
         """The sources whose inputs are taken."""
         load_cell = (LOAD_CELL,) if self._load is not None else ()
         return (*self._lines, *load_cell, *(self._skin.sources if self._skin is not None else ()))
+
+    @property
+    def publishes(self) -> tuple[str, ...]:
+        """The sources of the messages that are made anew."""
+        load_cell = (LOAD_CELL,) if self._load is not None else ()
+        return (*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ()))
 
     async def take(self, source: str, told: RawInput) -> None:
         """Publish all that an input leads to; an input of a source that is not configured leads to nothing."""

@@ -127,7 +127,7 @@ class Replay:
         elif happened.told is not None:
             self._clock.set(happened.t_mono_ns)
             await self._chain.take(happened.source, happened.told)
-        elif happened.topic in MADE_ANEW and self._run.has_inputs and happened.source in self._chain.sources:
+        elif happened.topic in MADE_ANEW and self._run.has_inputs and happened.source in self._chain.publishes:
             self.comparison.recorded(happened)
         elif happened.topic != EitHeatmap.topic:
             self._publisher.forward(happened.topic, wire_map_of(happened.content))

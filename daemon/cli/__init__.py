@@ -40,6 +40,7 @@ COMMANDS = {
     "doctor": Command("daemon.cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
     "ports": Command("daemon.cli.ports", "list the serial ports with their serial numbers"),
     "keys": Command("daemon.cli.keys", "make the keys for daemon and clients on a network"),
+    "completion": Command("daemon.cli.completion", "print what bash, zsh or tcsh needs to complete the command line"),
     "install": Command("daemon.cli.install", "make the daemon a service of this computer"),
     "uninstall": Command("daemon.cli.uninstall", "take the service away again"),
     "skin": Command("daemon.cli.skin", "hold the shear skin's models against its paper, and calibrate a skin"),

@@ -11,27 +11,36 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `check`."""
     parser.add_argument("config", type=Path, help="a YAML file such as config/demo.yaml")
+    parser.add_argument("--json", action="store_true", help="print what it says as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Load everything that `run` would load, and open no device."""
+    import json
+
     from daemon.cli.run import checked_emulators
     from daemon.config import load_daemon_config
     from daemon.opening import open_both, open_estimator
 
     config = load_daemon_config(args.config)
     checked_emulators(config.emulators, args.config)
+    told = {}
     if config.curve is not None:
-        print(f"keys: {_clients(config.curve)} may connect")
+        told["keys"] = f"{_clients(config.curve)} may connect"
     for name, fingertip in config.fingertips.items():
         grids = open_estimator(fingertip, name).grids
         torque = "with torque" if fingertip.calibration else "without torque: no calibration is configured"
         bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
-        print(f"{name}: {bank}, {torque}")
+        told[name] = f"{bank}, {torque}"
     if config.both is not None:
-        print(f"both: {' and '.join(open_both(config.both, config.fingertips).sides)} together, with torque")
+        told["both"] = f"{' and '.join(open_both(config.both, config.fingertips).sides)} together, with torque"
     if config.skin is not None:
-        print(f"skin: {_skin(config.skin)}")
+        told["skin"] = _skin(config.skin)
+    if args.json:
+        print(json.dumps({"config": str(args.config), "told": told}, ensure_ascii=False))
+        return 0
+    for name, what in told.items():
+        print(f"{name}: {what}")
     print(f"{args.config} is in order")
     return 0
 

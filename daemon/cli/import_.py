@@ -10,13 +10,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     mat = formats.add_parser("mat", help="the paper's MATLAB streams", description="Import the paper's streams.")
     mat.add_argument("sources", nargs="+", type=Path, metavar="SRC", help=".mat files of one recording, or its folder")
     mat.add_argument("--out", type=Path, required=True, metavar="REC", help="recording to write, e.g. twist.mcap")
+    mat.add_argument("--json", action="store_true", help="print what came in as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Import and say what came in."""
+    import json
+
     from daemon.recording.importing import import_mat
 
     imported = import_mat(args.sources, args.out)
+    if args.json:
+        counted = {"path": str(args.out), "frames": imported.frames, "torques": imported.torques}
+        print(json.dumps({**counted, "remarks": list(imported.remarks)}, ensure_ascii=False))
+        return 0
     counts = [f"{count} frames of the {side} side" for side, count in imported.frames.items()]
     print(f"{args.out}: {', '.join(counts)}, {imported.torques} torques.")
     for remark in imported.remarks:

@@ -13,10 +13,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--k", type=float, required=True, metavar="K", help="the model's first parameter")
     parser.add_argument("--sigma", type=float, required=True, metavar="S", help="the model's second parameter")
     parser.add_argument("--out", type=Path, required=True, metavar="V.npy", help="file for the 896 float64 voltages")
+    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Solve, and write the voltages only when there is a solution."""
+    import json
+
     import numpy as np
 
     from bank.errors import ConductivityError
@@ -38,5 +41,9 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(
             f"{args.out}: the voltages cannot be written: {error.strerror}; choose another --out"
         ) from error
-    print(f"{args.out}: 896 voltages, norm {np.linalg.norm(voltages):.9g}")
+    norm = float(np.linalg.norm(voltages))
+    if args.json:
+        print(json.dumps({"path": str(args.out), "voltages": len(voltages), "norm": norm}))
+    else:
+        print(f"{args.out}: 896 voltages, norm {norm:.9g}")
     return 0

@@ -1,0 +1,44 @@
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from daemon.cli import COMMANDS, main
+from daemon.cli.completion import whole_parser
+
+
+def completed(script: Path, *words: str) -> set[str]:
+    """Return what bash would offer at the end of a command line."""
+    line = " ".join(f"'{word}'" for word in words)
+    program = (
+        f'source "{script}"; COMP_WORDS=({line}); COMP_CWORD={len(words) - 1}; '
+        'complete -p shearloop >/dev/null || exit 9; _shtab_shearloop "$1"; printf "%s\\n" "${COMPREPLY[@]}"'
+    )
+    done = subprocess.run(["bash", "-c", program], capture_output=True, text=True, check=True)
+    assert done.stderr == ""
+    return set(done.stdout.split())
+
+
+def test_bash_completes_commands_and_options(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", "bash"]) == 0
+    script = tmp_path / "shearloop"
+    script.write_text(capsys.readouterr().out)
+    assert set(COMMANDS) <= completed(script, "shearloop", "")
+    assert completed(script, "shearloop", "do") == {"doctor"}
+    assert "--geometry" in completed(script, "shearloop", "doctor", "--")
+    assert {"server", "client", "allow", "revoke", "list"} <= completed(script, "shearloop", "keys", "")
+
+
+def test_every_shell_has_its_script(capsys: pytest.CaptureFixture[str]) -> None:
+    for shell in ("zsh", "tcsh"):
+        assert main(["completion", shell]) == 0
+        assert "doctor" in capsys.readouterr().out
+
+
+def test_where_a_file_is_meant_files_are_offered() -> None:
+    config = next(action for action in _command("check")._actions if action.dest == "config")
+    assert getattr(config, "complete", None)
+
+
+def _command(name: str):  # type: ignore[no-untyped-def]
+    return next(action for action in whole_parser()._actions if action.dest == "command").choices[name]

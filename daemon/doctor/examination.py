@@ -11,16 +11,17 @@ from daemon.doctor.devices import examine_devices
 from daemon.doctor.files import examine_files
 from daemon.doctor.finding import Finding, from_sentence, good, note
 from daemon.doctor.live import examine_daemon, listen, tasks_of_daemon
-from daemon.doctor.machine import examine_machine
+from daemon.doctor.machine import disk_finding, examine_machine
 from daemon.errors import UserError
 from daemon.ports import ports_there
 
 
 def examine(config_path: Path | None, seconds: float, geometry: Path | None = None) -> Iterator[Finding]:
     """Yield one finding after another; the devices are listened to for some seconds each, all at once."""
-    yield from examine_machine(Path("recordings"))
+    yield from examine_machine()
     yield ports_finding()
     if config_path is None:
+        yield disk_finding(Path())
         yield note(
             "configuration", "none was given", "files and devices were not examined", "`shearloop doctor CONFIG`"
         )
@@ -31,6 +32,7 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
         yield from_sentence("configuration", str(error), "the daemon will not start")
         return
     yield good("configuration", f"{config_path} is in order")
+    yield disk_finding(Path() if config.recording is None else config.recording.folder)
     yield from examine_files(config, geometry)
     tasks = _running(config)
     if tasks is not None:

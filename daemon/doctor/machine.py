@@ -11,7 +11,7 @@ from pathlib import Path
 
 from daemon.doctor.finding import Finding, good, note, trouble
 
-# An hour of frames and states recorded is some 300 MB.
+# An hour of recording is some 80 MB.
 LITTLE_DISK_BYTES, NO_DISK_BYTES = 2e9, 2e8
 LITTLE_MEMORY_BYTES = 5e8
 # A clock before this has never been set.
@@ -19,10 +19,9 @@ FIRST_SANE_UNIX_S = 1_704_067_200
 _TIME_ERROR = 5
 
 
-def examine_machine(folder: Path) -> Iterator[Finding]:
-    """Examine this computer; `folder` is where recordings go."""
+def examine_machine() -> Iterator[Finding]:
+    """Examine this computer."""
     yield clock_finding(time.time(), clock_state())
-    yield disk_finding(folder)
     yield memory_finding()
     yield robot_library_finding()
 
@@ -68,7 +67,7 @@ def disk_finding(folder: Path) -> Finding:
     if free < NO_DISK_BYTES:
         return trouble("disk", found, "recordings will fail, and experiments are not started then", "make room")
     if free < LITTLE_DISK_BYTES:
-        return note("disk", found, "some hours of recordings at most", "make room before a long experiment")
+        return note("disk", found, "a day of recordings at most", "make room before a long experiment")
     return good("disk", found)
 
 

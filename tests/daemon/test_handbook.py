@@ -6,7 +6,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import zmq
 
@@ -19,6 +18,7 @@ from daemon.publisher import Publisher
 from daemon.safety import TABLE
 from daemon.topics import TOPICS
 from tests.daemon.conftest import DEADLINE_S
+from tests.daemon.sample_messages import sample
 
 WRITTEN = {path.name: text for path, text in pages(ROOT).items()}
 
@@ -81,33 +81,7 @@ async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/publish"
     script = tmp_path / "subscriber.py"
     script.write_text(program.replace("tcp://127.0.0.1:7761", address))
-    frame = EitFrame(
-        source="right",
-        t_mono_ns=1,
-        channels=np.full(896, 0.5),
-        line=np.zeros(1024),
-        frame=1,
-        age_s=0.3,
-        saturated=0,
-        dead=0,
-        repeated=False,
-    )
-    estimate = EitEstimate(
-        source="right",
-        t_mono_ns=1,
-        torque_nm=0.125,
-        torque_low_nm=0.1,
-        torque_high_nm=0.15,
-        diameter_mm=None,
-        k=1.0,
-        sigma=1.0,
-        score=0.9,
-        runner_up=0.5,
-        valid=True,
-        why="",
-        frame=1,
-        latency_s=0.01,
-    )
+    frame, estimate = sample(EitFrame), sample(EitEstimate)
     with zmq.Context() as context:
         publisher = Publisher(context, address, Clock())
         process = await asyncio.create_subprocess_exec(sys.executable, str(script), stdout=subprocess.PIPE)
@@ -119,9 +93,9 @@ async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
                     # Until it has subscribed.
                     publisher.publish(estimate)
                     await asyncio.wait([seen], timeout=0.05)
-                assert b"right 0.125 " in seen.result()
+                assert b"text 0.5 " in seen.result()
                 publisher.publish(frame)
-                while b"right 0.5" not in await process.stdout.readline():
+                while b"text 5.0" not in await process.stdout.readline():
                     pass
         finally:
             process.kill()

@@ -1,0 +1,29 @@
+"""A message of any topic with something in every key."""
+
+import dataclasses
+import time
+from typing import Any, get_type_hints
+
+import numpy as np
+
+from daemon.messages import Message
+
+
+def sample(kind: type[Message]) -> Message:
+    """Return a message with something in every key."""
+    values: dict[str, Any] = {}
+    for item in dataclasses.fields(kind):
+        hint = str(get_type_hints(kind)[item.name])
+        if "ndarray" in hint:
+            values[item.name] = np.arange(6.0).reshape(2, 3)
+        elif "Mapping" in hint:
+            values[item.name] = {"right": {"alive": True, "rate_hz": 1.85, "errors": {"nan": 2}, "last_error": ""}}
+        elif "bool" in hint:
+            values[item.name] = True
+        elif "float" in hint:
+            values[item.name] = 0.5
+        elif "int" in hint:
+            values[item.name] = 3
+        else:
+            values[item.name] = "text"
+    return kind(**{**values, "t_mono_ns": time.monotonic_ns()})

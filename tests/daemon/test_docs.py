@@ -1,0 +1,44 @@
+"""The pages name only commands, options, files and pages that there are."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from daemon.cli import COMMANDS
+from daemon.cli.completion import whole_parser
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_and_pictures_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
+        if "://" not in target:
+            assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_and_options_exist(page: Path) -> None:
+    parsers = next(action for action in whole_parser()._actions if action.dest == "command").choices
+    assert parsers is not None
+    for text in re.findall(r"(?:^ {4}|`)(?:sudo )?(?:[./\w-]*/)?shearloop ([^`\n]*)", page.read_text(), re.MULTILINE):
+        words = shlex.split(text.split(" #")[0].split(";")[0], comments=False) if text.count("'") % 2 == 0 else []
+        if not words or not re.fullmatch(r"[a-z]+", words[0]):
+            continue
+        assert words[0] in COMMANDS, f"{page.name}: shearloop {text}"
+        known = _options(parsers[words[0]])
+        for word in words[1:]:
+            if word.startswith("--"):
+                assert word.rstrip(",.").split("=")[0] in known, f"{page.name}: shearloop {text}"
+
+
+def _options(parser) -> set[str]:  # type: ignore[no-untyped-def]
+    found = set(parser._option_string_actions)
+    for action in parser._actions:
+        if hasattr(action, "_parser_class"):
+            for below in action.choices.values():
+                found |= _options(below)
+    return found

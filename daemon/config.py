@@ -75,6 +75,7 @@ class Both(ConfigModel):
 
     calibration: Path = Field(description="made by `shearloop calibrate` on recordings of all these sides")
     estimator: EstimatorName | None = Field(None, description="default: the one that the calibration was made for")
+    creep: CreepConfig | None = Field(None, description="of the gels, as of a single fingertip")
 
 
 class LoadCellConfig(ConfigModel):

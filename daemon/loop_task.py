@@ -20,7 +20,7 @@ from drivers.ur.client import UrRobot
 from drivers.ur.messages import Enable, MoveLinear, Reply, RobotState, Stop, Unlock, WristSpeed, ZeroForceTorque
 
 WRENCH = "wrench"
-WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04)
+WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04, of_the_arm=True)
 # The brain is asked at each state of the robot, and no less often than this when there is none.
 LONGEST_TICK_S = 0.02
 # Every fifth state is published, and speaks as the torque of the wrench: 25 of 125 a second.

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
+from daemon.both import BOTH
 from daemon.clock import Clock
 from daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, LoopConfig
 from daemon.config_file import load_yaml_model
@@ -139,12 +140,9 @@ class Rig:
             sources[self.load_cell.source.name] = self.load_cell.source
         sources[WRENCH] = WRENCH_SOURCE
         required = ("robot", "gripper") if config.gripper is not None else ("robot",)
-        creep = {
-            name: Creep(tip.creep.share, tip.creep.time_s)
-            for name, tip in config.fingertips.items()
-            if tip.creep is not None
-        }
-        self.brain = make_brain(config.loop, sources, required, creep)
+        creep = {name: tip.creep for name, tip in (*config.fingertips.items(), (BOTH, config.both)) if tip is not None}
+        gels = {name: Creep(own.share, own.time_s) for name, own in creep.items() if own is not None}
+        self.brain = make_brain(config.loop, sources, required, gels)
         self.gripper = None
         if config.gripper is not None:
             self.gripper = make_gripper(config.gripper, publisher, self._feel, self.link_of("gripper"))

@@ -208,8 +208,10 @@ def _counted(run: _Run) -> Iterator[str]:
     else:
         yield "  the wrist was never held"
     for source, count in run.invalid.items():
-        of = count + len(run.torques.get(source, ()))
-        yield f"  {count} of {of} torques of {source} were not valid, as while it took its zero; none of them was used"
+        # Who never gave a torque is there for something else.
+        if source in run.torques:
+            of = count + len(run.torques[source])
+            yield f"  {count} of {of} torques of {source} were not valid, as while it took its zero, and were not used"
     if run.refused:
         for reason, count in run.refused.most_common():
             yield f"  {count} times {reason}"

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     from daemon.errors import UserError
     from daemon.logs import set_up_logging
     from daemon.run_summary import RunSummary
+    from daemon.service.priority import first_in_line
     from daemon.slices import SliceRecorder
 
     # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
@@ -63,11 +64,6 @@ def run(args: argparse.Namespace) -> int:
         from daemon.service.locked_memory import lock_memory
 
         lock_memory()
-    if config.robot is not None:
-        from daemon.service.priority import raise_priority
-
-        # Not an error where it is not allowed: late commands are seen and held by themselves.
-        raise_priority()
     checked_emulators(config.emulators, args.config)
     if args.recording is not None:
         from daemon.recordings import read_stream
@@ -80,7 +76,11 @@ def run(args: argparse.Namespace) -> int:
     listeners = () if slices is None else (slices,)
     truth = Truth(config.emulators)
     try:
-        with _emulators(config.emulators, args.config.parent, args.recording, truth) as processes:
+        with (
+            # Not an error where it is not allowed: late commands are seen, and hold the wrist by themselves.
+            first_in_line() if config.robot is not None else nullcontext(),
+            _emulators(config.emulators, args.config.parent, args.recording, truth) as processes,
+        ):
             happenings = Happenings(config.emulators, processes)
             summary = RunSummary(print_summary, truth.torques, lambda: happenings.happened)
             asyncio.run(run_daemon(config, (happenings, *listeners, *((Show(), summary) if args.show else ()))))

@@ -64,12 +64,14 @@ class Source:
     """A torque that can drive or supervise: how often it comes, and over what time it averages.
 
     `sticks` where friction hides it within a band: then it says nothing while the wrist turns through the band.
+    `of_the_arm` where it comes with the arm's state, whose age is watched already.
     """
 
     name: str
     period_s: float
     window_s: float = 0.0
     sticks: bool = False
+    of_the_arm: bool = False
 
 
 @dataclass(slots=True)

@@ -63,7 +63,7 @@ def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: in
 def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
     source = watched.driving
     latest = senses.torques.get(source.name)
-    for each in (source, *watched.supervising):
+    for each in (source, *(other for other in watched.supervising if not other.of_the_arm)):
         if why := _not_fresh(senses, each, settings, t_ns):
             yield Trouble(Event.ESTIMATE_STALE, why)
     if latest is None or _not_fresh(senses, source, settings, t_ns):

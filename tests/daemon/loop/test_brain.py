@@ -224,6 +224,27 @@ def test_a_tool_that_is_taken_away_is_noticed() -> None:
     assert phase(rig) is Phase.STOPPED
 
 
+def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_which() -> None:
+    rig = started(Rig(brain()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
+    rig.run(5)
+    rig.brain.senses.lost["load_cell"] = "/dev/ttyUSB3 was unplugged."
+    rig.step()
+    assert rig.speed == 0.0
+    assert "load_cell is gone: /dev/ttyUSB3 was unplugged." in rig.brain.standing.verdict.reasons[0]
+    rig.brain.senses.lost.clear()
+    rig.run(1)
+    assert rig.speed > 0.0, "it goes on by itself"
+
+
+def test_a_task_that_died_stops_the_wrist_and_says_of_what() -> None:
+    rig = started(Rig(brain()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
+    rig.run(5)
+    rig.brain.senses.died = {"right.estimator": "ValueError: no number"}
+    rig.step()
+    assert phase(rig) is Phase.STOPPED
+    assert "right.estimator: ValueError: no number" in rig.brain.standing.verdict.reasons[0]
+
+
 FAULTS = st.sampled_from(["right", "load_cell", "arm", "hand", "protective", "pause", "resume", "stop", "kick", "ack"])
 
 

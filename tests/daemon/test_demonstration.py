@@ -1,0 +1,75 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon.cli.demonstration import Happenings, Truth
+from daemon.config import Emulator
+from daemon.config_file import load_yaml_model
+
+S = 1_000_000_000
+
+
+def emulator(**changes: Any) -> Emulator:
+    return Emulator.model_validate({"device": "rig", **changes})
+
+
+def held(t_s: float, step: int = 7, hold: int = 1, phase: str = "running") -> dict[str, Any]:
+    return {"t_mono_ns": round(t_s * S), "step": step, "hold": hold, "phase": phase}
+
+
+def test_what_befalls_the_rig_is_said_once_when_the_step_has_been_held_for_its_time() -> None:
+    rig = emulator(happenings=[{"step": 7, "held_for_s": 12, "say": "kick -0.03"}])
+    process = subprocess.Popen([sys.executable, "-c", "print(input())"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    happenings = Happenings((rig,), [process])
+    for content in (held(0, step=6), held(50, hold=0), held(60), held(71.9), held(73, phase="held")):
+        happenings("loop.state", content)
+    assert happenings.happened == []
+    happenings("loop.state", held(73))
+    happenings("loop.state", held(74))
+    assert [words for _, words in happenings.happened] == ["kick -0.03"]
+    out, _ = process.communicate(timeout=30)
+    assert out == b"kick -0.03\n"
+
+
+def test_a_rig_that_has_ended_is_told_nothing() -> None:
+    rig = emulator(happenings=[{"step": 1, "say": "slip"}])
+    process = subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE)
+    process.wait(30)
+    happenings = Happenings((rig,), [process])
+    happenings("loop.state", held(1, step=1))
+    assert happenings.happened == []
+    process.communicate()
+
+
+def test_the_truth_is_read_up_to_its_last_whole_line() -> None:
+    truth = Truth((emulator(),))
+    try:
+        assert truth.path is not None
+        assert truth.arguments == ("--truth", str(truth.path))
+        assert truth.torques() is None
+        rows = [{"t_mono_ns": 1, "torque_nm": 0.1}, {"t_mono_ns": 2, "torque_nm": 0.2}]
+        truth.path.write_text("\n".join(map(json.dumps, rows)) + '\n{"t_mono_ns": 3, "torq')
+        known = truth.torques()
+        assert known is not None
+        assert known.torque_nm.tolist() == [0.1, 0.2]
+    finally:
+        truth.close()
+    assert not truth.path.exists()
+
+
+def test_without_an_emulated_rig_nobody_knows_the_truth() -> None:
+    truth = Truth((emulator(device="eit-kit"), emulator(arguments=["--truth", "own.jsonl"])))
+    assert truth.arguments == ()
+    assert truth.torques() is None
+    truth.close()
+
+
+def test_a_happening_of_two_lines_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "emulator.yaml"
+    path.write_text('device: rig\nhappenings: [{step: 1, say: "slip\\nkick 3"}]\n')
+    with pytest.raises(Exception, match="say"):
+        load_yaml_model(path, Emulator)

@@ -125,6 +125,10 @@ class Bench:
                         return content
         raise RuntimeError(f"{topic} never said so within {within_s:g} s")
 
+    def until_phase(self, phase: str) -> dict[str, Any]:
+        """Return the first state of the loop in a phase."""
+        return self.until("loop.state", lambda state: state["phase"] == phase)
+
     def event(self, name: str, since_ns: int, within_s: float = 5.0) -> dict[str, Any]:
         """Return the first event of the robot of a name since a moment."""
         out = self._rig.stdout
@@ -213,9 +217,7 @@ def measure_faults(bench: Bench) -> list[dict[str, Any]]:
         after_s = (state["t_mono_ns"] - asked_ns) / 1e9
         period_s = 1.0 / (TOPICS[fault.topic].rate_hz or 1.0)
         after = "running" if fault.passes else "stopped"
-        last = (
-            state if state["phase"] == after else bench.until("loop.state", lambda s, after=after: s["phase"] == after)
-        )
+        last = state if state["phase"] == after else bench.until_phase(after)
         if fault.passes:
             bench.command("stop")
         if fault.cure:

@@ -20,6 +20,8 @@ from bank.models import Conductivities
 
 Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]
+# Yields (row, its cells) for the rows of a bank on a mesh, in any order.
+RowsSolver = Callable[[Mesh, BankDefinition, Sequence[int]], Iterator[tuple[int, BankRow]]]
 
 
 class RowSolver:
@@ -57,13 +59,15 @@ def build_bank(
     path: Path,
     *,
     jobs: int = 1,
+    elsewhere: RowsSolver | None = None,
     on_row: Progress | None = None,
     on_notice: Notice | None = None,
 ) -> None:
     """Build a bank file of (K,) k and (S,) σ, taking over the finished rows of an interrupted build of the same bank.
 
     `on_row(done, total)` is called once at the start and after each row that is safely on the disk; `on_notice` gets
-    a sentence when there is something to say. Raises ModelError, GeometryError, and BankFileError where the bank
+    a sentence when there is something to say. Rows are solved by `elsewhere` where that is given, else in `jobs`
+    threads: with the same bytes. Raises ModelError, GeometryError, and BankFileError where the bank
     cannot be written or another build is at work on it. A bank that was there before is replaced only by a finished
     one.
     """
@@ -76,7 +80,8 @@ def build_bank(
         missing = [row for row in range(total) if row not in journal.rows]
         tell = on_row or _ignore
         tell(total - len(missing), total)
-        for row, cells in _solve(solver, missing, jobs):
+        solved = _solve(solver, missing, jobs) if elsewhere is None else elsewhere(mesh, definition, missing)
+        for row, cells in solved:
             journal.append(row, cells)
             tell(len(journal.rows), total)
         rows = [journal.rows[row] for row in range(total)]
@@ -89,6 +94,18 @@ def build_bank(
             np.stack([cells.signals for cells in rows]),
         )
         journal.remove()
+
+
+def solve_row(task: tuple[Mesh, BankDefinition], row: int) -> BankRow:
+    """Return the cells of a row, wherever this runs; the solver is kept for the next row of the same bank."""
+    definition = task[1]
+    if definition.identity not in _solvers:
+        _solvers.clear()
+        _solvers[definition.identity] = RowSolver(*task)
+    return _solvers[definition.identity].solve(row)
+
+
+_solvers: dict[str, RowSolver] = {}
 
 
 def _solve(solver: RowSolver, rows: Sequence[int], jobs: int) -> Iterator[tuple[int, BankRow]]:

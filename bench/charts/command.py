@@ -4,6 +4,8 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from daemon.cli.recorded import add_cluster
+
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
     "stability": "every estimator as faults grow: bias, spread, valid and false-valid share; continuity",
@@ -30,6 +32,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--split", type=float, default=0.6, metavar="SHARE", help="earlier part, which is fitted to (default: 0.6)"
     )
+    add_cluster(parser)
+    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes to share the work (default: 1)")
     parser.add_argument(
         "--rounds", type=int, default=5, metavar="N", help="how often everything is timed, by turns (default: 5)"
     )
@@ -43,6 +47,10 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--split must be a share from 0.1 to 0.9, not {args.split:g}")
     if args.rounds < 1:
         raise UserError(f"--rounds must be 1 or more, not {args.rounds}")
+    if args.jobs < 1:
+        raise UserError(f"--jobs must be 1 or more, not {args.jobs}")
+    if args.name == "speed-accuracy" and (args.cluster is not None or args.jobs > 1):
+        raise UserError("speed-accuracy measures times, one thread on this machine: leave out --cluster and --jobs")
     try:
         import matplotlib as _  # noqa: F401 - so that its absence is told before anything is measured
     except ModuleNotFoundError as error:
@@ -78,14 +86,18 @@ def _speed_accuracy(args: argparse.Namespace) -> list[Path]:
 def _stability(args: argparse.Namespace) -> list[Path]:
     from bench.charts.sources import bank_of, mesh_of, splits
     from bench.charts.stability_chart import chart
+    from daemon.workers import workers
 
     scratch, mesh = args.out / "banks", mesh_of(args.mesh)
     bank = bank_of(args.bank, mesh, scratch)
-    return chart(splits(args.recordings, args.split, scratch), bank, mesh, scratch, args.out)
+    with workers(args.cluster, args.jobs) as pool:
+        return chart(splits(args.recordings, args.split, scratch), bank, mesh, scratch, args.out, pool)
 
 
 def _scene(args: argparse.Namespace) -> list[Path]:
     from bench.charts.scene import chart
     from bench.charts.sources import splits
+    from daemon.workers import workers
 
-    return chart(splits(args.recordings, args.split, args.out / "banks"), args.out)
+    with workers(args.cluster, args.jobs) as pool:
+        return chart(splits(args.recordings, args.split, args.out / "banks"), args.out, pool)

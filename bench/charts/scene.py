@@ -7,22 +7,31 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from bank.design import ALLOWED, Choice, Design, designed
+from bank.design import ALLOWED, Choice, Design, Scene, designed
+from bank.fingertip import Fingertip
 from bench.charts.picture import SHADES, figure, save
 from bench.charts.sources import Split, own_fingertip
 from daemon.scene import choices_of, scene_of
+from daemon.workers import Workers
 
 _MESH_SIZE_CM = 0.07
 _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
 
 
-def chart(parts: Sequence[Split], out: Path) -> list[Path]:
-    """Design for the whole of each recording, draw and write."""
-    written = []
-    for split in parts:
-        design = designed(scene_of(split.whole), own_fingertip(_MESH_SIZE_CM))
-        written += write(split.title.split(",", maxsplit=1)[0], design, out)
-    return written
+def chart(parts: Sequence[Split], out: Path, pool: Workers) -> list[Path]:
+    """Design for the whole of each recording, draw and write; each recording is a task of its own."""
+    scenes = [scene_of(split.whole) for split in parts]
+    found = sorted(pool.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes), key=lambda pair: pair[0])
+    return [
+        path
+        for split, (_, design) in zip(parts, found, strict=True)
+        for path in write(split.title.split(",", maxsplit=1)[0], design, out)
+    ]
+
+
+def designed_on(fingertip: Fingertip, scene: Scene) -> Design:
+    """Return `designed` with its arguments as a task has them."""
+    return designed(scene, fingertip)
 
 
 def write(title: str, design: Design, out: Path) -> list[Path]:

@@ -13,6 +13,7 @@ from bank.estimators.guard import channel_noise
 from bench.charts.faults import FAULTS, Fault, Scene, Spoilt, scene_of
 from bench.charts.sources import Split
 from daemon.scene import residual_noise
+from daemon.workers import Workers
 
 Floats = NDArray[np.float64]
 # Of valid estimates one in twenty may miss its 95 % interval; an estimator that is wrong so often says it is right
@@ -161,11 +162,15 @@ def scene_for(split: Split, bank: Bank) -> Scene:
 _MEAN_V = 0.13
 
 
-def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank) -> list[Curve]:
-    """Return all estimators through all faults on one split."""
-    scene = scene_for(split, bank)
-    found = []
-    for calibration in fitted(split, names, physics):
-        tracker = Tracker(calibration, bank)
-        found += [sweep(tracker, scene, fault) for fault in FAULTS]
-    return found
+def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, pool: Workers) -> list[Curve]:
+    """Return all estimators through all faults on one split; each estimator is a task of its own."""
+    tasks = fitted(split, names, physics)
+    found = sorted(pool.map(swept, (scene_for(split, bank), str(bank.path.resolve())), tasks), key=lambda pair: pair[0])
+    return [one for _, curves in found for one in curves]
+
+
+def swept(shared: tuple[Scene, str], calibration: Calibration) -> list[Curve]:
+    """Return one estimator through all faults; a worker has to reach the bank's file."""
+    scene, path = shared
+    tracker = Tracker(calibration, Bank.open(path))
+    return [sweep(tracker, scene, fault) for fault in FAULTS]

@@ -13,18 +13,19 @@ from bench.charts.rims import at_rims
 from bench.charts.sources import Split, splits
 from bench.charts.stability import BROKEN_SHARE, Curve, fitted, misaligned, sweeps
 from bench.charts.stability_picture import continuity_figure, sweeps_figure
+from daemon.workers import Workers
 
 SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
 STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "fused")
 SHIFTS_S = (0.0, 0.27, 0.54, 1.08, 2.16, 4.33)
 
 
-def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path) -> list[Path]:
+def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, pool: Workers) -> list[Path]:
     """Sweep, draw and write: a chart for each recording, one for where the bank ends, and one for continuity."""
     physics, written = Physics(bank, mesh), []
     made_for = {"raw": STREAM_NAMES, "difference": SLICE_NAMES}
     for split in parts:
-        curves = sweeps(split, made_for[split.past.kind], physics, bank)
+        curves = sweeps(split, made_for[split.past.kind], physics, bank, pool)
         if split.past.kind == "raw":
             curves += misaligned(split, STREAM_NAMES, physics, SHIFTS_S)
         written += _written(f"stability-{_slug(split.title)}", split.title, curves, out)

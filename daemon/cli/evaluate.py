@@ -5,6 +5,8 @@ import json
 import sys
 from pathlib import Path
 
+from daemon.cli.recorded import add_cluster
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -19,6 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         default="0:1",
         help="share of each recording to judge on (default: all)",
     )
+    add_cluster(parser)
     parser.add_argument("--json", action="store_true", help="print the figures as JSON, and nothing else, on stdout")
     parser.add_argument("--plot", action="store_true", help="draw truth against estimate over time into --out")
     parser.add_argument("--out", type=Path, metavar="FILE", help="figure to draw (default with --plot: CAL.png)")
@@ -30,8 +33,9 @@ def run(args: argparse.Namespace) -> int:
     from bank.estimators import Calibration
     from daemon.cli.recorded import parsed_part
     from daemon.errors import UserError
-    from daemon.recording.evaluation import follow, judge, reasons
+    from daemon.recording.evaluation import followed, judge, reasons
     from daemon.recording.series import part_of, read_series
+    from daemon.workers import workers
 
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
@@ -43,7 +47,10 @@ def run(args: argparse.Namespace) -> int:
             f"{args.calibration} was made from {_KINDS[calibration.kind]}, and cannot judge {_KINDS[other]}; "
             "calibrate on recordings of the same kind"
         )
-    tracks = [follow(calibration, part_of(one, start, stop), bank) for one in series]
+    parts = [part_of(one, start, stop) for one in series]
+    shared = (calibration, None if bank is None else str(args.bank.resolve()))
+    with workers(args.cluster) as pool:
+        tracks = [track for _, track in sorted(pool.map(followed, shared, parts), key=lambda pair: pair[0])]
     figures = judge(tracks)
     if args.plot or args.out:
         out = args.out or args.calibration.with_suffix(".png")

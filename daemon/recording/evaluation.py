@@ -35,6 +35,12 @@ def follow(calibration: Calibration, series: FrameSeries, bank: Bank | None = No
     return Track(chosen, tuple(estimates), np.array(latency))
 
 
+def followed(shared: tuple[Calibration, str | None], series: FrameSeries) -> Track:
+    """Return `follow` of a calibration and the bank's path: a task for a worker, which has to reach the file."""
+    calibration, path = shared
+    return follow(calibration, series, None if path is None else Bank.open(path))
+
+
 def judge(tracks: Sequence[Track]) -> dict[str, float | int | None]:
     """Return the figures of `shearloop evaluate`: r, rmse_nm, bias_nm, coverage_95, valid_fraction, latency, frames.
 

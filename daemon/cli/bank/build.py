@@ -7,11 +7,17 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, Self
 
+from daemon.cli.recorded import add_cluster
 from daemon.errors import UserError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
     from tqdm import tqdm
 
+    from bank.bank_file import BankDefinition
+    from bank.journal import BankRow
+    from bank.mesh import Mesh
     from daemon.bank_config import GridConfig
 
 
@@ -21,6 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="the bank file to write")
     add_overrides(parser)
     parser.add_argument("--jobs", type=int, metavar="N", help="threads that solve (default: one per core)")
+    add_cluster(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
@@ -34,15 +41,23 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Build the bank, telling how far it is on stderr."""
     from bank.bank_file import Bank
-    from bank.build import build_bank
+    from bank.build import build_bank, solve_row
     from daemon.bank_config import load_bank_plan
+    from daemon.workers import workers
 
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
     if jobs < 1:
         raise UserError(f"--jobs must be 1 or more, not {jobs}")
     model, k, sigma = overrides(args)
     plan = load_bank_plan(args.config, model=model, k=k, sigma=sigma)
-    with _Progress(args.out.name) as progress:
+    with _Progress(args.out.name) as progress, workers(args.cluster, jobs) as pool:
+
+        def on_cluster(
+            mesh: "Mesh", definition: "BankDefinition", rows: "Sequence[int]"
+        ) -> "Iterator[tuple[int, BankRow]]":
+            for number, cells in pool.map(solve_row, (mesh, definition), rows):
+                yield rows[number], cells
+
         build_bank(
             plan.mesh,
             plan.model,
@@ -50,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
             plan.sigma_grid,
             args.out,
             jobs=jobs,
+            elsewhere=on_cluster if args.cluster is not None else None,
             on_row=progress.show,
             on_notice=lambda sentence: print(sentence, file=sys.stderr),
         )

@@ -1,0 +1,131 @@
+"""Where heavy tasks run: in this process, in processes beside it, or on the workers of a Dask cluster.
+
+The tasks are the same functions of the same values everywhere, so the numbers are the same. A task that a worker took
+with it when it died is given to another one; only where tasks kill one worker after the other is it given up.
+"""
+
+import socket
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+from daemon.errors import UserError
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+T = TypeVar("T")
+S = TypeVar("S")
+R = TypeVar("R")
+
+# What `--cluster` alone means: a cluster of this machine's own.
+LOCAL = "local"
+CONNECT_S = 20
+HELP = "Dask scheduler to run on, such as tcp://host:8786; alone: a cluster of this machine's own"
+
+
+class Workers(Protocol):
+    """Runs a function of what is shared and of each item."""
+
+    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
+        """Yield (number of the item, function(shared, item)) as they are finished, in any order.
+
+        The function must be found by its name in a module; what is shared is sent once. Raises what it raises.
+        """
+
+
+class InTurn:
+    """One after the other, in this process."""
+
+    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
+        """Yield the results in order."""
+        for number, item in enumerate(items):
+            yield number, function(shared, item)
+
+
+class Processes:
+    """Processes beside this one; spawned, so that none inherits our files, threads or locks."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+
+    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
+        """Yield results as they are finished."""
+        with ProcessPoolExecutor(min(self._count, max(len(items), 1)), get_context("spawn")) as pool:
+            try:
+                tasks = {pool.submit(function, shared, item): number for number, item in enumerate(items)}
+                for task in as_completed(tasks):
+                    yield tasks.pop(task), task.result()
+            except BrokenProcessPool as error:
+                raise UserError(
+                    "a process was killed, perhaps for want of memory; run again with fewer --jobs"
+                ) from error
+            finally:
+                pool.shutdown(wait=True, cancel_futures=True)
+
+
+class Cluster:
+    """The workers of a Dask cluster."""
+
+    def __init__(self, client: "Client") -> None:
+        self._client = client
+
+    def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
+        """Yield results as they are finished; the tasks of a worker that dies go to the others."""
+        from distributed import KilledWorker, as_completed
+
+        (kept,) = self._client.scatter([shared], broadcast=True, hash=False)
+        tasks = {self._client.submit(function, kept, item, pure=False): i for i, item in enumerate(items)}
+        try:
+            for task in as_completed(list(tasks)):
+                yield tasks[task], task.result()
+        except KilledWorker as error:
+            raise UserError(
+                "one task killed one worker after the other, perhaps for want of memory; give the workers more, or "
+                "run without --cluster"
+            ) from error
+        finally:
+            self._client.cancel(list(tasks))
+
+
+@contextmanager
+def workers(cluster: str | None, jobs: int = 1) -> "Iterator[Workers]":
+    """Return where tasks run: on the cluster at an address, on a local one, or in `jobs` processes without.
+
+    A local cluster needs the extra `cluster`; without it, processes do the same. Raises UserError for an address at
+    which no scheduler answers, and for one that is given without the extra.
+    """
+    if cluster is None:
+        yield InTurn() if jobs == 1 else Processes(jobs)
+        return
+    try:
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        if cluster == LOCAL:
+            yield Processes(max(jobs, 1))
+            return
+        raise UserError(f"--cluster needs {error.name}: `pip install 'shearloop[cluster]'`") from error
+    if cluster == LOCAL:
+        with (
+            LocalCluster(n_workers=max(jobs, 1), threads_per_worker=1, dashboard_address=None) as local,
+            Client(local) as client,
+        ):
+            yield Cluster(client)
+        return
+    _reach(cluster)
+    with Client(cluster, timeout=CONNECT_S) as client:
+        yield Cluster(client)
+
+
+def _reach(address: str) -> None:
+    """Raise UserError unless something listens at an address: a client that finds nothing leaves a thread behind."""
+    from distributed.comm import get_address_host_port
+
+    try:
+        with socket.create_connection(get_address_host_port(address), timeout=CONNECT_S):
+            return
+    except (OSError, ValueError) as error:
+        raise UserError(f"no Dask scheduler answers at {address}: {error}; start one with `dask scheduler`") from error

@@ -1,0 +1,153 @@
+"""The same tasks in turn, in processes, and on a real Dask cluster of two workers, one of which may be killed."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from multiprocessing import resource_tracker
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.cli import main
+from daemon.errors import UserError
+from daemon.workers import InTurn, Processes, workers
+from tests.daemon.test_bank_config import BANK, FINGERTIP
+
+ROOT = Path(__file__).parents[2]
+STARTED_S = 90
+
+
+@pytest.fixture(scope="session")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Start a scheduler and two workers, each a process of its own, and return the address."""
+    from distributed import Client
+
+    # Spawned processes have a tracker of resources, which stays with this one for good.
+    resource_tracker.ensure_running()
+    folder = tmp_path_factory.mktemp("dask")
+    found, log = folder / "scheduler.json", folder / "log"
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    common = ["--scheduler-file", str(found), "--no-dashboard"]
+    commands = [["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", *common]] + [
+        ["distributed.cli.dask_worker", "--nthreads", "1", "--name", name, "--local-directory", str(folder), *common]
+        for name in ("one", "two")
+    ]
+    processes: list[subprocess.Popen[bytes]] = []
+    with ExitStack() as stack:
+        output = stack.enter_context(log.open("wb"))
+        try:
+            processes += [
+                subprocess.Popen(
+                    [sys.executable, "-m", *command], cwd=ROOT, env=environment, stdout=output, stderr=output
+                )
+                for command in commands
+            ]
+            with Client(scheduler_file=str(found), timeout=STARTED_S) as client:
+                client.wait_for_workers(2, timeout=STARTED_S)
+                address = str(client.scheduler.address)
+            yield address
+        finally:
+            for process in reversed(processes):
+                process.terminate()
+            for process in processes:
+                process.wait(STARTED_S)
+
+
+def square(shared: dict[str, float], item: int) -> float:
+    """Return what every kind of worker has to return alike."""
+    return float(np.sin(shared["factor"] * item) ** 2)
+
+
+def fails(_: None, item: int) -> int:
+    """Fail for one item."""
+    if item == 2:
+        raise UserError("item 2 is wrong")
+    return item
+
+
+def dies_once(folder: str, item: int) -> int:
+    """Leave a line for every run; item 4 kills its worker the first time."""
+    with (Path(folder) / "runs").open("a") as file:
+        file.write(f"{item}\n")
+    first = Path(folder) / "killed"
+    if item == 4 and not first.exists():
+        first.write_text(str(os.getpid()))
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item * item
+
+
+def test_the_numbers_are_the_same_wherever_they_are_computed(scheduler: str) -> None:
+    items, shared = list(range(12)), {"factor": 0.37}
+    alone = dict(InTurn().map(square, shared, items))
+    assert dict(Processes(2).map(square, shared, items)) == alone
+    with workers(scheduler) as cluster:
+        assert dict(cluster.map(square, shared, items)) == alone
+
+
+def test_what_a_task_raises_is_raised_here(scheduler: str) -> None:
+    with workers(scheduler) as cluster, pytest.raises(UserError, match="item 2 is wrong"):
+        list(cluster.map(fails, None, range(4)))
+
+
+def test_a_worker_killed_in_the_middle_costs_only_its_tasks(scheduler: str, tmp_path: Path) -> None:
+    with workers(scheduler) as cluster:
+        results = dict(cluster.map(dies_once, str(tmp_path), range(12)))
+    assert results == {item: item * item for item in range(12)}
+    assert (tmp_path / "killed").exists()
+    runs = [int(line) for line in (tmp_path / "runs").read_text().split()]
+    # Twice ran the task that it died of, and what it had done but not yet handed over; all else once.
+    assert runs.count(4) == 2
+    assert len(runs) < 2 * 12 - 3
+
+
+@pytest.fixture(scope="session")
+def banks(scheduler: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return a bank built here, and the same one built on the cluster; before any test is watched (tqdm's thread)."""
+    folder = tmp_path_factory.mktemp("banks")
+    (folder / "tip.yaml").write_text(FINGERTIP)
+    (folder / "bank.yaml").write_text(BANK)
+    built = []
+    for name, options in (("here", ["--jobs", "1"]), ("there", ["--cluster", scheduler])):
+        built.append(folder / f"{name}.bank")
+        command = ["bank", "build", "--config", str(folder / "bank.yaml"), "--out", str(built[-1]), *options]
+        assert main(command) == 0
+    return built[0], built[1]
+
+
+def test_a_bank_has_the_same_bytes_from_a_cluster(banks: tuple[Path, Path]) -> None:
+    assert banks[0].read_bytes() == banks[1].read_bytes()
+
+
+def test_recordings_are_evaluated_to_the_same_figures_on_a_cluster(
+    scheduler: str, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slices, calibration = str(shared / "recordings" / "torque_slices"), str(tmp_path / "slices.cal")
+    assert main(["calibrate", slices, "--estimator", "regression", "--part", "0:0.6", "--out", calibration]) == 0
+    figures = []
+    for options in ([], ["--cluster", scheduler]):
+        capsys.readouterr()
+        assert main(["evaluate", calibration, slices, "--part", "0.6:1", "--json", *options]) == 0
+        found = json.loads(capsys.readouterr().out)
+        figures.append({name: value for name, value in found.items() if not name.startswith("latency")})
+    assert figures[0] == figures[1]
+
+
+def test_no_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "tip.yaml").write_text(FINGERTIP)
+    (tmp_path / "bank.yaml").write_text(BANK)
+    command = ["bank", "build", "--config", str(tmp_path / "bank.yaml"), "--out", str(tmp_path / "a.bank")]
+    assert main([*command, "--cluster", "tcp://127.0.0.1:9"]) == 2
+    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
+
+
+def test_without_the_extra_an_address_is_refused_and_a_local_cluster_is_processes(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with workers("local", 2) as pool:
+        assert isinstance(pool, Processes)
+    with pytest.raises(UserError, match=r"pip install 'shearloop\[cluster\]'"), workers("tcp://127.0.0.1:9"):
+        pass

@@ -4,7 +4,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
-from daemon.cli.recorded import add_cluster
+from daemon.cli.cluster import add_cluster
 
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",

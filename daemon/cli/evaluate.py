@@ -5,7 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-from daemon.cli.recorded import add_cluster
+from daemon.cli.cluster import add_cluster
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -1,20 +1,7 @@
 """Arguments that the commands on recordings share."""
 
-import argparse
-
 from daemon.errors import UserError
 from daemon.recording.schema import SIDES
-
-
-def add_cluster(parser: argparse.ArgumentParser) -> None:
-    """Add the option that moves heavy work to the workers of a Dask cluster."""
-    parser.add_argument(
-        "--cluster",
-        nargs="?",
-        const="local",
-        metavar="ADDRESS",
-        help="run on the Dask scheduler at this address, such as tcp://host:8786; alone: on a cluster of this machine",
-    )
 
 
 def parsed_part(text: str) -> tuple[float, float]:

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, Self
 
-from daemon.cli.recorded import add_cluster
+from daemon.cli.cluster import add_cluster
 from daemon.errors import UserError
 
 if TYPE_CHECKING:

@@ -117,7 +117,6 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
             values[known],
             _curve(curve) if blank.estimator == "fused" else _ridge(blank.estimator),
             strengths=_strengths(blank.estimator),
-            kind="difference",
         )
         tasks[name] = Task(reader, DifferenceGuard.fit(differences[:, 0]))
     if not tasks:

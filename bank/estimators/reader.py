@@ -9,16 +9,18 @@ import numpy as np
 from bank.errors import CalibrationError
 from bank.estimators.heads import Censored, Curve, Ridge, Rows, best_strength, later_splits, left_out_blocks
 from bank.estimators.intervals import Intervals
-from bank.estimators.values import FloatArray, Kind
+from bank.estimators.values import FloatArray
 
 Head: TypeAlias = Ridge | Censored | Curve
 HeadOf: TypeAlias = Callable[[FloatArray, FloatArray, float], Head]
 
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
-# Another stretch of frames lies further from the past than one part of a recording from the next. What drifts from
-# repeat to repeat has an error of few standard deviations and no tails: slices left out in turn are far enough.
-INFLATION = {"raw": 1.1, "difference": 1.0}
+# Future data lies further from the past than one part of a recording from the next …
+_INFLATION = 1.1
+# … but the error of a curve of slices is of what drifts from repeat to repeat, with few standard deviations and no
+# tails: blocks left out in turn are as far (docs/decisions/0042).
+_CURVE_INFLATION = 1.0
 _LEAST_FRAMES = 8
 # No interval is narrower than this share of the calibrated range: a load cell has noise too.
 _LEAST_HALF_WIDTH = 1e-3
@@ -69,7 +71,6 @@ def fit_reader(
     strengths: tuple[float, ...] = STRENGTHS,
     limit_reach: bool = False,
     edges: tuple[float, ...] = (),
-    kind: Kind = "raw",
 ) -> Reader:
     """Fit a head to (n, d) features and (n,) values in time order, and intervals to the residuals of what was left out.
 
@@ -95,11 +96,12 @@ def fit_reader(
     head = head_of(features, values, strength)
     if isinstance(head, Censored):
         edges = (-head.sigma, 0.0, 0.4 * float(np.abs(values).max()))
+    inflation = _CURVE_INFLATION if isinstance(head, Curve) else _INFLATION
     centre = features.mean(axis=0)
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)
     return Reader(
         head,
-        Intervals.fit(predicted, residuals, edges, INFLATION[kind], _LEAST_HALF_WIDTH * float(np.ptp(values))),
+        Intervals.fit(predicted, residuals, edges, inflation, _LEAST_HALF_WIDTH * float(np.ptp(values))),
         float(values.min()),
         float(values.max()),
         centre,

@@ -299,6 +299,7 @@ def draw(path: Path, faults: list[dict[str, Any]], jitter: dict[str, NDArray[np.
     for name, gaps in jitter.items():
         ordered = np.sort(gaps) * 1e3
         right.plot(ordered, 1.0 - np.arange(len(ordered)) / len(ordered), label=name, drawstyle="steps-post")
+    right.set_xscale("log")
     right.set_yscale("log")
     right.set_xlabel("time between two states of the robot, ms (125 a second)")
     right.set_ylabel("share that is longer")

@@ -118,6 +118,8 @@ class Brain:
 
     def pause(self) -> str | None:
         """Stand still until `resume`, or return why not."""
+        if self.experiment is not None and self.experiment.phase is Phase.PAUSED:
+            return "the experiment is paused already; `resume` goes on with it"
         if self.experiment is None or self.experiment.phase is not Phase.RUNNING:
             return "no experiment is running"
         self.experiment.pause()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from bench import stability_map, step_response
+from bench import stability_map, step_response, twin_step
 from bench.closed_loop import nanoseconds, run
 from bench.plant import LOAD_CELL, Plant, Sensor, Tool
 from daemon.control.controller import WristCommand
@@ -111,3 +111,13 @@ def test_the_map_bench_writes_numbers_and_a_chart(tmp_path: Path, monkeypatch: p
     for worst in figures["worst_disagreement"].values():
         assert max(worst.values()) < 0.05
     assert (tmp_path / "stability_map.png").stat().st_size > 10_000
+
+
+def test_the_step_on_the_rigs_own_physics_is_held_and_a_screw_ends_at_its_target() -> None:
+    numbers, tables, beyond, allowed = twin_step.measure(2)
+    assert numbers["eit"]["time_in_band_mean"] > 0.95
+    assert numbers["load_cell"]["in_band_at_settling_time_share"] == 1.0
+    assert abs(tables["load_cell"][:, -1] - 0.1).max() < 0.002
+    assert (abs(beyond) <= allowed).all()
+    creep = twin_step.calibrated_creep()
+    assert (creep.share, creep.time_s) == (pytest.approx(0.08, abs=0.02), pytest.approx(20.0, rel=0.5))

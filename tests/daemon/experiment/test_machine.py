@@ -144,6 +144,7 @@ def test_a_steps_limits_only_tighten_the_experiments() -> None:
         ({"do": "twist", "angles_rad": "0:1:1"}, "steps from 2 to 1000"),
         ({"do": "twist", "angles_rad": ["nan"]}, "finite"),
         ({"do": "fly"}, "'approach', 'retreat'"),
+        ({"do": "approach"}, "either pose_m_rad or along_tool_m"),
         ({"do": "grip", "width_mm": 200}, "140"),
         ({"do": "grip", "widht_mm": 20}, "not permitted"),
     ],

@@ -236,6 +236,16 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
     assert rig.speed > 0.0, "it goes on by itself"
 
 
+def test_a_pause_is_refused_with_the_reason() -> None:
+    rig = started(Rig(brain()), {"do": "wait", "wait_s": 60})
+    rig.step()
+    assert rig.brain.pause() is None
+    assert "paused already" in (rig.brain.pause() or "")
+    assert rig.brain.resume() is None
+    rig.brain.stop("the operator said so")
+    assert rig.brain.pause() == "no experiment is running"
+
+
 def test_a_task_that_died_stops_the_wrist_and_says_of_what() -> None:
     rig = started(Rig(brain()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)

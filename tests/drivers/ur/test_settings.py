@@ -48,6 +48,7 @@ def test_all_mistakes_are_told_together(tmp_path: Path) -> None:
         ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: 60", "three times"),
         ("host: 192.168.1.10", "host: 192.168.1.10\nhang_timeout_s: 0", "above 0"),
         ("margin_rad: 0.1", "margin_rad: 3.2", "no room"),
+        ("{inner: 4.0, hard: 8.0}", "{inner: 4.0, hard: 50.0}", "more than ur-rtde takes, which is 40"),
         ("margin_m: 0.02", "margin_m: 0", "above 0"),
         ("host: 192.168.1.10\n", "", "host: Field required"),
         ("limits:", "limits", "cannot be read"),

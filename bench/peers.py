@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from bank.bank_file import Bank
+from bank.bank_file import MIN_SIGNAL_NORM, Bank
 from bank.batch_forward import BatchForwardModel
 from bank.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
@@ -73,7 +73,8 @@ def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], dict[str, floa
     errors = []
     for voltages, each in zip(found, settings, strict=False):
         truth = model.direct.voltages(of.of(MODEL, *each))
-        errors.append(np.linalg.norm(voltages - truth) / np.linalg.norm(truth - homogeneous))
+        if (size := np.linalg.norm(truth - homogeneous)) >= MIN_SIGNAL_NORM:
+            errors.append(np.linalg.norm(voltages - truth) / size)
     return methods, {"largest": float(np.max(errors)), "cells": len(errors)}
 
 

@@ -1,0 +1,53 @@
+"""The bench of peers: what it compares agrees, and ratios are of one turn."""
+
+import numpy as np
+import pytest
+
+from bank.bank_file import Bank, BankDefinition, write_bank
+from bench import peers
+from tests.bank.conftest import small_fingertip
+
+
+@pytest.fixture(scope="module")
+def bank(tmp_path_factory) -> Bank:
+    path = tmp_path_factory.mktemp("bank") / "a.bank"
+    random, grid = np.random.default_rng(1), np.linspace(1.0, 2.0, 8)
+    signals = random.normal(0.0, 0.05, (8, 8, 896)).astype(np.float32)
+    definition = BankDefinition("ab" * 32, "gaussian_derivative", grid, grid)
+    write_bank(path, definition, signals[0, 0], np.ones((8, 8)), np.ones((8, 8), bool), signals)
+    return Bank.open(path)
+
+
+def test_ratios_are_taken_turn_by_turn() -> None:
+    seconds = {"own": [1.0, 2.0, 4.0], "peer": [3.0, 6.0, 12.0], "other": [1.0, 1.0, 1.0]}
+    found = peers.ratios(seconds, "own", iter(("peer", "absent")))
+    assert found == {"peer / own": {"median": 3.0, "low": 3.0, "high": 3.0, "n": 3}}
+
+
+def test_methods_take_turns() -> None:
+    calls: list[str] = []
+    methods = {name: (lambda name=name: calls.append(name), 1) for name in ("a", "b")}
+    found = peers.take_turns(methods, 3)
+    assert calls == ["a", "b"] * 4, "once to warm up, then in turns"
+    assert {name: len(each) for name, each in found.items()} == {"a": 3, "b": 3}
+
+
+def test_the_fast_ways_give_what_the_slow_ones_give(bank, monkeypatch) -> None:
+    monkeypatch.setattr(peers, "N_CELLS", 20)
+    methods, error = peers.cell_methods(small_fingertip())
+    assert 10 < error["cells"] <= 20
+    assert error["largest"] < 1e-9
+    one, two = methods["fast, one thread"][0](), np.vstack(methods["fast, two threads"][0]())
+    np.testing.assert_array_equal(one, two)
+    frames = peers.frames_of(bank, None)
+    matches, same = peers.match_methods(bank, frames)
+    assert same == peers.N_CHECKED
+    quick, plain = (matches[name][0]() for name in ("zero lag, fast", "zero lag, numpy float32"))
+    assert [bank.signals.shape[1] * each.cell[0] + each.cell[1] for each in quick] == plain
+
+
+def test_fewer_than_five_turns_are_refused(monkeypatch, capsys) -> None:
+    monkeypatch.setattr("sys.argv", ["peers", "--bank", "x", "--out", "y", "--turns", "4"])
+    with pytest.raises(SystemExit):
+        peers.main()
+    assert "--turns must be 5 or more" in capsys.readouterr().err

@@ -13,6 +13,8 @@ from bank.errors import CalibrationError
 from bank.skin.calibration import CalibrationTable, SkinCalibration
 
 FORMAT = "shearloop skin calibration 1"
+# A load cell at rest may read a little less than nothing; a skin cannot be pulled off its core.
+MOST_PULL_N = 0.05
 COLUMNS = ("r1_ohm", "r2_ohm", "shear_n", "normal_n")
 
 
@@ -48,6 +50,10 @@ def _numbers(path: Path, line: int, row: dict[str | None, str]) -> list[float]:
             number = math.nan
         if not math.isfinite(number) or (column.endswith("_ohm") and number <= 0):
             raise CalibrationError(f"{path}, line {line}: {column} is {row[column]!r}, not a usable number.")
+        if column == "normal_n" and number < -MOST_PULL_N:
+            raise CalibrationError(
+                f"{path}, line {line}: normal_n is {row[column]}; a force that presses on the skin is positive."
+            )
         numbers.append(number)
     return numbers
 

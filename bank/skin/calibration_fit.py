@@ -25,6 +25,10 @@ UNLOADED_BELOW_N = 0.02
 MOST_FRICTION = 0.5
 # A table that leaves the friction coefficient less certain than this says nothing about it.
 FRICTION_STD = 0.02
+NOT_RISING = (
+    "The response does not rise with the shear force everywhere; check that R1 is the gauge stretched by a positive "
+    "shear force, and that no gauge is broken."
+)
 FEWEST_PER_PIECE, MOST_PIECES = 8, 6
 
 
@@ -76,6 +80,8 @@ def fit_calibration(
         raise CalibrationError(
             f"{curve.rows} rows under load cannot carry {curve.pieces} pieces of curve and an interval; record more."
         )
+    if not curve.rises(PAPER_SECTION.friction if friction is None else friction):
+        raise CalibrationError(NOT_RISING)
     if friction is None:
         friction = _fit_friction(curve)
     idle = loading == 0
@@ -121,6 +127,10 @@ class _Curve:
         """The sum of squared residuals with the best curve for this friction."""
         return float(nnls(self._design(self._tensions(friction)), self._response)[1] ** 2)
 
+    def rises(self, friction: float) -> bool:
+        """Whether the response goes with the tension at all, and not against it."""
+        return float(self._tensions(friction) @ self._response) > 0.0
+
     @property
     def total_squares(self) -> float:
         return float(self._response @ self._response)
@@ -132,10 +142,7 @@ class _Curve:
         ends = min(float(tension.min()), 0.0), max(float(tension.max()), 0.0)
         knots = np.concatenate([[ends[0]], -self._lower[::-1], self._upper, [ends[1]]])
         if not (slopes > 0).all() or not (np.diff(knots) > 0).all():
-            raise CalibrationError(
-                "The response does not rise with the shear force everywhere; check that R1 is the gauge stretched by "
-                "a positive shear force, and that no gauge is broken."
-            )
+            raise CalibrationError(NOT_RISING)
         leverage = (np.linalg.qr(design).Q ** 2).sum(axis=1).max()
         freedom = self.rows - self.pieces
         scatter = distance / math.sqrt(freedom)

@@ -73,13 +73,18 @@ def _cell(value: str | float | None) -> str:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
+    from bank.errors import CalibrationError
     from bank.skin.calibration_file import read_table, save_calibration
     from bank.skin.calibration_fit import fit_calibration
     from daemon.errors import UserError
 
     if args.friction is not None and not 0 <= args.friction <= 1:
         raise UserError(f"--friction is {args.friction}; a coefficient of friction lies between 0 and 1.")
-    calibration = fit_calibration(read_table(args.table), friction=args.friction)
+    table = read_table(args.table)
+    try:
+        calibration = fit_calibration(table, friction=args.friction)
+    except CalibrationError as error:
+        raise UserError(f"{args.table}: {error}") from error
     save_calibration(calibration, args.out)
     whence = "fitted" if args.friction is None else "given"
     print(f"friction coefficient ({whence})        {calibration.friction:.4f}")

@@ -156,6 +156,8 @@ def test_swapped_gauges_few_rows_and_no_rest_are_refused_with_their_cure() -> No
     table = record(FULL)
     with pytest.raises(CalibrationError, match="R1 is the gauge stretched by a positive shear force"):
         fit_calibration(CalibrationTable(table.r2_ohm, table.r1_ohm, table.shear_n, table.normal_n), friction=0.04)
+    with pytest.raises(CalibrationError, match="R1 is the gauge stretched by a positive shear force"):
+        fit_calibration(CalibrationTable(table.r1_ohm, table.r2_ohm, -table.shear_n, table.normal_n))
     with pytest.raises(CalibrationError, match="record more"):
         fit_calibration(record([(1.0, loading(0.3))]), friction=0.04)
     with pytest.raises(CalibrationError, match="begin with a row without load"):
@@ -223,6 +225,7 @@ def test_a_table_is_read_whatever_the_order_of_its_columns(tmp_path: Path) -> No
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0,0\n", "line 2: there are more values"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n25,inf,0,0\n", "r2_ohm is 'inf'"),
         ("r1_ohm,r2_ohm,shear_n,normal_n\n0,25,0,0\n", "r1_ohm is '0'"),
+        ("r1_ohm,r2_ohm,shear_n,normal_n\n25,25,0,0\n25,25,1,-1\n", "line 3: normal_n is -1; a force that presses"),
     ],
 )
 def test_a_table_with_a_mistake_is_refused_by_line_and_column(text: str, named: str, tmp_path: Path) -> None:

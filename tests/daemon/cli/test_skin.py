@@ -87,6 +87,16 @@ def test_calibrate_takes_a_table_to_a_file(tmp_path: Path, capsys: pytest.Captur
     assert "(given)" in capsys.readouterr().out
 
 
+def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table, out = tmp_path / "table.csv", tmp_path / "skin.yaml"
+    write_table(table)
+    # The gauges the other way round.
+    table.write_text(table.read_text().replace("r1_ohm,r2_ohm", "r2_ohm,r1_ohm"))
+    assert main(["skin", "calibrate", str(table), "--out", str(out)]) == 2
+    assert f"{table}: The response does not rise with the shear force" in capsys.readouterr().err
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [(["none.csv"], "none.csv: the table cannot be read"), (["none.csv", "--friction", "2"], "--friction is 2.0")],

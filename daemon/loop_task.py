@@ -133,7 +133,8 @@ class LoopTask:
         self._brain.senses.arm = Arm(
             wrist_rad=state.wrist_rad,
             wrist_torque_nm=state.wrist_torque_nm,
-            t_ns=state.t_mono_ns,
+            # The moment that the controller speaks of: one that repeats itself is as stale as one that is silent.
+            t_ns=state.t_mono_ns - state.age_ns,
             protective_stop=state.protective_stop,
             emergency_stop=state.emergency_stop,
             blocked=state.blocked,

@@ -123,9 +123,9 @@ async def running_rig(
 
 
 async def started(command: Callable[..., Any], path: str) -> None:
-    """Start an experiment as soon as the robot is ready for it."""
+    """Start an experiment as soon as robot and gripper are ready for it: on a busy machine they may be late."""
     reply = await command("start", experiment=path)
-    while not reply["ok"] and "being made ready" in reply["why"]:
+    while not reply["ok"] and ("being made ready" in reply["why"] or "out of date" in reply["why"]):
         reply = await command("start", experiment=path)
     assert reply["ok"], reply
 

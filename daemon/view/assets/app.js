@@ -73,6 +73,7 @@ function fingertips() {
       tips.delete(source);
     }
   }
+  document.querySelector("main").classList.toggle("two-tips", sources.length > 1);
   for (const source of sources) {
     if (!tips.has(source)) tips.set(source, new FingertipPanel(source, settings.fingertip));
     tips.get(source).update(link);

@@ -7,9 +7,13 @@ const MOST_ROWS = 6000;
 const LATEST_S = 10;
 
 export class Series {
-  constructor() { this.clear(); }
+  constructor() {
+    this.version = 0;
+    this.clear();
+  }
 
   clear() {
+    this.version += 1;
     this.times = [];
     this.columns = new Map();
     this.last = new Map();
@@ -35,6 +39,7 @@ export class Series {
   }
 
   insert(t, values) {
+    this.version += 1;
     // Frames speak of the middle of their acquisition and come a little out of order.
     let at = this.times.length;
     while (at > 0 && this.times[at - 1] > t) at -= 1;
@@ -48,9 +53,32 @@ export class Series {
     while (drop < this.times.length && this.times[drop] < before) drop += 1;
     // Not one by one: arrays are cut a second at a time.
     if (drop < 40) return;
+    this.version += 1;
     this.times.splice(0, drop);
     for (const column of this.columns.values()) column.splice(0, drop);
   }
 
-  data(names) { return [this.times, ...names.map((name) => this.column(name))]; }
+  // Rows for uPlot, computed anew only after something came.
+  data(names) {
+    const key = names.join("\n");
+    if (this.drawn?.key !== key || this.drawn.version !== this.version) {
+      this.drawn = { key, version: this.version, rows: [this.times, ...names.map((name) => broken(this.column(name)))] };
+    }
+    return this.drawn.rows;
+  }
+}
+
+// uPlot leaves out what lies between a null and the rows beside it, and those may be of other sources: the null is drawn
+// out to this source's own neighbours.
+function broken(column) {
+  const rows = column.slice();
+  for (let i = 0; i < rows.length; i += 1) {
+    if (rows[i] !== null) continue;
+    for (let before = i - 1; before >= 0 && rows[before] === undefined; before -= 1) rows[before] = null;
+    while (i + 1 < rows.length && (rows[i + 1] === undefined || rows[i + 1] === null)) {
+      i += 1;
+      rows[i] = null;
+    }
+  }
+  return rows;
 }

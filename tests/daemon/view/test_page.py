@@ -140,6 +140,28 @@ def test_the_heatmap_has_k_upwards_and_sigma_to_the_right_and_shades_rise_evenly
     assert grey[-1] - grey[0] > 180
 
 
+def test_lines_break_where_nothing_is_known_and_go_on_past_what_others_say(browsed: Browsed) -> None:
+    rows = browsed.open().evaluate(
+        """async () => {
+          const { Series } = await import('/assets/series.js');
+          const series = new Series();
+          series.add(0.0, { a: 1 }, 5);
+          series.add(0.1, { b: 1 }, 5);
+          series.add(1.0, { a: 2 }, 5);
+          series.add(1.1, { b: 2 }, 5);
+          series.add(2.0, { a: null }, 5);
+          series.add(2.1, { b: 3 }, 5);
+          series.add(3.0, { a: 3 }, 5);
+          series.add(20.0, { b: 4 }, 5);
+          return series.data(['a', 'b']).map((column) => column.map((value) => value === undefined ? '' : value));
+        }"""
+    )
+    times, a, b = rows
+    assert times == [0.0, 0.1, 1.0, 1.1, 2.0, 2.1, 3.0, 4.6, 20.0]
+    assert a == [1, "", 2, None, None, None, 3, "", ""]
+    assert b == ["", 1, "", 2, "", 3, None, None, 4], "a pause breaks the line as well"
+
+
 def test_an_invalid_estimate_is_no_number(browsed: Browsed) -> None:
     nothing = {"torque_nm": None, "torque_low_nm": None, "torque_high_nm": None, "diameter_mm": None}
     browsed.daemon.say(estimate={**nothing, "valid": False, "why": "no signal above the noise"})

@@ -202,7 +202,7 @@ class LoopConfig(ConfigModel):
 class RecordingConfig(ConfigModel):
     """What is kept of every run: all messages and all raw inputs, a file for each experiment."""
 
-    folder: Path = Field(description="made where it is not there; one daemon writes some 80 MB an hour")
+    folder: Path = Field(description="made where it is not there; a rig with one fingertip writes some 50 MB an hour")
 
 
 class Happening(ConfigModel):

@@ -3,6 +3,8 @@
 const RETRY_MS = 500;
 // The viewer says something every quarter of a second; after this silence the connection is taken for lost.
 const LOST_AFTER_S = 1.0;
+// What is said of a time further from now is said by a replay; until it speaks of times that much earlier, it goes on.
+const REPLAYED_S = 5.0;
 
 const seconds = () => performance.now() / 1000;
 
@@ -16,6 +18,7 @@ export class Link {
     this.batchAt = null;
     this.daemonAt = null;
     this.offset = Date.now() / 1000 - seconds();
+    this.said = null;
     this.connect();
   }
 
@@ -32,6 +35,7 @@ export class Link {
       // Another viewer, perhaps another daemon: nothing from before may stand beside what comes now.
       this.latest.clear();
       this.daemonAt = null;
+      this.said = null;
     }
     this.batchAt = now;
     this.offset = batch.now - now;
@@ -43,10 +47,19 @@ export class Link {
       this.latest.set(`${message.topic}/${message.content.source}`, message);
       this.onMessage(message);
     }
+    if (batch.messages.length) this.hear(Math.max(...batch.messages.map((message) => message.content.timestamp - message.at)));
   }
 
-  // Unix time by the viewer's clock: the tablet's own may be wrong.
-  unixNow() { return seconds() + this.offset; }
+  // The latest time that is spoken of, less this page's: a frame speaks of a while ago, what follows it of now.
+  hear(said) {
+    if (this.said === null || said > this.said || this.said - said > REPLAYED_S) this.said = said;
+  }
+
+  // Unix time by the viewer's clock (the tablet's own may be wrong); of a replay, the recording's.
+  unixNow() {
+    const replayed = this.said !== null && Math.abs(this.said - this.offset) > REPLAYED_S;
+    return seconds() + (replayed ? this.said : this.offset);
+  }
 
   sinceBatch() { return this.batchAt === null ? Infinity : seconds() - this.batchAt; }
 

@@ -186,7 +186,9 @@ COMMANDS = ("tare", "start", "pause", "resume", "unlock", "stop")
 def made(given: Mapping[str, Any]) -> Message:
     """Return the message of these values; keys that the page does not show are left empty."""
     kind: type[Message] = given["kind"]
-    return kind(**{item.name: given.get(item.name) for item in dataclasses.fields(kind)})
+    # A replay speaks of a while ago.
+    values = {**given, "t_mono_ns": given["t_mono_ns"] - round(given.get("ago_s", 0.0) * 1e9)}
+    return kind(**{item.name: values.get(item.name) for item in dataclasses.fields(kind)})
 
 
 def said(folder: Path) -> list[Message]:

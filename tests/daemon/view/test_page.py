@@ -25,6 +25,18 @@ LIGHTNESS = """() => {
     best: light(at(0.17, 0.14)), other: light(at(0.8, 0.2)), lower: light(at(0.15, 0.8)), blank: at(0.97, 0.97)[3],
   };
 }"""
+# Whether a chart shows lines: axes and grid are grey.
+COLOURED = """(chart) => {
+  const canvas = document.querySelector(`${chart} canvas`);
+  if (!canvas?.width) return false;
+  const { data } = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height);
+  let coloured = 0;
+  for (let i = 0; i < data.length; i += 4) {
+    const spread = Math.max(data[i], data[i + 1], data[i + 2]) - Math.min(data[i], data[i + 1], data[i + 2]);
+    coloured += data[i + 3] > 128 && spread > 60;
+  }
+  return coloured > 20;
+}"""
 # The lightness of the scale of shades from its lower to its upper end.
 GREY = """async () => {
   const { shade } = await import('/assets/pictures.js');
@@ -175,6 +187,13 @@ def test_an_invalid_estimate_is_no_number(browsed: Browsed) -> None:
             "#diameter": "–",
         }
     )
+
+
+def test_a_replay_is_drawn_at_the_times_that_it_speaks_of(browsed: Browsed) -> None:
+    browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES})
+    browsed.open()
+    for chart in ("#torque-chart", "#shear-chart"):
+        browsed.page.wait_for_function(COLOURED, arg=chart)
 
 
 def test_every_reason_for_holding_is_told(browsed: Browsed) -> None:

@@ -159,7 +159,13 @@ def _draw_forward(axes: Axes, solved: Sequence[Solved]) -> None:
                 axes.axvline(one.cell_ms, color=shade, linestyle=LINES[number % len(LINES)], label=one.name)
             else:
                 text = f"{one.name}\n{one.triangles} triangles"
-                axes.annotate(text, (one.cell_ms, one.error), xytext=(6, 4), textcoords="offset points", fontsize=7)
+                axes.annotate(
+                    text,
+                    (one.cell_ms, one.error),
+                    xytext=(6, 4 if number % 2 else -18),
+                    textcoords="offset points",
+                    fontsize=7,
+                )
     axes.set(
         title=f"Forward methods, {len(CELLS)} cells of the Gaussian derivative",
         xlabel="time per cell, ms (one thread; cited ones from elsewhere)",

@@ -254,6 +254,7 @@ class Daemon:
             "pause": self._pause,
             "resume": self._resume,
             "unlock": self._unlock,
+            "set": self._set,
         }
 
     def _open_handlers(self) -> Mapping[str, Handler]:
@@ -318,6 +319,18 @@ class Daemon:
         for name in tared:
             tares[name]()
         return {"tared": tared}
+
+    async def _set(self, request: Mapping[str, Any]) -> Reply:
+        """Change what may be changed while it runs; nothing that moves anything is among it."""
+        source, heatmap = request.get("source"), request.get("heatmap")
+        if heatmap not in ("always", "on_request"):
+            raise CommandRefusedError("only `heatmap` can be set while it runs, to always or on_request")
+        if source is not None and not (isinstance(source, str) and source in self._fingertips):
+            raise CommandRefusedError(f"there is no fingertip {source!r}; there are {', '.join(self._fingertips)}")
+        names = [source] if source is not None else list(self._fingertips)
+        for name in names:
+            self._fingertips[name].always_heatmap = heatmap == "always"
+        return {"set": names, "heatmap": heatmap}
 
     async def _status(self, _request: Mapping[str, Any]) -> Reply:
         return {"tasks": self._health.tasks()}

@@ -38,7 +38,7 @@ class FingertipTask:
         self._board = board
         self._publisher = publisher
         self._pass_on = pass_on
-        self._always_heatmap = always_heatmap
+        self.always_heatmap = always_heatmap
         self._backlog: asyncio.Queue[Frame] = asyncio.Queue(LARGEST_BACKLOG)
 
     async def read(self) -> None:
@@ -70,7 +70,7 @@ class FingertipTask:
 
     async def _publish_heatmap(self, frame: Frame, reading: Reading) -> None:
         """Publish all scores where somebody looks at them, at their own price: no estimate waits for them."""
-        if not (self._always_heatmap or self._publisher.wanted(EitHeatmap.topic)) or not self._backlog.empty():
+        if not (self.always_heatmap or self._publisher.wanted(EitHeatmap.topic)) or not self._backlog.empty():
             return
         estimator = self.estimation.estimator
         heatmap = await asyncio.to_thread(estimator.heatmap, reading)

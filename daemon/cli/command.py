@@ -14,6 +14,7 @@ COMMANDS = {
     "resume": "go on",
     "stop": "end the experiment and stand still; where none is running, end the daemon",
     "unlock": "let robot and gripper move again after a stop, once it is safe",
+    "set": "change what may change while it runs: --heatmap",
 }
 
 
@@ -24,7 +25,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         choices=COMMANDS,
         help="; ".join(f"{name}: {what}" for name, what in COMMANDS.items()),
     )
-    parser.add_argument("--source", help="the fingertip to tare, or `skin`; all by default")
+    parser.add_argument("--source", help="the fingertip to tare or to set, or `skin`; all by default")
+    parser.add_argument(
+        "--heatmap", choices=("always", "on_request"), help="what to set: whether heatmaps wait for a subscriber"
+    )
     parser.add_argument(
         "--experiment", type=Path, metavar="FILE", help="what to start; else what the daemon's configuration names"
     )
@@ -44,6 +48,8 @@ def run(args: argparse.Namespace) -> int:
     from daemon.subscriber import checked_timeout_s
 
     arguments = {} if args.source is None else {"source": args.source}
+    if args.heatmap is not None:
+        arguments["heatmap"] = args.heatmap
     if args.experiment is not None:
         # The daemon may run in another folder.
         arguments["experiment"] = str(args.experiment.resolve())

@@ -106,4 +106,5 @@ A request is one msgpack map, `{{"command": NAME}}` with what the command takes 
 {table(("command", "what it does"), rows)}
 
 `start` takes `experiment`, the path of a file on the daemon's computer, or starts what the configuration names; `tare`
-takes `source`, one sensor's name, or tares all."""
+takes `source`, one sensor's name, or tares all; `set` takes `heatmap` (`always` or
+`on_request`) and `source`, one fingertip's name, or sets all."""

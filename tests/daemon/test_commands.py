@@ -3,7 +3,7 @@ import os
 import socket
 import threading
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,10 @@ import zmq.asyncio
 from hypothesis import given
 from hypothesis import strategies as st
 
+from daemon.app import Daemon
 from daemon.clock import Clock
 from daemon.command_server import CommandRefusedError, CommandServer
+from daemon.config import load_daemon_config
 from daemon.errors import UserError
 from daemon.messages import decode, encode
 from daemon.publisher import Publisher
@@ -137,3 +139,23 @@ def test_what_is_not_a_daemons_is_a_sentence(tmp_path: Path) -> None:
                 next(heard)
             sending.join()
             stranger.recv()
+
+
+async def test_what_may_change_while_it_runs_is_set_and_nothing_else(config: Callable[..., Path]) -> None:
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(config()), context)
+        change = daemon._handlers()["set"]
+        assert not daemon._fingertips["right"].always_heatmap
+        assert await change({"heatmap": "always"}) == {"set": ["right"], "heatmap": "always"}
+        assert daemon._fingertips["right"].always_heatmap
+        await change({"heatmap": "on_request", "source": "right"})
+        assert not daemon._fingertips["right"].always_heatmap
+        for wrong, why in (
+            ({}, "only `heatmap` can be set"),
+            ({"heatmap": ["always"]}, "only `heatmap` can be set"),
+            ({"torque_limit_nm": 9}, "only `heatmap` can be set"),
+            ({"heatmap": "always", "source": "left"}, "there is no fingertip 'left'; there are right"),
+        ):
+            with pytest.raises(CommandRefusedError, match=why):
+                await change(wrong)
+        daemon._close()

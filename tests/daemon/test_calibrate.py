@@ -190,7 +190,7 @@ def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Pat
         (("gripper-socket", "--port", "70000"), "no port"),
         (("gripper-socket", "--object-mm", "900"), "width in mm"),
         (("gripper-socket", "--bind", "192.0.2.1"), "cannot be played"),
-        (("gripper-modbus", "--link", "/nowhere/at/all"), "needs a folder"),
+        (("gripper-modbus", "--link", "/nowhere/at/all"), "/nowhere/at/all cannot be made"),
     ],
 )
 def test_an_emulator_that_cannot_be_played_says_why(

@@ -16,7 +16,8 @@ def checked_link(link: Path | None) -> Path | None:
     if link is None:
         return None
     try:
-        link.parent.mkdir(parents=True, exist_ok=True)
+        # `run/` of a fresh checkout; a longer way that is not there is a mistake.
+        link.parent.mkdir(exist_ok=True)
     except OSError as error:
         raise UserError(f"--link {link} cannot be made: {error.strerror}; choose another folder") from error
     if link.exists() and not link.is_symlink():

@@ -25,12 +25,13 @@ from daemon.fingertip import FingertipTask
 from daemon.health import HealthReporter, TaskFacts
 from daemon.keys import Gatekeeper, load_server_keys
 from daemon.links import log_link
+from daemon.load_cell_task import LOAD_CELL
 from daemon.loop.senses import Source
 from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Listener, Publisher
 from daemon.recording.identity import Attached, identity_of
 from daemon.recording.recorder import Recorder
-from daemon.rig import Rig
+from daemon.rig import Rig, make_load_cell
 from daemon.skin_setup import make_skin, skin_source
 from daemon.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from daemon.supervisor import Supervisor
@@ -86,6 +87,12 @@ class Daemon:
                     self._tap,
                 )
             hear = self._rig.brain.hear if self._rig is not None else lambda _: None
+            self._load_cell = self._rig.load_cell if self._rig is not None else None
+            if self._rig is None and config.load_cell is not None:
+                # Measured and recorded beside the fingertips, while something else twists.
+                self._load_cell = make_load_cell(
+                    config.load_cell, self.publisher, self._clock, hear, self._link_of(LOAD_CELL), self._tap(LOAD_CELL)
+                )
             self._skin: SkinTask | None = None
             if config.skin is not None:
                 self._skin = make_skin(config.skin, self.publisher, self._clock, hear, self._tap)
@@ -125,10 +132,10 @@ class Daemon:
         if self._skin is not None:
             self._health.add(SKIN, self._skin.facts)
             self._health.add(SKIN_SOURCE, self._skin.source_facts)
+        if self._load_cell is not None:
+            self._health.add(LOAD_CELL, self._load_cell.facts)
         if self._rig is not None:
             self._health.add("robot", self._rig.loop.facts)
-            if self._rig.load_cell is not None:
-                self._health.add("load_cell", self._rig.load_cell.facts)
             if self._rig.gripper is not None:
                 self._health.add("gripper", self._rig.gripper.facts)
         if self._recorder is not None:
@@ -178,6 +185,8 @@ class Daemon:
         if self._skin is not None:
             yield supervised(SKIN, self._skin.read)
             yield supervised(SKIN_SOURCE, self._skin.watch_source)
+        if self._load_cell is not None:
+            yield supervised(LOAD_CELL, self._load_cell.read)
         if self._rig is not None:
             for name, run in self._rig.tasks():
                 yield supervised(name, run)
@@ -312,6 +321,8 @@ class Daemon:
         tares: dict[str, Callable[[], None]] = {name: one.tare for name, one in self._estimations.items()}
         if self._skin is not None:
             tares[SKIN] = self._skin.tare
+        if self._load_cell is not None:
+            tares[LOAD_CELL] = self._load_cell.tare
         source = request.get("source")
         if source is not None and not (isinstance(source, str) and source in tares):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(tares)}")

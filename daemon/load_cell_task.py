@@ -46,11 +46,18 @@ class LoadCellTask:
                 )
                 self._take_zero(sample)
 
+    def tare(self) -> None:
+        """Take the mean of the next samples for zero."""
+        self._begin_zero()
+
     async def zero(self) -> str:
         """Take the mean of the next samples for zero; return why it could not be done, or an empty text."""
+        return await self._begin_zero()
+
+    def _begin_zero(self) -> asyncio.Future[str]:
         self._zeroing = []
         self._zeroed = asyncio.get_running_loop().create_future()
-        return await self._zeroed
+        return self._zeroed
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board."""

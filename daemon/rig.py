@@ -171,9 +171,7 @@ class Rig:
         return heard
 
     def tasks(self) -> Iterator[tuple[str, Callable[[], Awaitable[None]]]]:
-        """Yield the name and the coroutine of every task."""
-        if self.load_cell is not None:
-            yield "load_cell", self.load_cell.read
+        """Yield the name and the coroutine of every task but the load cell's, which may run without a rig."""
         if self.gripper is not None:
             yield "gripper", self.gripper.read
         yield "robot", self.robot.run

@@ -250,3 +250,22 @@ async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, t
         if process.returncode is None:
             process.kill()
             await process.wait()
+
+
+async def test_a_load_cell_is_read_without_a_robot_too(config: Write, tmp_path: Path) -> None:
+    link = str(tmp_path / "load-cell")
+    # Lines of torques, of which no calibration is needed.
+    async with running(config(load_cell={"device": {"path": "load-cell"}})) as daemon:
+        torques = collector(daemon, "load.torque")
+        async with shearloop(
+            *("emulate", "hx711", "--paper-sketch", "--torque-nm", "0.08", "--speed", "20", "--link", link),
+            stdin=asyncio.subprocess.PIPE,
+        ):
+            assert (await torques.get())["torque_nm"] == pytest.approx(0.08, abs=0.005)
+            address = f"ipc://{tmp_path}/commands"
+            reply = await asyncio.to_thread(request, address, {"command": "tare", "source": "load_cell"}, DEADLINE_S)
+            assert reply == {"ok": True, "tared": ["load_cell"]}
+            while abs((await torques.get())["torque_nm"]) > 0.005:
+                continue
+            status = await asyncio.to_thread(request, address, {"command": "status"}, DEADLINE_S)
+            assert status["tasks"]["load_cell"]["alive"]

@@ -23,6 +23,8 @@ from daemon.view.latest import Latest
 from daemon.view.server import make_app
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
+pytestmark = pytest.mark.real_time
+
 HOST = "127.0.0.41"
 SPEED = 5
 Write = Callable[..., Path]

@@ -21,6 +21,8 @@ from daemon.keys import make_key_pair
 from daemon.subscriber import messages
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
+pytestmark = pytest.mark.real_time
+
 Write = Callable[..., Path]
 HOST = "127.0.0.43"
 SPEED = 8

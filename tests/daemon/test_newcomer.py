@@ -27,6 +27,8 @@ from daemon.recording.writer import RecordingWriter
 from drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S
 
+pytestmark = pytest.mark.real_time
+
 PROGRAM = ".venv/bin/shearloop"
 N_FRAMES = 180
 GRIPPED = slice(40, 160)

@@ -26,6 +26,8 @@ from drivers.ur.messages import (
 from drivers.ur.settings import UrSettings, read_settings
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
+pytestmark = pytest.mark.real_time
+
 pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
 
 ROOT = Path(__file__).parents[3]

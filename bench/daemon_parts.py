@@ -148,6 +148,17 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / _TICKS_PER_S
 
 
+def cpu_of_threads_s(pid: int) -> dict[str, float]:
+    """Return the processor time of every thread that a process has at present, the first being its main one."""
+    found = {}
+    for task in sorted(Path(f"/proc/{pid}/task").iterdir(), key=lambda each: int(each.name)):
+        with contextlib.suppress(FileNotFoundError):
+            found[f"{task.name} {(task / 'comm').read_text().strip()}"] = (
+                int((task / "schedstat").read_text().split()[0]) / 1e9
+            )
+    return found
+
+
 def memory_mb(pid: int) -> dict[str, float]:
     """Return the resident memory of a process, and its proportional share of what it shares with others."""
     found = {}

@@ -23,6 +23,7 @@ from bank.bank_file import Bank
 from bench.daemon_parts import (
     Board,
     configuration,
+    cpu_of_threads_s,
     cpu_s,
     daemon,
     lines,
@@ -94,8 +95,11 @@ def flood(bank: Path, n_frames: int) -> dict[str, Any]:
     }
 
 
-def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, Any]:
-    """Return processor time and memory with the whole emulated rig at its rated speeds, and with a shared bank."""
+def rated(bank: Path, rig_bank: Path, seconds: float, *, recording: bool = True) -> dict[str, Any]:
+    """Return processor time, of every thread too, and memory with the whole emulated rig at its rated speeds.
+
+    Memory is told at the beginning and at the end, so that one that grows is seen to.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         host = f"127.{os.getpid() >> 14 & 63 | 192}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
@@ -109,6 +113,7 @@ def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, Any]:
             "load_cell": {"device": {"path": "load-cell"}},
             "robot": "ur.yaml",
             "gripper": {"socket": {"host": host}},
+            **({"recording": {"folder": str(folder / "recordings")}} if recording else {}),
         }
         config = folder / "daemon.yaml"
         config.write_text(yaml.safe_dump(content))
@@ -127,18 +132,35 @@ def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, Any]:
                     until = time.monotonic() + 10
                     while time.monotonic() < until:
                         tasks = received(health)[1]["tasks"]
+                    at_first = memory_mb(pid)
                     before = {each: cpu_s(each) for each in tree(pid)}
-                    time.sleep(seconds)
-                    shares = {each: (cpu_s(each) - cpu) / seconds for each, cpu in before.items()}
+                    threads_before = {each: cpu_of_threads_s(each) for each in before}
+                    begun = time.monotonic()
+                    until = begun + seconds
+                    while time.monotonic() < until:
+                        # Read as they come: the last one tells the rates at the end.
+                        tasks = received(health)[1]["tasks"]
+                    took_s = time.monotonic() - begun
+                    shares = {each: (cpu_s(each) - cpu) / took_s for each, cpu in before.items()}
+                    threads = {
+                        "daemon" if each == pid else "robot's process": {
+                            name: (cpu - earlier.get(name, 0.0)) / took_s
+                            for name, cpu in cpu_of_threads_s(each).items()
+                        }
+                        for each, earlier in threads_before.items()
+                    }
                     memory = {each: memory_mb(each) for each in before}
-                    tasks = received(health)[1]["tasks"]
             finally:
                 rig.terminate()
     children = [each for each in shares if each != pid]
     return {
         "ready_s": ready_s,
+        "recording": recording,
+        "seconds": took_s,
         "cpu_share_of_one_core": shares[pid],
         "cpu_share_of_the_robots_process": sum(shares[each] for each in children),
+        "cpu_shares_of_threads": threads,
+        "memory_mb_at_first": at_first,
         "memory_mb": memory[pid],
         "memory_mb_of_the_robots_process": sum(memory[each]["resident"] for each in children),
         "rates_hz": {task: facts.get("rate_hz") for task, facts in tasks.items() if facts.get("rate_hz")},
@@ -210,7 +232,9 @@ def main() -> None:
     if "flood" in wanted:
         found["flood"] = flood(args.bank, 10 * args.frames)
     if "rated" in wanted:
-        found["rated"] = rated(args.bank, args.rig_bank or args.bank, args.rated_s)
+        rig_bank = args.rig_bank or args.bank
+        found["rated"] = rated(args.bank, rig_bank, args.rated_s)
+        found["rated_without_recording"] = rated(args.bank, rig_bank, args.rated_s, recording=False)
     if "shared" in wanted:
         found["shared"] = shared_bank(args.bank)
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -17,9 +17,9 @@ from daemon import sd_notify
 from daemon.addresses import open_stop_address
 from daemon.both import BOTH, BothTask
 from daemon.clock import Clock
-from daemon.command_server import STATUS, STOP, CommandRefusedError, CommandServer, Handler, Reply
+from daemon.command_server import CommandServer
+from daemon.commands import Commands, needed
 from daemon.config import DaemonConfig, Fingertip
-from daemon.errors import UserError
 from daemon.estimation import Estimation
 from daemon.fingertip import FingertipTask
 from daemon.health import HealthReporter, TaskFacts
@@ -36,6 +36,7 @@ from daemon.skin_setup import make_skin, skin_source
 from daemon.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from daemon.supervisor import Supervisor
 from daemon.tool_diameter import FingertipDiameters
+from daemon.tracking import TrackedEstimator
 from drivers.eit_kit import EitKit
 from drivers.raw_input import Tap, no_tap
 from drivers.serial_port import LinkEvent
@@ -49,11 +50,13 @@ class Daemon:
 
     def __init__(self, config: DaemonConfig, context: zmq.asyncio.Context) -> None:
         """Open every file that the configuration names and bind the sockets; devices may come later."""
+        self._config = config
         self._clock = Clock()
         self.supervisor = Supervisor()
         self._stop = asyncio.Event()
         # The configured experiment, until it has begun.
         self._awaited: Path | None = None
+        self._rig: Rig | None = None
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
         both = open_both(config.both, config.fingertips) if config.both is not None else None
         with contextlib.ExitStack() as opened:
@@ -64,41 +67,44 @@ class Daemon:
                 opened.callback(self._gate.close)
             self.publisher = Publisher(context, config.publish, self._clock, keys)
             opened.callback(self.publisher.close)
-            self._commands = CommandServer(context, config.commands, self._handlers(), keys)
-            opened.callback(self._commands.close)
-            self._open_stop: CommandServer | None = None
-            if "commands" in config.network_addresses:
-                self._open_stop = CommandServer(context, open_stop_address(config.commands), self._open_handlers())
-                opened.callback(self._open_stop.close)
             self._recorder = _recorder(config, self.publisher, self._clock, self._busy, self._recording_failed)
             if self._recorder is not None:
                 opened.callback(self._recorder.close)
+            self._wire(estimators, both)
+            self._health = self._make_health()
+            commands = self._make_commands()
+            self._commands = CommandServer(context, config.commands, commands.handlers(), keys)
+            opened.callback(self._commands.close)
+            self._open_stop: CommandServer | None = None
+            if "commands" in config.network_addresses:
+                address = open_stop_address(config.commands)
+                self._open_stop = CommandServer(context, address, commands.open_handlers())
+                opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
-        self._rig: Rig | None = None
-        try:
-            if config.robot is not None:
-                self._rig = Rig(
-                    config,
-                    self.publisher,
-                    self._clock,
-                    _sources(config),
-                    self._tare_to_the_end,
-                    self.supervisor.deaths,
-                    self._tap,
-                )
-            hear = self._rig.brain.hear if self._rig is not None else lambda _: None
-            self._load_cell = self._rig.load_cell if self._rig is not None else None
-            if self._rig is None and config.load_cell is not None:
-                # Measured and recorded beside the fingertips, while something else twists.
-                self._load_cell = make_load_cell(
-                    config.load_cell, self.publisher, self._clock, hear, self._link_of(LOAD_CELL), self._tap(LOAD_CELL)
-                )
-            self._skin: SkinTask | None = None
-            if config.skin is not None:
-                self._skin = make_skin(config.skin, self.publisher, self._clock, hear, self._tap)
-        except BaseException:
-            self._close()
-            raise
+
+    def _wire(self, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None) -> None:
+        """Make the task of every device and of every estimator; none is opened yet."""
+        config = self._config
+        if config.robot is not None:
+            self._rig = Rig(
+                config,
+                self.publisher,
+                self._clock,
+                _sources(config),
+                self._tare_to_the_end,
+                self.supervisor.deaths,
+                self._tap,
+            )
+        hear = self._rig.brain.hear if self._rig is not None else lambda _: None
+        self._load_cell = self._rig.load_cell if self._rig is not None else None
+        if self._rig is None and config.load_cell is not None:
+            # Measured and recorded beside the fingertips, while something else twists.
+            self._load_cell = make_load_cell(
+                config.load_cell, self.publisher, self._clock, hear, self._link_of(LOAD_CELL), self._tap(LOAD_CELL)
+            )
+        self._skin: SkinTask | None = None
+        if config.skin is not None:
+            self._skin = make_skin(config.skin, self.publisher, self._clock, hear, self._tap)
         diameters = FingertipDiameters(BOTH)
         if self._rig is not None and self._rig.gripper is not None:
             self._rig.gripper.fingertips_say = diameters.at
@@ -123,24 +129,43 @@ class Daemon:
         self._estimations = {name: task.estimation for name, task in self._fingertips.items()}
         if self._both is not None:
             self._estimations[BOTH] = self._both.estimation
-        self._config = config
-        self._health = HealthReporter(self.publisher, self.supervisor, self._clock)
-        for name, task in self._fingertips.items():
-            self._health.add(name, task.facts)
-        if self._both is not None:
-            self._health.add(BOTH, self._both.facts)
+
+    def _make_commands(self) -> Commands:
+        tares: dict[str, Callable[[], None]] = {name: one.tare for name, one in self._estimations.items()}
         if self._skin is not None:
-            self._health.add(SKIN, self._skin.facts)
-            self._health.add(SKIN_SOURCE, self._skin.source_facts)
+            tares[SKIN] = self._skin.tare
         if self._load_cell is not None:
-            self._health.add(LOAD_CELL, self._load_cell.facts)
+            tares[LOAD_CELL] = self._load_cell.tare
+        return Commands(
+            rig=self._rig,
+            tares=tares,
+            fingertips=self._fingertips,
+            experiment=self._config.experiment,
+            begin=self._begin,
+            give_up_waiting=self._give_up_waiting,
+            tasks=self._health.tasks,
+            stop=self.stop,
+        )
+
+    def _make_health(self) -> HealthReporter:
+        health = HealthReporter(self.publisher, self.supervisor, self._clock)
+        for name, task in self._fingertips.items():
+            health.add(name, task.facts)
+        if self._both is not None:
+            health.add(BOTH, self._both.facts)
+        if self._skin is not None:
+            health.add(SKIN, self._skin.facts)
+            health.add(SKIN_SOURCE, self._skin.source_facts)
+        if self._load_cell is not None:
+            health.add(LOAD_CELL, self._load_cell.facts)
         if self._rig is not None:
-            self._health.add("robot", self._rig.loop.facts)
+            health.add("robot", self._rig.loop.facts)
             if self._rig.gripper is not None:
-                self._health.add("gripper", self._rig.gripper.facts)
+                health.add("gripper", self._rig.gripper.facts)
         if self._recorder is not None:
-            self._health.add("recording", self._recorder.facts)
-        self._health.add("commands", self._command_facts)
+            health.add("recording", self._recorder.facts)
+        health.add("commands", self._command_facts)
+        return health
 
     async def run(self) -> None:
         """Run until `stop` is called, then end every task and close the sockets."""
@@ -224,12 +249,17 @@ class Daemon:
 
     async def _begin(self, path: Path) -> str | None:
         """Begin the experiment in a file, recorded, or return why not; raises UserError for a file that is none."""
-        rig, recorder = self._needed_rig, self._recorder
+        rig, recorder = needed(self._rig), self._recorder
         attached = Attached.if_there(path) if recorder is not None else ()
         why = await rig.start(path)
         if why is None and recorder is not None and rig.brain.experiment is not None:
             recorder.experiment(rig.brain.experiment.file.name, attached)
         return why
+
+    def _give_up_waiting(self) -> Path | None:
+        """Begin the configured experiment no more, and return it; None where it was not waited for."""
+        awaited, self._awaited = self._awaited, None
+        return awaited
 
     def _tap(self, source: str) -> Tap:
         return no_tap if self._recorder is None else self._recorder.tap(source)
@@ -254,26 +284,6 @@ class Daemon:
     def _link_of(self, device: str) -> Callable[[LinkEvent], None]:
         return self._rig.link_of(device) if self._rig is not None else partial(log_link, device)
 
-    def _handlers(self) -> Mapping[str, Handler]:
-        return {
-            "tare": self._tare,
-            "status": self._status,
-            "stop": self._stop_wanted,
-            "start": self._start,
-            "pause": self._pause,
-            "resume": self._resume,
-            "unlock": self._unlock,
-            "set": self._set,
-        }
-
-    def _open_handlers(self) -> Mapping[str, Handler]:
-        """Return what everyone on the machine may do where commands need a key: look, and stop."""
-
-        async def refuse(_request: Mapping[str, Any]) -> Reply:
-            raise CommandRefusedError("this needs a key: give --key and --server-key; without one there is only `stop`")
-
-        return {name: own if name in (STOP, STATUS) else refuse for name, own in self._handlers().items()}
-
     def _command_facts(self) -> TaskFacts:
         """Return what was refused, by kind: commands, and clients that had no right to connect."""
         refused = self._commands.refused.copy()
@@ -287,81 +297,6 @@ class Daemon:
         if self._skin is not None:
             tares.append(self._skin.zero())
         return " ".join(filter(None, await asyncio.gather(*tares)))
-
-    @property
-    def _needed_rig(self) -> Rig:
-        if self._rig is None:
-            raise CommandRefusedError("the configuration has no robot; add `robot: ur.yaml` to it")
-        return self._rig
-
-    async def _start(self, request: Mapping[str, Any]) -> Reply:
-        path = request.get("experiment") or self._config.experiment
-        if not isinstance(path, str | Path):
-            raise CommandRefusedError("which experiment? Give its file, or name one in the configuration")
-        try:
-            why = await self._begin(Path(path))
-        except UserError as error:
-            raise CommandRefusedError(str(error)) from error
-        _refuse(why)
-        return {"experiment": str(path)}
-
-    async def _pause(self, _request: Mapping[str, Any]) -> Reply:
-        _refuse(self._needed_rig.brain.pause())
-        return {}
-
-    async def _resume(self, _request: Mapping[str, Any]) -> Reply:
-        _refuse(self._needed_rig.brain.resume())
-        return {}
-
-    async def _unlock(self, _request: Mapping[str, Any]) -> Reply:
-        _refuse(await self._needed_rig.loop.unlock())
-        return {}
-
-    async def _tare(self, request: Mapping[str, Any]) -> Reply:
-        tares: dict[str, Callable[[], None]] = {name: one.tare for name, one in self._estimations.items()}
-        if self._skin is not None:
-            tares[SKIN] = self._skin.tare
-        if self._load_cell is not None:
-            tares[LOAD_CELL] = self._load_cell.tare
-        source = request.get("source")
-        if source is not None and not (isinstance(source, str) and source in tares):
-            raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(tares)}")
-        tared = [source] if source is not None else list(tares)
-        for name in tared:
-            tares[name]()
-        return {"tared": tared}
-
-    async def _set(self, request: Mapping[str, Any]) -> Reply:
-        """Change what may be changed while it runs; nothing that moves anything is among it."""
-        source, heatmap = request.get("source"), request.get("heatmap")
-        if heatmap not in ("always", "on_request"):
-            raise CommandRefusedError("only `heatmap` can be set while it runs, to always or on_request")
-        if source is not None and not (isinstance(source, str) and source in self._fingertips):
-            raise CommandRefusedError(f"there is no fingertip {source!r}; there are {', '.join(self._fingertips)}")
-        names = [source] if source is not None else list(self._fingertips)
-        for name in names:
-            self._fingertips[name].always_heatmap = heatmap == "always"
-        return {"set": names, "heatmap": heatmap}
-
-    async def _status(self, _request: Mapping[str, Any]) -> Reply:
-        return {"tasks": self._health.tasks()}
-
-    async def _stop_wanted(self, request: Mapping[str, Any]) -> Reply:
-        stopped = self._rig.stop() if self._rig is not None else ""
-        awaited, self._awaited = self._awaited, None
-        if stopped:
-            return {"stopped": stopped}
-        if request.get("spare_daemon"):
-            # From a page that everyone may press stop on: it ends what moves or is about to, and nothing else.
-            return {"stopped": f"the start of {awaited.name}" if awaited is not None else ""}
-        # Nothing moves: the daemon itself is what stops, once the reply is out.
-        asyncio.get_running_loop().call_later(0.05, self.stop)
-        return {}
-
-
-def _refuse(why: str | None) -> None:
-    if why:
-        raise CommandRefusedError(why)
 
 
 def _sources(config: DaemonConfig) -> dict[str, Source]:

@@ -48,7 +48,7 @@ SECTIONS = (
     Section(
         "A command is refused, or an experiment ends",
         "Do what the sentence names, then send the command again.",
-        raised=("daemon/app.py", "daemon/experiment", "daemon/control"),
+        raised=("daemon/commands.py", "daemon/experiment", "daemon/control"),
         told=(
             "daemon/loop/brain.py",
             "daemon/loop/wrist.py",

@@ -144,7 +144,7 @@ def test_what_is_not_a_daemons_is_a_sentence(tmp_path: Path) -> None:
 async def test_what_may_change_while_it_runs_is_set_and_nothing_else(config: Callable[..., Path]) -> None:
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(config()), context)
-        change = daemon._handlers()["set"]
+        change = daemon._make_commands().handlers()["set"]
         assert not daemon._fingertips["right"].always_heatmap
         assert await change({"heatmap": "always"}) == {"set": ["right"], "heatmap": "always"}
         assert daemon._fingertips["right"].always_heatmap

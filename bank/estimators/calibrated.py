@@ -91,9 +91,12 @@ class Seen:
 
 
 def features_of(
-    calibration: Calibration, locator: Locator | None, difference: FloatArray, recent: FloatArray | None
+    calibration: Calibration, locator: Locator | None, difference: FloatArray, recent: FloatArray | None, t_s: float
 ) -> Seen:
-    """Return the features of (m, 896) differences, or of the motion in the recent frames for an estimator of motion."""
+    """Return the features of (m, 896) differences at t_s, or of the motion in the recent frames where motion is read.
+
+    A slice is followed by its time: how it is read drifts with it.
+    """
     if calibration.motion is not None:
         if recent is None:
             raise ValueError("features of motion need the recent frames")
@@ -106,7 +109,8 @@ def features_of(
         return Seen(np.concatenate([place.features for place in places]), places[0])
     if calibration.image is not None:
         return Seen((difference @ calibration.image.T).ravel())
-    return Seen((difference / calibration.scale).ravel())
+    features = (difference / calibration.scale).ravel()
+    return Seen(np.append(features, t_s) if calibration.estimator == "fused" else features)
 
 
 # The features that each quantity is read from, where that is not all of them: the paper's sigma and its square, and k.
@@ -161,14 +165,14 @@ class Tracker:
         self._difference = None
         if self._memory is None:
             difference = np.abs(frame.channels)
-            return self._read(difference, None, frame.usable)
+            return self._read(difference, None, frame.usable, frame.t_s)
         moment = self._memory.see(frame)
         if moment.why:
             return Estimate(valid=False, why=moment.why)
         self._difference = moment.difference
-        return self._read(moment.difference, self._memory.recent, moment.usable)
+        return self._read(moment.difference, self._memory.recent, moment.usable, frame.t_s)
 
-    def _read(self, difference: FloatArray, recent: FloatArray | None, usable: BoolArray) -> Estimate:
+    def _read(self, difference: FloatArray, recent: FloatArray | None, usable: BoolArray, t_s: float) -> Estimate:
         calibration = self.calibration
         refused: list[str] = []
         tasks = {"torque": (calibration.torque, "N·m"), "diameter": (calibration.diameter, "mm")}
@@ -185,7 +189,7 @@ class Tracker:
         if task_guard := next((task.guard for task in wanted.values() if task.guard is not None), None):
             # What a dead channel would have said is taken from the frames of the calibration.
             difference = np.where(usable, difference, task_guard.mean)
-        seen = features_of(calibration, self._locator, difference, recent)
+        seen = features_of(calibration, self._locator, difference, recent, t_s)
         if seen.place is not None and seen.place.ambiguous:
             return _with_place(
                 Estimate(valid=False, why=("two places of the bank far apart fit the frame equally well",)), seen.place

@@ -35,10 +35,10 @@ if TYPE_CHECKING:
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
 N_DIRECTIONS, N_LAGS = 4, 12
-# The curve of frames over torque and over diameter: degree, directions of drift, and memory in slices. Of the torque's
-# the mean error over six origins (19 to 44 of 49 slices, judged on all that follow) was least for these among degrees
-# 1 to 3, 1 to 3 directions and memories of 10 slices to all; two repeats are 20 slices (docs/decisions/0042).
-TORQUE_CURVE, DIAMETER_CURVE = (3, 2, 20.0), (1, 1, np.inf)
+# The curve of frames over torque and over diameter: degree, directions of drift, and whether there is a trend. Of the
+# torque's the mean error over six origins (19 to 44 of 49 slices, judged on all that follow) was least for these
+# (docs/decisions/0042).
+TORQUE_CURVE, DIAMETER_CURVE = (3, 3, True), (1, 1, False)
 # A hundred features of a few directions need little holding back.
 _MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4)
 # A full heatmap over all lags takes a good part of a second: more frames than this are thinned out to calibrate on.
@@ -99,6 +99,7 @@ def fit(name: Name, recordings: Sequence[FrameSeries], source: str, physics: Phy
 
 def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:
     frames = np.concatenate([one.channels for one in recordings])
+    times = _consecutive([one.t_s for one in recordings])
     torque = np.concatenate([one.torque_at_frames() for one in recordings])
     diameter = np.concatenate([one.diameter_mm for one in recordings])
     registered = _locator(blank, physics)
@@ -109,7 +110,12 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
         if not known.any():
             continue
         differences = np.abs(frames[known])
-        features = np.array([features_of(blank, registered, one, None).features for one in differences])
+        features = np.array(
+            [
+                features_of(blank, registered, one, None, t).features
+                for one, t in zip(differences, times[known].tolist(), strict=True)
+            ]
+        )
         columns = columns_for(blank.estimator, name, features)
         curve = TORQUE_CURVE if name == "torque" else DIAMETER_CURVE
         reader = fit_reader(
@@ -117,6 +123,7 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
             values[known],
             _curve(curve) if blank.estimator == "fused" else _ridge(blank.estimator),
             strengths=_strengths(blank.estimator),
+            rolling=name == "torque",
         )
         tasks[name] = Task(reader, DifferenceGuard.fit(differences[:, 0]))
     if not tasks:
@@ -133,8 +140,18 @@ def _strengths(name: Name) -> tuple[float, ...]:
     return {"paper": (1e-9,), "fused": (0.0,)}.get(name, STRENGTHS)
 
 
-def _curve(shape: tuple[int, int, float]) -> Callable[[FloatArray, FloatArray, float], Head]:
-    return lambda features, values, _: Curve.fit(features, values, *shape)
+def _curve(shape: tuple[int, int, bool]) -> Callable[[FloatArray, FloatArray, float], Head]:
+    degree, n_drift, trend = shape
+    return lambda features, values, _: Curve.fit(features, values, degree, n_drift, trend=trend)
+
+
+def _consecutive(times: list[FloatArray]) -> FloatArray:
+    """Return the times of several series one after another, each beginning one later than the one before has ended."""
+    shifted: list[FloatArray] = []
+    for one in times:
+        begins_early = bool(shifted) and one[0] <= shifted[-1][-1]
+        shifted.append(one - one[0] + shifted[-1][-1] + 1.0 if begins_early else one)
+    return np.concatenate(shifted)
 
 
 def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:
@@ -224,7 +241,7 @@ def _replayed(calibration: Calibration, locator: Locator | None, series: FrameSe
     ):
         moment = memory.see(TactileFrame.of(float(t_s), channels))
         if not moment.why and np.isfinite(torque) and i % every == 0:
-            features = features_of(calibration, locator, moment.difference, memory.recent).features
+            features = features_of(calibration, locator, moment.difference, memory.recent, float(t_s)).features
             rows.append(_Row(float(t_s - series.t_s[0]), features, moment.difference, float(torque), float(diameter)))
     return rows
 

@@ -22,8 +22,12 @@ CENSORED_SHARE = 0.02
 _LEAST_SIGMA_SHARE = 0.01
 _EM_ROUNDS = 100
 N_BLOCKS = 5
+FIRST_ORIGIN, N_ORIGINS = 0.6, 20
 # Terms beyond the linear one are held back as by so many frames that do not have them.
 _CURVATURE = 3.0
+# The same for how offset and slope drift with age. From 10 to 100 the error on later slices is nearly the same; without
+# a trend it is a sixth larger (docs/decisions/0042).
+_TREND, N_TREND = 30.0, 2
 # The paper's own number: with so many of the 896 channels its regression was four fifths as good as with all.
 N_RANKED = 272
 
@@ -118,7 +122,9 @@ class Curve:
     """Frames as a polynomial of the value, coefficients (degree + 1, q), with drift along `drift` (r, q) and noise.
 
     Of a frame's d channels only the q `channels` count that go best with the value: the others bring more drift. Each
-    is in units of its own `spread` (q,) about the curve, drawn half towards that of all.
+    is in units of its own `spread` (q,) about the curve, drawn half towards that of all. What a value makes of a frame
+    changes from repeat to repeat: offset and slope move by `trend` (2, q) as the logarithm of the age does, counted in
+    e-foldings from `last_t` on.
 
     The value of a frame minimises (x − curve)ᵀ Σ⁻¹ (x − curve), Σ = driftᵀ diag(drift_variance) drift + noise² I.
     """
@@ -126,6 +132,9 @@ class Curve:
     channels: NDArray[np.int64]
     spread: FloatArray
     coefficients: FloatArray
+    trend: FloatArray
+    first_t: float
+    last_t: float
     drift: FloatArray
     drift_variance: FloatArray
     noise: float
@@ -135,47 +144,57 @@ class Curve:
     high: float
 
     @classmethod
-    def fit(cls, frames: FloatArray, values: FloatArray, degree: int, n_drift: int, memory: float = np.inf) -> Self:
-        """Fit to (n, d) frames of (n,) values in time order.
+    def fit(cls, frames: FloatArray, values: FloatArray, degree: int, n_drift: int, *, trend: bool = False) -> Self:
+        """Fit to (n, d + 1) frames of (n,) values in time order; the last column is each frame's time.
 
-        The terms beyond the linear one are held back as by three frames without them. A frame that is `memory` frames
-        older counts 1/e as much: what comes next is more like what was last.
+        Any unit of time in which frames come about one apart. The terms beyond the linear one are held back as by three
+        frames without them, the trend as by thirty.
         """
-        n = len(values)
-        weights = np.exp((np.arange(n) - (n - 1)) / memory)
-        weights *= n / weights.sum()
+        frames, t = frames[:, :-1], frames[:, -1]
+        n, n_trend = len(values), N_TREND * trend
         centre, scale = float(values.mean()), float(values.std())
         distinct = len(np.unique(values))
-        if distinct <= degree or n < degree + n_drift + 3 or scale == 0:
+        if distinct <= degree or n < degree + n_trend + n_drift + 3 or scale == 0:
             raise CalibrationError(
                 f"{n} frames at {distinct} distinct values do not determine a curve of degree {degree} and its noise; "
-                f"record at least {degree + n_drift + 3}"
+                f"record at least {degree + n_trend + n_drift + 3}"
             )
         z = (values - centre) / scale
-        spread = _spread_about_parabola(frames, z, weights)
+        spread = _spread_about_parabola(frames, z)
         channels = np.sort(ranked_channels(frames / spread, values)[:N_RANKED])
         frames, spread = (frames / spread)[:, channels], spread[channels]
-        coefficients = _polynomial(frames, z, weights, degree)
-        residuals = frames - np.vander(z, degree + 1, increasing=True) @ coefficients
-        _, s, vt = np.linalg.svd(residuals * np.sqrt(weights)[:, None], full_matrices=False)
-        freedom = n - degree - 1
+        first_t, last_t = float(t[0]), float(t[-1])
+        age = _age(t, first_t, last_t)
+        powers = np.vander(z, degree + 1, increasing=True)
+        columns = np.hstack([powers, powers[:, :n_trend] * age[:, None]])
+        # A trend is held back in units of its own spread, as the values are in theirs.
+        held_back = [0.0, 0.0] + [_CURVATURE] * (degree - 1) + [_TREND * float(age.var())] * n_trend
+        coefficients = np.linalg.solve(columns.T @ columns + np.diag(held_back), columns.T @ frames)
+        _, s, vt = np.linalg.svd(frames - columns @ coefficients, full_matrices=False)
+        freedom = n - columns.shape[1]
         noise = float(np.sqrt((s[n_drift:freedom] ** 2).sum() / (freedom - n_drift) / frames.shape[1]))
         if noise == 0:
             raise CalibrationError("the frames have no noise at all: this is no recording of a real board")
         span = float(np.ptp(values))
         return cls(
-            channels, spread, coefficients, vt[:n_drift], s[:n_drift] ** 2 / freedom, noise, centre, scale,
+            channels, spread, coefficients[: degree + 1], coefficients[degree + 1 :], first_t, last_t,
+            vt[:n_drift], s[:n_drift] ** 2 / freedom, noise, centre, scale,
             float(values.min()) - 0.5 * span, float(values.max()) + 0.5 * span,
         )  # fmt: skip
 
     def predict(self, features: FloatArray) -> FloatArray:
-        """Return the (n,) values of (n, d) frames."""
-        return np.array([self.estimate(frame) for frame in features])
+        """Return the (n,) values of (n, d + 1) frames, the last column being their times."""
+        return np.array([self.estimate(frame[:-1], float(frame[-1])) for frame in features])
 
-    def estimate(self, frame: FloatArray, usable: BoolArray | None = None) -> float:
-        """Return a (d,) frame's value; channels that are not usable are left out."""
+    def estimate(self, frame: FloatArray, t: float, usable: BoolArray | None = None) -> float:
+        """Return a (d,) frame's value at the time t; channels that are not usable are left out.
+
+        A time before the last one that was fitted to is taken for that one: somebody counts from the beginning again.
+        """
         keep = np.ones(len(self.channels), dtype=np.bool_) if usable is None else usable[self.channels]
-        b, v, x = self.coefficients[:, keep], self.drift[:, keep], (frame[self.channels] / self.spread)[keep]
+        b, v, x = self.coefficients[:, keep].copy(), self.drift[:, keep], (frame[self.channels] / self.spread)[keep]
+        later = float(_age(np.array([max(t, self.last_t)]), self.first_t, self.last_t)[0])
+        b[: len(self.trend)] += later * self.trend[:, keep]
         inner = np.linalg.inv(np.diag(self.noise**2 / self.drift_variance) + v @ v.T)
 
         def whitened(rows: FloatArray) -> FloatArray:
@@ -188,20 +207,17 @@ class Curve:
         return _refined(grid, cost)
 
 
-def _polynomial(frames: FloatArray, z: FloatArray, weights: FloatArray, degree: int) -> FloatArray:
-    """Return the (degree + 1, d) weighted coefficients of (n, d) frames over (n,) values of unit spread."""
-    powers = np.vander(z, degree + 1, increasing=True)
-    penalty = np.diag([0.0, 0.0] + [_CURVATURE] * (degree - 1))
-    return np.asarray(
-        np.linalg.solve(powers.T @ (powers * weights[:, None]) + penalty, powers.T @ (frames * weights[:, None]))
-    )
+def _age(t: FloatArray, first_t: float, last_t: float) -> FloatArray:
+    """Return how much older than at last_t frames are, in e-foldings of the time since the first; negative: younger."""
+    return np.asarray(np.log((1.0 + np.maximum(t - first_t, 0.0)) / (1.0 + last_t - first_t)))
 
 
-def _spread_about_parabola(frames: FloatArray, z: FloatArray, weights: FloatArray) -> FloatArray:
+def _spread_about_parabola(frames: FloatArray, z: FloatArray) -> FloatArray:
     """Return the (d,) root mean square of each channel about its parabola, half of it from the median of all."""
     degree = min(2, len(np.unique(z)) - 1)
-    residuals = frames - np.vander(z, degree + 1, increasing=True) @ _polynomial(frames, z, weights, degree)
-    squares = (residuals**2 * weights[:, None]).mean(axis=0)
+    powers = np.vander(z, degree + 1, increasing=True)
+    penalty = np.diag([0.0, 0.0] + [_CURVATURE] * (degree - 1))
+    squares = ((frames - powers @ np.linalg.solve(powers.T @ powers + penalty, powers.T @ frames)) ** 2).mean(axis=0)
     # A channel that never changed brings no infinity: half is everybody's.
     return np.asarray(np.sqrt(0.5 * squares + 0.5 * np.median(squares) + np.finfo(np.float64).tiny))
 
@@ -221,6 +237,12 @@ def left_out_blocks(n: int) -> Iterator[tuple[Rows, Rows]]:
     block = np.arange(n) * N_BLOCKS // n
     for one in range(N_BLOCKS):
         yield np.flatnonzero(block != one), np.flatnonzero(block == one)
+
+
+def later_origins(n: int) -> Iterator[tuple[Rows, Rows]]:
+    """Yield pairs of (earlier, all later) parts of n rows, from six tenths of the time on: what is yet to come."""
+    for cut in range(round(FIRST_ORIGIN * n), n - 1, max(1, n // N_ORIGINS)):
+        yield np.arange(cut), np.arange(cut, n)
 
 
 def ranked_channels(frames: FloatArray, values: FloatArray) -> NDArray[np.int64]:

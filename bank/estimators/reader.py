@@ -7,7 +7,17 @@ from typing import TypeAlias
 import numpy as np
 
 from bank.errors import CalibrationError
-from bank.estimators.heads import Censored, Curve, Ridge, Rows, best_strength, later_splits, left_out_blocks
+from bank.estimators.heads import (
+    FIRST_ORIGIN,
+    Censored,
+    Curve,
+    Ridge,
+    Rows,
+    best_strength,
+    later_origins,
+    later_splits,
+    left_out_blocks,
+)
 from bank.estimators.intervals import Intervals
 from bank.estimators.values import FloatArray
 
@@ -16,12 +26,12 @@ HeadOf: TypeAlias = Callable[[FloatArray, FloatArray, float], Head]
 
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
-# Future data lies further from the past than one part of a recording from the next …
+# Future data lies further from the past than one part of a recording from the next, unless what was left out was the
+# future itself.
 _INFLATION = 1.1
-# … but the error of a curve of slices is of what drifts from repeat to repeat, with few standard deviations and no
-# tails: blocks left out in turn are as far (docs/decisions/0042).
-_CURVE_INFLATION = 1.0
 _LEAST_FRAMES = 8
+# Origins with fewer frames before them tell how bad a calibration of few frames is, not this one.
+_LEAST_BEFORE_ORIGIN = 12
 # No interval is narrower than this share of the calibrated range: a load cell has noise too.
 _LEAST_HALF_WIDTH = 1e-3
 # Values this far beyond the calibrated range, in spans of it, are extrapolated and not believed.
@@ -71,9 +81,12 @@ def fit_reader(
     strengths: tuple[float, ...] = STRENGTHS,
     limit_reach: bool = False,
     edges: tuple[float, ...] = (),
+    rolling: bool = False,
 ) -> Reader:
     """Fit a head to (n, d) features and (n,) values in time order, and intervals to the residuals of what was left out.
 
+    Left out are blocks in turn, or with `rolling` all that comes later than each of a row of origins: where values
+    drift and there are many repeats, these are what the future will be.
     Raises CalibrationError where the data does not determine them.
     """
     if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
@@ -89,14 +102,15 @@ def fit_reader(
     strength = strengths[0]
     if len(strengths) > 1:
         strength = _best(features, values, head_of, strengths)
-    # … and how far it goes astray, in blocks of time left out in turn: on the slices, what comes later had the same
-    # error as they (docs/decisions/0042), while fits to the first part alone say too much.
-    found = [judged(strength, past, future) for past, future in left_out_blocks(len(values))]
+    # … and how far it goes astray on what was left out.
+    rolling = rolling and FIRST_ORIGIN * len(values) >= _LEAST_BEFORE_ORIGIN
+    left_out = later_origins(len(values)) if rolling else left_out_blocks(len(values))
+    found = [judged(strength, past, future) for past, future in left_out]
     predicted, residuals = (np.concatenate([pair[i] for pair in found]) for i in (0, 1))
     head = head_of(features, values, strength)
     if isinstance(head, Censored):
         edges = (-head.sigma, 0.0, 0.4 * float(np.abs(values).max()))
-    inflation = _CURVE_INFLATION if isinstance(head, Curve) else _INFLATION
+    inflation = 1.0 if rolling or isinstance(head, Curve) else _INFLATION
     centre = features.mean(axis=0)
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)
     return Reader(

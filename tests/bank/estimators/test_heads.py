@@ -3,7 +3,16 @@ import pytest
 from scipy.stats import truncnorm
 
 from bank.errors import CalibrationError
-from bank.estimators.heads import Censored, Curve, Ridge, _below_zero, best_strength, later_splits, left_out_blocks
+from bank.estimators.heads import (
+    Censored,
+    Curve,
+    Ridge,
+    _below_zero,
+    best_strength,
+    later_origins,
+    later_splits,
+    left_out_blocks,
+)
 
 
 def test_a_ridge_without_strength_is_least_squares():
@@ -52,16 +61,20 @@ def test_the_moments_of_a_gaussian_below_zero(mean, sigma):
     np.testing.assert_allclose(np.ravel(found), expected, rtol=1e-6)
 
 
-def frames_on_a_curve(values, rng, noise=0.05, drift=1.0):
+def frames_on_a_curve(values, rng, noise=0.05, drift=1.0, begins_at=0.0, shrinking=0.0):
+    """Return (n, 201) frames, one a second; the response to a value shrinks by a share with each e-folding of age."""
     shapes = np.random.default_rng(9).normal(size=(4, 200))
-    z = np.asarray(values)[:, None]
-    return (
+    times = begins_at + np.arange(len(values))
+    value = np.asarray(values)[:, None]
+    z = value * (1 - shrinking * np.log1p(times))[:, None]
+    frames = (
         shapes[0]
         + z * shapes[1]
         + 0.2 * z**2 * shapes[2]
         + drift * rng.normal(size=z.shape) * shapes[3]
         + noise * (rng.normal(size=(len(z), 200)))
     )
+    return np.column_stack([frames, times])
 
 
 def test_a_curve_finds_the_value_through_drift_ten_times_the_noise():
@@ -94,8 +107,26 @@ def test_a_curve_works_on_with_the_channels_that_are_left():
     curve = Curve.fit(frames_on_a_curve(values, rng), values, 2, 1)
     frame = frames_on_a_curve([1.3], rng)[0]
     usable = rng.random(200) > 0.4
-    frame[~usable] = 1e3
-    assert curve.estimate(frame, usable) == pytest.approx(1.3, abs=0.05)
+    frame[:-1][~usable] = 1e3
+    assert curve.estimate(frame[:-1], 0.0, usable) == pytest.approx(1.3, abs=0.05)
+
+
+def test_a_response_that_shrinks_with_age_is_followed_beyond_what_was_fitted():
+    rng = np.random.default_rng(8)
+    values, later = rng.uniform(-1, 2, 60), rng.uniform(-1, 2, 60)
+    past = frames_on_a_curve(values, rng, drift=0.0, shrinking=0.08)
+    future = frames_on_a_curve(later, rng, drift=0.0, begins_at=60.0, shrinking=0.08)
+    still, followed = (
+        np.sqrt(np.mean((Curve.fit(past, values, 2, 1, trend=trend).predict(future) - later) ** 2))
+        for trend in (False, True)
+    )
+    assert followed < 0.6 * still
+    # Frames that are numbered from the beginning again are read as at the end of what was fitted.
+    curve, anew = Curve.fit(past, values, 2, 1, trend=True), future.copy()
+    anew[:, -1] -= 60.0
+    at_the_end = future.copy()
+    at_the_end[:, -1] = 59.0
+    np.testing.assert_array_equal(curve.predict(anew), curve.predict(at_the_end))
 
 
 def test_a_curve_needs_enough_frames():
@@ -106,8 +137,10 @@ def test_a_curve_needs_enough_frames():
 
 @pytest.mark.parametrize("n", [8, 13, 49, 500])
 def test_what_is_judged_comes_later_or_is_left_out(n):
-    for past, future in later_splits(n):
+    for past, future in [*later_splits(n), *later_origins(n)]:
         assert past.max() < future.min()
+    assert all(future.max() == n - 1 for _, future in later_origins(n))
+    assert 1 < len(list(later_origins(n))) <= 11
     blocks = [block for _, block in left_out_blocks(n)]
     np.testing.assert_array_equal(np.concatenate(blocks), np.arange(n))
     assert all(not set(rest) & set(block) for rest, block in left_out_blocks(n))

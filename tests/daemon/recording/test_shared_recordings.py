@@ -61,15 +61,18 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
     assert judge([follow(fit("fused", [twists], "all"), other)])["valid_fraction"] == 0
 
 
-@pytest.mark.parametrize(("share", "r", "rmse_nm"), [(0.592, 0.97, 0.0150), (0.796, 0.975, 0.0135)])
-def test_later_torque_slices(shared, share, r, rmse_nm):
-    """With three and four of five repeats to fit; with more the error still falls."""
+def test_later_torque_slices(shared):
+    """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
     (series,) = read_series(shared / "recordings/torque_slices")
-    figures = judge([follow(fit("fused", [part_of(series, 0, share)], "earlier"), part_of(series, share, 1))])
-    assert figures["r"] >= r
-    assert figures["rmse_nm"] <= rmse_nm
-    assert figures["coverage_95"] >= 0.9
-    assert figures["valid_fraction"] == 1
+    errors, covered = [], []
+    for n in (19, 24, 29, 34, 39, 44):
+        figures = judge([follow(fit("fused", [series.between(0, n)], "earlier"), series.between(n, 49))])
+        assert figures["r"] >= 0.96
+        assert figures["valid_fraction"] == 1
+        errors.append(figures["rmse_nm"])
+        covered += [figures["coverage_95"]] * figures["frames"]
+    assert np.mean(errors) <= 0.012
+    assert 0.9 <= np.mean(covered) <= 0.98
 
 
 def test_later_slices_of_the_cylinders(shared):

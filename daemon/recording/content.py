@@ -16,12 +16,12 @@ _SHAPE = "_shape"
 
 
 def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
-    """Return a message's map, as it goes on the wire, as JSON: arrays as flat lists, NaN and infinity as null."""
+    """Return a message's map, as it goes on the wire, as JSON: arrays as flat lists, without what has no value."""
     plain: dict[str, Any] = {}
     for key, value in content.items():
         if f"{key}{_SHAPE}" in content:
             plain[key] = _numbers(np.frombuffer(value, "<f4"))
-        elif not key.endswith(_SHAPE):
+        elif not (key.endswith(_SHAPE) or value is None or (isinstance(value, float) and not math.isfinite(value))):
             plain[key] = value
     if topic == EitFrame.topic:
         plain["arrival_unix_ns"] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns

@@ -13,6 +13,7 @@ from scipy.io import savemat
 
 from daemon.errors import UserError
 from daemon.recording.salvage import is_closed
+from daemon.recording.schema import completed, schema_of
 
 # A MATLAB name is at most 63 characters long; ours are far shorter.
 _LOG_TIME = "log_time_ns"
@@ -59,12 +60,13 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
 
 
 def rows_of(path: Path, topic: str, progress: Progress = lambda _: None) -> Rows:
-    """Return a topic's messages in order of time, log_time_ns first, nested maps as JSON text."""
+    """Return a topic's messages in order of time, log_time_ns first, nested maps as JSON text, None for no value."""
+    wire = schema_of(topic)
     rows = []
     try:
         with path.open("rb") as file:
             for _, _, message in make_reader(file, validate_crcs=True).iter_messages([topic]):
-                content = json.loads(message.data)
+                content = completed(wire, json.loads(message.data))
                 row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
                 rows.append({_LOG_TIME: message.log_time, **row})
                 progress(1)

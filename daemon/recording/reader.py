@@ -86,8 +86,8 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
         content = _content(path, channel, message)
         try:
             if channel.topic == LOAD_TOPIC:
-                # What the driver took for no load at all is no truth to calibrate on.
-                if not (content.get("saturated") or content.get("spike")):
+                # What the driver took for no load at all, or had no number for, is no truth to calibrate on.
+                if "torque_nm" in content and not (content.get("saturated") or content.get("spike")):
                     torques.append((message.log_time, float(content["torque_nm"])))
             elif channel.topic.startswith(f"{FRAME_TOPIC}."):
                 line = content["line"]

@@ -19,7 +19,16 @@ from daemon.config_file import ConfigModel, mistakes
 from daemon.errors import UserError
 from daemon.recording.content import input_of
 from daemon.recording.export import topics_of
-from daemon.recording.schema import CLOCK_TOPIC, CONFIGURATION, FRAME_TOPIC, INPUT, METADATA, input_topic, schema_of
+from daemon.recording.schema import (
+    CLOCK_TOPIC,
+    CONFIGURATION,
+    FRAME_TOPIC,
+    INPUT,
+    METADATA,
+    completed,
+    input_topic,
+    schema_of,
+)
 from drivers.raw_input import InputKind, RawInput
 
 Model = TypeVar("Model", bound=ConfigModel)
@@ -112,7 +121,8 @@ class RecordedRun:
             told = input_of(content)
             yield Happened(topic, told.t_ns, content, topic.removeprefix(f"{INPUT}."), told)
         elif self.has_inputs:
-            yield Happened(schema_of(topic), content["t_mono_ns"], content, content["source"])
+            wire = schema_of(topic)
+            yield Happened(wire, content["t_mono_ns"], completed(wire, content), content["source"])
         elif topic.startswith(f"{FRAME_TOPIC}."):
             yield from _line_as_input(topic.removeprefix(f"{FRAME_TOPIC}."), content)
         else:

@@ -4,6 +4,9 @@ A recording is an MCAP file (mcap.dev). Log times are Unix nanoseconds: of a mes
 frame the middle of its acquisition), of a raw input when it arrived. Any MCAP tool can show and plot one; the schemas
 describe every key.
 
+The schemas keep to what Foxglove takes of JSON Schema, which refuses a topic for anything more: each key has one type,
+every object names its properties. So a value that there is none of is not null; its key is left out.
+
 Topics are those of the wire; where several fingertips send one, its source follows: `eit.frame.right`. `input.SOURCE`
 holds all that a parser was told, bytes as text (Latin-1, so that each byte is one character), and `input.clock` how the
 monotonic clock was translated into Unix time: from these two a recording can be replayed.
@@ -40,7 +43,7 @@ DIAMETER_NOTE = "diameter_mm"
 LARGEST_DIAMETER_MM = 140.0
 
 _OF_FINGERTIPS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
-_NAMES = {float: "number", int: "integer", str: "string", bool: "boolean", type(None): "null"}
+_NAMES = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
 
 
@@ -88,34 +91,49 @@ def schemas() -> Mapping[str, dict[str, Any]]:
     }
 
 
+def completed(topic: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a recorded message of a wire topic with None for each value that there was none of."""
+    # A recording that was brought in from elsewhere has no source, and never had more keys than are there.
+    absent = _optional_keys(topic) if topic in TOPICS and "source" in content else ()
+    return {**content, **{key: None for key in absent if key not in content}}
+
+
+@cache
+def _optional_keys(topic: str) -> tuple[str, ...]:
+    """Return the keys of a wire topic that a message is without where there is no value, or none that is finite."""
+    hints = typing.get_type_hints(TOPICS[topic])
+    fields = [item.name for item in dataclasses.fields(TOPICS[topic])]
+    return tuple(name for name in fields if hints[name] is float or type(None) in typing.get_args(hints[name]))
+
+
 def _of_message(topic: str) -> dict[str, Any]:
     properties: dict[str, Any] = {
         "timestamp": {"type": "number", "description": "Unix time in s that the message speaks of"},
         "seq": {"type": "integer", "description": "number of the message, without gaps, per topic and source"},
     }
-    required = []
     hints = typing.get_type_hints(TOPICS[topic])
     for item in dataclasses.fields(TOPICS[topic]):
         unit, meaning = item.metadata.get("unit", ""), item.metadata.get("meaning", "")
         properties[item.name] = {**_type(hints[item.name]), "description": f"{meaning} ({unit})" if unit else meaning}
+    required = [name for name in properties if name not in _optional_keys(topic)]
     if topic == FRAME_TOPIC:
         properties["arrival_unix_ns"] = {"type": "integer", "description": "when the last byte of the line was read"}
         # A recording that was brought in from elsewhere has no more of a frame.
         required = ["arrival_unix_ns", "line"]
     elif topic == LOAD_TOPIC:
-        required = ["torque_nm"]
-    return _object(topic, properties, required or list(properties))
+        required = []
+    return _object(topic, properties, required)
 
 
 def _type(hint: Any) -> dict[str, Any]:
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        return {"type": [_NAMES[one] for one in typing.get_args(hint)]}
+        hint = next(part for part in typing.get_args(hint) if part is not type(None))
     if hint in _NAMES:
-        # A number that is NaN or infinite has no JSON form and is written as null.
-        return {"type": ["number", "null"] if hint is float else _NAMES[hint]}
+        return {"type": _NAMES[hint]}
     if typing.get_origin(hint) is np.ndarray:
-        return {"type": "array", "items": {"type": ["number", "null"]}}
-    return {"type": "object"}
+        # An element that is NaN has no JSON form and is null, for which there is no word that Foxglove takes.
+        return {"type": "array", "items": {"type": "number"}}
+    return {"type": "object", "properties": {}}
 
 
 def _object(title: str, properties: dict[str, Any], required: list[str]) -> dict[str, Any]:

@@ -163,7 +163,8 @@ class Trouble:
     @property
     def sentence(self) -> str:
         """What the operator reads: what happened, and what to do."""
-        return f"{self.rule.sentence.format(detail=self.detail)} {self.rule.cure}"
+        # A detail may be a sentence of a driver's; ours has a full stop of its own.
+        return f"{self.rule.sentence.format(detail=self.detail.removesuffix('.'))} {self.rule.cure}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,6 +48,8 @@ COMMANDS = {
 }
 
 EXIT_OK, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
+# As a shell has it for what SIGINT ended.
+EXIT_INTERRUPTED = 130
 
 
 class CommandModule(Protocol):
@@ -81,7 +83,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_OK
     except KeyboardInterrupt:
-        return 130
+        return EXIT_INTERRUPTED
 
 
 def _user_errors() -> tuple[type[Exception], ...]:

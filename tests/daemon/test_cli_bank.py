@@ -1,6 +1,7 @@
 """`shearloop bank`: what it writes and prints, and that every mistake is one sentence and status 2."""
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from bank.forward import ForwardModel
 from bank.mesh import load_mesh
 from bank.models import conductivity
 from daemon.cli import main
+from daemon.cli.bank import build as build_command
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 
 SOLVE = ["solve", "--mesh", "{folder}/tip.yaml", "--model", "step", "--k", "1", "--sigma", "1", "--out", "{folder}/v"]
@@ -48,6 +50,33 @@ def test_build_writes_the_bank_and_tells_its_identity(folder, tmp_path, capsys):
     assert (told["identity"], told["shape"], told["model"]) == (bank.identity, [2, 3, 896], "linear")
     assert told["valid_cells"] == bank.valid.sum()
     np.testing.assert_array_equal(bank.sigma_grid, [1, 1.25, 1.5])
+
+
+@pytest.mark.parametrize("rows_done", [0, 2])
+def test_a_build_that_is_interrupted_says_so_and_the_same_command_goes_on(
+    rows_done, folder, tmp_path, capsys, monkeypatch
+):
+    """SIGINT, as Ctrl-C sends it, while rows are being solved: no bank, no half of one, and no work lost."""
+    capsys.readouterr()
+    out = tmp_path / "c.bank"
+    build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", str(out), "--jobs", "1"]
+    show = build_command._Progress.show
+
+    def interrupted(self, done, total):
+        show(self, done, total)
+        if done == rows_done:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(build_command._Progress, "show", interrupted)
+        assert main(build) == 130
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert f"shearloop bank: interrupted: {out} was not written; its finished rows are in {out}.part" in told.err
+    assert [path.name for path in tmp_path.iterdir()] == ["c.bank.part"]
+    assert main(build) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["c.bank"]
+    assert out.read_bytes() == (folder / "a.bank").read_bytes()
 
 
 def test_info_checks_the_bank_and_says_what_it_is_of(folder, capsys):

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, Self
 
+from daemon.cli import EXIT_INTERRUPTED
 from daemon.cli.cluster import add_cluster
 from daemon.errors import UserError
 
@@ -40,6 +41,16 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build the bank, telling how far it is on stderr."""
+    try:
+        return _build(args)
+    except KeyboardInterrupt:
+        kept = args.out.with_name(f"{args.out.name}.part")
+        rest = f"its finished rows are in {kept}, and the same command goes on from there" if kept.exists() else ""
+        print(f"shearloop bank: interrupted: {args.out} was not written; {rest or 'nothing is left'}", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def _build(args: argparse.Namespace) -> int:
     from bank.bank_file import Bank
     from bank.build import build_bank, solve_row
     from daemon.bank_config import load_bank_plan

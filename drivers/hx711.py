@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 from drivers.calibration_file import CalibrationModel, Finite, Positive
+from drivers.lines import LineCutter
 from drivers.raw_input import InputKind, RawInput
 
 BAUD_RATE = 115200
@@ -113,6 +114,7 @@ REFUSED_LINES = {
     "not_decimal": "The load cell's board sent a line that is no decimal number; check the baud rate and the sketch.",
     "too_long": f"The load cell's board sent more than {MAX_LINE_BYTES} bytes without a line end; check the baud rate.",
     "empty": "The load cell's board sent an empty line; bytes were lost on the way, check the cable.",
+    "unfinished": "The load cell's board broke off in the middle of a line; check its plug and its power.",
 }
 
 
@@ -163,7 +165,8 @@ class LoadParser:
     def __init__(self, calibration: LoadCalibration, limits: LoadLimits | None = None) -> None:
         """Start before the first byte after the port was opened."""
         self._limits = limits or LoadLimits()
-        self.refused: Counter[str] = Counter()
+        self._lines = LineCutter(MAX_LINE_BYTES)
+        self._refused: Counter[str] = Counter()
         self._seq = 0
         self._last_mid_ns: int | None = None
         self.calibration = calibration
@@ -184,12 +187,16 @@ class LoadParser:
 
     def restart(self) -> None:
         """Forget everything but the counters: the port was opened (again), and bytes before that are lost."""
-        self._pending = b""
-        self._overlong = False
+        self._lines.restart()
         self._first_line = True
         self._last_raw: float | None = None
         self._repeats = 0
         self._despiker = Despiker(self._limits)
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What was not made a sample, by kind."""
+        return self._refused + Counter(too_long=self._lines.too_long, unfinished=self._lines.unfinished)
 
     @property
     def calibration(self) -> LoadCalibration:
@@ -203,32 +210,19 @@ class LoadParser:
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[LoadSample]:
         """Return the samples that `data` completes. Of several lines at once, the earlier are a period older each."""
-        *lines, rest = (self._pending + data).split(b"\n")
+        lines = self._lines.feed(data)
         samples = []
         for age, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
-            value = self._value(line)
+            value = None if line is None else self._value(line)
             partial, self._first_line = self._first_line, False
-            if value is not None:
+            if line is not None and value is not None:
                 samples.append(self._sample(value, len(line) + 1, t_arrival_ns - age * PERIOD_NS, partial=partial))
-        if len(rest) > MAX_LINE_BYTES:
-            self._refuse_overlong()
-            self._overlong, rest = True, b""
-        self._pending = rest
         return samples
 
-    def _refuse_overlong(self) -> None:
-        if not self._overlong:
-            self.refused["too_long"] += 1
-
     def _value(self, line: bytes) -> float | None:
-        if self._overlong or len(line) > MAX_LINE_BYTES:
-            # What is left of a line whose beginning is gone is not a line.
-            self._refuse_overlong()
-            self._overlong = False
-            return None
         text = line.strip(b"\r")
         if not _DECIMAL.fullmatch(text):
-            self.refused["not_decimal" if text else "empty"] += 1
+            self._refused["not_decimal" if text else "empty"] += 1
             return None
         return float(text)
 

@@ -13,6 +13,7 @@ from types import TracebackType
 from typing import Self
 
 READ_BYTES = 4096
+HANDED_OVER_S = 0.02
 
 
 class PtyPort:
@@ -97,9 +98,13 @@ class PtyPort:
         """Wait until the other side has read what was written, or for so long."""
         loop = asyncio.get_running_loop()
         end_s = loop.time() + timeout_s
+        # The kernel hands bytes over a little later than they were written: empty is what stays empty.
+        empty_since_s = loop.time()
         # No event tells that a terminal's buffer has been read.
-        while self._master is not None and loop.time() < end_s and self._unread_bytes():  # noqa: ASYNC110
+        while self._master is not None and loop.time() < min(end_s, empty_since_s + HANDED_OVER_S):
             await asyncio.sleep(0.001)
+            if self._master is not None and self._unread_bytes():
+                empty_since_s = loop.time()
 
     def _unread_bytes(self) -> int:
         return int.from_bytes(fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)), sys.byteorder)

@@ -1,4 +1,4 @@
-"""A device on a pseudo-terminal that answers what it is sent: it can be unplugged, and fall silent."""
+"""A device on a pseudo-terminal that answers what it is sent: it can be unplugged, fall silent, and break off."""
 
 import asyncio
 from abc import ABC, abstractmethod
@@ -6,6 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from drivers.emulators.pty_port import PtyPort
+
+# How long a port that is about to hang up waits for a reader that may not be there.
+UNREAD_S = 0.5
 
 
 class PtyServer(ABC):
@@ -17,6 +20,8 @@ class PtyServer(ABC):
         self._answer_s = answer_s
         self._replies: asyncio.Queue[bytes] = asyncio.Queue()
         self.silent = False
+        # Whether the next answer stops half-way, where the port hangs up and comes back.
+        self.breaks_off = False
 
     @abstractmethod
     def _answer(self, data: bytes) -> bytes:
@@ -31,6 +36,10 @@ class PtyServer(ABC):
                 # Between question and answer lies a measurement.
                 await asyncio.sleep(self._answer_s)
                 try:
+                    if self.breaks_off:
+                        self.breaks_off = False
+                        await self._break_off(reply)
+                        continue
                     await self._port.write(reply)
                 except ConnectionError:  # unplugged before the reply was out: nobody misses it
                     continue
@@ -43,6 +52,13 @@ class PtyServer(ABC):
     async def lose(self) -> None:
         """Unplug it."""
         self._port.unplug()
+
+    async def _break_off(self, reply: bytes) -> None:
+        await self._port.write(reply[: len(reply) // 2])
+        # A pseudo-terminal would take back what is not yet read.
+        await self._port.drained(UNREAD_S)
+        await self.lose()
+        await self.bring_back()
 
     def _received(self, data: bytes) -> None:
         reply = self._answer(data)

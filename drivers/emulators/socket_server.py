@@ -1,4 +1,4 @@
-"""A device's side of a socket: it can be lost, come back, and fall silent."""
+"""A device's side of a socket: it can be lost, come back, fall silent, and break off in the middle of an answer."""
 
 import asyncio
 from abc import ABC, abstractmethod
@@ -22,6 +22,8 @@ class SocketServer(ABC):
         # The port that is listened on: with 0, a free one from the first start on.
         self.port = port
         self.silent = False
+        # Whether the next answer is the last one, and only its first half.
+        self.breaks_off = False
 
     @abstractmethod
     def _answerer(self) -> Callable[[bytes], bytes]:
@@ -66,6 +68,10 @@ class SocketServer(ABC):
                 if replies and not self.silent:
                     # Between question and answer lies a measurement.
                     await asyncio.sleep(self._answer_s)
+                    if self.breaks_off:
+                        self.breaks_off = False
+                        writer.write(replies[: len(replies) // 2])
+                        break
                     writer.write(replies)
                     await writer.drain()
         except ConnectionError:

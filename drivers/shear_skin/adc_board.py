@@ -1,13 +1,14 @@
 """A cheap converter board on a serial port: it sends a line `v1,v2` in volts for each pair of conversions, unasked."""
 
 import re
-import time
 from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
+from contextlib import aclosing
 
-from drivers.errors import DeviceLostError, DriverError
+from drivers.lines import LineCutter
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
-from drivers.serial_port import Link, Received
+from drivers.sending_board import SendingBoard
+from drivers.serial_port import Link
 from drivers.shear_skin.daq import RATE_HZ, Voltages
 
 BAUD_RATE = 115200
@@ -18,9 +19,6 @@ NS_PER_BYTE = 10 * 10**9 // BAUD_RATE
 FULL_SCALE_V = 0.512
 # A value this near the end of the range is at the end of the range.
 _AT_THE_END = 0.9995
-# An Uno waits for its boot loader when the port is opened.
-BOOT_S = 4.0
-SILENT_PERIODS = 8
 
 _PAIR = re.compile(rb"([+-]?[0-9]{1,3}\.[0-9]{1,9}), ?([+-]?[0-9]{1,3}\.[0-9]{1,9})")
 
@@ -28,6 +26,7 @@ REFUSED_LINES = {
     "not two decimals": "The converter board sent a line that is not two decimals; check the baud rate and the sketch.",
     "too long": f"The converter board sent more than {MAX_LINE_BYTES} bytes without a line end; check the baud rate.",
     "empty": "The converter board sent an empty line; bytes were lost on the way, check the cable.",
+    "unfinished": "The converter board broke off in the middle of a line; check its plug and its power.",
 }
 
 
@@ -35,7 +34,8 @@ class PairParser:
     """Turns the board's bytes, in whatever slices they come, into voltages; counts by kind what it refuses. No I/O."""
 
     def __init__(self, rate_hz: float = RATE_HZ, full_scale_v: float = FULL_SCALE_V) -> None:
-        self.refused: Counter[str] = Counter()
+        self._lines = LineCutter(MAX_LINE_BYTES)
+        self._refused: Counter[str] = Counter()
         self.first_partials = 0
         self._period_ns = round(1e9 / rate_hz)
         self._end_v = _AT_THE_END * full_scale_v
@@ -44,9 +44,13 @@ class PairParser:
 
     def restart(self) -> None:
         """Begin anew: the port was opened, perhaps in the middle of a line."""
-        self._pending = b""
-        self._overlong = False
+        self._lines.restart()
         self._first = True
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What was not made voltages, by kind."""
+        return self._refused + Counter({"too long": self._lines.too_long, "unfinished": self._lines.unfinished})
 
     def take(self, told: RawInput) -> list[Voltages]:
         """Be told what happened, live or from a recording; return the voltages that it leads to."""
@@ -62,36 +66,23 @@ class PairParser:
         The first line after the port was opened is left out: its beginning may be lost, and what is left of a number
         may be a number.
         """
-        *lines, rest = (self._pending + data).split(b"\n")
+        lines = self._lines.feed(data)
         found = []
         for age, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
-            pair = self._pair(line)
+            pair = None if line is None else self._pair(line)
             first, self._first = self._first, False
             if first:
                 self.first_partials += 1
-            elif pair is not None:
+            elif line is not None and pair is not None:
                 found.append(self._voltages(*pair, len(line) + 1, t_arrival_ns - age * self._period_ns, t_arrival_ns))
-        if len(rest) > MAX_LINE_BYTES:
-            self._refuse_overlong()
-            self._overlong, rest = True, b""
-        self._pending = rest
         return found
 
-    def _refuse_overlong(self) -> None:
-        if not self._overlong:
-            self.refused["too long"] += 1
-
     def _pair(self, line: bytes) -> tuple[float, float] | None:
-        if self._overlong or len(line) > MAX_LINE_BYTES:
-            # What is left of a line whose beginning is gone is not a line.
-            self._refuse_overlong()
-            self._overlong = False
-            return None
         text = line.strip(b"\r")
         match = _PAIR.fullmatch(text)
         if match is None:
             if not self._first:
-                self.refused["not two decimals" if text else "empty"] += 1
+                self._refused["not two decimals" if text else "empty"] += 1
             return None
         return float(match[1]), float(match[2])
 
@@ -116,11 +107,9 @@ class AdcBoard:
         self, link: Link, rate_hz: float = RATE_HZ, full_scale_v: float = FULL_SCALE_V, tap: Tap = no_tap
     ) -> None:
         """Take the link to it; nothing is opened yet. `tap` hears of all that the parser is told."""
-        self._link = link
-        self._tap = tap
         self._period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
-        self._patience_s = BOOT_S
+        self._board = SendingBoard(link, self._parser.take, period_s=self._period_s, silent=_silent, tap=tap)
         self._lines = 0
 
     @property
@@ -130,45 +119,25 @@ class AdcBoard:
 
     async def readings(self) -> AsyncGenerator[Voltages]:
         """Yield every line's voltages, for ever; see `Daq`."""
-        with self._link:
-            while True:
-                try:
-                    received = await self._receive()
-                except DriverError as error:
-                    await self._link.lost(error)
-                    continue
-                for voltages in self._told(InputKind.DATA, received.t_arrival_ns, received.data):
-                    self._lines += 1
-                    yield voltages
-
-    def _told(self, kind: InputKind, t_ns: int, data: bytes = b"") -> list[Voltages]:
-        told = RawInput(kind, t_ns, data)
-        self._tap(told)
-        return self._parser.take(told)
+        async with aclosing(self._board.values()) as readings:
+            async for voltages in readings:
+                self._lines += 1
+                yield voltages
 
     def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
         """Return what health tells of the board."""
-        refusals = (f"{REFUSED_LINES[kind]} ({count} times)" for kind, count in sorted(self._parser.refused.items()))
+        refused = self._parser.refused
+        refusals = (f"{REFUSED_LINES[kind]} ({count} times)" for kind, count in sorted(refused.items()))
         return {
-            "connected": self._link.port is not None,
+            **self._board.facts(),
             "lines": self._lines,
-            "errors": dict(self._parser.refused),
+            "errors": dict(refused),
             "refusals": " ".join(refusals),
-            "openings": self._link.openings,
-            "last_loss": self._link.last_error,
         }
 
-    async def _receive(self) -> Received:
-        port = self._link.port
-        if port is None:
-            port = await self._link.open()
-            self._told(InputKind.OPENED, time.monotonic_ns())
-            self._patience_s = BOOT_S
-        received = await port.read(self._patience_s)
-        if received is None:
-            raise DeviceLostError(
-                f"{port.path} is open but has sent nothing for {self._patience_s:.1f} s; "
-                "check that it is the skin's converter board and that it has power."
-            )
-        self._patience_s = SILENT_PERIODS * self._period_s
-        return received
+
+def _silent(path: str, waited_s: float) -> str:
+    return (
+        f"{path} is open but has sent nothing for {waited_s:.1f} s; "
+        "check that it is the skin's converter board and that it has power."
+    )

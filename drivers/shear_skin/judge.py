@@ -104,6 +104,9 @@ class Judge:
         self._repeats = [1, 1]
         self._good: tuple[float, float] | None = None
         self._candidates: list[tuple[float, float]] = []
+        # What was last wrong with the source, and since when it is right again.
+        self._without_source = Fault.SOURCE_LOST
+        self._source_since_ns: int | None = None
 
     def sample(self, voltages: Voltages, source: SourceReading | None) -> SkinSample:
         """Return what a reading of the voltages says, with the latest reading of the source."""
@@ -144,9 +147,16 @@ class Judge:
 
     def _faults(self, voltages: Voltages, source: SourceReading | None) -> list[Fault]:
         if source is None or voltages.t_arrival_ns - source.t_ns > self._stale_ns:
+            self._without_source, self._source_since_ns = Fault.SOURCE_LOST, None
             return [Fault.SOURCE_LOST]
         if not source.output_on:
+            self._without_source, self._source_since_ns = Fault.SOURCE_OFF, None
             return [Fault.SOURCE_OFF]
+        if self._source_since_ns is None:
+            self._source_since_ns = source.t_ns
+        if voltages.t_mid_ns < self._source_since_ns:
+            # Measured before the current is known to have flowed: without it, sound gauges look like shorts.
+            return [self._without_source]
         gauges = self._of_gauges(voltages)
         if source.compliance:
             # In compliance the circuit is what is wrong; where the voltage lies tells which part of it.

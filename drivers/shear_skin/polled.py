@@ -88,6 +88,7 @@ class Polled(ABC, Generic[ReadingT]):
         if self._name and not_understood and self._strikes < STRIKES:
             return
         self._strikes, self._name = 0, ""
+        self._session.lines.restart()
         await self._link.lost(error)
 
 

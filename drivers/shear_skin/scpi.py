@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from time import monotonic_ns
 
 from drivers.errors import DeviceLostError, ProtocolError
+from drivers.lines import LineCutter
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.serial_port import Link, Port
 
@@ -24,35 +25,36 @@ class ReplyLines:
     """Cuts bytes, in whatever slices they come, into replies: instruments end them with CR, LF or both. No I/O."""
 
     def __init__(self) -> None:
-        self.refused: Counter[str] = Counter()
-        self.restart()
+        self._lines = LineCutter(LONGEST_REPLY)
+        self._refused: Counter[str] = Counter()
+        self.unasked = 0
+
+    @property
+    def refused(self) -> Counter[str]:
+        """What was not taken for a reply, by kind."""
+        counts = {"too long": self._lines.too_long, "unfinished": self._lines.unfinished, "unasked": self.unasked}
+        return self._refused + Counter(counts)
+
+    @property
+    def begun(self) -> bool:
+        """Whether a reply has begun to come and not ended."""
+        return self._lines.begun
 
     def restart(self) -> None:
         """Forget what was half received."""
-        self._begun = b""
-        self._flooded = False
+        self._lines.restart()
 
     def feed(self, data: bytes) -> list[str]:
         """Return the replies that `data` completes, without their ends; empty lines are none."""
-        *lines, rest = (self._begun + data).replace(b"\r", b"\n").split(b"\n")
         replies = []
-        for line in lines:
-            if self._flooded or len(line) > LONGEST_REPLY:
-                self._refuse_flood()
-                self._flooded = False
-            elif not line.isascii():
-                self.refused["not ASCII"] += 1
+        for line in self._lines.feed(data.replace(b"\r", b"\n")):
+            if line is None:
+                continue
+            if not line.isascii():
+                self._refused["not ASCII"] += 1
             elif text := line.decode().strip():
                 replies.append(text)
-        if len(rest) > LONGEST_REPLY:
-            self._refuse_flood()
-            self._flooded, rest = True, b""
-        self._begun = rest
         return replies
-
-    def _refuse_flood(self) -> None:
-        if not self._flooded:
-            self.refused["too long"] += 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +130,7 @@ class ScpiSession:
     async def ask(self, query: str) -> Reply:
         """Return the answer to a query; DeviceLostError when none comes."""
         # What comes without having been asked for must not be taken for the answer.
-        self.lines.refused["unasked"] += len(self._waiting)
+        self.lines.unasked += len(self._waiting)
         self._waiting.clear()
         asked_ns = monotonic_ns()
         await self.tell(query)
@@ -170,7 +172,14 @@ class ScpiSession:
             deadline_ns = begin_ns + int(self._deadline_s * 1e9)
         while not self._waiting:
             left_s = (deadline_ns - monotonic_ns()) / 1e9
-            received = await self._port.read(left_s) if left_s > 0 else None
+            try:
+                received = await self._port.read(left_s) if left_s > 0 else None
+            except DeviceLostError as error:
+                if not self.lines.begun:
+                    raise
+                raise DeviceLostError(
+                    f"{self._what} broke off in the middle of its answer to {query!r}: {error}"
+                ) from error
             if received is None:
                 waited_s = (deadline_ns - begin_ns) / 1e9
                 raise DeviceLostError(

@@ -102,11 +102,19 @@ def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line: str,
     assert "(1 times)" in sentence
 
 
+def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
+    parser = LoadParser(TORQUE_LINES)
+    parser.feed(b"0.010\r\n0.0", 0)
+    parser.restart()
+    assert [sample.raw for sample in parser.feed(b"20\r\n0.030\r\n", 1)] == [20.0, 0.03]
+    assert dict(parser.refused) == {"unfinished": 1}
+
+
 def test_memory_stays_bounded_when_no_line_ever_ends() -> None:
     parser = LoadParser(TORQUE_LINES)
     for _ in range(1000):
         assert parser.feed(b"7" * 1000, 0) == []
-        assert len(parser._pending) <= MAX_LINE_BYTES
+        assert len(parser._lines._begun) <= MAX_LINE_BYTES
     assert dict(parser.refused) == {"too_long": 1}
     samples = parser.feed(b"7\n0.5\n", 0)
     assert [(s.raw, s.partial) for s in samples] == [(0.5, False)]

@@ -78,7 +78,7 @@ class _Session:
         from drivers.errors import DeviceLostError
         from drivers.hx711 import LoadParser
         from drivers.hx711_calibration import UNCALIBRATED
-        from drivers.load_cell import BOOT_S
+        from drivers.sending_board import BOOT_S
 
         parser = LoadParser(UNCALIBRATED)
         while (received := await self._port.read(BOOT_S)) is not None:

@@ -8,7 +8,9 @@ from typing import Protocol
 from drivers.emulators.pty_server import PtyServer
 from drivers.emulators.socket_server import SocketServer
 
-COMMANDS = "silence [SECONDS], unplug [SECONDS], normal"
+COMMANDS = (
+    "silence [SECONDS], unplug [SECONDS], break-off (the next answer stops half-way, with the connection), normal"
+)
 
 Feed = Callable[[bytes], bytes]
 
@@ -17,6 +19,7 @@ class Server(Protocol):
     """A way in, as far as outages need it."""
 
     silent: bool
+    breaks_off: bool
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -64,7 +67,7 @@ class ScpiSerial(PtyServer):
 
 
 class Outages:
-    """Lets a way in fall silent or go away, for a time or until it is mended."""
+    """Lets a way in fall silent or go away, for a time or until it is mended, or break off once."""
 
     def __init__(self, server: Server) -> None:
         self._server = server
@@ -84,6 +87,8 @@ class Outages:
                     self._want(there=False)
                 if lasts_s is not None:
                     self._timer = asyncio.get_running_loop().call_later(lasts_s, self._end)
+            case ["break-off"]:
+                self._server.breaks_off = True
             case ["normal"]:
                 self._end()
             case _:
@@ -109,7 +114,7 @@ class Outages:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        self._server.silent = False
+        self._server.silent = self._server.breaks_off = False
         if not self._wanted:
             self._want(there=True)
 

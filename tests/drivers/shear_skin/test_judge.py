@@ -94,10 +94,22 @@ def test_a_jump_is_a_disturbance_until_it_stays() -> None:
     assert trusted == [True, True, False, True, False, False, True, True]
 
 
+def test_voltages_from_before_the_current_flowed_are_not_called_a_short() -> None:
+    one = judge()
+    on = SourceReading(2 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
+    assert one.sample(voltages(0.0, 0.0, 1), on).faults == (Fault.SOURCE_LOST,)
+    assert one.sample(voltages(0.123, 0.126, 2), on).trusted
+    off = SourceReading(3 * 10**8, output_on=False)
+    assert one.sample(voltages(0.0, 0.0, 3), off).faults == (Fault.SOURCE_OFF,)
+    on = SourceReading(5 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
+    assert one.sample(voltages(0.0, 0.0, 4), on).faults == (Fault.SOURCE_OFF,)
+    assert one.sample(voltages(0.0, 0.0, 6), on).faults == (Fault.SHORT_1, Fault.SHORT_2)
+
+
 def test_a_converter_that_stands_still_is_told_by_gauge() -> None:
     one = judge()
-    source = SourceReading(60 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
-    samples = [one.sample(voltages(0.123, 0.126 + 1e-6 * (n % 2), n), source) for n in range(60)]
+    sources = [SourceReading(n * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A) for n in range(60)]
+    samples = [one.sample(voltages(0.123, 0.126 + 1e-6 * (n % 2), n), source) for n, source in enumerate(sources)]
     assert samples[40].trusted
     assert list(samples[59].faults) == [Fault.STUCK_1]
 

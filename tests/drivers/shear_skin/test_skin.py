@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import re
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass, field
@@ -247,6 +248,46 @@ async def test_voltages_that_stop_coming_are_awaited(tmp_path: Path, adc: bool) 
             bench.reader("normal")
         await bench.next_says()
         assert any(sample.missed for sample in bench.samples), "the gap is counted"
+
+
+@pytest.mark.parametrize("serial_source", [True, False])
+async def test_a_source_that_breaks_off_in_the_middle_of_an_answer_is_named_counted_and_asked_again(
+    tmp_path: Path, serial_source: bool
+) -> None:
+    async with a_bench(tmp_path, serial_source=serial_source, adc=True) as bench:
+        await bench.next_says()
+        bench.source.command("break-off")
+        await bench.until(lambda: bench.skin.source_facts()["openings"] == 2)
+        await bench.next_says()
+        (told,) = (event.sentence for event in bench.events if not event.up)
+        assert re.match(r"The current source broke off in the middle of its answer to ':(OUTP|READ)\?': .+", told)
+        assert bench.source_errors == {"lost": 1, "unfinished": 1}
+        assert bench.skin.source_facts()["last_loss"] == told
+        assert bench.circuit.output_on, "the current is not interrupted"
+
+
+async def test_a_scanner_that_breaks_off_in_the_middle_of_an_answer_is_named_counted_and_asked_again(
+    tmp_path: Path,
+) -> None:
+    async with a_bench(tmp_path, serial_source=False, adc=False) as bench:
+        await bench.next_says()
+        bench.reader("break-off")
+        await bench.until(lambda: bench.skin.facts()["openings"] == 2)
+        await bench.next_says()
+        facts = bench.skin.facts()
+        assert facts["errors"] == {"lost": 1, "unfinished": 1, **errors_of_start(bench)}
+        told = str(facts["last_loss"])
+        assert told.startswith("The scanner broke off in the middle of its answer to 'READ?': 127.0.0.1:")
+        assert told.endswith("has closed the connection; see whether the instrument is still on.")
+        # Half an answer is no reading: every voltage is that of a gauge.
+        good = [sample for sample in bench.samples if sample.trusted]
+        assert all(0.1 < volts < 0.15 for sample in good for volts in (sample.v1_v, sample.v2_v))
+
+
+def errors_of_start(bench: Bench) -> Mapping[str, int]:
+    """Samples from before the source's first reading, and whatever is read while it is late."""
+    lost = sum(Fault.SOURCE_LOST in sample.faults for sample in bench.samples)
+    return {"source_lost": lost} if lost else {}
 
 
 async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(tmp_path: Path) -> None:

@@ -1,0 +1,30 @@
+"""Lines come through whole in any slices; what is no line is counted once."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.lines import LineCutter
+
+LONGEST = 8
+
+
+@given(st.lists(st.binary(max_size=2 * LONGEST), max_size=12))
+def test_slices_change_nothing_and_every_line_is_given_or_counted(slices: list[bytes]) -> None:
+    data = b"".join(slices)
+    whole, sliced = LineCutter(LONGEST), LineCutter(LONGEST)
+    expected = whole.feed(data)
+    assert [line for part in slices for line in sliced.feed(part)] == expected
+    *ended, rest = data.split(b"\n")
+    assert expected == [line if len(line) <= LONGEST else None for line in ended]
+    assert whole.too_long == sliced.too_long == sum(len(line) > LONGEST for line in [*ended, rest])
+    assert sliced.begun == whole.begun == (bool(rest.strip()) or len(rest) > LONGEST)
+    assert len(sliced._begun) <= LONGEST
+
+
+def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten() -> None:
+    lines = LineCutter(LONGEST)
+    lines.feed(b"1\n2")
+    lines.restart()
+    lines.restart()
+    assert (lines.unfinished, lines.begun) == (1, False)
+    assert lines.feed(b"3\n") == [b"3"]

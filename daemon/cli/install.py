@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daemon.cli.result import add_json, tell
+
 if TYPE_CHECKING:
     from daemon.service.steps import Step
 
@@ -23,6 +25,7 @@ def add_place(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--root", type=Path, default=Path("/"), metavar="DIR", help="the root of another system, such as an image"
     )
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -35,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--program {args.program} is not a file; give the path of the installed `shearloop`")
     root = args.root.absolute()
     steps = install_steps(root, program, real_time=args.real_time, running=systemd_runs(root))
-    return carry_out(steps, root, dry_run=args.dry_run)
+    return carry_out(steps, root, args)
 
 
 def systemd_runs(root: Path) -> bool:
@@ -43,14 +46,20 @@ def systemd_runs(root: Path) -> bool:
     return root == Path("/") and Path("/run/systemd/system").is_dir()
 
 
-def carry_out(steps: "Iterable[Step]", root: Path, *, dry_run: bool) -> int:
-    """Say and do each step, or only say it."""
+def carry_out(steps: "Iterable[Step]", root: Path, args: argparse.Namespace) -> int:
+    """Say and do each step, or only say it; as JSON all of them at the end."""
     from daemon.errors import UserError
 
-    if not dry_run and root == Path("/") and os.geteuid() != 0:
+    if not args.dry_run and root == Path("/") and os.geteuid() != 0:
         raise UserError("this changes the system: run it with sudo, or see what it would do with --dry-run")
+    told: list[dict[str, object]] = []
     for step in steps:
-        print(f"{'would ' if dry_run and step.acts else ''}{step.sentence()}", flush=True)
-        if not dry_run:
+        acts, sentence = step.acts, step.sentence()
+        told.append({"acts": acts, "says": sentence})
+        if not args.json:
+            print(f"{'would ' if args.dry_run and acts else ''}{sentence}", flush=True)
+        if not args.dry_run:
             step.carry_out()
+    if args.json:
+        tell({"root": str(root), "dry_run": args.dry_run, "steps": told}, (), as_json=True)
     return 0

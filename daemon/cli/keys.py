@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 
 from daemon.cli.connection import own_key_folder
+from daemon.cli.result import add_json, tell
 
 SERVER_FOLDER = Path("/etc/shearloop/keys")
 
@@ -15,6 +16,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     def action(name: str, summary: str, folder: Path) -> argparse.ArgumentParser:
         added = actions.add_parser(name, help=summary, description=summary)
         added.add_argument("--dir", type=Path, default=folder, metavar="DIR", help="default: %(default)s")
+        add_json(added)
         return added
 
     action("server", "make the daemon's keys, and the folder of allowed clients", SERVER_FOLDER)
@@ -24,8 +26,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     allow.add_argument("--name", help="what the client is called in the daemon's log (default: the file's name)")
     revoke = action("revoke", "let a client in no more", SERVER_FOLDER)
     revoke.add_argument("name", metavar="NAME", help="as `shearloop keys list` shows it")
-    shown = action("list", "show the daemon's public key and the allowed clients", SERVER_FOLDER)
-    shown.add_argument("--json", action="store_true", help="print it as JSON")
+    action("list", "show the daemon's public key and the allowed clients", SERVER_FOLDER)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -44,19 +45,26 @@ def _server(args: argparse.Namespace) -> None:
         clients.chmod(0o755)
     except OSError as error:
         raise cannot_write(error) from error
-    print(f"{secret}: the daemon's secret key, for its eyes alone")
-    print(f"{public}: give this file to every client, as ~/.config/shearloop/server.key")
-    print("next: `shearloop keys allow CLIENT.key` for each client, then add to the configuration:")
-    print(f"curve: {{server_key: {secret}, clients: {clients}}}")
+    sentences = [
+        f"{secret}: the daemon's secret key, for its eyes alone",
+        f"{public}: give this file to every client, as ~/.config/shearloop/server.key",
+        "next: `shearloop keys allow CLIENT.key` for each client, then add to the configuration:",
+        f"curve: {{server_key: {secret}, clients: {clients}}}",
+    ]
+    told = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
+    tell(told, sentences, as_json=args.json)
 
 
 def _client(args: argparse.Namespace) -> None:
     from daemon.keys import make_key_pair
 
     public, secret = make_key_pair(args.dir, "client")
-    print(f"{secret}: your secret key, which never leaves this machine")
-    print(f"{public}: bring this file to the daemon's machine, and there `sudo shearloop keys allow FILE --name YOU`")
-    print(f"bring the daemon's server.key back, as {args.dir / 'server.key'}")
+    sentences = [
+        f"{secret}: your secret key, which never leaves this machine",
+        f"{public}: bring this file to the daemon's machine, and there `sudo shearloop keys allow FILE --name YOU`",
+        f"bring the daemon's server.key back, as {args.dir / 'server.key'}",
+    ]
+    tell({"secret_file": str(secret), "public_file": str(public)}, sentences, as_json=args.json)
 
 
 def _allow(args: argparse.Namespace) -> None:
@@ -77,7 +85,7 @@ def _allow(args: argparse.Namespace) -> None:
         ) from error
     except OSError as error:
         raise cannot_write(error) from error
-    print(f"{name} may connect from now on")
+    tell({"allowed": name}, [f"{name} may connect from now on"], as_json=args.json)
 
 
 def _revoke(args: argparse.Namespace) -> None:
@@ -93,24 +101,19 @@ def _revoke(args: argparse.Namespace) -> None:
         raise UserError(f"there is no client {args.name!r}; allowed is {known}") from error
     except OSError as error:
         raise cannot_write(error) from error
-    print(f"{args.name} may connect no more; restart the daemon to end a connection that is open")
+    sentence = f"{args.name} may connect no more; restart the daemon to end a connection that is open"
+    tell({"revoked": args.name}, [sentence], as_json=args.json)
 
 
 def _list(args: argparse.Namespace) -> None:
-    import json
-
     from daemon.keys import allowed_clients, load_public_key
 
     server = load_public_key(args.dir / "server.key").decode()
     clients = {name: key.decode() for key, name in allowed_clients(args.dir / "clients").items()}
-    if args.json:
-        print(json.dumps({"server": server, "clients": clients}))
-        return
-    print(f"{server}  the daemon")
-    for name, key in clients.items():
-        print(f"{key}  {name}")
+    sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items())]
     if not clients:
-        print("nobody may connect yet; see `shearloop keys allow`")
+        sentences.append("nobody may connect yet; see `shearloop keys allow`")
+    tell({"server": server, "clients": clients}, sentences, as_json=args.json)
 
 
 def _check_name(name: str) -> None:

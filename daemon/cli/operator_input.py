@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import sys
 from types import TracebackType
 from typing import Self
 
@@ -12,8 +13,9 @@ READ_BYTES = 4096
 class Operator:
     """The person at the terminal, as an asynchronous context."""
 
-    def __init__(self) -> None:
-        """Nothing has been typed yet."""
+    def __init__(self, *, stdout_is_for_json: bool = False) -> None:
+        """Nothing has been typed yet; what is said goes to stderr where stdout is for a result alone."""
+        self._out = sys.stderr if stdout_is_for_json else sys.stdout
         self._begun = b""
         self._lines: asyncio.Queue[str | None] = asyncio.Queue()
         self._watching = False
@@ -39,12 +41,16 @@ class Operator:
         """Return the line that is typed after the prompt; UserError when the input has ended."""
         from daemon.errors import UserError
 
-        print(prompt, flush=True)
+        self.say(prompt)
         line = await self._lines.get()
         if line is None:
             self._lines.put_nowait(None)
             raise UserError("the input ended before all was measured; press Enter after each step")
         return line
+
+    def say(self, sentence: str) -> None:
+        """Print a sentence that asks for nothing."""
+        print(sentence, file=self._out, flush=True)
 
     def _read(self) -> bool:
         data = os.read(STDIN, READ_BYTES)

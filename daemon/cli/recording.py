@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon.cli.progress import progress_bar
+from daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
     from daemon.recording.summary import Summary
@@ -26,6 +27,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     repair.add_argument("recording", type=Path, metavar="REC", help="e.g. NAME.mcap.partial; it stays as it is")
     repair.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.mcap, or NAME.repaired.mcap")
+    add_json(repair)
     export = parts.add_parser(
         "export", help="as CSV, Parquet or for MATLAB", description="Write a recording's topics as tables."
     )
@@ -35,6 +37,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, metavar="PATH", help="a folder for a file per topic; for mat a file (default: beside REC)"
     )
     export.add_argument("--topic", action="append", metavar="TOPIC", help="only this topic; may be given several times")
+    add_json(export)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -92,7 +95,14 @@ def _repair(args: argparse.Namespace) -> int:
     lost = [f"{condition.torn_bytes} torn bytes at the end"] if condition.torn_bytes else []
     if condition.damaged_chunks:
         lost.append(f"{condition.damaged_chunks} damaged chunks")
-    print(f"{repaired.path}: {repaired.messages} messages are safe; left out: {' and '.join(lost) or 'nothing'}.")
+    told = {
+        "path": str(repaired.path),
+        "messages": repaired.messages,
+        "torn_bytes": condition.torn_bytes,
+        "damaged_chunks": condition.damaged_chunks,
+    }
+    sentence = f"{repaired.path}: {repaired.messages} messages are safe; left out: {' and '.join(lost) or 'nothing'}."
+    tell(told, [sentence], as_json=args.json)
     return 0
 
 
@@ -116,6 +126,5 @@ def _export(args: argparse.Namespace) -> int:
             progress(done)
 
         written = export(args.recording, args.format, out, topics, count)
-    for path in written:
-        print(path)
+    tell({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
     return 0

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon.addresses import PUBLISH_ADDRESS
+from daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
     from daemon.config import DaemonConfig
@@ -23,7 +24,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--publish", default=PUBLISH_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
     parser.add_argument("--config", type=Path, help="instead of the configuration in the recording")
     parser.add_argument("--wait", action="store_true", help="begin when somebody subscribes")
-    parser.add_argument("--show", action="store_true", help="print the estimates as they come")
+    printed = parser.add_mutually_exclusive_group()
+    printed.add_argument("--show", action="store_true", help="print the estimates as they come")
+    add_json(printed)
     parser.add_argument(
         "--check", action="store_true", help="exit with status 1 where an estimate is not the recorded one, bit for bit"
     )
@@ -42,6 +45,9 @@ def run(args: argparse.Namespace) -> int:
     same_code = run.metadata.get("code_sha256") == code_digest()
     for line in _told(comparison, same_code):
         print(line, file=sys.stderr)
+    if args.json:
+        counts = {"compared": dict(comparison.compared), "different": dict(comparison.different)}
+        tell({**counts, "examples": comparison.examples, "same_code": same_code}, (), as_json=True)
     return 1 if args.check and comparison.different else 0
 
 

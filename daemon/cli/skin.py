@@ -7,6 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from daemon.cli.result import add_json, tell
+
 if TYPE_CHECKING:
     from bank.skin.characterisation import Row
 
@@ -23,11 +25,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     characterise = actions.add_parser("characterise", help="print the paper's table beside the models'")
     characterise.add_argument("--out", type=Path, metavar="DIR", help="draw figures 5, 6 and 7 here, PNG and SVG")
-    characterise.add_argument("--json", action="store_true", help="print the table as JSON")
+    add_json(characterise)
     calibrate = actions.add_parser("calibrate", help="fit a calibration to a recorded table")
     calibrate.add_argument("table", type=Path, help="CSV with r1_ohm, r2_ohm, shear_n, normal_n")
     calibrate.add_argument("--out", type=Path, required=True, metavar="YAML", help="where the calibration goes")
     calibrate.add_argument("--friction", type=float, help="coefficient of friction, where the table cannot tell it")
+    add_json(calibrate)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -87,14 +90,26 @@ def _calibrate(args: argparse.Namespace) -> int:
         raise UserError(f"{args.table}: {error}") from error
     save_calibration(calibration, args.out)
     whence = "fitted" if args.friction is None else "given"
-    print(f"friction coefficient ({whence})        {calibration.friction:.4f}")
-    print(f"response per N of gauge tension      {calibration.slope_per_n:.4f} 1/N")
-    print(f"95 % prediction interval             ± {calibration.prediction_half_width_n:.4f} N")
-    print(
+    told = {
+        "path": str(args.out),
+        "friction": calibration.friction,
+        "friction_given": args.friction is not None,
+        "slope_per_n": calibration.slope_per_n,
+        "prediction_half_width_n": calibration.prediction_half_width_n,
+        "linear_to_n": calibration.linear_to_n,
+        "tension_n": [calibration.tension_n[0], calibration.tension_n[-1]],
+        "rows": calibration.rows,
+        "rows_beyond": calibration.rows_beyond,
+    }
+    sentences = [
+        f"friction coefficient ({whence})        {calibration.friction:.4f}",
+        f"response per N of gauge tension      {calibration.slope_per_n:.4f} 1/N",
+        f"95 % prediction interval             ± {calibration.prediction_half_width_n:.4f} N",
         f"straight to {calibration.linear_to_n} N; tension calibrated  "
-        f"{calibration.tension_n[0]:.2f} … {calibration.tension_n[-1]:.2f} N"
-    )
-    print(f"rows fitted                          {calibration.rows}")
-    print(f"rows left out beyond the curve       {calibration.rows_beyond}")
-    print(f"written: {args.out}")
+        f"{calibration.tension_n[0]:.2f} … {calibration.tension_n[-1]:.2f} N",
+        f"rows fitted                          {calibration.rows}",
+        f"rows left out beyond the curve       {calibration.rows_beyond}",
+        f"written: {args.out}",
+    ]
+    tell(told, sentences, as_json=args.json)
     return 0

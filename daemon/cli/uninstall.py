@@ -15,4 +15,4 @@ def run(args: argparse.Namespace) -> int:
     from daemon.service.installation import uninstall_steps
 
     root = args.root.absolute()
-    return carry_out(uninstall_steps(root, running=systemd_runs(root)), root, dry_run=args.dry_run)
+    return carry_out(uninstall_steps(root, running=systemd_runs(root)), root, args)

@@ -1,6 +1,7 @@
 """The guided calibrations and the emulators from the command line, each as a process of its own."""
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
@@ -38,10 +39,11 @@ class Process:
         assert self._child.stderr is not None
         assert "'?'" in self._child.stderr.readline()
 
-    def hear(self, beginning: str) -> str:
+    def hear(self, beginning: str, *, on_stderr: bool = False) -> str:
         """Return the next line that begins like this."""
-        assert self._child.stdout is not None
-        for line in self._child.stdout:
+        stream = self._child.stderr if on_stderr else self._child.stdout
+        assert stream is not None
+        for line in stream:
             self.said.append(line.strip())
             if line.startswith(beginning):
                 return line.strip()
@@ -94,6 +96,26 @@ def test_the_load_cell_is_calibrated_step_by_step_and_a_step_can_be_refused(tmp_
     assert calibration.torque_nm(81_250) == pytest.approx(0.0, abs=2e-4)
 
 
+def test_for_a_script_the_result_alone_is_on_stdout(tmp_path: Path) -> None:
+    link, out = tmp_path / "load", tmp_path / "load.yaml"
+    with process("emulate", "hx711", "--link", str(link), "--speed", "20") as board:
+        board.hear(str(link))
+        with process(
+            "calibrate", "load", "--port", str(link), "--mass-g", "100", "--out", str(out), "--json"
+        ) as script:
+            script.hear("Take every load off", on_stderr=True)
+            script.tell("")
+            script.hear("Put 100 g on", on_stderr=True)
+            board.told("mass 100")
+            script.tell("")
+            status, said, _ = script.end()
+    assert status == 0
+    told = json.loads(said)
+    assert told["path"] == str(out)
+    assert [level["mass_g"] for level in told["levels"]] == [0, 100]
+    assert told["calibration"] == load_calibration(out, LoadCalibration).model_dump(mode="json")
+
+
 @pytest.mark.parametrize("way", ["socket", "modbus"])
 def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path: Path, way: str) -> None:
     out, link = tmp_path / "gripper.yaml", tmp_path / "gripper"
@@ -103,19 +125,26 @@ def test_the_gripper_is_calibrated_on_objects_by_either_way(tmp_path: Path, way:
         host, _, port = where.partition(":")
         reach = ("--host", host, "--socket-port", port) if way == "socket" else ("--port", where)
         diameters = ("--diameter-mm", "10", "--diameter-mm", "40")
-        with process("calibrate", "gripper", *reach, *diameters, "--out", str(out)) as calibrate:
-            calibrate.hear("The fingers will open")
+        # One of the two ways as a script would: what is asked of the operator is then on stderr.
+        script = way == "modbus"
+        with process("calibrate", "gripper", *reach, *diameters, "--out", str(out), *["--json"] * script) as calibrate:
+            calibrate.hear("The fingers will open", on_stderr=script)
             calibrate.tell("")
-            calibrate.hear("Hold the object of 10 mm")
+            calibrate.hear("Hold the object of 10 mm", on_stderr=script)
             calibrate.tell("")
-            calibrate.hear("Hold the object of 10 mm")
+            if script:
+                calibrate.hear("Refused: the fingers closed without meeting anything", on_stderr=True)
+            calibrate.hear("Hold the object of 10 mm", on_stderr=script)
             for diameter in (10, 40):
                 gripper.told(f"object {diameter}")
                 calibrate.tell("")
-                calibrate.hear(f"  {diameter} mm:")
-            status, _, refused = calibrate.end()
+                calibrate.hear(f"  {diameter} mm:", on_stderr=script)
+            status, said, refused = calibrate.end()
     assert status == 0
-    assert "without meeting anything" in refused
+    if script:
+        assert [gauge["diameter_mm"] for gauge in json.loads(said)["gauges"]] == [10, 40]
+    else:
+        assert "without meeting anything" in refused
     found = load_calibration(out, WidthCalibration)
     # Two positions, each rounded to a count: the true gripper goes from 3 to 230 counts over 140 mm.
     assert found.width_mm(3) == pytest.approx(140, abs=5)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon.cli.operator_input import Operator
+from daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
     from drivers.robotiq.gripper import RobotiqGripper
@@ -24,6 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--force-n", type=float, default=10.0, metavar="N", help="to grip with (default: %(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the calibration file to write")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -45,16 +47,30 @@ def run(args: argparse.Namespace) -> int:
         client = SocketClient(args.host, args.socket_port)
     else:
         client = ModbusClient(serial_number=args.serial_number, path=args.port)
-    gauges = asyncio.run(_grip(RobotiqGripper(client, WidthCalibration.nominal()), args.diameter_mm, args.force_n))
+    gripper = RobotiqGripper(client, WidthCalibration.nominal())
+    operator = Operator(stdout_is_for_json=args.json)
+    gauges = asyncio.run(_grip(gripper, args.diameter_mm, args.force_n, operator))
     calibration = WidthCalibration.of_gauges(gauges)
     save_calibration(args.out, calibration)
-    print(f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm.")
-    print(f"Written to {args.out}.")
+    told = {
+        "path": str(args.out),
+        "calibration": calibration.model_dump(mode="json"),
+        "mm_per_count": calibration.mm_per_count,
+        "width_std_mm": calibration.width_std_mm,
+        "gauges": [{"counts": counts, "diameter_mm": diameter_mm} for counts, diameter_mm in gauges],
+    }
+    sentences = [
+        f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm.",
+        f"Written to {args.out}.",
+    ]
+    tell(told, sentences, as_json=args.json)
     return 0
 
 
-async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], force_n: float) -> list[tuple[float, float]]:
-    async with Operator() as operator:
+async def _grip(
+    gripper: "RobotiqGripper", diameters_mm: list[float], force_n: float, operator: Operator
+) -> list[tuple[float, float]]:
+    async with operator:
         try:
             await gripper.connect()
             await operator.ask(
@@ -69,7 +85,7 @@ async def _grip(gripper: "RobotiqGripper", diameters_mm: list[float], force_n: f
                 if counts is None:
                     print("Refused: the fingers closed without meeting anything.", file=sys.stderr, flush=True)
                 else:
-                    print(f"  {diameter_mm:g} mm: {counts} counts.", flush=True)
+                    operator.say(f"  {diameter_mm:g} mm: {counts} counts.")
                     gauges.append((counts, diameter_mm))
             return gauges
         finally:

@@ -3,10 +3,12 @@
 import argparse
 import asyncio
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from daemon.cli.operator_input import Operator
+from daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
     from drivers.hx711_calibration import LoadCalibrator
@@ -28,6 +30,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--reverse", action="store_true", help="the turn that presses on the cell counts as negative torque"
     )
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the calibration file to write")
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -44,15 +47,22 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--out {args.out} cannot be written: the folder {args.out.parent} does not exist")
     calibrator = LoadCalibrator(args.mass_g, args.lever_arm_mm * 1e-3, -1 if args.reverse else 1)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:
-        asyncio.run(_measure(port, calibrator))
+        asyncio.run(_measure(port, calibrator, Operator(stdout_is_for_json=args.json)))
     result = calibrator.result()
     save_calibration(args.out, result.calibration)
-    print(*result.sentences, f"Written to {args.out}.", sep="\n")
+    told = {
+        "path": str(args.out),
+        "calibration": result.calibration.model_dump(mode="json"),
+        "levels": [asdict(level) for level in result.levels],
+        "residual_nm": result.residual_nm,
+        "remarks": list(result.sentences),
+    }
+    tell(told, [*result.sentences, f"Written to {args.out}."], as_json=args.json)
     return 0
 
 
-async def _measure(port: "SerialPort", calibrator: "LoadCalibrator") -> None:
-    async with Operator() as operator:
+async def _measure(port: "SerialPort", calibrator: "LoadCalibrator", operator: Operator) -> None:
+    async with operator:
         session = _Session(port, calibrator, operator)
         # The port is read all the while: what waits in its buffer was measured under an earlier load.
         tasks = {asyncio.create_task(session.listen()), asyncio.create_task(session.lead())}
@@ -116,4 +126,5 @@ class _Session:
                 print(f"Refused: {error}", file=sys.stderr, flush=True)
             else:
                 level = self._calibrator.levels[-1]
-                print(f"  {level.mass_g:g} g: {level.mean:.6g}, noise {level.std:.3g}, {level.n} readings.", flush=True)
+                read = f"{level.mean:.6g}, noise {level.std:.3g}, {level.n} readings"
+                self._operator.say(f"  {level.mass_g:g} g: {read}.")

@@ -3,6 +3,8 @@
 import argparse
 from pathlib import Path
 
+from daemon.cli.result import add_json, tell
+
 ESTIMATORS = ("fused", "regression", "bank", "paper", "reconstruction")
 
 
@@ -19,6 +21,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--part", metavar="FROM:TO", default="0:1", help="share of each recording to use, e.g. 0:0.5 (default: all)"
     )
+    add_json(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,8 +44,17 @@ def run(args: argparse.Namespace) -> int:
     calibration.save(args.out)
     quantities = [name for name in ("torque", "diameter") if getattr(calibration, name) is not None]
     frames = sum(len(one.t_s) for one in parts)
-    print(
+    told = {
+        "path": str(args.out),
+        "estimator": args.estimator,
+        "quantities": quantities,
+        "frames": frames,
+        "sides": list(calibration.sides),
+        "source": source,
+    }
+    sentence = (
         f"{args.out}: estimator {args.estimator}, {' and '.join(quantities)} from {frames} frames of the "
         f"{' and '.join(calibration.sides)} side."
     )
+    tell(told, [sentence], as_json=args.json)
     return 0

@@ -85,6 +85,10 @@ def test_calibrate_takes_a_table_to_a_file(tmp_path: Path, capsys: pytest.Captur
     assert f"rows fitted                          {2 * len(loop(1.1))}" in printed
     assert main(["skin", "calibrate", str(table), "--out", str(out), "--friction", "0.04"]) == 0
     assert "(given)" in capsys.readouterr().out
+    assert main(["skin", "calibrate", str(table), "--out", str(out), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["path"], told["friction"], told["friction_given"]) == (str(out), calibration.friction, False)
+    assert told["rows"] == calibration.rows
 
 
 def test_a_table_that_no_curve_fits_is_refused_by_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -69,18 +69,21 @@ def test_a_damaged_chunk_is_left_out_and_told(
     at = content.index(b'{"torque_nm":0.5}') if b'{"torque_nm":0.5}' in content else len(content) // 4
     content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])
     path.write_bytes(content)
-    assert main(["recording", "repair", str(path)]) == 0
-    told = capsys.readouterr().out
-    assert "a.repaired.mcap" in told
+    assert main(["recording", "repair", str(path), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["path"], told["damaged_chunks"]) == (str(tmp_path / "a.repaired.mcap"), 1)
     kept = read_recording(tmp_path / "a.repaired.mcap").torque_nm
     assert set(np.round(kept, 2)) < set(np.round(0.01 * np.arange(100), 2))
-    assert len(kept) >= 24
+    assert len(kept) == told["messages"] >= 24
 
 
-def test_csv_parquet_and_matlab_hold_the_same(recording: Path, tmp_path: Path) -> None:
+def test_csv_parquet_and_matlab_hold_the_same(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     pyarrow_parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")
     for form in ("csv", "parquet", "mat"):
-        assert main(["recording", "export", str(recording), "--format", form]) == 0
+        assert main(["recording", "export", str(recording), "--format", form, "--json"]) == 0
+        assert all(Path(file).stat().st_size for file in json.loads(capsys.readouterr().out)["files"])
     with (tmp_path / "twist_csv" / "eit.frame.right.csv").open(newline="") as file:
         rows = list(csv.reader(file))
     assert rows[0][:3] == ["log_time_ns", "arrival_unix_ns", "line_0"]

@@ -13,10 +13,12 @@ KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "valid_fraction", "latency_ms_
 @pytest.mark.usefixtures("fonts")
 def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_path, capsys):
     first, second = tmp_path / "a.cal", tmp_path / "b.cal"
-    for out in (first, second):
-        assert main(["calibrate", str(slices_folder), "--part", "0:0.6", "--out", str(out)]) == 0
+    for out, form in ((first, []), (second, ["--json"])):
+        capsys.readouterr()
+        assert main(["calibrate", str(slices_folder), "--part", "0:0.6", "--out", str(out), *form]) == 0
     assert first.read_bytes() == second.read_bytes()
-    capsys.readouterr()
+    told = json.loads(capsys.readouterr().out)
+    assert (told["path"], told["estimator"], told["quantities"]) == (str(second), "fused", ["torque", "diameter"])
     assert main(["evaluate", str(first), str(slices_folder), "--part", "0.6:1", "--json", "--plot"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert set(figures) == KEYS | {"diameter_rmse_mm", "diameter_coverage_95"}

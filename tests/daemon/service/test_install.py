@@ -1,5 +1,6 @@
 """`shearloop install` and `uninstall`, on the root of another system."""
 
+import json
 import os
 from pathlib import Path
 
@@ -78,6 +79,15 @@ def test_a_dry_run_says_everything_and_does_nothing(
     assert "would run `" in said
     assert files(tmp_path) == {PLACES["shearloop.service"]}
     assert kept.read_text() == "something else"
+
+
+def test_for_a_script_the_steps_are_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert place(tmp_path, "install", "--dry-run", "--json") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["dry_run"] is True
+    assert {"acts": True, "says": f"write {tmp_path / EXAMPLE}"} in told["steps"]
+    assert place(tmp_path, "uninstall", "--dry-run", "--json") == 0
+    assert {"acts": False, "says": f"not there: {tmp_path / EXAMPLE}"} in json.loads(capsys.readouterr().out)["steps"]
 
 
 def test_a_running_system_is_told(tmp_path: Path) -> None:

@@ -1,0 +1,58 @@
+"""Every command that a script would want to read has `--json`, and what it prints with it is JSON and nothing else."""
+
+import argparse
+import importlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from daemon.cli import COMMANDS, main
+
+# What needs none, and why.
+WITHOUT = {
+    "run": "it logs JSON lines with --json-log, and publishes",
+    "emulate": "its events are JSON lines as they are",
+    "completion": "it prints what a shell reads",
+    "bank design": "it prints the YAML that `bank build` takes",
+    "bank plot": "it prints the files drawn, one a line",
+    "chart": "it prints the files drawn, one a line; its numbers are a JSON file among them",
+}
+
+
+def parsers(name: str, parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    """Yield the parsers of a command's parts, or its own where it has none."""
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for part, its_own in action.choices.items():
+                yield from parsers(f"{name} {part}", its_own)
+            return
+    yield name, parser
+
+
+def every_parser() -> Iterator[tuple[str, argparse.ArgumentParser]]:
+    for name, command in COMMANDS.items():
+        parser = argparse.ArgumentParser()
+        importlib.import_module(command.module).configure(parser)
+        yield from parsers(name, parser)
+
+
+def test_every_command_has_json_or_a_reason_to_have_none() -> None:
+    having = {name: "--json" in parser._option_string_actions for name, parser in every_parser()}
+    lacking = {name for name, has_it in having.items() if not has_it}
+    assert {next((known for known in WITHOUT if name.startswith(known)), name) for name in lacking} == set(WITHOUT)
+
+
+def test_keys_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def told(*words: str) -> dict[str, object]:
+        assert main(["keys", *words, "--json"]) == 0
+        return json.loads(capsys.readouterr().out)
+
+    server = told("server", "--dir", str(tmp_path / "server"))
+    client = told("client", "--dir", str(tmp_path / "client"))
+    assert Path(str(server["secret_file"])).stat().st_mode & 0o777 == 0o600
+    allow = ("allow", str(client["public_file"]), "--name", "ada", "--dir", str(tmp_path / "server"))
+    assert told(*allow) == {"allowed": "ada"}
+    assert list(told("list", "--dir", str(tmp_path / "server"))["clients"]) == ["ada"]
+    assert told("revoke", "ada", "--dir", str(tmp_path / "server")) == {"revoked": "ada"}

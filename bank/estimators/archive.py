@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from bank.bank_file import sync_directory
 from bank.errors import CalibrationError
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _KIND = "shearloop estimator calibration"
 _HEADER = "calibration.yaml"
 _DATE = (1980, 1, 1, 0, 0, 0)

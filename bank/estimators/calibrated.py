@@ -11,7 +11,8 @@ from bank.bank_file import Bank
 from bank.channels import CHANNEL_TABLE_HASH
 from bank.errors import CalibrationError
 from bank.estimators.archive import read_archive, write_archive
-from bank.estimators.guard import DifferenceGuard, SideGuard
+from bank.estimators.familiar import DifferenceGuard
+from bank.estimators.guard import SideGuard
 from bank.estimators.memory import Memory, Motion
 from bank.estimators.physics import BestCell, Locator, NearestCell, Place, Registration
 from bank.estimators.reader import Reader
@@ -20,14 +21,33 @@ from bank.estimators.values import BoolArray, Estimate, FloatArray, Kind, Tactil
 Name = Literal["paper", "bank", "regression", "reconstruction", "fused"]
 NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
 NEEDS_BANK: tuple[Name, ...] = ("paper", "bank")
+# Two cells of the paper's bank.
+_LEAST_MARGIN_K_CM = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
-    """How one quantity is read: its reader, and for differences the guard of those it was fitted to."""
+    """How one quantity is read: its reader, and for differences the guard of those it was fitted to.
+
+    ks are the least and the largest k in cm that frames were found at in the bank, none for an estimator without one.
+    """
 
     reader: Reader
     guard: DifferenceGuard | None
+    ks: FloatArray
+
+    def refuse_place(self, place: Place | None) -> tuple[str, ...]:
+        """Return why a place in the bank is none that torques were calibrated at: the match may have hopped."""
+        if place is None or not len(self.ks):
+            return ()
+        low, high = self.ks.tolist()
+        margin = max(high - low, _LEAST_MARGIN_K_CM)
+        if low - margin <= place.k <= high + margin:
+            return ()
+        return (
+            f"the bank fits best at k = {place.k:.2f} cm, and the calibration knows {low:.2f} to {high:.2f} cm; "
+            "another ridge of the bank fits the frame better, which was not calibrated",
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,15 +214,15 @@ class Tracker:
             return _with_place(
                 Estimate(valid=False, why=("two places of the bank far apart fit the frame equally well",)), seen.place
             )
-        values: dict[str, tuple[float, float]] = {}
+        values: dict[str, tuple[float, float, float]] = {}
         for name, task in wanted.items():
             features = read_from(calibration, name, seen.features, difference)
-            value, half = task.reader.read(features, float(usable.mean()))
-            half *= 1.0 if task.guard is None else task.guard.widening(difference[0], usable[0])
-            why = task.reader.refuse(value, features, name, tasks[name][1])
+            widening = 1.0 if task.guard is None else task.guard.widening(difference[0], usable[0])
+            read = task.reader.read(features, float(usable.mean()), widening)
+            why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])
             refused += [reason for reason in why if reason not in refused]
             if not why:
-                values[name] = (value, half)
+                values[name] = read
         if calibration.kind == "raw" and calibration.torque is not None and "torque" not in values:
             # What a frame beyond the calibrated torques says of the tool was not calibrated either.
             values.clear()
@@ -224,7 +244,7 @@ def read_from(calibration: Calibration, quantity: str, features: FloatArray, dif
     return columns_for(calibration.estimator, quantity, features)
 
 
-def _estimate(values: dict[str, tuple[float, float]], refused: Sequence[str]) -> Estimate:
+def _estimate(values: dict[str, tuple[float, float, float]], refused: Sequence[str]) -> Estimate:
     if not values:
         return Estimate(valid=False, why=tuple(refused))
     torque, diameter = values.get("torque"), values.get("diameter")
@@ -233,10 +253,10 @@ def _estimate(values: dict[str, tuple[float, float]], refused: Sequence[str]) ->
         why=(),
         torque_nm=torque[0] if torque else None,
         torque_low_nm=torque[0] - torque[1] if torque else None,
-        torque_high_nm=torque[0] + torque[1] if torque else None,
+        torque_high_nm=torque[0] + torque[2] if torque else None,
         diameter_mm=diameter[0] if diameter else None,
         diameter_low_mm=diameter[0] - diameter[1] if diameter else None,
-        diameter_high_mm=diameter[0] + diameter[1] if diameter else None,
+        diameter_high_mm=diameter[0] + diameter[2] if diameter else None,
     )
 
 

@@ -23,11 +23,21 @@ from bank.estimators.calibrated import (
     locator_for,
     read_from,
 )
-from bank.estimators.guard import DifferenceGuard, SideGuard
-from bank.estimators.heads import Censored, Curve, Ridge
+from bank.estimators.familiar import DifferenceGuard
+from bank.estimators.guard import SideGuard
+from bank.estimators.heads import Censored, Curve, Ridge, Rows
 from bank.estimators.memory import Memory, Motion, gripped_part
 from bank.estimators.physics import NOT_TURNED, Locator, Registration, image_matrix, register
-from bank.estimators.reader import STRENGTHS, Head, HeadOf, Reader, error_on_later, fit_reader, one_sided
+from bank.estimators.reader import (
+    STRENGTHS,
+    Difficulty,
+    Head,
+    HeadOf,
+    Reader,
+    error_on_later,
+    fit_reader,
+    one_sided,
+)
 from bank.estimators.values import FloatArray, FrameSeries, TactileFrame
 
 if TYPE_CHECKING:
@@ -124,11 +134,27 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
             _curve(curve) if blank.estimator == "fused" else _ridge(blank.estimator),
             strengths=_strengths(blank.estimator),
             rolling=name == "torque",
+            difficulty=_misfits(differences[:, 0]) if name == "torque" else None,
         )
-        tasks[name] = Task(reader, DifferenceGuard.fit(differences[:, 0]))
+        tasks[name] = Task(reader, DifferenceGuard.fit(differences[:, 0]), _ks(blank.estimator, features))
     if not tasks:
         raise CalibrationError("the slices come with neither torque nor diameter")
     return replace(blank, torque=tasks.get("torque"), diameter=tasks.get("diameter"))
+
+
+def _misfits(differences: FloatArray) -> Difficulty:
+    """Return how much wider the intervals of later ones among (n, 896) differences are, by a guard of the earlier."""
+
+    def difficulty(past: Rows, future: Rows) -> FloatArray:
+        guard, usable = DifferenceGuard.fit(differences[past]), np.ones(N_CHANNELS, dtype=np.bool_)
+        return np.array([guard.widening(one, usable) for one in differences[future]])
+
+    return difficulty
+
+
+def _ks(name: Name, features: FloatArray) -> FloatArray:
+    """Return the least and the largest k of (n, d) features, none for an estimator without a bank."""
+    return np.array([features[:, 0].min(), features[:, 0].max()]) if name in NEEDS_BANK else np.zeros(0)
 
 
 def _ridge(name: Name) -> Callable[[FloatArray, FloatArray, float], Head]:
@@ -176,10 +202,10 @@ def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics
     rows = [row for one in recordings for row in _replayed(calibration, locator, one, every)]
     if not rows:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
-    calibration, reader = _torque_reader(
-        calibration, np.array([row.features for row in rows]), np.array([row.torque_nm for row in rows])
-    )
-    return replace(calibration, torque=Task(reader, None), diameter=_diameter_task(calibration, rows))
+    features = np.array([row.features for row in rows])
+    calibration, reader = _torque_reader(calibration, features, np.array([row.torque_nm for row in rows]))
+    torque = Task(reader, None, _ks(calibration.estimator, features))
+    return replace(calibration, torque=torque, diameter=_diameter_task(calibration, rows))
 
 
 def _torque_reader(calibration: Calibration, features: FloatArray, torque: FloatArray) -> tuple[Calibration, Reader]:
@@ -218,7 +244,8 @@ def _diameter_task(calibration: Calibration, rows: list["_Row"]) -> Task | None:
     motion = calibration.motion is not None
     head: HeadOf = Ridge.fit if motion else _ridge(calibration.estimator)
     strengths = STRENGTHS if motion else _strengths(calibration.estimator)
-    return Task(fit_reader(features, diameters, head, strengths=strengths), None)
+    seen = np.array([row.features for row in known])
+    return Task(fit_reader(features, diameters, head, strengths=strengths), None, _ks(calibration.estimator, seen))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,15 +31,11 @@ LARGEST_JUMPING_SHARE = 0.12
 LARGEST_UNUSABLE_SHARE = 0.25
 # Directions in which frames move while gripped or idle, which the grip's discriminant looks away from.
 _N_NUISANCE = 2
-# A difference is judged against those left out in turn, with this margin. On the recorded slices the later ones stay
-# within 1.2 times of them; with twice as much, a third of a foreign frame mixed in passed for a torque.
-_MISFIT_MARGIN, _LEAST_OUTLYING, _OUTLYING_NOISES = 1.5, 0.05, 5.0
 # A channel that is off by more than this share of what it should read, beyond the common gain, has lost its electrode.
 # Recorded frames stay within 0.4, but for single channels while the grip closes.
 _LOST_SHARE = 0.6
 # No recorded frame has more than two channels at its largest value: so many are at an amplifier's rail.
 _FEWEST_AT_RAIL = 9
-_FOLDS, _LEAST_DIFFERENCES = 7, 8
 # Closing and opening take this many frames, and move the frame so much further than twisting under load.
 STEP_FRAMES, _STEP_MARGIN = 4, 1.25
 # Where between the idle frames' highest score and the gripped frames' lowest the line is drawn.
@@ -194,79 +190,3 @@ def _deviation(frame: FloatArray, known: FloatArray, usable: BoolArray) -> float
     if gain <= 0:
         return np.inf
     return float(np.median(np.abs(x / gain - reference) / reference))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DifferenceGuard:
-    """Which differences a calibration can speak of: as large, and as well explained, as those it was made from.
-
-    They lie about the mean (896,) along the directions (r, 896), with noise in volts beside; the misfit of a
-    difference is its mean squared residual in units of noise².
-    """
-
-    mean: FloatArray
-    directions: FloatArray
-    noise: float
-    least_norm: float
-    largest_misfit: float
-    largest_outlying: float
-
-    @classmethod
-    def fit(cls, differences: FloatArray) -> Self:
-        """Fit to (n, 896) differences; the limits come from frames that were left out in turn."""
-        n = len(differences)
-        if n < _LEAST_DIFFERENCES:
-            raise CalibrationError(f"{n} slices are too few to know what is familiar; record {_LEAST_DIFFERENCES}")
-        seen = []
-        for fold in range(_FOLDS):
-            left_out = np.arange(n) % _FOLDS == fold
-            part = cls._explaining(differences[~left_out])
-            seen += [part.misfit(one, np.ones(N_CHANNELS, dtype=np.bool_)) for one in differences[left_out]]
-        misfit, outlying = np.array(seen).max(axis=0)
-        whole = cls._explaining(differences)
-        least = 0.5 * float(np.linalg.norm(differences, axis=1).min() / np.sqrt(N_CHANNELS))
-        return cls(
-            whole.mean, whole.directions, whole.noise, least,
-            _MISFIT_MARGIN * float(misfit), max(_MISFIT_MARGIN * float(outlying), _LEAST_OUTLYING),
-        )  # fmt: skip
-
-    @classmethod
-    def _explaining(cls, differences: FloatArray) -> Self:
-        mean, rank = differences.mean(axis=0), min(4, len(differences) // 4)
-        _, s, vt = np.linalg.svd(differences - mean, full_matrices=False)
-        freedom = len(differences) - 1 - rank
-        noise = float(np.sqrt((s[rank:] ** 2).sum() / freedom / N_CHANNELS))
-        if noise == 0:
-            raise CalibrationError("the slices have no noise at all: this is no recording of a real board")
-        return cls(mean, vt[:rank], noise, 0.0, np.inf, np.inf)
-
-    def misfit(self, difference: FloatArray, usable: BoolArray) -> tuple[float, float]:
-        """Return the misfit of a (896,) difference and the share of channels beyond five times the noise."""
-        v, x = self.directions[:, usable], (difference - self.mean)[usable]
-        residual = (x - np.linalg.lstsq(v.T, x, rcond=None)[0] @ v) / self.noise
-        return float((residual**2).mean()), float((np.abs(residual) > _OUTLYING_NOISES).mean())
-
-    def widening(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return by how much an interval grows because a difference is explained less well than those left out."""
-        familiar = self.largest_misfit / _MISFIT_MARGIN
-        return float(np.sqrt(max(self.misfit(difference, usable)[0] / familiar, 1.0)))
-
-    def refuse(self, difference: FloatArray, usable: BoolArray) -> tuple[str, ...]:
-        """Return the reasons against a (896,) difference, judged by its usable channels."""
-        if 1.0 - usable.mean() > LARGEST_UNUSABLE_SHARE:
-            return (
-                f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; look at the ribbon cable",
-            )
-        size = float(np.sqrt((difference[usable] ** 2).mean()))
-        if size < self.least_norm:
-            return (
-                f"no grip: the difference to the homogeneous frame is {1e3 * size:.1f} mV a channel, and gripping "
-                f"makes at least {1e3 * self.least_norm:.1f} mV",
-            )
-        misfit, outlying = self.misfit(difference, usable)
-        if misfit > self.largest_misfit or outlying > self.largest_outlying:
-            return (
-                f"outside of the calibration: the misfit is {misfit:.1f} (at most {self.largest_misfit:.1f}), with "
-                f"{100 * outlying:.0f} % of the channels far off (at most {100 * self.largest_outlying:.0f} %)",
-            )
-        return ()

@@ -23,12 +23,17 @@ from bank.estimators.values import FloatArray
 
 Head: TypeAlias = Ridge | Censored | Curve
 HeadOf: TypeAlias = Callable[[FloatArray, FloatArray, float], Head]
+# From (earlier, later) rows to how much harder each of the later ones is to read than is typical of the earlier ones.
+Difficulty: TypeAlias = Callable[[Rows, Rows], FloatArray]
 
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
 # Future data lies further from the past than one part of a recording from the next, unless what was left out was the
 # future itself.
 _INFLATION = 1.1
+# Origins have fewer frames before them than the calibration has, of which a curve with its drift makes the most: where
+# misfit is taken account of, 97 % of later slices lie within this share of what was left out (docs/decisions/0042).
+_CURVE_INFLATION = 0.81
 _LEAST_FRAMES = 8
 # Origins with fewer frames before them tell how bad a calibration of few frames is, not this one.
 _LEAST_BEFORE_ORIGIN = 12
@@ -38,27 +43,52 @@ _LEAST_HALF_WIDTH = 1e-3
 _LARGEST_BEYOND = 0.35
 # Features this many times larger than any at calibration are of something else.
 _LARGEST_REACH = 1.6
+# Values left out at either end of the range, to see whether what lies beyond it is read as beyond it, or at its end:
+# if more than half of the way beyond is missing.
+_AT_END, _MAY_BE_MISSING = 0.2, 0.5
+# As far beyond the range, in spans of it, as frames still pass for familiar ones (`stability-rims` of docs/charts.md).
+_UNSEEN = 0.5
+# Loads above this share of the largest count as loads, and this share of them must lie within their intervals; if
+# it is less, intervals reach as far as loads were missed by.
+_LOADED_SHARE, _LEAST_COVERED = 0.1, 0.85
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reader:
-    """A head with its intervals, the range of values and the reach of features that it was calibrated on."""
+    """A head with its intervals, the range of values and the reach of features that it was calibrated on.
+
+    Values at or below low_end may be read of anything lower, those at or above high_end of anything higher (−∞ and ∞
+    where that was not looked at). missed_below and missed_above are the least that an
+    interval reaches to either side, because loads went unseen by so much.
+    """
 
     head: Head
     intervals: Intervals
     low: float
     high: float
+    low_end: float
+    high_end: float
+    missed_below: float
+    missed_above: float
     mean_feature: FloatArray
     reach: FloatArray
 
-    def read(self, features: FloatArray, usable_share: float = 1.0) -> tuple[float, float]:
-        """Return the value of (d,) features and half the width of its 95 % interval.
+    def read(
+        self, features: FloatArray, usable_share: float = 1.0, widening: float = 1.0
+    ) -> tuple[float, float, float]:
+        """Return the value of (d,) features and how far its 95 % interval reaches below and above it.
 
         With a share of the channels unusable the rest have to carry the noise of all: the interval grows by the root.
         """
         raw = float(self.head.predict(features[None])[0])
-        half = self.intervals.half_width(raw) / float(np.sqrt(max(usable_share, 0.1)))
-        return _shown(self.head, raw), half
+        half = widening * self.intervals.half_width(raw) / float(np.sqrt(max(usable_share, 0.1)))
+        value, beyond = _shown(self.head, raw), _UNSEEN * (self.high - self.low)
+        below, above = max(half, self.missed_below), max(half, self.missed_above)
+        if value <= self.low_end:
+            below = max(below, value - (self.low - beyond))
+        if value >= self.high_end:
+            above = max(above, self.high + beyond - value)
+        return value, below, above
 
     def refuse(self, value: float, features: FloatArray, name: str, unit: str) -> tuple[str, ...]:
         """Return the reasons why a value is beyond what was calibrated."""
@@ -82,11 +112,14 @@ def fit_reader(
     limit_reach: bool = False,
     edges: tuple[float, ...] = (),
     rolling: bool = False,
+    difficulty: Difficulty | None = None,
 ) -> Reader:
     """Fit a head to (n, d) features and (n,) values in time order, and intervals to the residuals of what was left out.
 
     Left out are blocks in turn, or with `rolling` all that comes later than each of a row of origins: where values
-    drift and there are many repeats, these are what the future will be.
+    drift and there are many repeats, these are what the future will be. With `difficulty` residuals are taken in units
+    of it, and whoever reads widens by it (normalised conformal prediction, Papadopoulos et al. 2002); then it is also
+    looked at whether values beyond the range would be read as such.
     Raises CalibrationError where the data does not determine them.
     """
     if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
@@ -104,23 +137,72 @@ def fit_reader(
         strength = _best(features, values, head_of, strengths)
     # … and how far it goes astray on what was left out.
     rolling = rolling and FIRST_ORIGIN * len(values) >= _LEAST_BEFORE_ORIGIN
-    left_out = later_origins(len(values)) if rolling else left_out_blocks(len(values))
+    left_out = list(later_origins(len(values)) if rolling else left_out_blocks(len(values)))
     found = [judged(strength, past, future) for past, future in left_out]
     predicted, residuals = (np.concatenate([pair[i] for pair in found]) for i in (0, 1))
+    truth = np.concatenate([values[future] for _, future in left_out])
+    hardness = np.ones_like(truth)
+    if difficulty is not None:
+        hardness = np.concatenate([difficulty(past, future) for past, future in left_out])
     head = head_of(features, values, strength)
     if isinstance(head, Censored):
         edges = (-head.sigma, 0.0, 0.4 * float(np.abs(values).max()))
     inflation = 1.0 if rolling or isinstance(head, Curve) else _INFLATION
+    if rolling and difficulty is not None and isinstance(head, Curve):
+        inflation = _CURVE_INFLATION
     centre = features.mean(axis=0)
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)
+    least = _LEAST_HALF_WIDTH * float(np.ptp(values))
+    intervals = Intervals.fit(predicted, residuals / hardness, edges, inflation, least)
+    low_end, high_end = -np.inf, np.inf
+    if difficulty is not None:
+        low_end, high_end = (
+            _end(head, features, values, lambda rows: head_of(features[rows], values[rows], strength), sign)
+            for sign in (1, -1)
+        )
+    half = np.array([intervals.half_width(one) for one in predicted])
+    missed_below, missed_above = _missed(truth, residuals, half, inflation) if difficulty is None else (0.0, 0.0)
     return Reader(
-        head,
-        Intervals.fit(predicted, residuals, edges, inflation, _LEAST_HALF_WIDTH * float(np.ptp(values))),
-        float(values.min()),
-        float(values.max()),
-        centre,
-        reach,
-    )
+        head, intervals, float(values.min()), float(values.max()),
+        low_end, high_end, missed_below, missed_above, centre, reach,
+    )  # fmt: skip
+
+
+def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[Rows], Head], sign: int) -> float:
+    """Return the value at or below which (for the sign −1: above which) a reading may be of anything further out.
+
+    The outermost values are left out and read by what is left. If they are read at its end instead of beyond it, then
+    so will be what lies beyond the whole range. Otherwise it is the end of the range itself.
+    """
+    outward = sign * values
+    order = np.argsort(outward, kind="stable")
+    n_out = round(_AT_END * len(values))
+    out, kept = order[:n_out], np.sort(order[n_out:])
+    found, inside = float(outward.min()), float(outward[kept].min())
+    if len(kept) < _LEAST_FRAMES or np.ptp(values[kept]) == 0:
+        return sign * found
+
+    def read(by: Head, rows: Rows) -> float:
+        return float(np.median([sign * _shown(by, one) for one in by.predict(features[rows])]))
+
+    seen, true = read(refit(kept), out), float(np.median(outward[out]))
+    if seen - true > _MAY_BE_MISSING * (inside - true) > 0:
+        # As far inside the end as these were read, or as the outermost are read now, so will be those beyond.
+        found = max(found, found + seen - inside, read(head, order[: n_out // 2]))
+    return sign * found
+
+
+def _missed(truth: FloatArray, residuals: FloatArray, half: FloatArray, inflation: float) -> tuple[float, float]:
+    """Return by how much loads are read too high and too low, where intervals miss them too often; 0 where not.
+
+    Most frames of a stream are free of load and read as such: their small residuals say nothing of a load that an
+    estimator does not see. Loads are a stratum of their own then, by their truth (label-conditional, Vovk 2012).
+    """
+    loaded = np.abs(truth) > _LOADED_SHARE * float(np.abs(truth).max())
+    if loaded.all() or not loaded.any() or (np.abs(residuals) <= half)[loaded].mean() >= _LEAST_COVERED:
+        return 0.0, 0.0
+    low, high = np.quantile(residuals[loaded], [0.025, 0.975])
+    return inflation * max(float(high), 0.0), inflation * max(-float(low), 0.0)
 
 
 def error_on_later(features: FloatArray, values: FloatArray, head_of: HeadOf, strengths: tuple[float, ...]) -> float:

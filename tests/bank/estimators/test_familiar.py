@@ -1,0 +1,108 @@
+"""What a calibration of slices can speak of, and what it says of a frame at the rim of it."""
+
+import numpy as np
+import pytest
+
+from bank.estimators import FrameSeries, TactileFrame, Tracker, fit
+from bank.estimators.familiar import DifferenceGuard
+from bank.estimators.heads import Ridge
+from bank.estimators.physics import Place
+from bank.estimators.reader import Reader, fit_reader
+
+ALL = np.ones(896, dtype=np.bool_)
+
+
+def follow(calibration, frames):
+    tracker = Tracker(calibration)
+    return [tracker.estimate(TactileFrame.of(100.0 + i, frame)) for i, frame in enumerate(frames)]
+
+
+def beyond(series: FrameSeries, below_nm: float) -> np.ndarray:
+    """Return what the slices' frames become at a torque so far below the least of them, along their own slope."""
+    frames, torque = series.channels, series.torque_at_frames()
+    slope = np.polyfit(torque, frames.reshape(len(torque), -1), 1)[0].reshape(frames.shape[1:])
+    return frames[np.argmin(torque)] - below_nm * slope
+
+
+def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced):
+    series = sliced()
+    guard = DifferenceGuard.fit(series.channels[:, 0])
+    near, far = (beyond(series, nm)[0] for nm in (0.01, 0.15))
+    assert guard.refuse(near, ALL) == ()
+    # Its misfit is as small as any: only how far it lies out tells of it.
+    assert guard.misfit(far, ALL)[0] < guard.largest_misfit
+    assert "standard deviations from those calibrated on" in guard.refuse(far, ALL)[0]
+
+
+@pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
+def test_a_foreign_frame_mixed_in_is_refused(sliced, share):
+    calibration, later = fit("fused", [sliced()], "all"), sliced(seed=3)
+    foreign = later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
+    assert not any(one.valid for one in follow(calibration, (1 - share) * later.channels + share * foreign))
+    assert all(one.valid for one in follow(calibration, later.channels))
+
+
+def test_channels_that_vary_much_do_not_drown_the_others():
+    rng = np.random.default_rng(0)
+    scale = np.where(np.arange(896) < 90, 1e-2, 1e-4)
+    frames = 5e-2 + scale * rng.normal(size=(30, 896))
+    guard = DifferenceGuard.fit(frames)
+    # Ten times its own spread on every quiet channel is nothing beside one spread of the loud ones, in volts.
+    odd = frames[3] + np.where(np.arange(896) < 90, 0.0, 1e-3) * np.where(np.arange(896) % 2, 1, -1)
+    assert guard.refuse(odd, ALL)
+    assert not guard.refuse(frames[3], ALL)
+
+
+def saturating(value):
+    """Return features of values that cannot tell how far below a third a value is."""
+    return np.column_stack([np.maximum(value, 0.3), np.maximum(value, 0.3) ** 2])
+
+
+def reader_of(features, values) -> Reader:
+    return fit_reader(features, values, Ridge.fit, strengths=(1e-9,), difficulty=lambda _, later: np.ones(len(later)))
+
+
+def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
+    rng = np.random.default_rng(1)
+    values = rng.uniform(0.0, 1.0, 200)
+    reader = reader_of(saturating(values) + rng.normal(0, 1e-3, (200, 2)), values)
+    low_value, below, above = reader.read(saturating(np.array([-0.3]))[0])
+    assert low_value == pytest.approx(0.15, abs=0.1)
+    assert low_value - below < -0.3
+    assert above < 0.3
+    _, below, above = reader.read(saturating(np.array([0.6]))[0])
+    assert max(below, above) < 0.3
+
+
+def test_where_values_beyond_are_read_as_such_intervals_reach_no_further_than_the_range():
+    rng = np.random.default_rng(2)
+    values = rng.uniform(0.0, 1.0, 200)
+    reader = reader_of(values[:, None] + rng.normal(0, 1e-3, (200, 1)), values)
+    assert (reader.low_end, reader.high_end) == (values.min(), values.max())
+    assert reader.read(np.array([0.02]))[1] < 0.01
+
+
+def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
+    """Of a stream most is free of load: its small residuals must not stand for a load that leaves no trace."""
+    rng = np.random.default_rng(3)
+    torque = np.where(np.arange(600) % 40 < 3, rng.uniform(0.02, 0.06, 600), 0.0)
+    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
+    reader = fit_reader(blind, torque, Ridge.fit)
+    loaded = np.flatnonzero(torque > 0.01)
+    read = np.array([reader.read(blind[i]) for i in loaded])
+    assert (torque[loaded] - read[:, 0] <= read[:, 2]).mean() > 0.9
+    assert reader.missed_above > 0.03
+    assert reader.missed_below == 0.0
+    # One that sees it pays nothing.
+    seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
+    assert fit_reader(seeing, torque, Ridge.fit).missed_above == 0.0
+
+
+def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced):
+    from dataclasses import replace
+
+    task = replace(fit("fused", [sliced()], "all").torque, ks=np.array([3.12, 3.17]))
+    place = Place(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
+    assert task.refuse_place(place) == ()
+    assert task.refuse_place(None) == ()
+    assert "another ridge" in task.refuse_place(replace(place, k=3.41))[0]

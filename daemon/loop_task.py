@@ -122,11 +122,7 @@ class LoopTask:
         }
 
     async def _next_state(self) -> RobotState | None:
-        try:
-            async with asyncio.timeout(LONGEST_TICK_S):
-                return await self._robot.next_state()
-        except TimeoutError:
-            return None
+        return await self._robot.next_state_within(LONGEST_TICK_S)
 
     def _sense(self, state: RobotState) -> None:
         self._states += 1

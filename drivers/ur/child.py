@@ -183,7 +183,8 @@ def _fly(pipe: Pipe, settings: UrSettings, arm: "Arm") -> NoReturn:
             # A command is carried out when it comes: waiting for the next cycle would be a delay in the loop.
             if pipe.wait(left_s) and _obey(pipe, pilot, arm.read()):
                 leaving_s = time.monotonic() + FAREWELL_S
-        time.sleep(max(0.0, due_s - time.monotonic()))
+        if (left_s := due_s - time.monotonic()) > 0:
+            time.sleep(left_s)
 
 
 def _obey(pipe: Pipe, pilot: Pilot, reading: Reading) -> bool:

@@ -8,11 +8,12 @@ and nothing moves until someone says `Enable` (or `Unlock`) anew.
 import asyncio
 import contextlib
 import importlib.util
+import os
 import signal
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -74,7 +75,8 @@ class UrRobot:
         self._stdin: asyncio.StreamWriter | None = None
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
         self._number = 0
-        self._fresh = asyncio.Condition()
+        # Who waits for the next state; None is for those who wait no longer.
+        self._awaiting: set[asyncio.Future[RobotState | None]] = set()
 
     @property
     def state(self) -> RobotState | None:
@@ -83,11 +85,27 @@ class UrRobot:
 
     async def next_state(self) -> RobotState:
         """Return the next state that arrives; waits through losses of the connection."""
-        async with self._fresh:
-            await self._fresh.wait()
-            while self._state is None:
-                await self._fresh.wait()
-            return self._state
+        while True:
+            state = await self._next(None)
+            if state is not None:
+                return state
+
+    async def next_state_within(self, seconds: float) -> RobotState | None:
+        """Return the next state that arrives, or None where none does within so many seconds."""
+        return await self._next(seconds)
+
+    async def _next(self, seconds: float | None) -> RobotState | None:
+        # 125 times a second: a future and a timer are a third of the price of a condition and `asyncio.timeout`.
+        loop = asyncio.get_running_loop()
+        arrived: asyncio.Future[RobotState | None] = loop.create_future()
+        self._awaiting.add(arrived)
+        timer = loop.call_later(seconds, _give_up, arrived) if seconds is not None else None
+        try:
+            return await arrived
+        finally:
+            self._awaiting.discard(arrived)
+            if timer is not None:
+                timer.cancel()
 
     async def send(self, command: Command) -> Reply:
         """Return the one reply to a command: what is sent after clipping, or why nothing is.
@@ -130,12 +148,18 @@ class UrRobot:
     # ---- one process ----------------------------------------------------------------------------------------------
 
     async def _one_process(self) -> None:
+        with _output() as (stdout, its_stdout):
+            await self._converse(stdout, its_stdout)
+
+    async def _converse(self, stdout: int, its_stdout: "_Descriptor") -> None:
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "drivers.ur.child",
-            stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE,
+            stdin=asyncio.subprocess.PIPE, stdout=its_stdout.number, stderr=asyncio.subprocess.PIPE,
         )  # fmt: skip
+        # Held by the process alone, it ends with it.
+        its_stdout.close()
         self.pid = process.pid
-        conversation = _Conversation(self, process)
+        conversation = _Conversation(self, process, stdout)
         loss: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -164,7 +188,7 @@ class UrRobot:
                 future.set_result(Reply(refused="The robot's process ended before it answered; nothing is sent again."))
         self._waiting.clear()
 
-    async def take(self, number: int, message: Message) -> None:
+    def take(self, number: int, message: Message) -> None:
         """Act on a message of the process."""
         match message:
             case RobotState():
@@ -172,8 +196,10 @@ class UrRobot:
                 self._state = message
                 if first:
                     self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
-                async with self._fresh:
-                    self._fresh.notify_all()
+                awaiting, self._awaiting = self._awaiting, set()
+                for arrived in awaiting:
+                    if not arrived.done():
+                        arrived.set_result(message)
             case Reply():
                 future = self._waiting.get(number)
                 if future is not None and not future.done():
@@ -197,41 +223,73 @@ class _LostError(DeviceLostError):
 class _Conversation:
     """The pipe to one process."""
 
-    def __init__(self, robot: UrRobot, process: asyncio.subprocess.Process) -> None:
-        if process.stdin is None or process.stdout is None or process.stderr is None:
+    def __init__(self, robot: UrRobot, process: asyncio.subprocess.Process, stdout: int) -> None:
+        if process.stdin is None or process.stderr is None:
             raise DriverError("The robot's process was started without pipes.")
         self._robot = robot
         self._settings = robot.settings
         self._process = process
-        self._stdin, self._stdout, self._stderr = process.stdin, process.stdout, process.stderr
+        self._stdin, self._stdout, self._stderr = process.stdin, stdout, process.stderr
+        self._decoder = Decoder()
+        self._heard_s = time.monotonic()
+        # Done when the process has no more to say, or has said what ends the conversation.
+        self._over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._said: deque[str] = deque(maxlen=8)
         self._doing = "starting"
         self._stdin.write(encode(Configure(robot.settings)))
 
     async def listen(self) -> None:
         """Take messages until the process has no more; a silent process is ended."""
-        decoder = Decoder()
-        while True:
-            patience_s = self._patience_s()
-            try:
-                async with asyncio.timeout(patience_s):
-                    data = await self._stdout.read(1 << 16)
-            except TimeoutError:
-                self._kill()
-                raise _LostError("hung", self._hung(patience_s)) from None
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._stdout, self._hear)
+        try:
+            while not self._over.done():
+                patience_s = self._patience_s()
+                silent_s = time.monotonic() - self._heard_s
+                if silent_s >= patience_s:
+                    self._kill()
+                    raise _LostError("hung", self._hung(patience_s))
+                await asyncio.wait([self._over], timeout=min(patience_s - silent_s, self._settings.hang_timeout_s))
+        finally:
+            loop.remove_reader(self._stdout)
+        # What was wrong with a message is raised here.
+        self._over.result()
+        raise await self._died()
+
+    def _hear(self) -> None:
+        """Take what the process has said, as it arrives: 125 times a second, so that no task is woken for it."""
+        try:
+            data = os.read(self._stdout, 1 << 16)
+            self._heard_s = time.monotonic()
+            for number, message in self._decoder.feed(data):
+                self._take(number, message)
+        except BlockingIOError:
+            return
+        except ProtocolError as error:
+            self._kill()
+            self._end_with(_LostError("garbled", str(error)))
+        except Exception as error:  # noqa: BLE001 - raised again by `listen`, whose task it ends
+            self._end_with(error)
+        else:
             if not data:
-                raise await self._died()
-            try:
-                for number, message in decoder.feed(data):
-                    if isinstance(message, Phase):
-                        self._doing = message.doing
-                    elif isinstance(message, RobotState):
-                        self._doing = "controlling"
-                        self._robot.connected(self._stdin)
-                    await self._robot.take(number, message)
-            except ProtocolError as error:
-                self._kill()
-                raise _LostError("garbled", str(error)) from error
+                self._end_with(None)
+
+    def _take(self, number: int, message: Message) -> None:
+        if isinstance(message, RobotState):
+            self._doing = "controlling"
+            self._robot.connected(self._stdin)
+        elif isinstance(message, Phase):
+            self._doing = message.doing
+        self._robot.take(number, message)
+
+    def _end_with(self, error: Exception | None) -> None:
+        asyncio.get_running_loop().remove_reader(self._stdout)
+        if self._over.done():
+            return
+        if error is None:
+            self._over.set_result(None)
+        else:
+            self._over.set_exception(error)
 
     async def keep_alive(self) -> None:
         """Give signs of life four times in the time after which motion would be stopped."""
@@ -257,7 +315,6 @@ class _Conversation:
             self._stdin.close()
             try:
                 async with asyncio.timeout(FAREWELL_S), asyncio.TaskGroup() as tasks:
-                    tasks.create_task(_drain(self._stdout))
                     tasks.create_task(_drain(self._stderr))
                     tasks.create_task(self._process.wait())
             except TimeoutError:
@@ -300,3 +357,35 @@ class _Conversation:
 async def _drain(stream: asyncio.StreamReader) -> None:
     while await stream.read(1 << 16):
         pass
+
+
+def _give_up(arrived: "asyncio.Future[RobotState | None]") -> None:
+    if not arrived.done():
+        arrived.set_result(None)
+
+
+@dataclass(slots=True)
+class _Descriptor:
+    """An open file, closed once."""
+
+    number: int
+    is_open: bool = True
+
+    def close(self) -> None:
+        """Close it, unless it is closed already."""
+        if self.is_open:
+            self.is_open = False
+            os.close(self.number)
+
+
+@contextlib.contextmanager
+def _output() -> Iterator[tuple[int, _Descriptor]]:
+    """Give the end of a pipe that is read here without waiting, and the end that is written by a process."""
+    reading, writing = os.pipe()
+    its_end = _Descriptor(writing)
+    os.set_blocking(reading, False)
+    try:
+        yield reading, its_end
+    finally:
+        its_end.close()
+        os.close(reading)

@@ -1,6 +1,7 @@
 """Commands and measured states held against the limits; pure functions, every reason told."""
 
 import math
+from operator import le
 from typing import NamedTuple
 
 from drivers.ur.messages import MoveLinear, Reading, Stop, WristSpeed
@@ -88,6 +89,11 @@ def clip_linear(asked: MoveLinear, limits: Limits) -> ClippedMove:
 
 def violation(reading: Reading, limits: Limits) -> str:
     """Return a sentence naming the hard limit that the measured state is beyond, or the empty string."""
+    return "" if within(reading, limits) else beyond(reading, limits)
+
+
+def beyond(reading: Reading, limits: Limits) -> str:
+    """Return what `violation` does; it looks at every value in turn, which is worth while only when one is beyond."""
     if not all(map(math.isfinite, (*reading.q_rad, *reading.qd_rad_per_s, *reading.tcp_pose, *reading.wrench))):
         return "The controller reports values that are no numbers."
     joints, box = limits.joints, limits.workspace
@@ -105,6 +111,23 @@ def violation(reading: Reading, limits: Limits) -> str:
         if value > bound.hard:
             return f"{name} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
     return ""
+
+
+def within(reading: Reading, limits: Limits) -> bool:
+    """Return whether all is finite and within the hard limits, at a tenth of the price of saying what is not."""
+    joints, box, wrench = limits.joints, limits.workspace, reading.wrench
+    position = reading.tcp_pose[:3]
+    # Of what is no number all comparisons are false, and so is a sum with it among others finite.
+    return (
+        math.isfinite(sum(reading.q_rad) + sum(reading.qd_rad_per_s) + sum(reading.tcp_pose) + sum(wrench))
+        and all(map(le, joints.lower_rad, reading.q_rad))
+        and all(map(le, reading.q_rad, joints.upper_rad))
+        and all(map(le, box.lower_m, position))
+        and all(map(le, position, box.upper_m))
+        and abs(reading.qd_rad_per_s[WRIST]) <= limits.wrist_speed_rad_per_s.hard
+        and _norm(wrench[:3]) <= limits.force_n.hard
+        and _norm(wrench[3:]) <= limits.torque_nm.hard
+    )
 
 
 def line_violation(reading: Reading, limits: Limits) -> str:
@@ -162,4 +185,5 @@ def _fading(reading: Reading, limits: Limits) -> list[tuple[float, str]]:
 
 
 def _norm(vector: tuple[float, ...]) -> float:
-    return math.sqrt(sum(value * value for value in vector))
+    x, y, z = vector
+    return math.sqrt(x * x + y * y + z * z)

@@ -5,7 +5,6 @@ robot. One cycle is `tick`; commands come between cycles through `request`. What
 but a command given after it.
 """
 
-import dataclasses
 import math
 from typing import Protocol
 
@@ -80,6 +79,8 @@ class Pilot:
         self._clipped: tuple[str, ...] = ()
         self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s, operator_asked=False)
         self._unlock_number: int | None = None
+        self._judged: Reading | None = None
+        self._beyond = ""
 
     @property
     def at_rest(self) -> bool:
@@ -125,7 +126,7 @@ class Pilot:
             self._end(trouble)
             self._speed_thread = False
             return None
-        beyond = violation(reading, self._limits)
+        beyond = self._violation(reading)
         if beyond:
             self._held = beyond
             self._stop(reading, beyond)
@@ -144,9 +145,20 @@ class Pilot:
 
     def state(self, reading: Reading) -> RobotState:
         """Return the reading with everything that this pilot adds to it."""
-        values = {field.name: getattr(reading, field.name) for field in dataclasses.fields(reading)}
         return RobotState(
-            **values,
+            reading.t_mono_ns,
+            reading.timestamp_s,
+            reading.age_ns,
+            reading.connected,
+            reading.q_rad,
+            reading.qd_rad_per_s,
+            reading.tcp_pose,
+            reading.wrench,
+            reading.robot_mode,
+            reading.safety_mode,
+            reading.runtime_state,
+            reading.speed_scaling,
+            reading.moving_linearly,
             wrist_torque_nm=tool_axis_torque(reading),
             protective_stop=reading.safety_mode == SAFETY_PROTECTIVE_STOP,
             emergency_stop=reading.safety_mode in SAFETY_EMERGENCY_STOPS,
@@ -207,7 +219,7 @@ class Pilot:
         return Reply(sent=sent)
 
     def _enable(self, reading: Reading) -> Reply:
-        why = self._unfit(reading) or violation(reading, self._limits)
+        why = self._unfit(reading) or self._violation(reading)
         if self._recovery is not None:
             why = sentences.BEING_MADE_READY
         if not why:
@@ -314,10 +326,16 @@ class Pilot:
     def _unfit(self, reading: Reading) -> str:
         return sentences.unfit(reading, self._settings.host, self._settings.state_timeout_s)
 
+    def _violation(self, reading: Reading) -> str:
+        """Return `violation` of a reading, which several rules ask for in one cycle."""
+        if reading is not self._judged:
+            self._judged, self._beyond = reading, violation(reading, self._limits)
+        return self._beyond
+
     def _blocked(self, reading: Reading) -> str:
         if self._recovery is not None:
             return sentences.BEING_MADE_READY
-        return self._unfit(reading) or violation(reading, self._limits) or self._held
+        return self._unfit(reading) or self._violation(reading) or self._held
 
     def _recover(self, recovery: Recovery, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
         if not reading.connected or reading.age_ns > self._settings.state_timeout_s * 1e9:
@@ -352,5 +370,5 @@ def tool_axis_torque(reading: Reading) -> float:
         return reading.wrench[5]
     x, y, z = x / angle, y / angle, z / angle
     sine, versine = math.sin(angle), 1 - math.cos(angle)
-    axis = (x * z * versine + y * sine, y * z * versine - x * sine, 1 - (x * x + y * y) * versine)
-    return sum(a * t for a, t in zip(axis, reading.wrench[3:], strict=True))
+    _, _, _, tx, ty, tz = reading.wrench
+    return (x * z * versine + y * sine) * tx + (y * z * versine - x * sine) * ty + (1 - (x * x + y * y) * versine) * tz

@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation, violation
+from drivers.ur.limits import beyond, clip_linear, clip_stop, clip_wrist, line_violation, violation, within
 from drivers.ur.messages import MoveLinear, Reading, Stop, WristSpeed
 from drivers.ur.pilot import tool_axis_torque
 from drivers.ur.settings import Bound, JointRange, Limits, Workspace
@@ -121,6 +121,22 @@ def test_linear_move_ends_within_the_workspace_and_tells_what_was_clipped(asked:
     after = (*sent.pose, sent.speed_m_per_s, sent.acceleration_m_per_s2)
     changes = sum(a != b for a, b in zip(before, after, strict=True))
     assert len(reasons) == changes
+
+
+near_limits = st.sampled_from([0.0, 2.0, -2.0, 1.0, 0.999, 3.0, 60.0, 6.0, 60.1, math.nan, math.inf, -math.inf, 1e308])
+sixes = st.tuples(*[near_limits | st.floats(-7, 7)] * 6)
+
+
+@given(st.just(AT_REST), sixes, sixes, sixes, sixes)
+def test_a_state_is_quickly_within_exactly_where_no_value_is_beyond(now, q, qd, pose, wrench) -> None:
+    for one in (
+        dataclasses.replace(now, q_rad=q, qd_rad_per_s=qd, tcp_pose=pose, wrench=wrench),
+        *(dataclasses.replace(now, **{name: value}) for name, value in
+          (("q_rad", q), ("qd_rad_per_s", qd), ("tcp_pose", pose), ("wrench", wrench))),
+    ):  # fmt: skip
+        said = beyond(one, LIMITS)
+        assert within(one, LIMITS) == (not said) or abs(sum(map(abs, q + qd + pose + wrench))) >= 1e308
+        assert violation(one, LIMITS) == said
 
 
 def test_every_hard_limit_is_named() -> None:

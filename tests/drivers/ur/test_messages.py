@@ -40,8 +40,11 @@ wrist, line, stop = (
 )
 sent = st.none() | wrist | line | stop
 reasons = st.lists(st.text(max_size=20), max_size=3).map(tuple)
+mode, time_ns = st.integers(-(2**31), 2**31 - 1), st.integers(-(2**63), 2**63 - 1)
 states = st.builds(
     RobotState,
+    t_mono_ns=time_ns, age_ns=time_ns, robot_mode=mode, safety_mode=mode, runtime_state=mode,
+    motion_id=st.integers(0, 2**32 - 1),
     q_rad=six, qd_rad_per_s=six, tcp_pose=six, wrench=six, sent=sent, clipped=reasons,
     timestamp_s=finite, speed_scaling=finite, wrist_torque_nm=finite,
     motion=st.sampled_from(["idle", "wrist", "linear", "stopping"]),
@@ -88,6 +91,25 @@ def test_command_with_anything_missing_wrong_or_more_is_refused(body: bytes) -> 
     code = encode(WristSpeed(0.1, 1.0))[8]
     with pytest.raises(ProtocolError, match="WristSpeed"):
         Decoder().feed(struct.pack("<IIB", len(body), 1, code) + body)
+
+
+@pytest.mark.parametrize("change", ["a byte less of words", "a word more", "half of the numbers", "no such motion"])
+def test_a_state_with_anything_missing_wrong_or_more_is_refused(change: str) -> None:
+    state = RobotState(
+        0, 0.0, 0, True, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, 7, 1, 2, 1.0, False,
+        0.0, False, False, "", False, "stopping", 0, "", None, (),
+    )  # fmt: skip
+    header, body = encode(state)[:9], encode(state)[9:]
+    numbers = body.index(b"{")
+    body = {
+        "a byte less of words": body[:-1],
+        "a word more": body[:-1] + b',"time_s":1.0}',
+        "half of the numbers": body[: numbers // 2],
+        # Before the five flags.
+        "no such motion": body[: numbers - 6] + b"\x04" + body[numbers - 5 :],
+    }[change]
+    with pytest.raises(ProtocolError, match="RobotState"):
+        Decoder().feed(struct.pack("<I", len(body)) + header[4:] + body)
 
 
 def test_states_carry_what_is_no_number() -> None:

@@ -28,6 +28,9 @@ from daemon.loop.watch import Watched, WatchSettings, troubles
 from daemon.loop.wrist import Wrist, WristTurn
 from daemon.safety import Event, Response, SafetyGate, Trouble, Verdict
 
+# Of no experiment; made once, for it is asked for at every tick.
+NO_LIMITS = Limits()
+
 
 @dataclass(frozen=True, slots=True)
 class Orders:
@@ -167,7 +170,7 @@ class Brain:
     def tick(self, t_ns: int) -> Orders:
         """Return what is to be done now."""
         experiment, arm = self.experiment, self.senses.arm
-        limits = experiment.limits if experiment is not None else Limits()
+        limits = experiment.limits if experiment is not None else NO_LIMITS
         drive = experiment.file.drive if experiment is not None else next(iter(self._wrists))
         found = [*self._troubles(limits, drive, t_ns), *self._notes]
         self._notes.clear()

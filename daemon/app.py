@@ -32,6 +32,7 @@ from daemon.publisher import Listener, Publisher
 from daemon.recording.identity import Attached, identity_of
 from daemon.recording.recorder import Recorder
 from daemon.rig import Rig, make_load_cell
+from daemon.rig_check import checked_experiment
 from daemon.skin_setup import make_skin, skin_source
 from daemon.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from daemon.supervisor import Supervisor
@@ -57,6 +58,7 @@ class Daemon:
         # The configured experiment, until it has begun.
         self._awaited: Path | None = None
         self._rig: Rig | None = None
+        checked_experiment(config)
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
         both = open_both(config.both, config.fingertips) if config.both is not None else None
         with contextlib.ExitStack() as opened:

@@ -1,6 +1,7 @@
 """What a daemon is told in YAML. Units are in the keys; unknown keys are refused; nothing changes after loading."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal, TypeVar
 
@@ -119,6 +120,12 @@ class ScannerConfig(ConfigModel):
         (101, 102), description="the channels of gauge 1 and gauge 2"
     )
     range_v: float = Field(1.0, gt=0, le=300)
+
+    @model_validator(mode="after")
+    def _two_channels(self) -> "ScannerConfig":
+        if self.channels[0] == self.channels[1]:
+            raise ValueError(f"gives both gauges the channel {self.channels[0]}; each has its own")
+        return self
 
 
 class AdcConfig(ConfigModel):
@@ -252,11 +259,27 @@ class DaemonConfig(ConfigModel):
                 raise ValueError(open_to_the_network(address, key))
         if self.publish == self.commands and not self.publish.endswith(":*"):
             raise ValueError(f"`publish` and `commands` are both {self.publish}; give each an address of its own")
+        for port, keys in self._ports().items():
+            if len(keys) > 1:
+                raise ValueError(f"`{keys[0]}` and `{keys[1]}` are both {port}; each device has its own")
         if self.experiment is not None and self.robot is None:
             raise ValueError("an experiment needs a robot: add `robot: ur.yaml`, or take `experiment` out")
         if self.gripper is not None and self.robot is None:
             raise ValueError("a gripper without a robot cannot be driven: add `robot: ur.yaml`, or take `gripper` out")
         return self
+
+    def _ports(self) -> dict[str, list[str]]:
+        """Return the keys that name each serial port and each socket."""
+        found: dict[str, list[str]] = {}
+        for key, section in _sections(self, ""):
+            match section:
+                case SerialDevice(serial_number=str(number)):
+                    found.setdefault(f"the port with the serial number {number}", []).append(key)
+                case SerialDevice(path=Path() as path):
+                    found.setdefault(f"the port {os.path.normpath(path)}", []).append(key)
+                case InstrumentSocket(host=host, port=port):
+                    found.setdefault(f"{host}:{port}", []).append(key)
+        return found
 
     @property
     def network_addresses(self) -> dict[str, str]:
@@ -273,6 +296,17 @@ def load_daemon_config(path: Path) -> DaemonConfig:
     config = load_yaml_model(path, DaemonConfig)
     folder = path.resolve().parent
     return _from_folder(config, folder)
+
+
+def _sections(section: ConfigModel, key: str) -> Iterator[tuple[str, ConfigModel]]:
+    """Yield every section within a section, with its key in the file."""
+    for name in type(section).model_fields:
+        value, own = getattr(section, name), f"{key}.{name}".lstrip(".")
+        inner = {f"{own}.{part}": item for part, item in value.items()} if isinstance(value, dict) else {own: value}
+        for path, item in inner.items():
+            if isinstance(item, ConfigModel):
+                yield path, item
+                yield from _sections(item, path)
 
 
 Model = TypeVar("Model", bound=ConfigModel)

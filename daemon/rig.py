@@ -9,10 +9,8 @@ from types import MappingProxyType
 from daemon.both import BOTH
 from daemon.clock import Clock
 from daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, LoopConfig
-from daemon.config_file import load_yaml_model
 from daemon.control.creep import Creep
 from daemon.control.tuning import RequiredMargins
-from daemon.experiment.steps import ExperimentFile
 from daemon.gripper_task import GripperTask
 from daemon.links import log_event, log_link
 from daemon.load_cell_task import LOAD_CELL, LoadCellTask
@@ -23,6 +21,7 @@ from daemon.loop.watch import WatchSettings
 from daemon.loop.wrist import Wrist, WristSettings
 from daemon.loop_task import WRENCH, WRENCH_SOURCE, LoopTask
 from daemon.publisher import Publisher
+from daemon.rig_check import read_experiment
 from drivers.calibration_file import load_calibration
 from drivers.hx711 import LoadCalibration
 from drivers.load_cell import LoadCell
@@ -70,17 +69,19 @@ def make_gripper_client(config: GripperConfig) -> GripperClient:
     raise ValueError("a gripper has a way in")
 
 
+def gripper_calibration(config: GripperConfig) -> WidthCalibration:
+    """Return the gripper's calibration, or the maker's figures; raises DriverError when it cannot be used."""
+    if config.calibration is None:
+        return WidthCalibration.nominal()
+    return load_calibration(config.calibration, WidthCalibration)
+
+
 def make_gripper(
     config: GripperConfig, publisher: Publisher, feel: Callable[[Hand], None], on_event: Callable[[LinkEvent], None]
 ) -> GripperTask:
     """Return the gripper's task; raises DriverError when its calibration cannot be used."""
     client = make_gripper_client(config)
-    calibration = (
-        load_calibration(config.calibration, WidthCalibration)
-        if config.calibration is not None
-        else WidthCalibration.nominal()
-    )
-    return GripperTask(RobotiqGripper(client, calibration, on_event=on_event), publisher, feel)
+    return GripperTask(RobotiqGripper(client, gripper_calibration(config), on_event=on_event), publisher, feel)
 
 
 def make_brain(
@@ -187,7 +188,7 @@ class Rig:
     async def start(self, path: Path) -> str | None:
         """Begin the experiment in a file, or return why not; raises UserError for a file that is none."""
         before = self._stops
-        why = await self.loop.start(load_yaml_model(path, ExperimentFile))
+        why = await self.loop.start(read_experiment(path))
         if why is None and self._stops != before:
             self.brain.stop("the operator said stop")
             return "stop was said while it was being started"

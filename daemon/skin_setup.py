@@ -5,8 +5,10 @@ from functools import partial
 
 from bank.skin.calibration import SkinCalibration
 from bank.skin.calibration_file import load_calibration
+from bank.skin.gauge import joule_heating_k
 from daemon.clock import Clock
 from daemon.config import InstrumentSocket, SerialDevice, SkinConfig, SkinDaqConfig, SkinSourceConfig
+from daemon.errors import UserError
 from daemon.links import log_link
 from daemon.loop.senses import Source, Torque
 from daemon.messages import SkinShear
@@ -24,6 +26,9 @@ from drivers.shear_skin.source import PERIOD_S as SOURCE_PERIOD_S
 from drivers.shear_skin.source import Keithley6430, RecordedSource, SourceReading
 from drivers.tcp_port import TcpLink
 
+# The paper's bound.
+MOST_WARMING_K = 5.0
+
 OnEvent = Callable[[LinkEvent], None]
 
 
@@ -36,13 +41,45 @@ def make_skin(
 ) -> SkinTask:
     """Return the skin's task; raises BankError when its calibration cannot be used. Nothing is opened yet.
 
-    `tap` gives what hears of the inputs of a source, by its name.
+    Raises UserError where the instruments cannot measure these gauges. `tap` gives what hears of the inputs of a
+    source, by its name.
     """
     calibration = load_calibration(config.calibration)
+    check_circuit(config, calibration)
     source = _current_source(config.source, tap(SKIN_SOURCE))
     skin = ShearSkin(source, _daq(config.daq, tap(SKIN_DAQ)), _limits(calibration))
     estimator = _estimator(config, calibration)
     return SkinTask(skin, estimator, publisher, clock, hear, config.tool_radius_mm, tap(SKIN))
+
+
+def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:
+    """Raise UserError where the gauges would get too warm, or their voltages reach beyond source or converter."""
+    current_a = config.source.current_ma * 1e-3
+    largest_ohm = max(calibration.rest_ohm) * (1.0 + max(calibration.response[-1], -calibration.response[0]))
+    gauge_v, whole_v = largest_ohm * current_a, (largest_ohm + min(calibration.rest_ohm)) * current_a
+    warming_k = joule_heating_k(max(calibration.rest_ohm) * current_a**2)
+    told = f"`skin.source.current_ma`: {config.source.current_ma:g} mA"
+    if warming_k > MOST_WARMING_K:
+        raise UserError(
+            f"{told} warm a gauge of {max(calibration.rest_ohm):.1f} Ω by {warming_k:.1f} K, more than the "
+            f"{MOST_WARMING_K:g} K that are allowed; take 5"
+        )
+    if whole_v > config.source.compliance_v:
+        raise UserError(
+            f"{told} need {whole_v:.2f} V at the end of the calibration, and `skin.source.compliance_v` is "
+            f"{config.source.compliance_v:g}; raise that, or lower the current"
+        )
+    adc, scanner = config.daq.adc, config.daq.scanner
+    if adc is not None and gauge_v >= adc.full_scale_v:
+        raise UserError(
+            f"{told} make {gauge_v:.2f} V of a gauge at the end of the calibration, and `skin.daq.adc.full_scale_v` is "
+            f"{adc.full_scale_v:g}; set the converter's gain lower, or the current"
+        )
+    if scanner is not None and gauge_v > scanner.range_v:
+        raise UserError(
+            f"{told} make {gauge_v:.2f} V of a gauge at the end of the calibration, and `skin.daq.scanner.range_v` is "
+            f"{scanner.range_v:g}; take the next range"
+        )
 
 
 class RecordedSkin:

@@ -226,7 +226,7 @@ class ReconnectPolicy:
 
 @dataclass(frozen=True, slots=True)
 class LinkEvent:
-    """A port was opened (`up`) or lost or not found; `repeated` events belong into the debug log only."""
+    """A port was opened (`up`) or lost or not found; `repeated` ones say it once more, for the debug log only."""
 
     up: bool
     sentence: str
@@ -300,15 +300,21 @@ class Link(ABC):
     def given_up(self, error: DriverError) -> Retry:
         """Close the port for the reason given, and tell it; return when it might be tried again."""
         self._close()
-        self.last_error = str(error)
+        before, self.last_error = self.last_error, str(error)
         retry = self._policy.failed(time.monotonic_ns())
-        self._on_event(LinkEvent(up=False, sentence=self.last_error, repeated=retry.repeated))
+        # Another reason is news, even if it came with no rest in between.
+        repeated = retry.repeated and _without_numbers(before) == _without_numbers(self.last_error)
+        self._on_event(LinkEvent(up=False, sentence=self.last_error, repeated=repeated))
         return retry
 
     def _close(self) -> None:
         if self.port is not None:
             self.port.close()
             self.port = None
+
+
+def _without_numbers(sentence: str) -> str:
+    return "".join(letter for letter in sentence if not letter.isdigit())
 
 
 class SerialLink(Link):

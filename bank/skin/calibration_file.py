@@ -105,9 +105,17 @@ def load_calibration(path: Path) -> SkinCalibration:
         values = file.model_dump(exclude={"format"})
         lists = {name: tuple(values[name]) for name in ("tension_n", "response", "rest_ohm")}
         return SkinCalibration(**values | lists)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise CalibrationError(f"{path}: the calibration cannot be read: {error}.") from error
+    except OSError as error:
+        raise CalibrationError(
+            f"{path}: the calibration cannot be read: {error.strerror}; make it with `shearloop skin calibrate`."
+        ) from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise CalibrationError(f"{path}: the calibration cannot be read: {' '.join(str(error).split())}.") from error
     except ValidationError as error:
+        if not (isinstance(document, dict) and "format" in document):
+            raise CalibrationError(
+                f"{path} is not a calibration as `shearloop skin calibrate` writes it: it has no `format: {FORMAT}`."
+            ) from error
         wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in error.errors())
         raise CalibrationError(
             f"{path} is not a calibration as `shearloop skin calibrate` writes it: {wrong}."

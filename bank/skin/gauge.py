@@ -14,6 +14,8 @@ Floats = NDArray[np.float64]
 EXCITATION_A = 5e-3
 # Eutectic gallium indium at room temperature.
 EGAIN_RESISTIVITY_OHM_M = 29.4e-8
+# Of one gauge, 7 mm by 3 mm.
+SENSOR_AREA_M2 = 7e-3 * 3e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +27,7 @@ class Gauge:
     channel_width_m: float = 50e-6
     channel_height_m: float = 50e-6
     resistivity_ohm_m: float = EGAIN_RESISTIVITY_OHM_M
-    sensor_area_m2: float = 7e-3 * 3e-3
+    sensor_area_m2: float = SENSOR_AREA_M2
 
     @property
     def resistance_ohm(self) -> float:
@@ -41,13 +43,18 @@ class Gauge:
         """The same power where a current source feeds the gauge, as in the paper: 5 mA."""
         return self.power_w(current_a * self.resistance_ohm)
 
-    def joule_heating_k(self, current_a: float = EXCITATION_A, convection_w_m2_k: float = 10.0) -> float:
-        """Steady temperature rise of the gauge's area in air, one side cooled.
+    def joule_heating_k(self, current_a: float = EXCITATION_A) -> float:
+        """Steady temperature rise of the gauge's area in still air."""
+        return joule_heating_k(self.power_at_current_w(current_a), self.sensor_area_m2)
 
-        10 W/(m² K) is the usual figure for still air; conduction into the skin and the core is left out, so the
-        true rise is smaller.
-        """
-        return self.power_at_current_w(current_a) / (convection_w_m2_k * self.sensor_area_m2)
+
+def joule_heating_k(power_w: float, area_m2: float = SENSOR_AREA_M2, convection_w_m2_k: float = 10.0) -> float:
+    """Return the steady temperature rise of an area in air, one side cooled: P / (h A).
+
+    10 W/(m² K) is the usual figure for still air; conduction into the skin and the core is left out, so the true
+    rise is smaller. The paper's own analysis gives no more than 5 K.
+    """
+    return power_w / (convection_w_m2_k * area_m2)
 
 
 def gauge_factor(poisson_ratio: float = 0.5) -> float:

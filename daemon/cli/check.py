@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from daemon.config import CurveConfig, SkinConfig
+    from daemon.config import CurveConfig, DaemonConfig, SkinConfig
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,7 @@ def run(args: argparse.Namespace) -> int:
     from daemon.cli.run import checked_emulators
     from daemon.config import load_daemon_config
     from daemon.opening import open_both, open_estimator
+    from daemon.rig_check import checked_experiment
 
     config = load_daemon_config(args.config)
     checked_emulators(config.emulators, args.config)
@@ -36,6 +37,10 @@ def run(args: argparse.Namespace) -> int:
         told["both"] = f"{' and '.join(open_both(config.both, config.fingertips).sides)} together, with torque"
     if config.skin is not None:
         told["skin"] = _skin(config.skin)
+    told.update(_rig(config))
+    experiment = checked_experiment(config)
+    if experiment is not None:
+        told["experiment"] = f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.drive}"
     if args.json:
         print(json.dumps({"config": str(args.config), "told": told}, ensure_ascii=False))
         return 0
@@ -43,6 +48,25 @@ def run(args: argparse.Namespace) -> int:
         print(f"{name}: {what}")
     print(f"{args.config} is in order")
     return 0
+
+
+def _rig(config: "DaemonConfig") -> dict[str, str]:
+    """Return what is told of load cell, gripper and robot."""
+    from daemon.rig import gripper_calibration, load_cell_calibration
+    from drivers.ur.settings import read_settings
+
+    told = {}
+    if config.load_cell is not None:
+        own = config.load_cell.calibration
+        load_cell_calibration(config.load_cell)
+        told["load_cell"] = "torques in N·m as the board sends them" if own is None else f"calibration {own}"
+    if config.gripper is not None:
+        own = config.gripper.calibration
+        gripper_calibration(config.gripper)
+        told["gripper"] = "widths by the maker's figures" if own is None else f"calibration {own}"
+    if config.robot is not None:
+        told["robot"] = f"{read_settings(config.robot).host}, limits of {config.robot}"
+    return told
 
 
 def _clients(curve: "CurveConfig") -> str:
@@ -57,9 +81,11 @@ def _skin(config: "SkinConfig") -> str:
     import math
 
     from bank.skin.calibration_file import load_calibration
+    from daemon.skin_setup import check_circuit
     from daemon.skin_zero import MOST_CHANGE
 
     calibration = load_calibration(config.calibration)
+    check_circuit(config, calibration)
     radius = "without torque: no tool_radius_mm" if config.tool_radius_mm is None else "with torque"
     told = (
         f"calibration {config.calibration} to {calibration.tension_n[0]:+.1f} … {calibration.tension_n[-1]:+.1f} N, "

@@ -169,3 +169,34 @@ class ExperimentFile(_Section):
         None, description="what `shearloop run --slices DIR` keeps of each held angle; nothing by default"
     )
     steps: Annotated[tuple[Step, ...], Field(min_length=1)]
+
+
+def beyond_limits(file: ExperimentFile) -> str:
+    """Return which step asks for what its limits forbid, or an empty text."""
+    for number, step in enumerate(file.steps):
+        own = step.limits or file.limits
+        allowed = min(own.torque_nm, file.limits.torque_nm), min(own.angle_rad, file.limits.angle_rad)
+        for wants, limit, unit, key in zip(
+            _reach(step), allowed, ("N·m", "rad"), ("torque_nm", "angle_rad"), strict=True
+        ):
+            if wants >= limit:
+                return (
+                    f"`steps[{number}]` ({step.do}) asks for {wants:g} {unit}, and its limit is {limit:g} {unit}; "
+                    f"raise `limits.{key}`, or ask for less"
+                )
+    return ""
+
+
+def _reach(step: Step) -> tuple[float, float]:
+    """Return the torque (N·m) and the angle from the grip (rad) that a step asks for; 0 where that is not known."""
+    match step:
+        case HoldTorque():
+            return abs(step.torque_nm), 0.0
+        case Tighten():
+            return step.until_torque_nm, step.until_angle_rad
+        case Identify():
+            return 0.0, step.amplitude_rad
+        case Twist(absolute=False):
+            return 0.0, max(map(abs, step.angles_rad))
+        case _:
+            return 0.0, 0.0

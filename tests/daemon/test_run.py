@@ -166,7 +166,8 @@ def robotless(config: Write, tmp_path: Path) -> Path:
     """Write a configuration with an experiment, and with a robot that is not there."""
     robot = yaml.safe_load(Path("config/ur.yaml").read_text())
     (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": "127.0.0.62"}))
-    return config(robot="ur.yaml", experiment=str(Path("config/experiments/loosen.yaml").resolve()))
+    rig = {"robot": "ur.yaml", "gripper": {"socket": {"host": "127.0.0.62"}}, "load_cell": {"device": {"path": "load"}}}
+    return config(**rig, experiment=str(Path("config/experiments/loosen.yaml").resolve()))
 
 
 async def test_a_stop_calls_off_an_experiment_that_waits_for_its_devices_and_spares_the_daemon(

@@ -12,8 +12,8 @@ import zmq
 import zmq.asyncio
 
 from daemon.app import Daemon
+from daemon.cli import main
 from daemon.config import load_daemon_config
-from daemon.errors import UserError
 from daemon.request import request
 from daemon.synthetic_skin import SyntheticSkin
 from drivers.emulators.skin.instruments import SkinInstruments
@@ -207,17 +207,78 @@ async def test_one_daemon_carries_a_fingertip_and_a_skin(config: Callable[..., P
         assert "There is no serial port" in tasks["skin"]["last_loss"], "without its instruments the daemon runs on"
 
 
-def test_mistakes_in_the_skin_s_section_are_told_with_their_cure(tmp_path: Path) -> None:
-    def said(content: dict[str, Any]) -> str:
-        with pytest.raises(UserError) as error:
-            load_daemon_config(written(tmp_path, content))
-        return str(error.value)
+SCANNER = {"scanner": {"socket": {"host": "127.0.0.1", "port": 5025}}}
+SOCKET = {"socket": {"host": "127.0.0.1", "port": 5025}}
+SOURCE = {"serial": {"path": "skin-source"}}
+HOLDS = str(Path(__file__).parents[2] / "config" / "experiments" / "skin_hold_shear.yaml")
+ROBOT = str(Path(__file__).parents[2] / "config" / "demo_ur.yaml")
 
-    assert "nothing is measured: give `fingertips`, a `skin`, or both" in said({})
-    both = section({**ADC, "scanner": {"socket": {"host": "a", "port": 1}}})
-    assert "`skin.daq` give either scanner or adc, and not both" in said({"skin": both})
-    assert "`skin.source` give either socket or serial" in said({"skin": section(ADC, source={})})
-    assert "`skin.normal_n`" in said({"skin": section(ADC, normal_n=-1)})
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        ({}, "nothing is measured: give `fingertips`, a `skin`, or both"),
+        ({"skin": section({**ADC, **SCANNER})}, "`skin.daq` give either scanner or adc, and not both"),
+        ({"skin": section({})}, "`skin.daq` give either scanner or adc, and not both"),
+        ({"skin": section(ADC, source={})}, "`skin.source` give either socket or serial"),
+        ({"skin": section(ADC, source={"serial": {}})}, "`skin.source.serial` give either serial_number or path"),
+        ({"skin": section(ADC, source={"socket": {"host": "a"}})}, "`skin.source.socket.port` is missing"),
+        ({"skin": section(ADC, normal_n=-1)}, "`skin.normal_n` should be greater than or equal to 0 (found -1"),
+        ({"skin": section(ADC, normal_N=1)}, "`skin.normal_N` is not a known key, did you mean `normal_n`?"),
+        ({"skin": section(ADC, tool_radius_mm=-15)}, "`skin.tool_radius_mm` should be greater than 0"),
+        (
+            {"skin": section(ADC, source={**SOURCE, "current_ma": 50})},
+            "`skin.source.current_ma` should be less than or equal to 20 (found 50",
+        ),
+        (
+            {"skin": section(ADC, source={**SOURCE, "current_ma": 7})},
+            "`skin.source.current_ma`: 7 mA warm a gauge of 25.3 Ω by 5.9 K, more than the 5 K that are allowed",
+        ),
+        (
+            {"skin": section(ADC, source={**SOURCE, "compliance_v": 0.2})},
+            "5 mA need 0.30 V at the end of the calibration, and `skin.source.compliance_v` is 0.2",
+        ),
+        (
+            {"skin": section({"adc": {**ADC["adc"], "full_scale_v": 0.15}})},
+            "5 mA make 0.18 V of a gauge at the end of the calibration, and `skin.daq.adc.full_scale_v` is 0.15",
+        ),
+        (
+            {"skin": section({"scanner": {**SCANNER["scanner"], "range_v": 0.1}})},
+            "5 mA make 0.18 V of a gauge at the end of the calibration, and `skin.daq.scanner.range_v` is 0.1",
+        ),
+        (
+            {"skin": section({"scanner": {**SCANNER["scanner"], "channels": [101, 101]}})},
+            "`skin.daq.scanner` gives both gauges the channel 101",
+        ),
+        (
+            {"skin": section({"adc": {"device": {"path": "./skin-source"}}})},
+            "`skin.source.serial` and `skin.daq.adc.device` are both the port skin-source; each device has its own",
+        ),
+        (
+            {"skin": section(SCANNER, source=SOCKET)},
+            "`skin.source.socket` and `skin.daq.scanner.socket` are both 127.0.0.1:5025",
+        ),
+        (
+            {"skin": section(ADC), "load_cell": {"device": {"path": "skin-daq"}}},
+            "`skin.daq.adc.device` and `load_cell.device` are both the port skin-daq",
+        ),
+        (
+            {"skin": section(ADC, tool_radius_mm=None), "robot": ROBOT, "experiment": HOLDS},
+            "`drive: skin` has no torque without a radius: add `skin.tool_radius_mm`, or take another",
+        ),
+        ({"skin": section(ADC, calibration="none.yaml")}, "none.yaml: the calibration cannot be read: No such file"),
+        ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),
+    ],
+)
+def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(
+    tmp_path: Path, content: dict[str, Any], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = written(tmp_path, content)
+    for command in ("check", "run"):
+        assert main([command, str(path)]) == 2
+        said = capsys.readouterr().err
+        assert told in said
+        assert said.count("\n") == 1, "one line"
 
 
 def test_a_calibration_that_is_none_is_told_before_anything_is_opened(tmp_path: Path) -> None:

@@ -1,0 +1,59 @@
+"""Whether the files of a rig are in order and its experiment can be carried out with what is configured."""
+
+from pathlib import Path
+
+from daemon.both import BOTH
+from daemon.config import DaemonConfig
+from daemon.config_file import load_yaml_model
+from daemon.errors import UserError
+from daemon.experiment.steps import ExperimentFile, Grip, Release, beyond_limits
+from daemon.load_cell_task import LOAD_CELL
+from daemon.loop_task import WRENCH
+from daemon.skin_task import SKIN
+
+
+def read_experiment(path: Path) -> ExperimentFile:
+    """Return the experiment in a file; UserError where it is none, or asks for more than its own limits."""
+    file = load_yaml_model(path, ExperimentFile)
+    if why := beyond_limits(file):
+        raise UserError(f"{path}: {why}")
+    return file
+
+
+def checked_experiment(config: DaemonConfig) -> ExperimentFile | None:
+    """Return the configured experiment, None where there is none; UserError where it can never be carried out."""
+    path = config.experiment
+    if path is None:
+        return None
+    file = read_experiment(path)
+    driving = _may_drive(config)
+    if file.drive not in driving:
+        raise UserError(f"{path}: `drive: {file.drive}` {_why_not(file.drive, config)}; there are {', '.join(driving)}")
+    if config.gripper is None:
+        for number, step in enumerate(file.steps, 1):
+            if isinstance(step, Grip | Release):
+                raise UserError(
+                    f"{path}: step {number} is `{step.do}`, and no gripper is configured; "
+                    "add a `gripper` section to the configuration, or take the step out"
+                )
+    return file
+
+
+def _may_drive(config: DaemonConfig) -> list[str]:
+    """Return the names of the torques that are measured."""
+    found = [name for name, own in config.fingertips.items() if own.calibration is not None]
+    if config.both is not None:
+        found.append(BOTH)
+    if config.skin is not None and config.skin.tool_radius_mm is not None:
+        found.append(SKIN)
+    if config.load_cell is not None:
+        found.append(LOAD_CELL)
+    return [*found, WRENCH]
+
+
+def _why_not(drive: str, config: DaemonConfig) -> str:
+    if drive in config.fingertips:
+        return "is a fingertip without a calibration, which has no torque: add `calibration`, or take another"
+    if drive == SKIN and config.skin is not None:
+        return "has no torque without a radius: add `skin.tool_radius_mm`, or take another"
+    return "is none of the torques that are measured: take another, or configure its device"

@@ -1,0 +1,92 @@
+"""An experiment that can never be carried out is refused before anything is opened."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from daemon.config import DaemonConfig, load_daemon_config
+from daemon.errors import UserError
+from daemon.rig_check import checked_experiment
+
+SERIAL = {"device": {"path": "port"}}
+STEPS = [{"do": "tare"}, {"do": "wait", "wait_s": 1}]
+
+
+def config(folder: Path, experiment: dict[str, Any], **more: Any) -> DaemonConfig:
+    (folder / "experiment.yaml").write_text(yaml.safe_dump({"name": "one", "steps": STEPS, **experiment}))
+    content = {
+        "fingertips": {"right": {"device": {"path": "right"}, "calibration": "right.cal"}, "left": SERIAL},
+        "robot": "ur.yaml",
+        "experiment": "experiment.yaml",
+        **more,
+    }
+    (folder / "config.yaml").write_text(yaml.safe_dump(content))
+    return load_daemon_config(folder / "config.yaml")
+
+
+def refusal(folder: Path, experiment: dict[str, Any], **more: Any) -> str:
+    with pytest.raises(UserError) as error:
+        checked_experiment(config(folder, experiment, **more))
+    return str(error.value)
+
+
+def test_a_torque_that_is_measured_may_drive(tmp_path: Path) -> None:
+    for drive in ("right", "load_cell", "wrench"):
+        file = checked_experiment(config(tmp_path, {"drive": drive}, load_cell={"device": {"path": "load"}}))
+        assert file is not None
+        assert file.drive == drive
+
+
+def test_a_torque_that_is_not_measured_may_not_drive(tmp_path: Path) -> None:
+    assert refusal(tmp_path, {"drive": "load_cell"}).endswith(
+        "experiment.yaml: `drive: load_cell` is none of the torques that are measured: take another, or configure its "
+        "device; there are right, wrench"
+    )
+    assert "`drive: left` is a fingertip without a calibration" in refusal(tmp_path, {"drive": "left"})
+
+
+@pytest.mark.parametrize("step", [{"do": "grip"}, {"do": "release"}])
+def test_a_gripper_that_is_not_there_is_missed_before_the_start(tmp_path: Path, step: dict[str, Any]) -> None:
+    told = refusal(tmp_path, {"steps": [*STEPS, step]})
+    assert f"step 3 is `{step['do']}`, and no gripper is configured; add a `gripper` section" in told
+
+
+LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("step", "told"),
+    [
+        (
+            {"do": "hold_torque", "torque_nm": -0.2},
+            "asks for 0.2 N·m, and its limit is 0.2 N·m; raise `limits.torque_nm`",
+        ),
+        (
+            {"do": "hold_torque", "torque_nm": 0.15, "limits": {"torque_nm": 0.1}},
+            "asks for 0.15 N·m, and its limit is 0.1 N·m",
+        ),
+        (
+            {"do": "hold_torque", "torque_nm": 0.25, "limits": {"torque_nm": 0.3}},
+            "asks for 0.25 N·m, and its limit is 0.2 N·m",
+        ),
+        ({"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": 2}, "asks for 2 rad, and its limit is 1 rad"),
+        (
+            {"do": "twist", "angles_rad": "0.1:1.2:5"},
+            "asks for 1.2 rad, and its limit is 1 rad; raise `limits.angle_rad`",
+        ),
+    ],
+)
+def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(
+    tmp_path: Path, step: dict[str, Any], told: str
+) -> None:
+    said = refusal(tmp_path, {"drive": "wrench", "limits": LIMITS, "steps": [*STEPS, step]})
+    assert f"`steps[2]` ({step['do']}) {told}" in said
+
+
+def test_a_file_that_is_none_is_told_with_its_name(tmp_path: Path) -> None:
+    daemon = config(tmp_path, {})
+    (tmp_path / "experiment.yaml").unlink()
+    with pytest.raises(UserError, match=r"experiment\.yaml: the configuration cannot be read: No such file"):
+        checked_experiment(daemon)

@@ -13,6 +13,7 @@ import numpy as np
 from bank.bank_file import Bank
 from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
+from bank.estimators.alignment import check_alignment
 from bank.estimators.calibrated import (
     NEEDS_BANK,
     Calibration,
@@ -70,11 +71,19 @@ class Physics:
     mesh: "Mesh | None" = None
 
 
-def fit(name: Name, recordings: Sequence[FrameSeries], source: str, physics: Physics | None = None) -> Calibration:
+def fit(
+    name: Name,
+    recordings: Sequence[FrameSeries],
+    source: str,
+    physics: Physics | None = None,
+    *,
+    trust_times: bool = False,
+) -> Calibration:
     """Calibrate an estimator on recordings of one kind, in time order; `source` says in words what they are.
 
     Slices with torque give a torque, those with diameters a diameter. Raises CalibrationError for recordings that do
-    not determine the calibration, and for physics that the estimator needs and did not get.
+    not determine the calibration, for torques that are clearly stamped at other times than the frames unless
+    `trust_times` is set, and for physics that the estimator needs and did not get.
     """
     physics = physics or Physics()
     if not recordings:
@@ -104,6 +113,8 @@ def fit(name: Name, recordings: Sequence[FrameSeries], source: str, physics: Phy
         diameter=None,
     )
     chosen = [one.of_sides(sides) for one in recordings]
+    if blank.kind == "raw" and not trust_times:
+        check_alignment(recordings)
     return _fit_raw(blank, chosen, physics) if blank.kind == "raw" else _fit_slices(blank, chosen, physics)
 
 

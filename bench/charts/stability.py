@@ -127,16 +127,21 @@ def fitted(split: Split, names: Sequence[Name], physics: Physics) -> list[Calibr
 
 
 def misaligned(split: Split, names: Sequence[Name], physics: Physics, shifts_s: Sequence[float]) -> list[Curve]:
-    """Return estimators whose calibration took each torque for one measured so much later, judged on the truth."""
-    levels: dict[str, list[Level]] = {}
+    """Return estimators whose calibration took each torque for one measured so much later, judged on the truth.
+
+    A calibration that is refused gives no valid estimate.
+    """
+    levels: dict[str, list[Level]] = {name: [] for name in names}
     for shift in shifts_s:
         past = split.past
         late = replace(past, torque_t_s=past.torque_t_s + shift)
-        for calibration in fitted(replace(split, past=late), names, physics):
-            tracker = Tracker(calibration, physics.bank)
-            estimates = estimates_of(tracker, Spoilt(shortened(split.future)))
-            found = judged(estimates, truth_of(shortened(split.future)), shift)
-            levels.setdefault(calibration.estimator, []).append(found)
+        calibrated = {one.estimator: one for one in fitted(replace(split, past=late), names, physics)}
+        for name, found in levels.items():
+            estimates: list[Estimate] = []
+            if name in calibrated:
+                estimates = estimates_of(Tracker(calibrated[name], physics.bank), Spoilt(shortened(split.future)))
+            truth = truth_of(shortened(split.future)) if estimates else np.zeros(0)
+            found.append(judged(estimates, truth, shift))
     return [curve("calibrated on misaligned times", "s", name, found) for name, found in levels.items()]
 
 

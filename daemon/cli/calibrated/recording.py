@@ -1,10 +1,13 @@
 """`shearloop calibrate REC… --estimator NAME --out CAL`: fit an estimator to recordings."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 from daemon.cli.result import add_json, tell
 
+# A stamp that is further off belongs to another recording.
+_LARGEST_LATE_S = 600.0
 ESTIMATORS = ("fused", "regression", "bank", "paper", "reconstruction")
 
 
@@ -21,6 +24,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--part", metavar="FROM:TO", default="0:1", help="share of each recording to use, e.g. 0:0.5 (default: all)"
     )
+    parser.add_argument(
+        "--load-late",
+        type=float,
+        metavar="S",
+        help="seconds that the load cell's stamps are late, which are taken off; 0 takes them for right unchecked",
+    )
     add_json(parser)
 
 
@@ -30,17 +39,24 @@ def run(args: argparse.Namespace) -> int:
     from bank.estimators import Physics, fit
     from bank.mesh import load_mesh
     from daemon.cli.recorded import parsed_part, parsed_sides
+    from daemon.errors import UserError
     from daemon.recording.series import part_of, read_series
 
     start, stop = parsed_part(args.part)
     series = [one for path in args.recordings for one in read_series(path, parsed_sides(args.sides))]
+    late_s = args.load_late
+    if late_s is not None and not abs(late_s) <= _LARGEST_LATE_S:
+        raise UserError(f"--load-late must be seconds from -{_LARGEST_LATE_S:g} to {_LARGEST_LATE_S:g}, not {late_s:g}")
     parts = [part_of(one, start, stop) for one in series]
+    if late_s:
+        parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
     names = ", ".join(path.name for path in args.recordings)
     source = names if (start, stop) == (0.0, 1.0) else f"{names} from {start:g} to {stop:g}"
-    calibration = fit(args.estimator, parts, source, physics)
+    source += f", load {late_s:g} s late" if late_s else ""
+    calibration = fit(args.estimator, parts, source, physics, trust_times=late_s is not None)
     calibration.save(args.out)
     quantities = [name for name in ("torque", "diameter") if getattr(calibration, name) is not None]
     frames = sum(len(one.t_s) for one in parts)

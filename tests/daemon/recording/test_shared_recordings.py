@@ -4,10 +4,15 @@ The bounds are what issue 4 asks for; where the data at hand does not carry that
 and the reason stands in docs/decisions/0042-default-estimator.md.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from bank.errors import CalibrationError
 from bank.estimators import FrameSeries, fit
+from bank.estimators.alignment import alignment
+from bank.estimators.familiar import DifferenceGuard
 from daemon.recording.evaluation import follow, judge
 from daemon.recording.importing import import_mat
 from daemon.recording.reader import read_recording
@@ -80,3 +85,25 @@ def test_later_slices_of_the_cylinders(shared):
     figures = judge([follow(fit("fused", [part_of(series, 0, 0.62)], "earlier"), part_of(series, 0.62, 1))])
     assert figures["diameter_rmse_mm"] <= 5
     assert figures["coverage_95"] >= 0.9
+
+
+@pytest.mark.parametrize("stop", [0.4, 0.6, 1.0])
+def test_the_load_goes_with_the_frames_and_half_a_second_beside_is_refused(twists, stop):
+    part = part_of(twists, 0, stop)
+    found = alignment(part)
+    assert found is not None
+    assert 0.0 < found.late_s < 0.4
+    for late_s in (0.54, -0.54):
+        with pytest.raises(CalibrationError, match="that moves them is stamped"):
+            fit("fused", [replace(part, torque_t_s=part.torque_t_s + late_s)], "shifted")
+
+
+@pytest.mark.parametrize("n", [19, 24, 29, 34, 39, 44])
+def test_no_later_slice_is_strange_and_a_third_of_a_foreign_one_is(shared, n):
+    (series,) = read_series(shared / "recordings/torque_slices")
+    frames, usable = series.channels[:, 0], np.ones(896, dtype=np.bool_)
+    guard = DifferenceGuard.fit(frames[:n])
+    later = frames[n:]
+    foreign = later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
+    assert not any(guard.refuse(one, usable) for one in later)
+    assert all(guard.refuse(0.65 * one + 0.35 * foreign, usable) for one in later)

@@ -39,6 +39,7 @@ SECTIONS = (
         told=(
             "daemon/estimator.py",
             "bank/estimators/guard.py",
+            "bank/estimators/familiar.py",
             "daemon/skin_estimator.py",
             "daemon/skin_zero.py",
             "drivers/shear_skin/judge.py",

@@ -29,6 +29,7 @@ TIE = 1e-12
 RUNNER_UP_RADIUS = 5
 # Frames of pure noise that pass for a signal: one in a million, at 1.85 frames a second about one in six days.
 FALSE_ALARM = 1e-6
+_LEAST_ENERGY = float(chdtri(N_CHANNELS, FALSE_ALARM))
 # Cells whose spectra are in memory at once: 1024 × 897 complex numbers and as many correlations are 30 MB.
 CHUNK_CELLS = 1024
 # All 2 · 896 − 1 lags of the linear cross-correlation, none of them wrapped around.
@@ -218,7 +219,7 @@ def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal 
         raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
     with np.errstate(over="ignore"):  # far above the noise is all that matters
         energy = float(np.sum((values / noise) ** 2))
-    least = float(chdtri(N_CHANNELS, FALSE_ALARM))
+    least = _LEAST_ENERGY
     if energy > least:
         return None
     return NoSignal(

@@ -51,16 +51,31 @@ class Estimation:
 
     async def of(self, *frames: Frame) -> Reading:
         """Estimate from the frames of one moment, one a side, publish it, and return what they said."""
+        reading = self.at_once(*frames)
+        return await self.slowly(*frames) if reading is None else reading
+
+    def at_once(self, *frames: Frame) -> Reading | None:
+        """Do the same where it takes no more than some milliseconds; where it does, return None: then call `slowly`.
+
+        Most frames take less than it costs to hand them to a thread.
+        """
         if self._tare_wanted:
             self._tare_wanted = False
             # A replay takes its zero before the same frame.
             self._tap(RawInput(InputKind.TARE, self._clock.now_ns(), str(frames[0].seq).encode()))
             self.estimator.tare()
-        # Most frames take less than it costs to hand them to a thread; the others would keep commands and devices
-        # waiting.
         reading: Reading | None = self.estimator.quickly(*frames)
-        if reading is None:
-            reading = await self._slowly(*frames)
+        if reading is not None:
+            self._finish(frames, reading)
+        return reading
+
+    async def slowly(self, *frames: Frame) -> Reading:
+        """Estimate in a thread, so that commands and devices are not kept waiting."""
+        reading = await asyncio.to_thread(self.estimator.update, *frames)  # type: ignore[arg-type]  # one a side
+        self._finish(frames, reading)
+        return reading
+
+    def _finish(self, frames: tuple[Frame, ...], reading: Reading) -> None:
         self._publish(frames, reading)
         self.count += 1
         if self._tared and not self._tare_wanted and self.estimator.baseline_complete:
@@ -69,10 +84,6 @@ class Estimation:
                 if not waiting.done():
                     waiting.set_result("")
             self._tared.clear()
-        return reading
-
-    async def _slowly(self, *frames: Frame) -> Reading:
-        return await asyncio.to_thread(self.estimator.update, *frames)  # type: ignore[arg-type]  # one a side
 
     def _publish(self, frames: tuple[Frame, ...], reading: Reading) -> None:
         torque, now_ns = reading.torque_nm, self._clock.now_ns()

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -19,6 +20,16 @@ LARGEST_BACKLOG = 8
 
 async def _nobody(_: Frame) -> None:
     """Take a frame that nobody else wants."""
+
+
+@dataclass(slots=True)
+class _Taken:
+    """A frame on its way to the estimating task, and what came of estimating it at once."""
+
+    frame: Frame
+    reading: Reading | None = None
+    takes_long: bool = False
+    error: Exception | None = None
 
 
 class FingertipTask:
@@ -39,22 +50,45 @@ class FingertipTask:
         self._publisher = publisher
         self._pass_on = pass_on
         self.always_heatmap = always_heatmap
-        self._backlog: asyncio.Queue[Frame] = asyncio.Queue(LARGEST_BACKLOG)
+        self._backlog: asyncio.Queue[_Taken] = asyncio.Queue(LARGEST_BACKLOG)
+        # Whether the estimating task has nothing to do: then a frame may be estimated before it goes there.
+        self._idle = False
 
     async def read(self) -> None:
-        """Publish every frame that arrives and pass it on, until cancelled."""
+        """Estimate and publish every frame that arrives and pass it on, until cancelled.
+
+        The estimate comes first, unless it takes long, and the frame itself after it: that can wait.
+        """
         async with contextlib.aclosing(self._board.frames()) as frames:
             async for frame in frames:
+                taken = _Taken(frame)
+                if self._idle and self._backlog.empty():
+                    self._estimate_at_once(taken)
                 self._publisher.publish(frame_message(self.name, frame))
-                await self._backlog.put(frame)
+                await self._backlog.put(taken)
                 await self._pass_on(frame)
 
     async def estimate(self) -> None:
-        """Estimate from every frame, in order, until cancelled."""
+        """Estimate from every frame that `read` has not, in order, and publish heatmaps, until cancelled."""
         while True:
-            frame = await self._backlog.get()
-            reading = await self.estimation.of(frame)
+            self._idle = True
+            try:
+                taken = await self._backlog.get()
+            finally:
+                self._idle = False
+            frame, reading = taken.frame, taken.reading
+            if taken.error is not None:
+                raise taken.error
+            if reading is None:
+                reading = await (self.estimation.slowly(frame) if taken.takes_long else self.estimation.of(frame))
             await self._publish_heatmap(frame, reading)
+
+    def _estimate_at_once(self, taken: "_Taken") -> None:
+        try:
+            taken.reading = self.estimation.at_once(taken.frame)
+        except Exception as error:  # noqa: BLE001 - the estimating task dies of it, and not the one that reads the board
+            taken.error = error
+        taken.takes_long = taken.reading is None
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board and the estimates."""

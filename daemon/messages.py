@@ -18,6 +18,9 @@ Scalar: TypeAlias = float | int | str | bool | None
 FloatArray: TypeAlias = NDArray[np.floating]
 
 
+_NAMES: dict[type, tuple[str, ...]] = {}
+
+
 def column(unit: str, meaning: str) -> Any:
     """Declare one key of a message, with its unit (empty for a bare number or a text) and what it means."""
     return field(metadata={"unit": unit, "meaning": meaning})
@@ -217,14 +220,22 @@ class Health(Message):
 def wire_map(message: Message, timestamp: float, seq: int) -> dict[str, Any]:
     """Return the map that goes on the wire, arrays as little-endian float32 with their shapes beside them."""
     content: dict[str, Any] = {"timestamp": timestamp, "seq": seq}
-    for item in dataclasses.fields(message):
-        value = getattr(message, item.name)
+    for name in _names(type(message)):
+        value = getattr(message, name)
         if isinstance(value, np.ndarray):
-            content[item.name] = np.ascontiguousarray(value, "<f4").tobytes()
-            content[f"{item.name}_shape"] = list(value.shape)
+            content[name] = np.ascontiguousarray(value, "<f4").tobytes()
+            content[f"{name}_shape"] = list(value.shape)
         else:
-            content[item.name] = value
+            content[name] = value
     return content
+
+
+def _names(kind: type[Message]) -> tuple[str, ...]:
+    """Return the names of a message's fields, looked up once: `dataclasses.fields` is slow."""
+    names = _NAMES.get(kind)
+    if names is None:
+        names = _NAMES[kind] = tuple(item.name for item in dataclasses.fields(kind))
+    return names
 
 
 def encode(content: Mapping[str, Any]) -> bytes:

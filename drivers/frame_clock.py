@@ -38,8 +38,10 @@ class FrameClock:
     def __init__(self, nominal_period_ns: int) -> None:
         self._period_ns = float(nominal_period_ns)
         self._learned = False
-        # (frames counted, arrival) of the last frames, restarts included: their usual spacing is the period, roughly.
-        self._latest: deque[tuple[int, int]] = deque(maxlen=LEARN_FROM + SPACING_FRAMES)
+        # (frames counted, arrival) of the last frames, restarts included, and the last spacings, each over some of
+        # them: their usual one is the period, roughly.
+        self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
+        self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
         # (frame number, arrival), one run of the board without a gap.
         self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
         self._straight_ns = 0
@@ -79,16 +81,18 @@ class FrameClock:
                 self.restart()
         self._seen.append((number, arrival_ns))
         self._latest.append((self._latest[-1][0] + steps if self._latest else 0, arrival_ns))
+        if len(self._latest) > SPACING_FRAMES:
+            (n, before_ns), (m, _) = self._latest[0], self._latest[-1]
+            self._spacings.append((arrival_ns - before_ns) / (m - n))
         self._learn(number)
-        recent = list(self._seen)[-PHASE_WINDOW:]
-        self._straight_ns = round(min(arrival + (number - n) * self._period_ns for n, arrival in recent))
+        recent = islice(reversed(self._seen), PHASE_WINDOW)
+        self._straight_ns = round(min([arrival + (number - n) * self._period_ns for n, arrival in recent]))
         return self._straight_ns
 
     def _learn(self, number: int) -> None:
-        if len(self._latest) < LEARN_FROM + SPACING_FRAMES:
+        if len(self._spacings) < LEARN_FROM:
             return
-        apart = zip(self._latest, islice(self._latest, SPACING_FRAMES, None), strict=False)
-        spacing = median((b - a) / (m - n) for (n, a), (m, b) in apart)
+        spacing = median(self._spacings)
         if spacing <= 0:
             return
         if abs(self._period_ns - spacing) > PLAUSIBLE * spacing:

@@ -103,10 +103,8 @@ class SerialPort:
         Raises DeviceLostError when the port has gone.
         """
         if self._read is None:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(timeout_s):
-                    # Always by way of the loop: a device that never pauses must not keep the other tasks from running.
-                    await self._readable()
+            # Always by way of the loop: a device that never pauses must not keep the other tasks from running.
+            await self._readable(timeout_s)
         if self._read is None:
             # The loop itself may have been late: silent is only what has nothing to read now.
             self._drain()
@@ -115,20 +113,27 @@ class SerialPort:
             raise result
         return result
 
-    async def _readable(self) -> None:
+    async def _readable(self, timeout_s: float) -> None:
+        """Wait until something was read, but no longer; a future and a timer, for every frame comes this way."""
         loop = asyncio.get_running_loop()
-        arrived = asyncio.Event()
+        over: asyncio.Future[None] = loop.create_future()
 
         def read() -> None:
             # Here rather than in the task, which runs later: the arrival is stamped as early as can be.
             loop.remove_reader(self._descriptor)
             self._drain()
-            arrived.set()
+            end()
 
+        def end() -> None:
+            if not over.done():
+                over.set_result(None)
+
+        timer = loop.call_later(timeout_s, end)
         loop.add_reader(self._descriptor, read)
         try:
-            await arrived.wait()
+            await over
         finally:
+            timer.cancel()
             loop.remove_reader(self._descriptor)
 
     def _drain(self) -> None:

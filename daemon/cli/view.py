@@ -47,8 +47,8 @@ def run(args: argparse.Namespace) -> int:
 
     set_up_logging()
     keys = client_keys(args)
-    # Where the daemon's commands need keys and there are none here, a stop is heard all the same.
-    stop = None if keys is not None or needs_keys(args.commands) else lambda: stop_address(args.commands)
+    # Of a daemon on this machine a stop is heard whatever becomes of our keys.
+    stop = None if needs_keys(args.commands) else lambda: stop_address(args.commands)
     place = Place(args.connect, args.commands, keys, stop)
     path = args.token_file or default_path()
     token = kept_token(path, anew=args.new_token)

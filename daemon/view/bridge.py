@@ -35,7 +35,7 @@ class Place:
     publish: str
     commands: str
     keys: ClientKeys | None = None
-    # Where a stop is heard now: where commands need a key that we have not, a socket of this machine's own.
+    # Where a stop is heard now: where commands need a key, a socket of this machine's own that needs none.
     stop_address: Callable[[], str] | None = None
 
 
@@ -124,7 +124,9 @@ class Bridge:
         self, threads: ThreadPoolExecutor, address: str, content: Mapping[str, Any], timeout_s: float
     ) -> dict[str, Any]:
         loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(threads, request, address, content, timeout_s, self._place.keys)
+        # A socket of this machine's own is spoken to in the clear.
+        keys = self._place.keys if address == self._place.commands else None
+        return await loop.run_in_executor(threads, request, address, content, timeout_s, keys)
 
     def close(self) -> None:
         """Close the socket; commands on their way are waited for."""

@@ -201,6 +201,11 @@ class Tracker:
             if task is None:
                 continue
             why = task.guard.refuse(difference[0], usable[0]) if task.guard is not None else ()
+            if name == "diameter" and self._memory is not None and not self._memory.own_baseline:
+                # Where the gel stands means nothing without knowing where it stood.
+                if calibration.torque is None:
+                    refused.append("the fingertip was gripped from the first frame on: its idle frame is not known")
+                continue
             refused += [reason for reason in why if reason not in refused]
             if not why:
                 wanted[name] = task

@@ -26,7 +26,7 @@ from bank.estimators.calibrated import (
 )
 from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.guard import SideGuard
-from bank.estimators.heads import Censored, Curve, Ridge, Rows
+from bank.estimators.heads import Censored, Curve, Ridge, Rows, later_origins
 from bank.estimators.memory import Memory, Motion, gripped_part
 from bank.estimators.physics import NOT_TURNED, Locator, Registration, image_matrix, register
 from bank.estimators.reader import (
@@ -57,6 +57,8 @@ _LARGEST_MATCHED = 120
 # A place drifts from recording to recording as motion does not: motion alone is preferred unless it leaves more than
 # this share of the torque's variance unexplained on later frames, and the place takes this share off the error.
 _MOTION_MAY_LEAVE, _PLACE_MUST_GAIN = 0.5, 0.5
+# Where more than this is left on a tool of another diameter, none of the torque is common to the tools.
+_TOOLS_MAY_LEAVE = 0.75
 # A diameter stays the same within a recording: more frames than this tell no more, and take long.
 _MOST_FOR_DIAMETER = 240
 # Fewer different diameters than this do not determine a line and whether it is one.
@@ -144,7 +146,7 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
             values[known],
             _curve(curve) if blank.estimator == "fused" else _ridge(blank.estimator),
             strengths=_strengths(blank.estimator),
-            rolling=name == "torque",
+            left_out=later_origins(int(known.sum())) if name == "torque" else (),
             difficulty=_misfits(differences[:, 0]) if name == "torque" else None,
         )
         tasks[name] = Task(reader, DifferenceGuard.fit(differences[:, 0]), _ks(blank.estimator, features))
@@ -194,13 +196,9 @@ def _consecutive(times: list[FloatArray]) -> FloatArray:
 def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:
     parts = [gripped_part(one) for one in recordings]
     guards = tuple(
-        SideGuard.fit(
-            side,
-            *(np.concatenate([one.channels[part[i], layer] for one, part in zip(recordings, parts, strict=True)])
-              for i in range(3)),
-        )
+        SideGuard.fit(side, *(_frames_of(one, part, layer) for one, part in zip(recordings, parts, strict=True)))
         for layer, side in enumerate(blank.sides)
-    )  # fmt: skip
+    )
     calibration = replace(blank, guards=guards, scale=_finite(np.array([guard.noise for guard in guards])))
     if blank.estimator == "fused":
         gripped = [one.channels[part[1]] for one, part in zip(recordings, parts, strict=True)]
@@ -210,29 +208,40 @@ def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics
         calibration = replace(calibration, registration=register(guards[0].idle, physics.bank.homogeneous))
     locator = _locator(calibration, physics)
     every = _thinning(calibration, recordings)
-    rows = [row for one in recordings for row in _replayed(calibration, locator, one, every)]
+    rows = [row for i, one in enumerate(recordings) for row in _replayed(calibration, locator, i, one, every)]
     if not rows:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
     features = np.array([row.features for row in rows])
-    calibration, reader = _torque_reader(calibration, features, np.array([row.torque_nm for row in rows]))
-    torque = Task(reader, None, _ks(calibration.estimator, features))
-    return replace(calibration, torque=torque, diameter=_diameter_task(calibration, rows))
+    calibration, reader, unexplained = _torque_reader(calibration, features, np.array([row.torque_nm for row in rows]))
+    torque, diameter = Task(reader, None, _ks(calibration.estimator, features)), _diameter_task(calibration, rows)
+    if diameter is not None and _undetermined(recordings, unexplained):
+        return replace(calibration, diameter=diameter)
+    return replace(calibration, torque=torque, diameter=diameter)
 
 
-def _torque_reader(calibration: Calibration, features: FloatArray, torque: FloatArray) -> tuple[Calibration, Reader]:
-    """Return the torque's reader, and the calibration with the features that do better on later frames."""
+def _frames_of(
+    series: FrameSeries, part: tuple[slice, slice, slice], layer: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return one side's frames before the grip, in it, and after it."""
+    before, during, after = (series.channels[one, layer] for one in part)
+    return before, during, after
+
+
+def _torque_reader(
+    calibration: Calibration, features: FloatArray, torque: FloatArray
+) -> tuple[Calibration, Reader, float]:
+    """Return the torque's reader, and the calibration with the features that do better on later frames.
+
+    Third comes the share of the torque's variance that motion leaves unexplained there, 0 where none is read.
+    """
     motion = calibration.motion
     if motion is None:
-        columns = columns_for(calibration.estimator, "torque", features)
-        return calibration, fit_reader(
-            columns,
-            torque,
-            _ridge(calibration.estimator),
-            strengths=_strengths(calibration.estimator),
-            # Places in the bank are within its grid; all else would follow a drift to wherever it leads.
-            limit_reach=calibration.estimator not in NEEDS_BANK,
-        )
-    head: HeadOf = Censored.fit if one_sided(torque) else Ridge.fit_scaled
+        columns, head = columns_for(calibration.estimator, "torque", features), _ridge(calibration.estimator)
+        strengths = _strengths(calibration.estimator)
+        # Places in the bank are within its grid; all else would follow a drift to wherever it leads.
+        limit_reach = calibration.estimator not in NEEDS_BANK
+        return calibration, fit_reader(columns, torque, head, strengths=strengths, limit_reach=limit_reach), 0.0
+    head = Censored.fit if one_sided(torque) else Ridge.fit_scaled
     # Whether the gel's place tells more than its motion is for the recordings to say.
     n_motion = motion.n_lags * motion.directions.shape[0] * motion.directions.shape[1]
     choices = {False: features[:, :n_motion], True: features}
@@ -240,7 +249,8 @@ def _torque_reader(calibration: Calibration, features: FloatArray, torque: Float
     unexplained = errors[False] / float(torque.var())
     placed = unexplained > _MOTION_MAY_LEAVE and errors[True] < _PLACE_MUST_GAIN * errors[False]
     reader = fit_reader(choices[placed], torque, head, strengths=_MOTION_STRENGTHS, limit_reach=True)
-    return replace(calibration, motion=replace(motion, placed=placed)), reader
+    calibration = replace(calibration, motion=replace(motion, placed=placed))
+    return calibration, reader, errors[placed] / float(torque.var())
 
 
 def _diameter_task(calibration: Calibration, rows: list["_Row"]) -> Task | None:
@@ -255,14 +265,25 @@ def _diameter_task(calibration: Calibration, rows: list["_Row"]) -> Task | None:
     motion = calibration.motion is not None
     head: HeadOf = Ridge.fit if motion else _ridge(calibration.estimator)
     strengths = STRENGTHS if motion else _strengths(calibration.estimator)
-    seen = np.array([row.features for row in known])
-    return Task(fit_reader(features, diameters, head, strengths=strengths), None, _ks(calibration.estimator, seen))
+    # Whoever grips a tool again sees another recording, not a later part of this one.
+    number = np.array([row.recording for row in known])
+    each = [(np.flatnonzero(number != one), np.flatnonzero(number == one)) for one in np.unique(number)]
+    left_out = [pair for pair in each if len(np.unique(diameters[pair[0]])) >= _LEAST_DIAMETERS]
+    reader = fit_reader(features, diameters, head, strengths=strengths, left_out=left_out)
+    return Task(reader, None, _ks(calibration.estimator, np.array([row.features for row in known])))
+
+
+def _undetermined(recordings: list[FrameSeries], unexplained: float) -> bool:
+    """Return whether tools of different diameters turn so differently that no torque is common to them."""
+    tools = {float(one.diameter_mm[0]) for one in recordings if len(one.t_s) and np.isfinite(one.diameter_mm[0])}
+    return len(tools) > 1 and unexplained > _TOOLS_MAY_LEAVE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """One frame that is calibrated on: how long after its recording's first, what is seen and what is true."""
+    """One frame that is calibrated on: of which recording, how long after its first, what is seen and what is true."""
 
+    recording: int
     since_s: float
     features: FloatArray
     difference: FloatArray
@@ -270,7 +291,9 @@ class _Row:
     diameter_mm: float
 
 
-def _replayed(calibration: Calibration, locator: Locator | None, series: FrameSeries, every: int) -> list[_Row]:
+def _replayed(
+    calibration: Calibration, locator: Locator | None, recording: int, series: FrameSeries, every: int
+) -> list[_Row]:
     """Return the frames that an estimate would be made of, by the way that makes it."""
     memory = Memory(calibration.guards, calibration.motion)
     rows = []
@@ -280,7 +303,8 @@ def _replayed(calibration: Calibration, locator: Locator | None, series: FrameSe
         moment = memory.see(TactileFrame.of(float(t_s), channels))
         if not moment.why and np.isfinite(torque) and i % every == 0:
             features = features_of(calibration, locator, moment.difference, memory.recent, float(t_s)).features
-            rows.append(_Row(float(t_s - series.t_s[0]), features, moment.difference, float(torque), float(diameter)))
+            since_s = float(t_s - series.t_s[0])
+            rows.append(_Row(recording, since_s, features, moment.difference, float(torque), float(diameter)))
     return rows
 
 

@@ -38,8 +38,13 @@ _LOST_SHARE = 0.6
 _FEWEST_AT_RAIL = 9
 # Closing and opening take this many frames, and move the frame so much further than twisting under load.
 STEP_FRAMES, _STEP_MARGIN = 4, 1.25
-# Where between the idle frames' highest score and the gripped frames' lowest the line is drawn.
-_THRESHOLD_SHARE = 0.35
+# A grip scores more than the idle frames did, by this many times their scatter, and at least by this share of the
+# calibration's grip: idle frames of other sessions score 0.06 at most, their grips from 0.12 on (docs/decisions/0042).
+_FREE_SCATTERS, _LEAST_RISE = 3.0, 0.08
+_LEAST_IDLE, _LEAST_GRIPPED = 5, 20
+# A session that begins on another day is a little off from both of the calibration's frames. One that deviates as
+# little as this is of the same hour, and its score tells.
+_CLEARLY_NEARER, _SAME_HOUR, _GRIPPED_SCORE = 0.8, 0.01, 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,39 +66,50 @@ class SideGuard:
     fall_limit: float
 
     @classmethod
-    def fit(cls, side: str, idle: FloatArray, gripped: FloatArray, released: FloatArray) -> Self:
-        """Fit to the (n, 896) frames before the grip, in it, and after it (which may be none)."""
-        if len(idle) < 5 or len(gripped) < 20:
+    def fit(cls, side: str, *recordings: tuple[FloatArray, FloatArray, FloatArray]) -> Self:
+        """Fit to the (n, 896) frames before the grip, in it, and after it (which may be none) of each recording.
+
+        Each recording is seen from its own idle frames, for a gel drifts from one to the next.
+        """
+        n_idle, n_gripped = (min(len(one[i]) for one in recordings) for i in (0, 1))
+        if n_idle < _LEAST_IDLE or n_gripped < _LEAST_GRIPPED:
             raise CalibrationError(
-                f"side {side}: {len(idle)} idle and {len(gripped)} gripped frames are too few to tell a grip; "
+                f"side {side}: {n_idle} idle and {n_gripped} gripped frames are too few to tell a grip; "
                 "begin the recording some seconds before gripping"
             )
-        base, noise = np.median(idle, axis=0), channel_noise(gripped)
-        relative, scale = base + _SMALL_V, np.where(np.isfinite(noise), noise, 1.0) / (base + _SMALL_V)
+        bases = [np.median(idle, axis=0) for idle, _, _ in recordings]
+        noise = np.sqrt(np.mean([channel_noise(gripped) ** 2 for _, gripped, _ in recordings], axis=0))
+        base = np.mean(bases, axis=0)
+        scale = np.where(np.isfinite(noise), noise, 1.0) / (base + _SMALL_V)
         floor = 0.3 * float(np.median(scale))
         scale = np.where(np.isfinite(noise), np.maximum(scale, floor), np.inf)
+        relative = [
+            tuple((part - own) / (own + _SMALL_V) for part in one) for own, one in zip(bases, recordings, strict=True)
+        ]
 
-        parts = [part for part in (idle, gripped, released) if len(part)]
+        def discriminant(rows: slice) -> FloatArray:
+            parts = [np.concatenate([one[i][rows] for one in relative]) / scale for i in range(3)]
+            return _discriminant([part for part in parts if len(part)]) / scale
 
-        def seen(rows: slice) -> list[FloatArray]:
-            return [(part[rows] - base) / relative / scale for part in parts]
-
-        weights = _discriminant(seen(slice(None))) / scale
         # Of 896 channels some combination parts any frames: whether they differ shows on those it was not made from.
-        half = _discriminant(seen(slice(0, None, 2))) / scale
-        low, high = _apart([(part[1::2] - base) / relative @ half for part in parts])
-        if high <= low:
-            raise CalibrationError(
-                f"side {side}: gripped frames cannot be told from idle ones; did the fingertip touch the tool?"
-            )
-        score = [(part - base) / relative @ weights for part in parts]
-        low, high = _apart(score)
-        threshold = low + _THRESHOLD_SHARE * (high - low)
+        half = discriminant(slice(0, None, 2))
+        for one in relative:
+            low, high = _apart([part[1::2] @ half for part in one])
+            if high <= low:
+                raise CalibrationError(
+                    f"side {side}: gripped frames cannot be told from idle ones; did the fingertip touch the tool?"
+                )
+        weights = discriminant(slice(None))
+        free = np.concatenate([one[0] @ weights for one in relative])
+        threshold = float(np.quantile(free, 0.99)) + max(_FREE_SCATTERS * float(free.std()), _LEAST_RISE)
         step_limit = fall_limit = np.inf
-        if len(released) == 0:
-            step_limit = _STEP_MARGIN * float(steps(gripped, noise).max())
-            fall_limit = _STEP_MARGIN * float(-(score[1][STEP_FRAMES:] - score[1][:-STEP_FRAMES]).min())
-        return cls(side, base, gripped.mean(axis=0), noise, weights, threshold, step_limit, fall_limit)
+        if not any(len(released) for _, _, released in recordings):
+            gripped = [frames for _, frames, _ in recordings]
+            score = [one[1] @ weights for one in relative]
+            step_limit = _STEP_MARGIN * max(float(steps(frames, noise).max()) for frames in gripped)
+            fall_limit = _STEP_MARGIN * max(float((one[:-STEP_FRAMES] - one[STEP_FRAMES:]).max()) for one in score)
+        mean = np.concatenate([gripped for _, gripped, _ in recordings]).mean(axis=0)
+        return cls(side, base, mean, noise, weights, threshold, step_limit, fall_limit)
 
     def foreign(self, frame: FloatArray, usable: BoolArray) -> str | None:
         """Return why this is not the fingertip of the calibration, or None."""
@@ -115,9 +131,12 @@ class SideGuard:
         return off
 
     def idle_like(self, frame: FloatArray) -> bool:
-        """Return whether a frame is nearer to the calibration's idle frame than to the gripped one."""
+        """Return whether a session's first frame is idle: not clearly nearer to the calibration's gripped frame."""
         known = np.isfinite(self.noise)
-        return _deviation(frame, self.idle, known) <= _deviation(frame, self.gripped, known)
+        from_idle, from_gripped = (_deviation(frame, one, known) for one in (self.idle, self.gripped))
+        if min(from_idle, from_gripped) < _SAME_HOUR and self.grip(frame, self.idle) > _GRIPPED_SCORE:
+            return False
+        return _CLEARLY_NEARER * from_idle <= from_gripped
 
     def grip(self, frame: FloatArray, idle: FloatArray) -> float:
         """Return the grip's score, about 0 when idle and 1 as gripped at calibration; idle is this session's frame."""

@@ -22,7 +22,7 @@ CENSORED_SHARE = 0.02
 _LEAST_SIGMA_SHARE = 0.01
 _EM_ROUNDS = 100
 N_BLOCKS = 5
-FIRST_ORIGIN, N_ORIGINS = 0.6, 20
+FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
 # Terms beyond the linear one are held back as by so many frames that do not have them.
 _CURVATURE = 3.0
 # The same for how offset and slope drift with age. From 10 to 100 the error on later slices is nearly the same; without
@@ -239,10 +239,15 @@ def left_out_blocks(n: int) -> Iterator[tuple[Rows, Rows]]:
         yield np.flatnonzero(block != one), np.flatnonzero(block == one)
 
 
-def later_origins(n: int) -> Iterator[tuple[Rows, Rows]]:
-    """Yield pairs of (earlier, all later) parts of n rows, from six tenths of the time on: what is yet to come."""
-    for cut in range(round(FIRST_ORIGIN * n), n - 1, max(1, n // N_ORIGINS)):
-        yield np.arange(cut), np.arange(cut, n)
+def later_origins(n: int) -> list[tuple[Rows, Rows]]:
+    """Return pairs of (earlier, all later) parts of n rows, from six tenths of the time on: what is yet to come.
+
+    None where the first has fewer rows than tell how good this calibration is.
+    """
+    first = round(FIRST_ORIGIN * n)
+    if first < LEAST_BEFORE_ORIGIN:
+        return []
+    return [(np.arange(cut), np.arange(cut, n)) for cut in range(first, n - 1, max(1, n // N_ORIGINS))]
 
 
 def ranked_channels(frames: FloatArray, values: FloatArray) -> NDArray[np.int64]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
@@ -32,8 +33,15 @@ _BASELINE_FRAMES = 10
 _LARGEST_GAP_S = 1.4
 # A large step is so much more than what twisting under load makes.
 _LARGE_STEP = 1.4
+# Frames that are less than this share of the way from the idle to the loaded ones, in the median of so many, are idle.
+# Gripped and not twisted they are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
+_LIKE_IDLE_SHARE, _LIKE_IDLE_FRAMES = 0.45, 5
 # Fewer frames than this after a step are not yet the gel let go.
 _LEAST_RELEASED = 10
+# A session's baseline is made of at least so many frames before a grip is looked for.
+_LEAST_IDLE = 5
+# A grip has ended when its score is below this share of its mean over so many frames.
+_LOOSE_SHARE, _LEVEL_FRAMES = 0.5, 60
 # Bridged frames among those remembered: more, and the memory is made up.
 _LARGEST_BRIDGED = 3
 
@@ -110,6 +118,35 @@ def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: Floa
     return np.asarray(found @ shapes)
 
 
+class Grip:
+    """Whether one fingertip is gripped, from the grip's score (0 idle, 1 as at calibration), frame by frame.
+
+    A grip begins with a rise by the threshold above the lowest score since the last one (a gel that recovers from a
+    release scores less and less), and ends below half of that, or below a share of this grip's own mean score: today's
+    grip may be a fifth or three times as strong as the one at calibration.
+    """
+
+    def __init__(self, threshold: float) -> None:
+        self._threshold = threshold
+        self._floor = 0.0
+        self._level: float | None = None
+        self._frames = 0
+
+    def see(self, score: float) -> bool:
+        """Take the next frame's score and return whether it is gripped."""
+        if self._level is None:
+            self._floor = min(self._floor, max(score, 0.0))
+            if score - self._floor > self._threshold:
+                self._level, self._frames = score, 1
+            return self._level is not None
+        if score < max(self._floor + 0.5 * self._threshold, _LOOSE_SHARE * self._level):
+            self._level, self._floor = None, max(score, 0.0)
+            return False
+        self._frames = min(self._frames + 1, _LEVEL_FRAMES)
+        self._level += (score - self._level) / self._frames
+        return True
+
+
 class Memory:
     """The state of one session; every frame goes through `see` in order."""
 
@@ -126,6 +163,7 @@ class Memory:
         self._t_s = -np.inf
         self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
         self._let_go = [False for _ in guards]
+        self._grips = [Grip(guard.grip_threshold) for guard in guards]
         self._lost = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
         # Frames that are still to be taken for idle ones, on somebody's word, and those taken.
         self._idle_wanted = 0
@@ -139,6 +177,11 @@ class Memory:
     def taking_idle(self) -> bool:
         """Whether frames are being taken for idle ones."""
         return self._idle_wanted > 0
+
+    @property
+    def own_baseline(self) -> bool:
+        """Whether every fingertip was seen idle in this session, so that the difference is this session's."""
+        return all(self._idle)
 
     @property
     def recent(self) -> FloatArray | None:
@@ -211,11 +254,12 @@ class Memory:
 
     def _judged(self, channels: FloatArray, usable: BoolArray) -> Moment:
         assert self._baselines is not None  # noqa: S101 - set by _learn_baseline just before
-        loose = [
-            guard.side
-            for layer, guard in enumerate(self._guards)
-            if self._let_go[layer] or guard.grip(channels[layer], self._baselines[layer]) < guard.grip_threshold
+        held = [
+            not 0 < len(self._idle[layer]) < _LEAST_IDLE
+            and grip.see(guard.grip(channels[layer], self._baselines[layer]))
+            for layer, (guard, grip) in enumerate(zip(self._guards, self._grips, strict=True))
         ]
+        loose = [guard.side for layer, guard in enumerate(self._guards) if self._let_go[layer] or not held[layer]]
         difference = self._difference(channels, usable)
         if loose:
             self._recent.clear()
@@ -288,7 +332,9 @@ class Memory:
         for layer, guard in enumerate(self._guards):
             idle = self._idle[layer]
             begun = first and guard.idle_like(channels[layer])
-            following = bool(idle) and guard.grip(channels[layer], self._baselines[layer]) < 0.3 * guard.grip_threshold
+            # One frame is a poor baseline: the first few are taken unless they look gripped outright.
+            limit = 0.5 * guard.grip_threshold if len(idle) >= _LEAST_IDLE else max(0.5, guard.grip_threshold)
+            following = bool(idle) and guard.grip(channels[layer], self._baselines[layer]) < limit
             if (begun or following) and not self._recent:
                 idle.append(channels[layer])
                 self._baselines[layer] = np.mean(idle, axis=0)
@@ -311,27 +357,50 @@ def _too_few(guard: SideGuard, usable: BoolArray) -> str | None:
 
 
 def gripped_part(series: FrameSeries) -> tuple[slice, slice, slice]:
-    """Return which frames came before the grip, in it, and after it, going by the torque and the largest steps.
+    """Return which frames came before the grip, in it, and after it, going by the torque, the steps, and the place.
 
-    The grip begins with the last large step of the frames before the first torque, and ends with the first large one
-    after the last torque. Raises CalibrationError for a recording without torque.
+    Loaded frames are gripped, and those before the first large step are not. The grip begins with the last large step
+    before the first torque, or later, where the frames begin to look more like the loaded ones than like the idle ones;
+    it ends in the same way. What no torque is known of is in neither. Raises CalibrationError for a recording without
+    torque.
     """
-    torque = np.abs(np.nan_to_num(series.torque_at_frames()))
+    known = series.torque_at_frames()
+    torque = np.abs(np.nan_to_num(known))
     loaded = np.flatnonzero(torque > 0.1 * torque.max()) if torque.max() > 0 else np.zeros(0, dtype=np.int64)
     if len(loaded) == 0:
         raise CalibrationError("the recording holds no torque to calibrate on; record the load cell beside the frames")
-    span = slice(int(loaded[0]), int(loaded[-1]) + 1)
-    step = np.zeros(len(series.t_s))
+    n, span = len(series.t_s), slice(int(loaded[0]), int(loaded[-1]) + 1)
+    step = np.zeros(n)
     for layer in range(len(series.sides)):
         frames = series.channels[:, layer]
         step[STEP_FRAMES:] = np.maximum(step[STEP_FRAMES:], steps(frames, channel_noise(frames[span])))
     large = np.flatnonzero(step > _LARGE_STEP * float(np.quantile(step[span], 0.99)))
     before, after = large[large < loaded[0]], large[large > loaded[-1]]
     begin = int(before[-1]) + 1 if len(before) else 0
-    end = int(after[0]) - 1 if len(after) else len(series.t_s)
+    end = int(after[0]) - 1 if len(after) else n
     # The transients of closing and opening belong to neither side.
     idle_end = int(before[0]) - 1 if len(before) else 0
-    released = int(after[-1]) + 1 if len(after) else len(series.t_s)
-    if len(series.t_s) - released < _LEAST_RELEASED:
-        released = len(series.t_s)
-    return slice(0, idle_end), slice(begin, end), slice(released, len(series.t_s))
+    let_go = 0
+    for layer in range(len(series.sides)):
+        like_idle = _like_idle(series.channels[:, layer], slice(0, idle_end), span)
+        earlier, later = np.flatnonzero(like_idle[: loaded[0]]), np.flatnonzero(like_idle[loaded[-1] :])
+        let_go = max(let_go, int(np.flatnonzero(~like_idle)[-1]) + _LIKE_IDLE_FRAMES // 2)
+        if len(earlier):
+            begin = max(begin, int(earlier[-1]) + _LIKE_IDLE_FRAMES // 2)
+        if len(later):
+            end = min(end, int(loaded[-1] + later[0]) - _LIKE_IDLE_FRAMES // 2)
+    end = min(end, int(np.flatnonzero(np.isfinite(known))[-1]) + 1)
+    released = int(after[-1]) + 1 if len(after) else let_go
+    if n - released < _LEAST_RELEASED:
+        released = n
+    return slice(0, idle_end), slice(begin, end), slice(released, n)
+
+
+def _like_idle(frames: FloatArray, idle: slice, loaded: slice) -> BoolArray:
+    """Return which (n, 896) frames are nearer to the idle ones than to the loaded ones, along what parts the two."""
+    if idle.stop == 0:
+        return np.zeros(len(frames), dtype=np.bool_)
+    base, noise = np.median(frames[idle], axis=0), channel_noise(frames[loaded])
+    moved = (np.median(frames[loaded], axis=0) - base) / noise
+    along = median_filter((frames - base) / noise @ moved, _LIKE_IDLE_FRAMES, mode="nearest")
+    return np.asarray(along < _LIKE_IDLE_SHARE * float(moved @ moved))

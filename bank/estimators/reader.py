@@ -1,23 +1,13 @@
 """A reader turns the features of a frame into one value with its interval."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
 
 from bank.errors import CalibrationError
-from bank.estimators.heads import (
-    FIRST_ORIGIN,
-    Censored,
-    Curve,
-    Ridge,
-    Rows,
-    best_strength,
-    later_origins,
-    later_splits,
-    left_out_blocks,
-)
+from bank.estimators.heads import Censored, Curve, Ridge, Rows, best_strength, later_splits, left_out_blocks
 from bank.estimators.intervals import Intervals
 from bank.estimators.values import FloatArray
 
@@ -35,8 +25,6 @@ _INFLATION = 1.1
 # misfit is taken account of, 97 % of later slices lie within this share of what was left out (docs/decisions/0042).
 _CURVE_INFLATION = 0.81
 _LEAST_FRAMES = 8
-# Origins with fewer frames before them tell how bad a calibration of few frames is, not this one.
-_LEAST_BEFORE_ORIGIN = 12
 # No interval is narrower than this share of the calibrated range: a load cell has noise too.
 _LEAST_HALF_WIDTH = 1e-3
 # Values this far beyond the calibrated range, in spans of it, are extrapolated and not believed.
@@ -111,15 +99,15 @@ def fit_reader(
     strengths: tuple[float, ...] = STRENGTHS,
     limit_reach: bool = False,
     edges: tuple[float, ...] = (),
-    rolling: bool = False,
+    left_out: Sequence[tuple[Rows, Rows]] = (),
     difficulty: Difficulty | None = None,
 ) -> Reader:
     """Fit a head to (n, d) features and (n,) values in time order, and intervals to the residuals of what was left out.
 
-    Left out are blocks in turn, or with `rolling` all that comes later than each of a row of origins: where values
-    drift and there are many repeats, these are what the future will be. With `difficulty` residuals are taken in units
-    of it, and whoever reads widens by it (normalised conformal prediction, Papadopoulos et al. 2002); then it is also
-    looked at whether values beyond the range would be read as such.
+    `left_out` are pairs of rows fitted to and rows that stand for what is to come; by default blocks of time in turn.
+    With `difficulty` residuals are taken in units of it, and whoever reads widens by it (normalised conformal
+    prediction, Papadopoulos et al. 2002); then it is also looked at whether values beyond the range would be read as
+    such.
     Raises CalibrationError where the data does not determine them.
     """
     if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
@@ -136,19 +124,18 @@ def fit_reader(
     if len(strengths) > 1:
         strength = _best(features, values, head_of, strengths)
     # … and how far it goes astray on what was left out.
-    rolling = rolling and FIRST_ORIGIN * len(values) >= _LEAST_BEFORE_ORIGIN
-    left_out = list(later_origins(len(values)) if rolling else left_out_blocks(len(values)))
-    found = [judged(strength, past, future) for past, future in left_out]
+    blocks = list(left_out or left_out_blocks(len(values)))
+    found = [judged(strength, past, future) for past, future in blocks]
     predicted, residuals = (np.concatenate([pair[i] for pair in found]) for i in (0, 1))
-    truth = np.concatenate([values[future] for _, future in left_out])
+    truth = np.concatenate([values[future] for _, future in blocks])
     hardness = np.ones_like(truth)
     if difficulty is not None:
-        hardness = np.concatenate([difficulty(past, future) for past, future in left_out])
+        hardness = np.concatenate([difficulty(past, future) for past, future in blocks])
     head = head_of(features, values, strength)
     if isinstance(head, Censored):
         edges = (-head.sigma, 0.0, 0.4 * float(np.abs(values).max()))
-    inflation = 1.0 if rolling or isinstance(head, Curve) else _INFLATION
-    if rolling and difficulty is not None and isinstance(head, Curve):
+    inflation = 1.0 if left_out or isinstance(head, Curve) else _INFLATION
+    if left_out and difficulty is not None and isinstance(head, Curve):
         inflation = _CURVE_INFLATION
     centre = features.mean(axis=0)
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)

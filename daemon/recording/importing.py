@@ -1,5 +1,6 @@
 """Brings the paper's MATLAB streams into a recording: stamps straightened, damaged load values counted and left out."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from scipy.ndimage import minimum_filter1d
 
 from bank.estimators.values import LARGEST_TORQUE_NM
 from daemon.errors import UserError
-from daemon.recording.schema import SIDES
+from daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 from daemon.recording.writer import RecordingWriter
 from daemon.recordings import LoadStream, Stream, contents, read_load_stream, read_stream
 from drivers.frame_clock import slope_below
@@ -22,6 +23,7 @@ NOMINAL_PERIOD_NS = 541_200_000
 _AROUND_FRAMES = 12
 # The load cell's board sends a line each 91.6 ms, whether anyone reads it or not.
 LOAD_PERIOD_S = 0.0916
+_DIAMETER = re.compile(r"(\d+(?:\.\d+)?)mm[_.]")
 # Stamps of frames and load that lie within this of each other, row by row, come from one loop.
 _ONE_LOOP_S = 0.02
 
@@ -55,7 +57,10 @@ def import_mat(sources: Sequence[Path], out: Path) -> Imported:
     remarks: list[str] = []
     torque_t_s, torque_nm = _load(load, streams, remarks)
     source = ", ".join(sorted(path.name for path in _files(sources)))
-    with RecordingWriter(out, source, {"remarks": " ".join(remarks)} if remarks else None) as writer:
+    notes = {"remarks": " ".join(remarks)} if remarks else {}
+    if (diameter := _diameter_mm(_files(sources))) is not None:
+        notes[DIAMETER_NOTE] = diameter
+    with RecordingWriter(out, source, notes or None) as writer:
         for side in (side for side in SIDES if side in streams):
             stream = streams[side]
             arrivals = [round(float(unix_s) * 1e9) for unix_s in stream.unix_s]
@@ -102,6 +107,17 @@ def _load(load: LoadStream | None, streams: dict[str, Stream], remarks: list[str
 
 def _one_loop(load_s: FloatArray, frame_s: FloatArray) -> bool:
     return len(load_s) == len(frame_s) and float(np.median(np.abs(load_s - frame_s))) < _ONE_LOOP_S
+
+
+def _diameter_mm(files: Sequence[Path]) -> str | None:
+    """Return the diameter in mm that the files' names begin with, as those of cylinders do (10mm_1_right.mat).
+
+    Raises UserError where they tell of different ones.
+    """
+    told = sorted({found[1] for path in files if (found := _DIAMETER.match(path.name))})
+    if len(told) > 1:
+        raise UserError(f"the files are of cylinders of {' and '.join(told)} mm; import one recording at a time")
+    return told[0] if told and 0 < float(told[0]) < LARGEST_DIAMETER_MM else None
 
 
 def _files(sources: Sequence[Path]) -> list[Path]:

@@ -10,7 +10,7 @@ ALL = np.ones(896, dtype=bool)
 
 def guard_of(series, layer=0):
     idle, gripped, released = gripped_part(series)
-    return SideGuard.fit("right", *(series.channels[part, layer] for part in (idle, gripped, released)))
+    return SideGuard.fit("right", tuple(series.channels[part, layer] for part in (idle, gripped, released)))
 
 
 def test_grip_and_release_are_found_in_a_recording(recorded):
@@ -49,7 +49,7 @@ def test_grip_is_about_one_gripped_and_zero_idle(recorded):
 def test_a_release_is_known_by_its_step_where_none_was_calibrated(recorded):
     idle, gripped, released = gripped_part(recorded)
     frames = recorded.channels[:, 0]
-    guard = SideGuard.fit("right", frames[idle], frames[gripped], frames[:0])
+    guard = SideGuard.fit("right", (frames[idle], frames[gripped], frames[:0]))
     assert np.isfinite(guard.step_limit)
     opening, closing = int(released.start), int(gripped.start)
     assert guard.released(frames[opening + 2], frames[opening - 6], guard.idle) is True
@@ -60,9 +60,9 @@ def test_a_release_is_known_by_its_step_where_none_was_calibrated(recorded):
 def test_too_little_is_said_to_be(recorded):
     frames = recorded.channels[:, 0]
     with pytest.raises(CalibrationError, match="2 idle and 200 gripped frames are too few"):
-        SideGuard.fit("right", frames[:2], frames[50:250], frames[:0])
+        SideGuard.fit("right", (frames[:2], frames[50:250], frames[:0]))
     with pytest.raises(CalibrationError, match="cannot be told from idle"):
-        SideGuard.fit("right", frames[:12], frames[6:34], frames[:0])
+        SideGuard.fit("right", (frames[:12], frames[6:34], frames[:0]))
     silent = type(recorded)(
         "raw", recorded.sides, recorded.t_s, recorded.channels, recorded.torque_t_s,
         np.zeros_like(recorded.torque_nm), recorded.diameter_mm,

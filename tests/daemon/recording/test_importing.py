@@ -35,6 +35,19 @@ def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path):
     assert "2 load values beyond 20 N·m" in imported.remarks[0]
 
 
+def test_the_diameter_that_files_of_cylinders_are_named_by_is_noted(mat_folder, tmp_path):
+    folder = mat_folder()
+    for path in list(folder.iterdir()):
+        path.rename(folder / f"12.5mm_1_{path.name}")
+    import_mat([folder], tmp_path / "a.mcap")
+    (series,) = read_series(tmp_path / "a.mcap")
+    assert (series.diameter_mm == 12.5).all()
+    one = next(folder.glob("*load*"))
+    one.rename(folder / "20mm_1_load.mat")
+    with pytest.raises(UserError, match=r"of cylinders of 12\.5 and 20 mm"):
+        import_mat([folder], tmp_path / "b.mcap")
+
+
 def test_two_sides_are_paired_by_time(mat_folder, tmp_path):
     import_mat([mat_folder()], tmp_path / "a.mcap")
     both = series_of(read_recording(tmp_path / "a.mcap"))

@@ -29,6 +29,42 @@ def twists(shared, tmp_path_factory) -> FrameSeries:
     return series_of(read_recording(out))
 
 
+@pytest.fixture(scope="module")
+def cylinders(shared, tmp_path_factory) -> dict[int, FrameSeries]:
+    folder, out = shared / "recordings/streams/cylinders", tmp_path_factory.mktemp("cylinders")
+    for mm in (10, 20, 30, 40):
+        import_mat(sorted(folder.glob(f"{mm}mm_*.mat")), out / f"{mm}.mcap")
+    return {mm: series_of(read_recording(out / f"{mm}.mcap")) for mm in (10, 20, 30, 40)}
+
+
+def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders):
+    """Fitted to one cylinder each, whose grips are from a tenth to eight times as strong as on the others."""
+    idle_s, held_s = 7.0, (24.5, 87.0)
+    for fitted in cylinders.values():
+        calibration = fit("fused", [fitted], "one cylinder")
+        for other in cylinders.values():
+            estimates = follow(calibration, other).estimates
+            held = (other.t_s > held_s[0]) & (other.t_s < held_s[1])
+            assert not any("no grip" in why for one in np.array(estimates)[held] for why in one.why)
+            assert not any(one.valid for one in np.array(estimates)[(other.t_s < idle_s) | (other.t_s > 97.5)])
+
+
+def test_cylinders_that_turn_differently_give_a_diameter_and_no_torque(cylinders):
+    calibration = fit("fused", list(cylinders.values()), "all four")
+    assert calibration.torque is None
+    for mm, series in cylinders.items():
+        found = [one.diameter_mm for one in follow(calibration, series).estimates if one.valid]
+        assert len(found) > 100
+        assert abs(np.mean(found) - mm) < 2
+    # Each was gripped once only: how far the diameter of a tool is off that was not among them is what it says.
+    assert calibration.diameter is not None
+    assert 8 < calibration.diameter.reader.intervals.half_widths[0] < 25
+    # A session that begins gripped does not know where the gel stood before.
+    later = follow(calibration, part_of(cylinders[10], 0.5, 0.8)).estimates
+    assert not any(one.valid for one in later)
+    assert "its idle frame is not known" in later[-1].why[0]
+
+
 @pytest.mark.parametrize(
     ("sides", "r", "rmse_nm"),
     [(("right",), 0.85, 0.008), (("left",), 0.85, 0.008), (("right", "left"), 0.93, 0.0055)],

@@ -6,24 +6,21 @@ tells: the width of the true force (peak to peak) over the last 12 s of each hol
 friction's own band; and how far from the set point it is held. Over gains and over delays, with normal forces, with
 and without the controller's deadband, with a normal force that is not the one configured, with a loop that is given a
 number where friction leaves a band, and with an estimator that knows nothing of friction: the worst of several noises
-each. Numbers go to `skin_loop.json`, the chart to `skin_loop.png` and `.svg`.
+each. Numbers go to `skin_loop.json`, the chart to `skin_loop.png` and `.svg`; `shearloop chart stability` draws the
+same as `stability-skin`.
 """
 
 import argparse
-import json
 import math
 from collections import deque
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bank.skin.calibration import SkinCalibration
-from bank.skin.calibration_file import load_calibration
 from daemon.config import LoopConfig
 from daemon.experiment.machine import Phase
 from daemon.experiment.steps import ExperimentFile
@@ -35,9 +32,6 @@ from daemon.skin_task import SKIN, skin_torque
 from daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
 from drivers.emulators.skin.daq import NOISE_V
 from drivers.shear_skin.judge import SkinSample
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 Floats = NDArray[np.float64]
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
@@ -236,7 +230,7 @@ def over_delays() -> list[Case]:
     ]
 
 
-def worst(case: Case, calibration: SkinCalibration) -> Held:
+def worst(calibration: SkinCalibration, case: Case) -> Held:
     """Return the widest oscillation and the largest offset over several noises; or the run that broke off."""
     found = [judge(replace(case, seed=case.seed + seed), calibration)[0] for seed in range(SEEDS)]
     broken = next((held for held in found if math.isnan(held.width_n)), None)
@@ -246,87 +240,23 @@ def worst(case: Case, calibration: SkinCalibration) -> Held:
     return replace(found[0], width_n=width_n, offset_n=offset_n)
 
 
-def draw(gains: list[Held], delays: list[Held], loop: SkinLoop, out: Path) -> None:
-    """Draw the run of one case, width and offset of all over the gain, and the width over the delay."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12.0, 7.5), layout="constrained")
-    grid = figure.add_gridspec(2, 3, height_ratios=(1.0, 1.3))
-    over = figure.add_subplot(grid[0, :])
-    width, offset, delay = (figure.add_subplot(grid[1, i]) for i in range(3))
-    _run(over, loop)
-    bound = "2 μFn"
-    _curves(width, gains, lambda case: case.kp, lambda held: held.width_n / held.bound_n)
-    width.set(title="Limit cycle over the gain", xlabel="gain kp", ylabel=f"peak to peak / {bound}")
-    _curves(offset, gains, lambda case: case.kp, lambda held: held.offset_n / held.bound_n)
-    offset.set(title="Accuracy over the gain", xlabel="gain kp", ylabel=f"mean distance from the set point / {bound}")
-    for axes in (width, offset):
-        axes.set_xscale("log")
-        axes.set_xticks(GAINS, [f"{kp:g}" for kp in GAINS])
-        axes.minorticks_off()
-    _curves(delay, delays, lambda case: case.age_s, lambda held: held.width_n / held.bound_n)
-    delay.set_xticks(AGES_S, [f"{age_s:g}" for age_s in AGES_S])
-    delay.set(title="Limit cycle over the delay", xlabel="age of a reading, s", ylabel=f"peak to peak / {bound}")
-    for axes in (width, delay, offset):
-        axes.set_ylim(-0.05, max(1.2, axes.get_ylim()[1]))
-        axes.axhline(1.0, color="black", lw=1, ls=":")
-    for axes in (width, delay):
-        axes.axhspan(-0.05, 1.0, color="#55a868", alpha=0.08, lw=0)
-        axes.annotate(f"allowed: up to {bound}", (0.02, 0.96), xycoords=("axes fraction", "data"), fontsize=8, va="top")
-    handles, labels = width.get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
-    delay.legend(fontsize=8)
-    for axes in (over, width, offset, delay):
-        axes.grid(alpha=0.25)
-    for suffix in ("png", "svg"):
-        figure.savefig(out / f"skin_loop.{suffix}", dpi=130)
-
-
-def _run(axes: "Axes", loop: SkinLoop) -> None:
-    time_s = np.arange(len(loop.truth_n)) * TICK_S
-    estimate = np.array(loop.estimate_n[: len(time_s)])
-    axes.plot(time_s, loop.truth_n, color="#1f4e79", lw=1.2, label="true shear force")
-    axes.plot(time_s[: len(estimate)], estimate, color="#c44e52", lw=0.9, label="estimate")
-    axes.plot(time_s, loop.set_point_n, color="#888888", lw=1, ls="--", label="set point")
-    axes.set(
-        title="Zero, identification, and three holds (Fn = 1 N, kp = 0.5)", xlabel="time, s", ylabel="shear force, N"
-    )
-    axes.legend(loc="upper left", fontsize=8)
-
-
-def _curves(axes: "Axes", found: list[Held], over: Callable[[Case], float], value: Callable[[Held], float]) -> None:
-    for name, marker in zip(dict.fromkeys(held.case.name for held in found), "os^Dvx*", strict=False):
-        mine = [held for held in found if held.case.name == name]
-        axes.plot(
-            [over(held.case) for held in mine], [value(held) for held in mine], marker=marker, ms=5, lw=1, label=name
-        )
-
-
 def main() -> None:
     """Measure, write, draw, print."""
+    from bench.charts.limit_cycle import chart
+    from daemon.workers import InTurn
+
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("run/bench"))
-    out: Path = parser.parse_args().out
-    out.mkdir(parents=True, exist_ok=True)
-    calibration = load_calibration(CALIBRATION)
-    gains, delays = (_measured(cases, calibration) for cases in (over_gains(), over_delays()))
-    shown = judge(Case(name="shown"), calibration)[1]
-    document = json.dumps([asdict(held) for held in (*gains, *delays)], indent=1)
-    (out / "skin_loop.json").write_text(document + "\n", encoding="utf-8")
-    draw(gains, delays, shown, out)
+    chart(parser.parse_args().out, InTurn(), "skin_loop", told=_told)
 
 
-def _measured(cases: list[Case], calibration: SkinCalibration) -> list[Held]:
-    found = []
-    for case in cases:
-        held = worst(case, calibration)
-        found.append(held)
-        print(
-            f"{case.name:34} kp {case.kp:4.2f}  age {case.age_s:4.2f} s   width {held.width_n:.4f} N of "
-            f"{held.bound_n:.2f} allowed   offset {held.offset_n:.4f} N   {held.phase}",
-            flush=True,
-        )
-    return found
+def _told(held: Held) -> None:
+    case = held.case
+    print(
+        f"{case.name:34} kp {case.kp:4.2f}  age {case.age_s:4.2f} s   width {held.width_n:.4f} N of "
+        f"{held.bound_n:.2f} allowed   offset {held.offset_n:.4f} N   {held.phase}",
+        flush=True,
+    )
 
 
 if __name__ == "__main__":

@@ -45,6 +45,9 @@ class _Step:
     set_point_nm: float | None = None
     # From the first to the last message of a closed loop that holds.
     held_from_ns: int | None = None
+    # The wrist's own angle at its beginning and at its end.
+    wrist_from_rad: float | None = None
+    wrist_to_rad: float | None = None
 
 
 @dataclass(slots=True)
@@ -99,6 +102,10 @@ class RunSummary:
 
     def _sense(self, run: _Run, topic: str, content: Mapping[str, Any]) -> None:
         source, gripped = content["source"], run.steps and run.steps[-1].holds
+        if topic == "robot.state" and run.steps:
+            step = run.steps[-1]
+            step.wrist_to_rad = content["wrist_rad"]
+            step.wrist_from_rad = step.wrist_to_rad if step.wrist_from_rad is None else step.wrist_from_rad
         if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
             run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
         elif topic in TORQUES and not content.get("valid", True):
@@ -147,6 +154,8 @@ def _lines(run: _Run, phase: str, truth: Known | None, happened: Sequence[tuple[
         if step.set_point_nm is not None and step.held_from_ns is not None:
             here = [event for event in happened if step.from_ns <= event[0] <= step.to_ns]
             yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here)
+        if step.name == "tighten":
+            yield from _turned(step, run, truth)
     yield from _counted(run)
 
 
@@ -159,14 +168,27 @@ def _beside(step: _Step, run: _Run) -> str:
     return ""
 
 
+def _turned(step: _Step, run: _Run, truth: Known | None) -> Iterator[str]:
+    if step.wrist_from_rad is not None and step.wrist_to_rad is not None:
+        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; what drove: {run.driving}"
+    for name, known in _known(run, truth).items():
+        turning = known.between(step.from_ns, step.to_ns).torque_nm
+        if turning.size and name in ("the truth", run.driving):
+            largest_nm = turning[np.abs(turning).argmax()]
+            yield f"    {name:<10} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at the most"
+
+
+def _known(run: _Run, truth: Known | None) -> dict[str, Known]:
+    sources = {name: Known(*map(np.array, zip(*values, strict=True))) for name, values in run.torques.items()}
+    return sources if truth is None else {"the truth": truth, **sources}
+
+
 def _held(
     step: _Step, set_nm: float, from_ns: int, run: _Run, truth: Known | None, happened: list[tuple[int, str]]
 ) -> Iterator[str]:
     held_s = (step.to_ns - from_ns) / 1e9
     yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; what drove: {run.driving}"
-    sources = {name: Known(*map(np.array, zip(*values, strict=True))) for name, values in run.torques.items()}
-    if truth is not None:
-        sources = {"the truth": truth, **sources}
+    sources = _known(run, truth)
     for name, known in sources.items():
         held = known.between(from_ns, step.to_ns).torque_nm
         if held.size:

@@ -8,7 +8,7 @@ from daemon.cli.cluster import add_cluster
 
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
-    "stability": "every estimator as faults grow: bias, spread, valid and false-valid share; continuity",
+    "stability": "every estimator as faults grow (bias, spread, valid, false-valid), continuity, the loop on the skin",
     "scene": "how much model, bank and board the recording's own noise asks for",
 }
 

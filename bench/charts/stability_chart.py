@@ -1,4 +1,4 @@
-"""`shearloop chart stability`: every fault on every recording, where the bank ends, and continuity."""
+"""`shearloop chart stability`: every fault on every recording, where the bank ends, continuity, the skin's loop."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -7,6 +7,7 @@ from pathlib import Path
 from bank.bank_file import Bank
 from bank.estimators import Name, Physics
 from bank.mesh import Mesh
+from bench.charts import limit_cycle
 from bench.charts.continuity import STEPS, walks
 from bench.charts.picture import save
 from bench.charts.rims import at_rims
@@ -21,7 +22,7 @@ SHIFTS_S = (0.0, 0.27, 0.54, 1.08, 2.16, 4.33)
 
 
 def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, pool: Workers) -> list[Path]:
-    """Sweep, draw and write: a chart for each recording, one for where the bank ends, and one for continuity."""
+    """Sweep, draw and write: a chart per recording, and for the bank's rims, continuity, and the loop on the skin."""
     physics, written = Physics(bank, mesh), []
     made_for = {"raw": STREAM_NAMES, "difference": SLICE_NAMES}
     for split in parts:
@@ -38,7 +39,8 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
             )  # fmt: skip
     synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
     curves = list(at_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
-    return [*written, *_written("stability-rims", "where the bank ends, on synthetic slices", curves, out)]
+    written += _written("stability-rims", "where the bank ends, on synthetic slices", curves, out)
+    return written + limit_cycle.chart(out, pool, "stability-skin")
 
 
 def _written(name: str, title: str, curves: Sequence[Curve], out: Path) -> list[Path]:

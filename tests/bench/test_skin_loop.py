@@ -1,16 +1,21 @@
 """The loop around the emulated skin, in virtual time: what the bench measures, held to what it has to be."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from bank.skin.calibration import SkinCalibration
 from bank.skin.calibration_file import load_calibration
+from bench import skin_loop
+from bench.charts import limit_cycle
 from bench.skin_loop import CALIBRATION, Case, SkinLoop, judge
 from daemon.config import load_daemon_config
 from daemon.config_file import load_yaml_model
 from daemon.experiment.machine import Phase
 from daemon.experiment.steps import ExperimentFile, HoldTorque
+from daemon.workers import InTurn
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -61,6 +66,22 @@ def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_p
     said = loop.run(60.0)
     assert said.startswith(Phase.STOPPED.value)
     assert max(loop.truth_n) < 2.0, "half of what the drift would have had it push by then"
+
+
+@pytest.mark.usefixtures("fonts")
+def test_the_stability_chart_shows_the_limit_cycle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = Case(name="told the band", hold_s=4.0)
+    monkeypatch.setattr(limit_cycle, "over_gains", lambda: [case])
+    monkeypatch.setattr(limit_cycle, "over_delays", lambda: [replace(case, name="not told", band=False)])
+    monkeypatch.setattr(skin_loop, "SEEDS", 1)
+    heard: list[str] = []
+    paths = limit_cycle.chart(tmp_path, InTurn(), "stability-skin", lambda held: heard.append(held.case.name))
+    assert heard == ["told the band", "not told"]
+    assert [path.name for path in paths] == ["stability-skin.json", "stability-skin.svg", "stability-skin.png"]
+    told, not_told = json.loads(paths[0].read_text())["held"]
+    assert told["width_n"] <= told["bound_n"] == pytest.approx(0.08)
+    assert not_told["case"]["band"] is False
+    assert paths[2].stat().st_size > 20_000
 
 
 def test_the_demo_holds_the_force_that_it_says() -> None:

@@ -99,3 +99,19 @@ def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase: str) ->
     lines: list[str] = []
     RunSummary(lines.extend)("loop.state", loop_state(0, phase=phase))
     assert not lines
+
+
+def test_where_a_screw_ended_and_what_it_took_is_told() -> None:
+    lines: list[str] = []
+    truth = Known(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
+    summary = RunSummary(lines.extend, lambda: truth)
+    turning = {"step_name": "tighten", "driving": "load_cell", "set_point_nm": None}
+    summary("loop.state", loop_state(10, **turning))
+    for t_s, wrist_rad, torque_nm in ((10.0, 0.4, -0.05), (11.0, 0.2, -0.176), (12.0, -0.1, -0.121)):
+        summary("robot.state", {"source": "robot", "wrist_rad": wrist_rad})
+        summary("load.torque", {"source": "load_cell", "t_mono_ns": round(t_s * S), "torque_nm": torque_nm})
+    summary("loop.state", loop_state(12.1, phase="done", **turning))
+    told = "\n".join(lines)
+    assert "    turned by -0.500 rad; what drove: load_cell" in told
+    assert "    the truth  -0.1190 N·m at the end, -0.1800 at the most" in told
+    assert "    load_cell  -0.1210 N·m at the end, -0.1760 at the most" in told

@@ -16,8 +16,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "play a converter board under this name (without a place: under none)",
         "play a scanning multimeter on this port instead, 0 for a free one",
-        "`silence [SECONDS]`, `unplug [SECONDS]`, `normal` befall its interface, and `missing`, `garbage`, `torn`, "
-        "`stuck [SECONDS]` the board's lines.",
+        "`silence [SECONDS]`, `unplug [SECONDS]`, `normal` befall its interface, `break-off` the scanner's "
+        "next answer, and `missing`, `garbage`, `torn`, `stuck [SECONDS]` the board's lines.",
     )
 
 

@@ -11,7 +11,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         parser,
         "a name for its RS-232 port",
         "listen on this port instead, 0 for a free one",
-        "`silence [SECONDS]`, `unplug [SECONDS]`, `normal` befall its interface.",
+        "`silence [SECONDS]`, `unplug [SECONDS]`, `break-off` (the next answer ends half-way), `normal` befall its "
+        "interface.",
     )
 
 

@@ -238,9 +238,11 @@ def _torque_reader(
     if motion is None:
         columns, head = columns_for(calibration.estimator, "torque", features), _ridge(calibration.estimator)
         strengths = _strengths(calibration.estimator)
-        # Places in the bank are within its grid; all else would follow a drift to wherever it leads.
+        # Places in the bank are within its grid; all else would follow a drift to wherever it leads. Without memory
+        # the gel's drift goes into the torque: what is left out must come later, as the future will.
         limit_reach = calibration.estimator not in NEEDS_BANK
-        return calibration, fit_reader(columns, torque, head, strengths=strengths, limit_reach=limit_reach), 0.0
+        reader = fit_reader(columns, torque, head, strengths=strengths, limit_reach=limit_reach, rolling=True)
+        return calibration, reader, 0.0
     head = Censored.fit if one_sided(torque) else Ridge.fit_scaled
     # Whether the gel's place tells more than its motion is for the recordings to say.
     n_motion = motion.n_lags * motion.directions.shape[0] * motion.directions.shape[1]

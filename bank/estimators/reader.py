@@ -9,7 +9,7 @@ import numpy as np
 from bank.errors import CalibrationError
 from bank.estimators.heads import Censored, Curve, Ridge, Rows, best_strength, later_splits, left_out_blocks
 from bank.estimators.intervals import Intervals
-from bank.estimators.values import FloatArray
+from bank.estimators.values import BoolArray, FloatArray
 
 Head: TypeAlias = Ridge | Censored | Curve
 HeadOf: TypeAlias = Callable[[FloatArray, FloatArray, float], Head]
@@ -36,9 +36,8 @@ _LARGEST_REACH = 1.6
 _AT_END, _MAY_BE_MISSING = 0.2, 0.5
 # As far beyond the range, in spans of it, as frames still pass for familiar ones (`stability-rims` of docs/charts.md).
 _UNSEEN = 0.5
-# Loads above this share of the largest count as loads, and this share of them must lie within their intervals; if
-# it is less, intervals reach as far as loads were missed by.
-_LOADED_SHARE, _LEAST_COVERED = 0.1, 0.85
+# Loads above this share of the largest count as loads, and this share of them must lie within their intervals.
+_LOADED_SHARE, _LEAST_COVERED = 0.1, 0.75
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,8 +45,8 @@ class Reader:
     """A head with its intervals, the range of values and the reach of features that it was calibrated on.
 
     Values at or below low_end may be read of anything lower, those at or above high_end of anything higher (−∞ and ∞
-    where that was not looked at). missed_below and missed_above are the least that an
-    interval reaches to either side, because loads went unseen by so much.
+    where that was not looked at). One that misses_loads did not see too many of those left out: of what it says, an
+    interval reaches over all values that it was calibrated on.
     """
 
     head: Head
@@ -56,8 +55,7 @@ class Reader:
     high: float
     low_end: float
     high_end: float
-    missed_below: float
-    missed_above: float
+    misses_loads: bool
     mean_feature: FloatArray
     reach: FloatArray
 
@@ -71,7 +69,9 @@ class Reader:
         raw = float(self.head.predict(features[None])[0])
         half = widening * self.intervals.half_width(raw) / float(np.sqrt(max(usable_share, 0.1)))
         value, beyond = _shown(self.head, raw), _UNSEEN * (self.high - self.low)
-        below, above = max(half, self.missed_below), max(half, self.missed_above)
+        below, above = half, half
+        if self.misses_loads:
+            below, above = half + max(value - self.low, 0.0), half + max(self.high - value, 0.0)
         if value <= self.low_end:
             below = max(below, value - (self.low - beyond))
         if value >= self.high_end:
@@ -148,10 +148,10 @@ def fit_reader(
             for sign in (1, -1)
         )
     half = np.array([intervals.half_width(one) for one in predicted])
-    missed_below, missed_above = _missed(truth, residuals, half, inflation) if difficulty is None else (0.0, 0.0)
+    misses_loads = difficulty is None and _misses_loads(truth, np.abs(residuals) <= half)
     return Reader(
         head, intervals, float(values.min()), float(values.max()),
-        low_end, high_end, missed_below, missed_above, centre, reach,
+        low_end, high_end, misses_loads, centre, reach,
     )  # fmt: skip
 
 
@@ -179,17 +179,14 @@ def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[
     return sign * found
 
 
-def _missed(truth: FloatArray, residuals: FloatArray, half: FloatArray, inflation: float) -> tuple[float, float]:
-    """Return by how much loads are read too high and too low, where intervals miss them too often; 0 where not.
+def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:
+    """Return whether too many loads lie outside of their intervals.
 
     Most frames of a stream are free of load and read as such: their small residuals say nothing of a load that an
-    estimator does not see. Loads are a stratum of their own then, by their truth (label-conditional, Vovk 2012).
+    estimator does not see. Loads are a stratum of their own, by their truth (label-conditional, Vovk 2012).
     """
     loaded = np.abs(truth) > _LOADED_SHARE * float(np.abs(truth).max())
-    if loaded.all() or not loaded.any() or (np.abs(residuals) <= half)[loaded].mean() >= _LEAST_COVERED:
-        return 0.0, 0.0
-    low, high = np.quantile(residuals[loaded], [0.025, 0.975])
-    return inflation * max(float(high), 0.0), inflation * max(-float(low), 0.0)
+    return bool(loaded.any() and not loaded.all() and inside[loaded].mean() < _LEAST_COVERED)
 
 
 def error_on_later(features: FloatArray, values: FloatArray, head_of: HeadOf, strengths: tuple[float, ...]) -> float:

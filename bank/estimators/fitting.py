@@ -241,7 +241,8 @@ def _torque_reader(
         # Places in the bank are within its grid; all else would follow a drift to wherever it leads. Without memory
         # the gel's drift goes into the torque: what is left out must come later, as the future will.
         limit_reach = calibration.estimator not in NEEDS_BANK
-        reader = fit_reader(columns, torque, head, strengths=strengths, limit_reach=limit_reach, rolling=True)
+        later = later_origins(len(torque))
+        reader = fit_reader(columns, torque, head, strengths=strengths, limit_reach=limit_reach, left_out=later)
         return calibration, reader, 0.0
     head = Censored.fit if one_sided(torque) else Ridge.fit_scaled
     # Whether the gel's place tells more than its motion is for the recordings to say.

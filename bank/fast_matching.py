@@ -6,6 +6,7 @@ compresses decides how long it takes, never what comes out.
 """
 
 from abc import abstractmethod
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,6 +24,7 @@ from bank.matching import (
     ReferenceMatcher,
     ZeroLagMatcher,
     unit_magnitude,
+    unit_magnitudes,
 )
 
 # How far two ways of adding up 896 products in float64 may be apart: where a tie hangs on less, the reference decides.
@@ -33,6 +35,8 @@ _ROUNDING_32 = 6e-5
 _FEW_LAGS = 128
 # With fewer cells, sorting them out in float32 costs more than scoring them.
 _FEW_CELLS = 48
+# Fewer than this are matched before a thread has begun.
+_FEWEST_PER_THREAD = 4
 # Scoring more than this takes longer than about a millisecond.
 _QUICK_SCORES = 1 << 13
 
@@ -74,6 +78,24 @@ class _PruningMatcher(Matcher):
             return self._search(unit_magnitude(difference), runner_up=True, quick=True)
         except (_Undecided, TakesLongError):
             return None
+
+    def matches(self, differences: ArrayLike, *, threads: int = 1) -> list[Match]:
+        """Return what `match` returns of each of (n, 896) differences, without the runner-ups.
+
+        Several threads share them, each a run of neighbours: most of the work is done without the interpreter's lock.
+        Raises MatchingError as `heatmaps` does.
+        """
+        frames = np.asarray(differences, dtype=np.float64)
+        # Wrong input is told before any thread is at work.
+        unit_magnitudes(frames)
+        if threads == 1 or len(frames) < _FEWEST_PER_THREAD * threads:
+            return self._in_turn(frames)
+        with ThreadPoolExecutor(threads) as pool:
+            parts = pool.map(self._in_turn, np.array_split(frames, threads))
+            return [match for part in parts for match in part]
+
+    def _in_turn(self, frames: FloatArray) -> list[Match]:
+        return [self.match(frame, runner_up=False) for frame in frames]
 
     @abstractmethod
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match: ...

@@ -125,6 +125,8 @@ def match_methods(bank: Bank, frames: Floats) -> tuple[dict[str, tuple[Run, int]
         "zero lag, numpy float32": (lambda: [int(np.argmax(signals @ frame)) for frame in single], n),
         "all lags, fast": (lambda: [every.match(frame, runner_up=False) for frame in frames], n),
         "all lags, fast, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
+        "all lags, fast, batch on two threads": (lambda: every.matches(frames, threads=2), n),
+        "zero lag, fast, batch on two threads": (lambda: zero.matches(frames, threads=2), n),
         "all lags, numpy float32 FFT": (by_fft, 4),
     }
     try:
@@ -203,7 +205,17 @@ def main() -> None:
         "seconds": {name: spread(each) for name, each in seconds.items()},
         "ratios": {
             **ratios(seconds, own, iter(("pyEIT", "direct", "fast, one thread"))),
-            **ratios(seconds, exact, iter(("all lags, numpy float32 FFT", "all lags, fast, with runner-up"))),
+            **ratios(
+                seconds,
+                exact,
+                iter(
+                    (
+                        "all lags, numpy float32 FFT",
+                        "all lags, fast, with runner-up",
+                        "all lags, fast, batch on two threads",
+                    )
+                ),
+            ),
             **ratios(
                 seconds,
                 quick,
@@ -213,6 +225,9 @@ def main() -> None:
         "cited": {
             "EIDORS, seconds per cell": EIDORS_CELL_S,
             f"EIDORS / {own}": EIDORS_CELL_S / statistics.median(seconds[own]),
+        },
+        "batches_a_minute": {
+            name: spread([60 / each for each in seconds[name]]) for name in seconds if "batch" in name
         },
         "error_against_direct": error,
         f"matches_like_the_reference_of_{N_CHECKED}": same,

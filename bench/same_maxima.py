@@ -18,10 +18,13 @@ from scipy.io import loadmat
 from bank.bank_file import Bank
 from bank.channels import N_LINE_VALUES, channels_of_line
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
-from bank.matching import ReferenceMatcher, ZeroLagMatcher, best_match
+from bank.matching import Matcher, ReferenceMatcher, ZeroLagMatcher, best_match
 
 AT_ONCE = 32
-KINDS = {"all lags": (ReferenceMatcher, FastMatcher), "zero lag": (ZeroLagMatcher, FastZeroLagMatcher)}
+KINDS: dict[str, tuple[type[Matcher], type[FastMatcher | FastZeroLagMatcher]]] = {
+    "all lags": (ReferenceMatcher, FastMatcher),
+    "zero lag": (ZeroLagMatcher, FastZeroLagMatcher),
+}
 
 
 def recorded(folder: Path, every: int) -> Iterator[NDArray[np.float64]]:
@@ -51,16 +54,22 @@ def main() -> None:
     bank = Bank.open(args.bank)
     found = {}
     for kind in args.kinds:
-        reference, fast = (each.from_bank(bank) for each in KINDS[kind])
-        frames = same = 0
+        slow_kind, fast_kind = KINDS[kind]
+        reference, fast = slow_kind.from_bank(bank), fast_kind.from_bank(bank)
+        frames = same = batches = in_batches = 0
         furthest = 0.0
         for part in recorded(args.recordings, args.every):
+            batched: list[tuple[int, int]] = []
             for frame, heatmap in zip(part, reference.heatmaps(part), strict=True):
                 slow, quick = best_match(heatmap, bank.k_grid, bank.sigma_grid), fast.match(frame)
                 frames += 1
+                batched.append(quick.cell)
                 same += (slow.cell, slow.runner_up_cell) == (quick.cell, quick.runner_up_cell)
                 furthest = max(furthest, abs(slow.score - quick.score))
-        found[kind] = {"frames": frames, "same": same, "largest_difference_of_scores": furthest}
+            in_batches += [match.cell for match in fast.matches(part, threads=2)] == batched
+            batches += 1
+        found[kind] = {"frames": frames, "same": same, "largest_difference_of_scores": furthest,
+            "batches": batches, "same_batches": in_batches}  # fmt: skip
         print(kind, found[kind])
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps({"every": args.every, **found}, indent=2) + "\n")

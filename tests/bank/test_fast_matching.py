@@ -156,6 +156,20 @@ def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
 
 
 @both
+def test_a_batch_is_its_frames_in_their_order_in_any_number_of_threads(slow, fast) -> None:
+    random = np.random.default_rng(5)
+    frames = random.normal(size=(19, N_CHANNELS)) + 3 * BANK[0][BANK[1]][random.integers(0, BANK[1].sum(), 19)]
+    alone = [fast.match(frame, runner_up=False) for frame in frames]
+    assert [match.cell for match in alone] == [slow.match(frame).cell for frame in frames]
+    for threads in (1, 2, 3, 7):
+        assert fast.matches(frames, threads=threads) == alone
+    assert fast.matches(frames[:0], threads=2) == []
+    frames[-1] = 0.0
+    with pytest.raises(MatchingError, match="zero in all channels"):
+        fast.matches(frames, threads=2)
+
+
+@both
 def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast) -> None:
     frame = np.random.default_rng(7).normal(size=N_CHANNELS)
     assert fast.match(frame, runner_up=False) == dataclasses.replace(

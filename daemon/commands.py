@@ -91,6 +91,12 @@ class Commands:
         source = request.get("source")
         if source is not None and not (isinstance(source, str) and source in self._tares):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(self._tares)}")
+        experiment = self._rig.brain.experiment if self._rig is not None else None
+        if experiment is not None and experiment.running:
+            raise CommandRefusedError(
+                f"the experiment {experiment.file.name!r} is running, and a new zero would change what its torques "
+                "are; stop it first, or give it a step `tare`"
+            )
         tared = [source] if source is not None else list(self._tares)
         for name in tared:
             self._tares[name]()

@@ -7,7 +7,7 @@ from daemon.addresses import COMMAND_ADDRESS, needs_keys, stop_address
 from daemon.cli.connection import add_connection, client_keys
 
 COMMANDS = {
-    "tare": "take the zero of fingertips and skin anew, nothing gripped",
+    "tare": "take the zero of every torque sensor anew, nothing gripped and no experiment running",
     "status": "how each task is",
     "start": "begin an experiment",
     "pause": "stand still until `resume`",

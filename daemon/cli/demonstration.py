@@ -10,6 +10,7 @@ from subprocess import Popen
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import structlog
 
 if TYPE_CHECKING:
     from daemon.config import Emulator
@@ -82,6 +83,26 @@ class Happenings:
                 process.stdin.write(f"{happening.say}\n".encode())
                 process.stdin.flush()
                 self.happened.append((time.monotonic_ns(), happening.say))
+
+
+class Deaths:
+    """Says once, for each emulated device, that its process has ended while the daemon runs."""
+
+    def __init__(self, emulators: "tuple[Emulator, ...]", processes: Sequence["Popen[bytes]"]) -> None:
+        """Take the emulators and their processes, in the same order."""
+        self._alive = [(emulator.device, process) for emulator, process in zip(emulators, processes, strict=True)]
+
+    def __call__(self, topic: str, _: Mapping[str, Any]) -> None:
+        """Look at each message of `health`, which comes once a second, whether all of them live."""
+        if topic != "health":
+            return
+        for entry in [entry for entry in self._alive if entry[1].poll() is not None]:
+            self._alive.remove(entry)
+            structlog.get_logger().error(
+                "an emulated device has ended: what it played is gone until the daemon is started again",
+                device=entry[0],
+                status=entry[1].returncode,
+            )
 
 
 def print_summary(lines: Sequence[str]) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from daemon.cli.demonstration import Truth
     from daemon.config import Emulator
+    from daemon.publisher import Listener
 
 # Long enough for an emulator to remove its port's link, short enough for a clean stop within a second.
 EMULATOR_STOP_S = 0.5
@@ -44,7 +45,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run until SIGINT, SIGTERM or `shearloop command stop`."""
     from daemon.app import run_daemon
-    from daemon.cli.demonstration import Happenings, Truth, print_summary
+    from daemon.cli.demonstration import Deaths, Happenings, Truth, print_summary
     from daemon.config import RecordingConfig, load_daemon_config
     from daemon.errors import UserError
     from daemon.logs import set_up_logging
@@ -73,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
                 # Here, and not in the emulator's process alone: without its frames the daemon would wait for ever.
                 read_stream(args.recording, _side(emulator.arguments))
     slices = SliceRecorder(args.slices) if args.slices is not None else None
-    listeners = () if slices is None else (slices,)
+    listeners: tuple[Listener, ...] = () if slices is None else (slices,)
     truth = Truth(config.emulators)
     try:
         with (
@@ -83,7 +84,8 @@ def run(args: argparse.Namespace) -> int:
         ):
             happenings = Happenings(config.emulators, processes)
             summary = RunSummary(print_summary, truth.torques, lambda: happenings.happened)
-            asyncio.run(run_daemon(config, (happenings, *listeners, *((Show(), summary) if args.show else ()))))
+            listeners = (Deaths(config.emulators, processes), happenings, *listeners)
+            asyncio.run(run_daemon(config, (*listeners, *((Show(), summary) if args.show else ()))))
     finally:
         truth.close()
     if slices is not None:

@@ -4,8 +4,11 @@ import socket
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest.mock import AsyncMock
 
 import pytest
 import zmq
@@ -16,12 +19,14 @@ from hypothesis import strategies as st
 from daemon.app import Daemon
 from daemon.clock import Clock
 from daemon.command_server import CommandRefusedError, CommandServer
+from daemon.commands import Commands
 from daemon.config import load_daemon_config
 from daemon.errors import UserError
 from daemon.messages import decode, encode
 from daemon.publisher import Publisher
 from daemon.rate_limit import RateLimit
 from daemon.request import request
+from daemon.rig import Rig
 from daemon.subscriber import messages
 
 
@@ -159,3 +164,27 @@ async def test_what_may_change_while_it_runs_is_set_and_nothing_else(config: Cal
             with pytest.raises(CommandRefusedError, match=why):
                 await change(wrong)
         daemon._close()
+
+
+async def test_no_zero_is_taken_while_an_experiment_runs() -> None:
+    tared: list[str] = []
+    experiment = SimpleNamespace(running=True, file=SimpleNamespace(name="hold"))
+    commands = Commands(
+        rig=cast("Rig", SimpleNamespace(brain=SimpleNamespace(experiment=experiment))),
+        tares={name: partial(tared.append, name) for name in ("right", "load_cell")},
+        fingertips={},
+        experiment=None,
+        begin=AsyncMock(),
+        give_up_waiting=lambda: None,
+        tasks=dict,
+        stop=lambda: None,
+    )
+    tare = commands.handlers()["tare"]
+    for request_ in ({}, {"source": "load_cell"}):
+        with pytest.raises(CommandRefusedError, match="the experiment 'hold' is running, and a new zero would change"):
+            await tare(request_)
+    assert tared == []
+    experiment.running = False
+    assert await tare({"source": "load_cell"}) == {"tared": ["load_cell"]}
+    assert await tare({}) == {"tared": ["right", "load_cell"]}
+    assert tared == ["load_cell", "right", "load_cell"]

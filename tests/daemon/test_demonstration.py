@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from structlog.testing import capture_logs
 
-from daemon.cli.demonstration import Happenings, Truth
+from daemon.cli.demonstration import Deaths, Happenings, Truth
 from daemon.config import Emulator
 from daemon.config_file import load_yaml_model
 
@@ -43,6 +44,20 @@ def test_a_rig_that_has_ended_is_told_nothing() -> None:
     happenings("loop.state", held(1, step=1))
     assert happenings.happened == []
     process.communicate()
+
+
+def test_an_emulated_device_that_dies_is_told_once() -> None:
+    with capture_logs() as told:
+        living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+        dead = subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"], stdin=subprocess.PIPE)
+        deaths = Deaths((emulator(device="eit-kit"), emulator()), [living, dead])
+        dead.wait(30)
+        for topic in ("loop.state", "health", "health"):
+            deaths(topic, {})
+        living.communicate(b"\n", timeout=30)
+        dead.communicate()
+    ((device, status),) = [(entry["device"], entry["status"]) for entry in told]
+    assert (device, status) == ("rig", 3)
 
 
 def test_the_truth_is_read_up_to_its_last_whole_line() -> None:

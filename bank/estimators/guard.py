@@ -134,9 +134,16 @@ class SideGuard:
         """Return whether a session's first frame is idle: not clearly nearer to the calibration's gripped frame."""
         known = np.isfinite(self.noise)
         from_idle, from_gripped = (_deviation(frame, one, known) for one in (self.idle, self.gripped))
-        if min(from_idle, from_gripped) < _SAME_HOUR and self.grip(frame, self.idle) > _GRIPPED_SCORE:
+        even = frame / self.gain(frame)
+        if min(from_idle, from_gripped) < _SAME_HOUR and self.grip(even, self.idle) > _GRIPPED_SCORE:
             return False
         return _CLEARLY_NEARER * from_idle <= from_gripped
+
+    def gain(self, idle: FloatArray) -> float:
+        """Return how much larger all voltages of an idle frame are than at calibration: no grip, but the gel's age."""
+        judged = self.idle > _WELL_ABOVE_NOISE_V
+        found = float(np.median(idle[judged] / self.idle[judged])) if judged.any() else 1.0
+        return found if found > 0 else 1.0
 
     def grip(self, frame: FloatArray, idle: FloatArray) -> float:
         """Return the grip's score, about 0 when idle and 1 as gripped at calibration; idle is this session's frame."""

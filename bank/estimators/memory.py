@@ -185,8 +185,14 @@ class Memory:
 
     @property
     def recent(self) -> FloatArray | None:
-        """The (n_lags + 1, m, 896) last frames, the newest last; None while they are not complete."""
-        return np.array(self._recent) if len(self._recent) == self._recent.maxlen else None
+        """The (n_lags + 1, m, 896) last frames at the calibration's gain, the newest last; None while incomplete."""
+        return np.array(self._recent) / self._gains() if len(self._recent) == self._recent.maxlen else None
+
+    def _gains(self) -> FloatArray:
+        """Return the (m, 1) gain of each fingertip's idle frame of this session against the calibration's."""
+        if self._baselines is None or not self.own_baseline:
+            return np.ones((len(self._guards), 1))
+        return np.array([[guard.gain(one)] for guard, one in zip(self._guards, self._baselines, strict=True)])
 
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
@@ -260,7 +266,7 @@ class Memory:
             for layer, (guard, grip) in enumerate(zip(self._guards, self._grips, strict=True))
         ]
         loose = [guard.side for layer, guard in enumerate(self._guards) if self._let_go[layer] or not held[layer]]
-        difference = self._difference(channels, usable)
+        difference = self._difference(channels, usable) / self._gains()
         if loose:
             self._recent.clear()
             self._bridged.clear()
@@ -278,8 +284,10 @@ class Memory:
         self._passed.append(channels)
         if self._baselines is None or len(self._passed) <= STEP_FRAMES:
             return
+        gains = self._gains()
         for layer, guard in enumerate(self._guards):
-            released = guard.released(channels[layer], self._passed[0][layer], self._baselines[layer])
+            now, then, idle = (one[layer] / gains[layer] for one in (channels, self._passed[0], self._baselines))
+            released = guard.released(now, then, idle)
             if released is not None:
                 self._let_go[layer] = released
 

@@ -47,6 +47,34 @@ def test_a_slow_drift_of_the_baseline_changes_little(fused_calibration, twisting
     )
 
 
+@pytest.mark.parametrize(
+    ("grip", "gain", "shift"), [(0.3, 1.0, 0.0), (2.0, 1.0, 0.0), (1.0, 0.75, 0.0), (1.0, 1.0, 0.03), (0.5, 1.2, 0.03)]
+)
+def test_another_session_takes_its_own_baseline(fused_calibration, twisting, grip, gain, shift):
+    """A grip of another strength, a board of another gain, a gel that dried: idle is what the session begins with."""
+    other = twisting(seed=20)
+    gripped = (other.t_s > 20) & (other.t_s < 140)
+    step = np.median(other.channels[gripped], axis=0) - np.median(other.channels[other.t_s < 19], axis=0)
+    dried = 1 + shift * np.random.default_rng(20).normal(size=other.channels.shape[1:])
+    channels = gain * dried * (other.channels + (grip - 1) * gripped[:, None, None] * step)
+    session = changed(other, channels=channels)
+    estimates = follow(fused_calibration, session)
+    valid = np.array([one.valid for one in estimates])
+    assert not valid[(other.t_s < 19) | (other.t_s > 145)].any()
+    assert valid[(other.t_s > 32) & (other.t_s < 138)].mean() > 0.9
+    r, rmse, coverage = judged(estimates, session)
+    assert r > 0.95
+    assert rmse < 0.008
+    assert coverage > 0.85
+
+
+def test_a_session_that_begins_gripped_is_read_from_its_motion(fused_calibration, twisting):
+    later = twisting(seed=21).between(60, 240)
+    estimates = follow(fused_calibration, later)
+    assert np.mean([one.valid for one in estimates[15:]]) > 0.9
+    assert judged(estimates, later)[0] > 0.95
+
+
 def test_no_idle_frame_is_valid(fused_calibration, twisting):
     other = twisting(seed=7)
     idle = (other.t_s < 19) | (other.t_s > other.t_s[-1] - 18)

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
     from bank.bank_file import Bank
+    from daemon.reproduce.banks import Grid
     from daemon.reproduce.report import Reproduction
 
 
@@ -62,29 +63,39 @@ def run(args: argparse.Namespace) -> int:
 def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict[str, Bank]]":
     from scipy import fft
 
-    from daemon.reproduce.analysis import analyse_diameter, analyse_torque, score_models
-    from daemon.reproduce.banks import GRIDS, cached_bank, choose_mesh
+    from daemon.reproduce.analysis import analyse_diameter, analyse_torque, match_slices, score_models
+    from daemon.reproduce.banks import GRIDS, cached_bank, choose_mesh, focused_grid
     from daemon.reproduce.inputs import read_inputs
-    from daemon.reproduce.report import Reproduction
+    from daemon.reproduce.report import Reproduction, moved_focus
 
     inputs = read_inputs(args.recordings)
     chosen = choose_mesh(args.recordings, args.mesh, args.bank_config)
     print(f"mesh: {chosen.origin}", file=sys.stderr)
-    with _Progress() as progress:
-        banks = {
-            name: cached_bank(name, grid, chosen.mesh, args.out / "banks", jobs, progress.rows)
-            for name, grid in GRIDS.items()
-        }
-        progress.begin("matching", inputs.n_matches, "slice")
+    notes = list(inputs.notes)
+    with _Progress() as progress, fft.set_workers(jobs):
+
+        def built(name: str, grid: "Grid") -> "Bank":
+            return cached_bank(name, grid, chosen.mesh, args.out / "banks", jobs, progress.rows)
+
+        banks = {"wide": built("wide", GRIDS["wide"])}
         torque = diameter = models = None
-        with fft.set_workers(jobs):
-            if inputs.torque is not None:
-                torque = analyse_torque(inputs.torque, banks["focused"], banks["wide"], progress.advance)
-                models = score_models(inputs.torque, inputs.raw_difference, chosen.mesh)
-            if inputs.diameter is not None:
-                diameter = analyse_diameter(inputs.diameter, banks["wide"], progress.advance)
+        if inputs.torque is not None:
+            slices = inputs.torque.differences
+            progress.begin("matching", len(slices), "slice")
+            on_wide = match_slices(slices, banks["wide"], progress.advance)
+            focus = focused_grid(on_wide.k, on_wide.sigma)
+            if focus is not GRIDS["focused"]:
+                notes.append(moved_focus(focus))
+            banks["focused"] = built("focused", focus)
+            progress.begin("matching", len(slices), "slice")
+            on_focused = match_slices(slices, banks["focused"], progress.advance)
+            torque = analyse_torque(inputs.torque, on_focused, on_wide)
+            models = score_models(inputs.torque, inputs.raw_difference, chosen.mesh)
+        if inputs.diameter is not None:
+            progress.begin("matching", len(inputs.diameter.differences), "slice")
+            diameter = analyse_diameter(inputs.diameter, banks["wide"], progress.advance)
     valid_cells = int(banks["wide"].valid.sum())
-    return Reproduction(chosen.origin, valid_cells, torque, diameter, models, inputs.notes), banks
+    return Reproduction(chosen.origin, valid_cells, torque, diameter, models, tuple(notes)), banks
 
 
 class _Progress:

@@ -140,11 +140,9 @@ def match_slices(differences: FloatArray, bank: Bank, progress: Progress) -> Mat
     )
 
 
-def analyse_torque(slices: TorqueSlices, focused: Bank, wide: Bank, progress: Progress) -> TorqueResult:
-    """Match torque slices, at least three of them, on both banks and relate sigma to torque."""
+def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) -> TorqueResult:
+    """Relate the sigma of torque slices, at least three of them, to torque, by their matches on both banks."""
     torque = slices.torque_nm
-    on_focused = match_slices(slices.differences, focused, progress)
-    on_wide = match_slices(slices.differences, wide, progress)
     sigma = on_focused.sigma
     groups, grouping = _levels(torque)
     parts, held_out = _held_out_parts(torque)

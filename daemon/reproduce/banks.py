@@ -39,6 +39,36 @@ GRIDS = {
 }
 
 
+# The paper's focused grid is where nearly all of its own slices match best; a tool of another thickness is elsewhere.
+FEWEST_INSIDE = 0.9
+# Of the best matches: outliers set no border. Around them so many of the wide bank's steps are added.
+_ENDS, _STEPS_AROUND = (0.02, 0.98), 2
+
+
+def focused_grid(k: NDArray[np.float64], sigma: NDArray[np.float64]) -> Grid:
+    """Return the cells to look at more closely, from the best matches k (n,), sigma (n,) on the wide bank, in cm.
+
+    The paper's own, where they hold the matches; else as many around the matches, and over no less.
+    """
+    paper, wide = GRIDS["focused"], GRIDS["wide"]
+    inside = _within(k, paper.k) & _within(sigma, paper.sigma)
+    if inside.mean() >= FEWEST_INSIDE:
+        return paper
+    return Grid(_around(k, paper.k, wide.k), _around(sigma, paper.sigma, wide.sigma))
+
+
+def _within(found: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.bool_]:
+    inside: NDArray[np.bool_] = (found >= grid[0]) & (found <= grid[-1])
+    return inside
+
+
+def _around(found: NDArray[np.float64], paper: NDArray[np.float64], wide: NDArray[np.float64]) -> NDArray[np.float64]:
+    low, high = np.quantile(found, _ENDS)
+    half = max(high - low + 2 * _STEPS_AROUND * (wide[1] - wide[0]), paper[-1] - paper[0]) / 2
+    middle = (low + high) / 2
+    return np.linspace(max(middle - half, wide[0]), min(middle + half, wide[-1]), len(paper))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenMesh:
     """A mesh, and where it is from, for the report."""

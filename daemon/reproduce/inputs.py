@@ -24,13 +24,6 @@ class Inputs:
     raw_difference: NDArray[np.float64] | None
     notes: tuple[str, ...]
 
-    @property
-    def n_matches(self) -> int:
-        """How often a slice is matched: torque slices on two banks, diameter slices on one."""
-        n_torque = 0 if self.torque is None else len(self.torque.torque_nm)
-        n_diameter = 0 if self.diameter is None else len(self.diameter.diameter_mm)
-        return 2 * n_torque + n_diameter
-
 
 def read_inputs(recordings: Path) -> Inputs:
     """Read torque_slices and diameter_slices of a folder.

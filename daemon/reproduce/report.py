@@ -13,6 +13,7 @@ from bank.calibration import Calibration
 from bank.errors import CalibrationError
 from bank.models import MODELS
 from daemon.reproduce.analysis import DiameterResult, ModelScores, TorqueResult, all_notes
+from daemon.reproduce.banks import Grid
 
 FloatArray = NDArray[np.float64]
 
@@ -39,6 +40,14 @@ class Reproduction:
     diameter: DiameterResult | None
     models: ModelScores | None
     notes: tuple[str, ...]
+
+
+def moved_focus(grid: Grid) -> str:
+    """Return the sentence for a focused bank that is not where the paper's is."""
+    return (
+        "Most slices match best beyond the paper's focused bank: this one lies around them, "
+        f"k {grid.k[0]:.2f} to {grid.k[-1]:.2f} cm, sigma {grid.sigma[0]:.2f} to {grid.sigma[-1]:.2f} cm."
+    )
 
 
 def as_json(found: Reproduction) -> dict[str, Any]:

@@ -15,10 +15,11 @@ from daemon.reproduce.analysis import (
     analyse_diameter,
     analyse_torque,
     correlation,
+    match_slices,
     score_models,
     smoothed_along_channels,
 )
-from daemon.reproduce.banks import Grid, cached_bank
+from daemon.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +33,9 @@ def slices_of(signals: NDArray, columns: list[int], torque: list[float]) -> Torq
 
 
 def analysed(signals: NDArray, bank, columns: list[int], torque: list[float]) -> TorqueResult:
-    return analyse_torque(slices_of(signals, columns, torque), bank, bank, lambda _: None)
+    slices = slices_of(signals, columns, torque)
+    matches = match_slices(slices.differences, bank, lambda _: None)
+    return analyse_torque(slices, matches, matches)
 
 
 def test_torque_is_related_to_the_sigma_of_the_best_match(signals: NDArray, bank) -> None:
@@ -137,3 +140,25 @@ def test_sigma_falls_with_torque_on_the_shared_slices(shared: Path) -> None:
     best = [best_match(heatmap, k, sigma).sigma for heatmap in matcher.heatmaps(slices.differences)]
     # On the full focused grid of 100 × 100 it is −0.67487; on these 6 × 15 cells it was measured as −0.69073.
     assert correlation(np.array(best), slices.torque_nm) == pytest.approx(-0.69073, abs=0.002)
+
+
+def test_the_focused_bank_is_the_paper_s_where_the_slices_match_there() -> None:
+    paper = GRIDS["focused"]
+    k, sigma = np.linspace(3.11, 3.39, 50), np.linspace(1.21, 1.89, 50)
+    assert focused_grid(k, sigma) is paper
+    k[:4] = 0.2
+    assert focused_grid(k, sigma) is paper, "a few chance matches move nothing"
+
+
+def test_the_focused_bank_moves_to_where_the_slices_match() -> None:
+    k, sigma = np.full(50, 3.68), np.linspace(1.0, 1.7, 50)
+    sigma[0] = 4.0
+    grid = focused_grid(k, sigma)
+    assert grid.k.shape == grid.sigma.shape == (100,)
+    assert np.ptp(grid.k) == pytest.approx(0.3), "over no less than the paper's"
+    assert grid.k.mean() == pytest.approx(3.68)
+    assert grid.sigma[0] < 1.0
+    assert 1.7 < grid.sigma[-1] < 2.0, "an outlier sets no border"
+    edge = focused_grid(np.full(50, 4.39), np.full(50, 0.05))
+    assert edge.k[-1] == GRIDS["wide"].k[-1]
+    assert edge.sigma[0] == GRIDS["wide"].sigma[0]

@@ -24,10 +24,11 @@ Floats = NDArray[np.float64]
 # The share of the noise that each choice may add.
 ALLOWED = 1.0 / 3.0
 CHANNEL_S = 0.6e-3
+# Above 0.5 cm the electrodes decide: nothing becomes coarser.
 MESH_SIZES_CM = (0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.05)
 COUNTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 150)
 RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-CHANNEL_COUNTS = (8, 16, 32, 64, 112, 168, 224, 336, 448, 672, 896)
+CHANNEL_COUNTS = (8, 16, 32, 64, 112, 168, 224, 280, 336, 392, 448, 504, 560, 616, 672, 728, 784, 840, 896)
 # Parameters of each model beside the amplitude: the step has no width.
 PARAMETERS = {name: 1 if model.sigma_unit == "not used" else 2 for name, model in MODELS.items()}
 _FOLDS = 8
@@ -289,7 +290,9 @@ def _board_choices(scene: Scene) -> tuple[Choice, Choice]:
     def added(channels: NDArray[np.int64]) -> float:
         return float(np.sqrt(max((spread(channels) / least) ** 2 - 1.0, 0.0)))
 
-    order = np.argsort(-np.abs(slope), kind="stable")
+    # By how much each counts in that reading, where drift is taken out: not by how far the torque moves it alone.
+    inner = np.linalg.inv(np.eye(_N_DRIFT) * scene.noise_v**2 + drift.T @ drift)
+    order = np.argsort(-np.abs(slope - drift @ (inner @ (drift.T @ slope))), kind="stable")
     channels = [Step(n, added(order[:n]), _rate(n)) for n in CHANNEL_COUNTS]
     injection = CHANNELS[:, 0]
     taken: list[int] = []

@@ -64,21 +64,31 @@ def _draw_choice(axes: Axes, choice: Choice) -> None:
     axes.set(xscale=scale, yscale="log", xlabel=f"{choice.name}, {choice.unit}", ylabel="added error / noise")
     axes.axhline(ALLOWED, color="black", linestyle="--", linewidth=1)
     axes.annotate(
-        "a third of the noise", (0.98, ALLOWED), xycoords=("axes fraction", "data"), xytext=(0, 3),
-        textcoords="offset points", fontsize=8, ha="right",
+        "a third of the noise", (0.02, ALLOWED), xycoords=("axes fraction", "data"), xytext=(0, -10),
+        textcoords="offset points", fontsize=8, ha="left",
     )  # fmt: skip
     chosen = choice.chosen
     ring = max(chosen.added, _LEAST_SHOWN)
     axes.plot(chosen.setting, ring, "o", markersize=15, markerfacecolor="none", color="black")
     if settings[0] > settings[-1]:
         axes.invert_xaxis()
-    ticks = settings[:: max(1, len(settings) // _MOST_TICKS)]
+    ticks = settings[:: max(1, len(settings) // _MOST_TICKS)] if scale == "log" else _spaced(settings)
     axes.set_xticks(ticks, [f"{value:g}" for value in ticks], fontsize=8, rotation=60 if scale == "log" else 0)
     axes.minorticks_off()
     axes.set_ylim(0.5 * min(shown), 3.0 * max(*shown, ALLOWED))
     axes.grid(alpha=0.25)
     cost = chosen.cost.split(";", maxsplit=1)[0]
     axes.set_title(f"{chosen.setting:g} {choice.unit}: {cost}", fontsize=9.5)
+
+
+def _spaced(settings: Sequence[float]) -> list[float]:
+    """Return settings, from the last one back, that stand far enough apart on a linear axis to be read."""
+    apart = (max(settings) - min(settings)) / (1.3 * _MOST_TICKS)
+    kept = [settings[-1]]
+    for one in reversed(settings):
+        if kept[-1] - one >= apart:
+            kept.append(one)
+    return kept
 
 
 def _draw_models(axes: Axes, design: Design) -> None:

@@ -9,6 +9,7 @@ from bank.estimators import Name, Physics
 from bank.mesh import Mesh
 from bench.charts import limit_cycle
 from bench.charts.continuity import STEPS, walks
+from bench.charts.detectability import detectability_figure, detected
 from bench.charts.picture import save
 from bench.charts.rims import at_rims
 from bench.charts.sources import Split, splits
@@ -36,6 +37,11 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
             written += save(
                 continuity_figure(split.title, found), {"steps": STEPS, "walks": rows}, out,
                 f"continuity-{_slug(split.title)}",
+            )  # fmt: skip
+            seen = detected(split.whole)
+            written += save(
+                detectability_figure(split.title.split(",", maxsplit=1)[0], seen),
+                {"mixtures": [asdict(one) for one in seen]}, out, f"detectability-{_slug(split.title)}",
             )  # fmt: skip
     synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
     curves = list(at_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bank.channels import CHANNELS
-from bank.design import ALLOWED, Choice, Scene, Step, designed
+from bank.design import ALLOWED, Choice, Scene, Step, _board_choices, designed
 from bank.errors import CalibrationError
 from bank.fingertip import Fingertip
 from bank.forward import ForwardModel
@@ -69,6 +69,17 @@ def test_all_injections_lose_nothing_and_half_of_them_are_twice_as_fast(quiet) -
     assert "1.86 frames/s" in quiet.injections.steps[-1].cost
     assert "3.72 frames/s" in quiet.injections.steps[15].cost
     assert len(quiet.injections.steps) == len(np.unique(CHANNELS[:, 0]))
+
+
+def test_channels_that_drift_as_they_twist_are_not_those_that_are_kept() -> None:
+    """Half of the channels move twice as far with the torque, and along the same with a drift that says nothing."""
+    rng = np.random.default_rng(4)
+    torque, drift = rng.normal(size=(2, 60))
+    loud = np.arange(896) % 2 == 0
+    slope = np.where(loud, 2e-3, 1e-3) * np.where(rng.random(896) < 0.5, 1, -1)
+    frames = 0.1 + np.outer(torque, slope) + np.outer(drift, np.where(loud, 10 * slope, 0.0))
+    channels, _ = _board_choices(Scene(frames + rng.normal(0, 1e-3, frames.shape), 1e-3, torque))
+    assert {step.setting: step.added for step in channels.steps}[448] < ALLOWED
 
 
 def test_a_choice_that_nothing_is_good_enough_for_says_so() -> None:

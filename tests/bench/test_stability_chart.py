@@ -9,6 +9,7 @@ import pytest
 from bank.bank_file import Bank
 from bank.estimators import Estimate, Physics, Tracker
 from bench.charts.continuity import walks
+from bench.charts.detectability import detectability_figure, detected
 from bench.charts.faults import FAULTS, lost_channels
 from bench.charts.rims import at_rims
 from bench.charts.sources import Split, bank_of, own_fingertip, splits
@@ -92,3 +93,16 @@ def test_the_mean_of_cells_alike_does_not_hop_and_the_rims_are_walked(parts, ban
     for figure in (sweeps_figure("rims", rims), continuity_figure("slices", found)):
         assert len(figure.axes) >= 2
     assert json.dumps([one.hops for one in found])
+
+
+@pytest.mark.usefixtures("fonts")
+def test_the_more_of_a_frame_is_foreign_the_less_of_it_passes(parts) -> None:
+    found = detected(parts[0].whole, origins=(0.6,))
+    for kind in {one.kind for one in found}:
+        passing = {one.share: one for one in found if one.kind == kind}
+        assert passing[0.0].passing == passing[0.0].passing_best == 1.0
+        assert passing[0.5].passing == 0.0
+        # The guard, which does not know the future, cannot let less pass than the best limit.
+        assert all(one.passing >= one.passing_best - 0.05 or one.share > 0.3 for one in passing.values())
+        assert passing[0.0].auc == 0.5 < passing[0.35].auc
+    assert len(detectability_figure("slices", found).axes) == 2

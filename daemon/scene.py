@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bank.design import ALLOWED, Choice, Design, Scene, designed
+from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import channel_noise
-from bank.estimators.memory import gripped_part
 from bank.estimators.values import FrameSeries
 from daemon.bank_config import FingertipConfig
 from daemon.config_file import load_yaml_model

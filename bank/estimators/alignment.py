@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bank.errors import CalibrationError
+from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import channel_noise
 from bank.estimators.heads import left_out_blocks
-from bank.estimators.memory import gripped_part
 from bank.estimators.values import FloatArray, FrameSeries
 
 _SHIFTS_S = np.round(np.arange(-6.0, 6.01, 0.12), 2)

@@ -25,9 +25,10 @@ from bank.estimators.calibrated import (
     read_from,
 )
 from bank.estimators.familiar import DifferenceGuard
+from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Censored, Curve, Ridge, Rows, later_origins
-from bank.estimators.memory import Memory, Motion, gripped_part
+from bank.estimators.memory import Memory, Motion
 from bank.estimators.physics import NOT_TURNED, Locator, Registration, image_matrix, register
 from bank.estimators.reader import (
     STRENGTHS,

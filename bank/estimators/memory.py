@@ -12,32 +12,21 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from bank.channels import N_CHANNELS
-from bank.errors import CalibrationError
 from bank.estimators.guard import (
     LARGEST_JUMPING_SHARE,
     LARGEST_UNUSABLE_SHARE,
     STEP_FRAMES,
     SideGuard,
     at_rail,
-    channel_noise,
-    steps,
 )
-from bank.estimators.values import BoolArray, FloatArray, FrameSeries, TactileFrame
+from bank.estimators.values import BoolArray, FloatArray, TactileFrame
 
 # Frames that an idle baseline is averaged over at the most recent end.
 _BASELINE_FRAMES = 10
 # Frames further apart than this many periods of 0.54 s have lost the thread.
 _LARGEST_GAP_S = 1.4
-# A large step is so much more than what twisting under load makes.
-_LARGE_STEP = 1.4
-# Frames that are less than this share of the way from the idle to the loaded ones, in the median of so many, are idle.
-# Gripped and not twisted they are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
-_LIKE_IDLE_SHARE, _LIKE_IDLE_FRAMES = 0.45, 5
-# Fewer frames than this after a step are not yet the gel let go.
-_LEAST_RELEASED = 10
 # A session's baseline is made of at least so many frames before a grip is looked for.
 _LEAST_IDLE = 5
 # A grip has ended when its score is below this share of its mean over so many frames.
@@ -362,53 +351,3 @@ def _too_few(guard: SideGuard, usable: BoolArray) -> str | None:
         f"{guard.side} fingertip: {100 * unusable:.0f} % of the channels are dead or saturated; look at the ribbon "
         "cable and the gel's contact with the electrodes"
     )
-
-
-def gripped_part(series: FrameSeries) -> tuple[slice, slice, slice]:
-    """Return which frames came before the grip, in it, and after it, going by the torque, the steps, and the place.
-
-    Loaded frames are gripped, and those before the first large step are not. The grip begins with the last large step
-    before the first torque, or later, where the frames begin to look more like the loaded ones than like the idle ones;
-    it ends in the same way. What no torque is known of is in neither. Raises CalibrationError for a recording without
-    torque.
-    """
-    known = series.torque_at_frames()
-    torque = np.abs(np.nan_to_num(known))
-    loaded = np.flatnonzero(torque > 0.1 * torque.max()) if torque.max() > 0 else np.zeros(0, dtype=np.int64)
-    if len(loaded) == 0:
-        raise CalibrationError("the recording holds no torque to calibrate on; record the load cell beside the frames")
-    n, span = len(series.t_s), slice(int(loaded[0]), int(loaded[-1]) + 1)
-    step = np.zeros(n)
-    for layer in range(len(series.sides)):
-        frames = series.channels[:, layer]
-        step[STEP_FRAMES:] = np.maximum(step[STEP_FRAMES:], steps(frames, channel_noise(frames[span])))
-    large = np.flatnonzero(step > _LARGE_STEP * float(np.quantile(step[span], 0.99)))
-    before, after = large[large < loaded[0]], large[large > loaded[-1]]
-    begin = int(before[-1]) + 1 if len(before) else 0
-    end = int(after[0]) - 1 if len(after) else n
-    # The transients of closing and opening belong to neither side.
-    idle_end = int(before[0]) - 1 if len(before) else 0
-    let_go = 0
-    for layer in range(len(series.sides)):
-        like_idle = _like_idle(series.channels[:, layer], slice(0, idle_end), span)
-        earlier, later = np.flatnonzero(like_idle[: loaded[0]]), np.flatnonzero(like_idle[loaded[-1] :])
-        let_go = max(let_go, int(np.flatnonzero(~like_idle)[-1]) + _LIKE_IDLE_FRAMES // 2)
-        if len(earlier):
-            begin = max(begin, int(earlier[-1]) + _LIKE_IDLE_FRAMES // 2)
-        if len(later):
-            end = min(end, int(loaded[-1] + later[0]) - _LIKE_IDLE_FRAMES // 2)
-    end = min(end, int(np.flatnonzero(np.isfinite(known))[-1]) + 1)
-    released = int(after[-1]) + 1 if len(after) else let_go
-    if n - released < _LEAST_RELEASED:
-        released = n
-    return slice(0, idle_end), slice(begin, end), slice(released, n)
-
-
-def _like_idle(frames: FloatArray, idle: slice, loaded: slice) -> BoolArray:
-    """Return which (n, 896) frames are nearer to the idle ones than to the loaded ones, along what parts the two."""
-    if idle.stop == 0:
-        return np.zeros(len(frames), dtype=np.bool_)
-    base, noise = np.median(frames[idle], axis=0), channel_noise(frames[loaded])
-    moved = (np.median(frames[loaded], axis=0) - base) / noise
-    along = median_filter((frames - base) / noise @ moved, _LIKE_IDLE_FRAMES, mode="nearest")
-    return np.asarray(along < _LIKE_IDLE_SHARE * float(moved @ moved))

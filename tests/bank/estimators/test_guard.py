@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from bank.errors import CalibrationError
+from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import LEAST_NOISE_V, SideGuard, channel_noise
-from bank.estimators.memory import gripped_part
 
 ALL = np.ones(896, dtype=bool)
 

@@ -77,7 +77,8 @@ class Cluster:
         """Yield results as they are finished; the tasks of a worker that dies go to the others."""
         from distributed import KilledWorker, as_completed
 
-        (kept,) = self._client.scatter([shared], broadcast=True, hash=False)
+        # The result of a task, which is made anew where the workers that had it are gone; what is scattered is lost.
+        kept = self._client.submit(_itself, shared, pure=False)
         tasks = {self._client.submit(function, kept, item, pure=False): i for i, item in enumerate(items)}
         try:
             for task in as_completed(list(tasks)):
@@ -89,6 +90,10 @@ class Cluster:
             ) from error
         finally:
             self._client.cancel(list(tasks))
+
+
+def _itself(shared: S) -> S:
+    return shared
 
 
 @contextmanager

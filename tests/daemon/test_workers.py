@@ -5,17 +5,23 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from multiprocessing import resource_tracker
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from bank.estimators import Name, Physics
+from bench.charts.faults import FAULTS
+from bench.charts.sources import bank_of, own_fingertip, splits
+from bench.charts.stability import sweeps
 from daemon.cli import main
 from daemon.errors import UserError
-from daemon.workers import InTurn, Processes, workers
+from daemon.reproduce.banks import Grid
+from daemon.workers import Cluster, InTurn, Processes, workers
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 
 ROOT = Path(__file__).parents[2]
@@ -123,18 +129,67 @@ def test_a_bank_has_the_same_bytes_from_a_cluster(banks: tuple[Path, Path]) -> N
     assert banks[0].read_bytes() == banks[1].read_bytes()
 
 
-def test_recordings_are_evaluated_to_the_same_figures_on_a_cluster(
-    scheduler: str, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_recordings_are_evaluated_to_the_same_figures_on_a_cluster_that_a_worker_is_killed_of(
+    scheduler: str, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], killed: list[int]
 ) -> None:
     slices, calibration = str(shared / "recordings" / "torque_slices"), str(tmp_path / "slices.cal")
     assert main(["calibrate", slices, "--estimator", "regression", "--part", "0:0.6", "--out", calibration]) == 0
     figures = []
     for options in ([], ["--cluster", scheduler]):
         capsys.readouterr()
-        assert main(["evaluate", calibration, slices, "--part", "0.6:1", "--json", *options]) == 0
+        assert main(["evaluate", calibration, slices, slices, "--part", "0.6:1", "--json", *options]) == 0
         found = json.loads(capsys.readouterr().out)
         figures.append({name: value for name, value in found.items() if not name.startswith("latency")})
+    assert killed
     assert figures[0] == figures[1]
+
+
+@pytest.fixture
+def killed(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Kill a worker as soon as the first result of anything is here, and give the numbers of those killed.
+
+    Its nanny starts another one, which is waited for at the end.
+    """
+    from distributed import Client
+
+    found: list[int] = []
+    whole = Cluster.map
+
+    def interrupted(self: Cluster, function: Any, shared: Any, items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        for number, result in whole(self, function, shared, items):
+            if not found:
+                found.append(next(iter(self._client.run(os.getpid).values())))
+                os.kill(found[0], signal.SIGKILL)
+            yield number, result
+
+    monkeypatch.setattr(Cluster, "map", interrupted)
+    yield found
+    with Client(scheduler, timeout=STARTED_S) as client:
+        client.wait_for_workers(2, timeout=STARTED_S)
+
+
+def test_a_bank_that_a_worker_is_killed_under_has_the_same_bytes(
+    banks: tuple[Path, Path], scheduler: str, killed: list[int]
+) -> None:
+    again = banks[0].with_name("killed.bank")
+    config = str(banks[0].with_name("bank.yaml"))
+    assert main(["bank", "build", "--config", config, "--out", str(again), "--cluster", scheduler]) == 0
+    assert killed
+    assert again.read_bytes() == banks[0].read_bytes()
+
+
+def test_a_chart_has_the_same_numbers_from_a_cluster_that_a_worker_is_killed_of(
+    scheduler: str, killed: list[int], tmp_path: Path
+) -> None:
+    bank = bank_of(None, own_fingertip(0.4).mesh(), tmp_path, Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8)))
+    split = next(one for one in splits([], 0.6, tmp_path) if one.past.kind == "difference")
+    # The quickest one, twice: a task each.
+    names: tuple[Name, ...] = ("regression", "regression")
+    with workers(scheduler) as cluster:
+        there = sweeps(split, names, Physics(bank, None), bank, cluster)
+    assert killed
+    assert there == sweeps(split, names, Physics(bank, None), bank, InTurn())
+    assert len(there) == 2 * len(FAULTS)
 
 
 def test_no_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

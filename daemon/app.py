@@ -120,10 +120,10 @@ class Daemon:
             self._both = BothTask(estimation(BOTH, both), both.sides, period_s)
         self._fingertips = {
             name: FingertipTask(
-                _board(config.fingertips[name], self._link_of(name), self._tap(name)),
+                _board(config.fingertips[name], name, self._link_of(name), self._tap(name), self._both),
                 estimation(name, estimator),
                 self.publisher,
-                **_passed_on(self._both, name),
+                **({"room": self._both.room} if self._both is not None and name in self._both.sides else {}),
                 always_heatmap=config.fingertips[name].heatmap == "always",
             )
             for name, estimator in estimators.items()
@@ -329,11 +329,9 @@ def _recorder(
     return recorder
 
 
-def _passed_on(both: BothTask | None, name: str) -> Mapping[str, Any]:
-    return {"pass_on": partial(both.take, name)} if both is not None and name in both.sides else {}
-
-
-def _board(config: Fingertip, on_event: Callable[[LinkEvent], None], tap: Tap) -> EitKit:
+def _board(
+    config: Fingertip, name: str, on_event: Callable[[LinkEvent], None], tap: Tap, both: BothTask | None
+) -> EitKit:
     return EitKit(
         path=config.device.path,
         serial_number=config.device.serial_number,
@@ -341,6 +339,7 @@ def _board(config: Fingertip, on_event: Callable[[LinkEvent], None], tap: Tap) -
         frame_period_s=config.frame_period_s,
         on_event=on_event,
         tap=tap,
+        **({"on_frame": partial(both.take, name)} if both is not None else {}),
     )
 
 

@@ -21,18 +21,33 @@ class BothTask:
         self.estimation = estimation
         self.sides = sides
         self._pairing: Pairing[Frame] = Pairing(sides, round(period_s * 1e9))
-        self._backlog: asyncio.Queue[tuple[Frame, ...]] = asyncio.Queue(LARGEST_BACKLOG)
+        self._backlog: asyncio.Queue[tuple[Frame, ...]] = asyncio.Queue()
+        self._room = asyncio.Event()
+        self._room.set()
 
-    async def take(self, side: str, frame: Frame) -> None:
-        """Take in a frame that one of the fingertips has sent."""
+    def take(self, side: str, frame: Frame) -> None:
+        """Take in a frame that one of the fingertips has sent, when it comes.
+
+        Not later: which frames make a pair follows from the order in which they came, whatever was waited for since.
+        So a replay finds the same pairs.
+        """
         pair = self._pairing.take(side, frame.t_mid_ns, frame)
         if pair is not None:
-            await self._backlog.put(pair[1])
+            self._backlog.put_nowait(pair[1])
+            if self._backlog.qsize() >= LARGEST_BACKLOG:
+                self._room.clear()
+
+    async def room(self) -> None:
+        """Wait until the estimator has caught up: before more is read from the boards."""
+        await self._room.wait()
 
     async def estimate(self) -> None:
         """Estimate from every pair, in order, until cancelled."""
         while True:
-            await self.estimation.of(*await self._backlog.get())
+            pair = await self._backlog.get()
+            if self._backlog.qsize() < LARGEST_BACKLOG:
+                self._room.set()
+            await self.estimation.of(*pair)
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the estimates."""

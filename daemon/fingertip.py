@@ -18,8 +18,8 @@ from drivers.eit_kit import EitKit, Frame
 LARGEST_BACKLOG = 8
 
 
-async def _nobody(_: Frame) -> None:
-    """Take a frame that nobody else wants."""
+async def _at_once() -> None:
+    """Wait for nothing."""
 
 
 @dataclass(slots=True)
@@ -33,14 +33,14 @@ class _Taken:
 
 
 class FingertipTask:
-    """Ties one board to one estimator; `pass_on` gets every frame as well."""
+    """Ties one board to one estimator; `room` waits until whoever else gets its frames can bear more."""
 
     def __init__(
         self,
         board: EitKit,
         estimation: Estimation,
         publisher: Publisher,
-        pass_on: Callable[[Frame], Awaitable[None]] = _nobody,
+        room: Callable[[], Awaitable[None]] = _at_once,
         *,
         always_heatmap: bool = False,
     ) -> None:
@@ -48,14 +48,14 @@ class FingertipTask:
         self.estimation = estimation
         self._board = board
         self._publisher = publisher
-        self._pass_on = pass_on
+        self._room = room
         self.always_heatmap = always_heatmap
         self._backlog: asyncio.Queue[_Taken] = asyncio.Queue(LARGEST_BACKLOG)
         # Whether the estimating task has nothing to do: then a frame may be estimated before it goes there.
         self._idle = False
 
     async def read(self) -> None:
-        """Estimate and publish every frame that arrives and pass it on, until cancelled.
+        """Estimate and publish every frame that arrives, until cancelled.
 
         The estimate comes first, unless it takes long, and the frame itself after it: that can wait.
         """
@@ -66,7 +66,7 @@ class FingertipTask:
                     self._estimate_at_once(taken)
                 self._publisher.publish(frame_message(self.name, frame))
                 await self._backlog.put(taken)
-                await self._pass_on(frame)
+                await self._room()
 
     async def estimate(self) -> None:
         """Estimate from every frame that `read` has not, in order, and publish heatmaps, until cancelled."""

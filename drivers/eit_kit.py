@@ -27,7 +27,8 @@ class EitKit:
     """One board, named by USB serial number or path.
 
     `zero_slots` (1024,) is true where its injection pattern makes a value 0; `frame_period_s` serves until the period
-    is measured; `on_event` hears when the board comes and goes, `tap` of all that the parser is told.
+    is measured; `on_event` hears when the board comes and goes, `tap` of all that the parser is told, and `on_frame` at
+    once of every frame that comes of it, whenever `frames` is asked for the next.
     """
 
     def __init__(
@@ -39,8 +40,10 @@ class EitKit:
         frame_period_s: float = NOMINAL_PERIOD_NS / 1e9,
         on_event: Callable[[LinkEvent], None] = lambda _: None,
         tap: Tap = no_tap,
+        on_frame: Callable[[Frame], None] = lambda _: None,
     ) -> None:
         self._tap = tap
+        self._on_frame = on_frame
         self._link = SerialLink(
             serial_number=serial_number, path=None if path is None else os.fspath(path), on_event=on_event
         )
@@ -91,7 +94,10 @@ class EitKit:
     def _told(self, kind: InputKind, t_ns: int, data: bytes = b"") -> list[Frame]:
         told = RawInput(kind, t_ns, data)
         self._tap(told)
-        return self._parser.take(told)
+        frames = self._parser.take(told)
+        for frame in frames:
+            self._on_frame(frame)
+        return frames
 
     def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
         """Return what health tells of the board; counts are since the process began."""

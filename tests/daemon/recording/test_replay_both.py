@@ -1,0 +1,157 @@
+"""Two fingertips, one by itself and both together with the default estimator: recorded live, replayed at any speed."""
+
+import asyncio
+import math
+from collections import Counter
+from collections.abc import Callable
+from contextlib import AsyncExitStack
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import zmq.asyncio
+from scipy.io import savemat
+
+from bank.channels import channels_of_line, line_of_channels
+from bank.estimators import FrameSeries, fit
+from daemon.app import Daemon
+from daemon.both import LARGEST_BACKLOG, BothTask
+from daemon.config import load_daemon_config
+from drivers.eit_format import ADC_STEP_V
+from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.recording.test_replay import measured, replayed
+
+Messages = list[tuple[str, dict[str, Any]]]
+N_FRAMES = 120
+GRIPPED = slice(25, 110)
+PERIOD_S = 0.5408
+PLAYED = 25
+SIDES = {"right": "Right_Data", "left": "Left_Data"}
+TORQUE_NM = np.zeros(N_FRAMES)
+TORQUE_NM[40:104] = 0.1 * np.abs(np.sin(np.pi * np.arange(64) / 22))
+
+
+class Twists(NamedTuple):
+    """What two boards send while a tool is twisted three times, and calibrations fitted to it."""
+
+    boards: dict[str, Path]
+    calibrations: dict[str, Path]
+
+
+@pytest.fixture(scope="module")
+def twists(tmp_path_factory: pytest.TempPathFactory) -> Twists:
+    folder = tmp_path_factory.mktemp("twists")
+    random = np.random.default_rng(4)
+    t_s = PERIOD_S * np.arange(N_FRAMES)
+    boards, channels = {}, []
+    for side, variable in SIDES.items():
+        idle, grip, twist = random.integers(40, 200, 896), random.integers(-15, 16, 896), random.normal(0, 5, 896)
+        steps = idle + random.integers(-1, 2, (N_FRAMES, 896)) + np.round(np.outer(TORQUE_NM / 0.1, twist)).astype(int)
+        steps[GRIPPED] += grip
+        lines = np.round(line_of_channels(steps * ADC_STEP_V), 4)
+        channels.append([channels_of_line(line) for line in lines])
+        boards[side] = folder / f"{side}.mat"
+        savemat(boards[side], {variable: np.column_stack([739_588 + t_s / 86_400, lines])})
+    series = FrameSeries(
+        "raw", tuple(SIDES), t_s, np.array(channels).swapaxes(0, 1), t_s, TORQUE_NM, np.full(N_FRAMES, np.nan)
+    )
+    calibrations = {}
+    for name, sides in (("both", tuple(SIDES)), ("right", ("right",))):
+        calibrations[name] = folder / f"{name}.cal"
+        fit("fused", [series.of_sides(sides)], "a test").save(calibrations[name])
+    return Twists(boards, calibrations)
+
+
+async def test_pairs_follow_from_the_order_of_arrival_and_boards_wait_while_too_many_are_left() -> None:
+    """What the estimator has not caught up with changes no pair: so a replay, which never waits, finds the same."""
+    go_on, estimated = asyncio.Event(), []
+
+    async def estimate(*frames: SimpleNamespace) -> None:
+        await go_on.wait()
+        estimated.append(tuple(frame.t_mid_ns for frame in frames))
+
+    both = BothTask(SimpleNamespace(of=estimate), ("right", "left"), 1.0)
+    estimating = asyncio.create_task(both.estimate())
+    number = 0
+    while both._room.is_set():
+        both.take("right", SimpleNamespace(t_mid_ns=number * 10**9))
+        both.take("left", SimpleNamespace(t_mid_ns=number * 10**9 + 1))
+        number += 1
+    reading_on = asyncio.create_task(both.room())
+    assert both.facts()["backlog"] == LARGEST_BACKLOG
+    assert not reading_on.done()
+    go_on.set()
+    async with asyncio.timeout(DEADLINE_S):
+        await reading_on
+        while len(estimated) < number:
+            await asyncio.sleep(0)
+    assert estimated == [(n * 10**9, n * 10**9 + 1) for n in range(number)]
+    estimating.cancel()
+    await asyncio.gather(estimating, return_exceptions=True)
+
+
+async def record(config: Path, boards: dict[str, Path]) -> Messages:
+    """Run a daemon before two boards that play their recordings once, and return what it published."""
+    published: Messages = []
+    frames, enough = Counter[str](), asyncio.Event()
+
+    def listen(topic: str, content: dict[str, Any]) -> None:
+        published.append((topic, content))
+        frames.update([content["source"]] * (topic == "eit.estimate"))
+        # On a busy computer one board falls behind the other, and what is left over has no partner.
+        if all(frames[side] >= N_FRAMES - 10 for side in SIDES) and frames["both"] > N_FRAMES // 3:
+            enough.set()
+
+    async with asyncio.timeout(DEADLINE_S), AsyncExitStack() as played:
+        for side, stream in boards.items():
+            play = ["--recording", str(stream), "--once", "--speed", str(PLAYED), "--side", side]
+            link = ["--link", str(config.parent / f"eit-{side}")]
+            board = await played.enter_async_context(
+                shearloop("emulate", "eit-kit", *play, *link, stdin=asyncio.subprocess.PIPE)
+            )
+            # Both are there before the daemon is, which starts them in the same moment.
+            assert board.stdout is not None
+            await board.stdout.readline()
+        with zmq.asyncio.Context() as context:
+            daemon = Daemon(load_daemon_config(config), context)
+            daemon.publisher.listen(listen)
+            running = asyncio.create_task(daemon.run())
+            try:
+                await enough.wait()
+            finally:
+                daemon.stop()
+                await running
+    return published
+
+
+def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
+    config: Callable[..., Path], tiny_bank: Path, twists: Twists, tmp_path: Path
+) -> None:
+    fingertips = {
+        side: {"device": {"path": f"eit-{side}"}, "bank": str(tiny_bank), "frame_period_s": PERIOD_S / PLAYED}
+        for side in SIDES
+    }
+    fingertips["right"] |= {"calibration": str(twists.calibrations["right"]), "estimator": "fused"}
+    path = config(
+        fingertips=fingertips,
+        both={"calibration": str(twists.calibrations["both"])},
+        recording={"folder": "recordings"},
+    )
+    live = asyncio.run(record(path, twists.boards))
+    (recording,) = (tmp_path / "recordings").iterdir()
+    # Recorded at many times a board's pace: at speed 1 it takes as long as it took.
+    replays = {}
+    for speed in (1.0, 7.0, math.inf):
+        again, comparison = asyncio.run(replayed(recording, speed, f"ipc://{tmp_path}/replay"))
+        assert comparison.different == {}, comparison.examples
+        assert comparison.compared["eit.estimate"] >= 2 * (N_FRAMES - 12) + N_FRAMES // 3
+        replays[speed] = measured([one for one in again if one[0] == "eit.estimate"])
+    assert replays[1.0] == replays[7.0] == replays[math.inf]
+    for source in ("right", "left", "both"):
+        then = measured([one for one in live if one[0] == "eit.estimate" and one[1]["source"] == source])
+        assert [one for one in replays[math.inf] if one[1]["source"] == source][: len(then)] == then
+    torques = [one["torque_nm"] for _, one in replays[math.inf] if one["source"] == "right" and one["valid"]]
+    assert len(torques) > 30
+    assert np.ptp(torques) > 0.05

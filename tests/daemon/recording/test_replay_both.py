@@ -66,27 +66,26 @@ def twists(tmp_path_factory: pytest.TempPathFactory) -> Twists:
 
 async def test_pairs_follow_from_the_order_of_arrival_and_boards_wait_while_too_many_are_left() -> None:
     """What the estimator has not caught up with changes no pair: so a replay, which never waits, finds the same."""
-    go_on, estimated = asyncio.Event(), []
+    go_on, all_estimated, estimated, number = asyncio.Event(), asyncio.Event(), [], 0
 
     async def estimate(*frames: SimpleNamespace) -> None:
         await go_on.wait()
         estimated.append(tuple(frame.t_mid_ns for frame in frames))
+        if len(estimated) == number:
+            all_estimated.set()
 
-    both = BothTask(SimpleNamespace(of=estimate), ("right", "left"), 1.0)
+    both = BothTask(SimpleNamespace(of=estimate, count=0), ("right", "left"), 1.0)
     estimating = asyncio.create_task(both.estimate())
-    number = 0
     while both._room.is_set():
         both.take("right", SimpleNamespace(t_mid_ns=number * 10**9))
         both.take("left", SimpleNamespace(t_mid_ns=number * 10**9 + 1))
         number += 1
-    reading_on = asyncio.create_task(both.room())
     assert both.facts()["backlog"] == LARGEST_BACKLOG
-    assert not reading_on.done()
+    reading_on = asyncio.create_task(both.room())
     go_on.set()
     async with asyncio.timeout(DEADLINE_S):
         await reading_on
-        while len(estimated) < number:
-            await asyncio.sleep(0)
+        await all_estimated.wait()
     assert estimated == [(n * 10**9, n * 10**9 + 1) for n in range(number)]
     estimating.cancel()
     await asyncio.gather(estimating, return_exceptions=True)

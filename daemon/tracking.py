@@ -15,6 +15,9 @@ from bank.polynomial import Interval
 from daemon.estimator import FloatArray, Matcher, Reading
 from drivers.eit_kit import Frame
 
+# These take a millisecond, always the same few products; the others search a bank or reconstruct.
+QUICK = ("regression", "fused")
+
 
 @dataclass(frozen=True, slots=True)
 class Scoring:
@@ -37,6 +40,9 @@ class TrackedEstimator:
         self._tracker = Tracker(calibration, bank)
         self._scoring = scoring
         self._baseline_frames = baseline_frames
+        self._is_quick = calibration.estimator in QUICK
+        # Frames that the tracker has taken in, with what it made of them, while their match is left to a thread.
+        self._unmatched: tuple[tuple[Frame, ...], Estimate, FloatArray | None] | None = None
 
     @property
     def grids(self) -> tuple[FloatArray, FloatArray] | None:
@@ -52,14 +58,47 @@ class TrackedEstimator:
         """Take a new homogeneous frame from the frames to come, which are of an untouched fingertip."""
         self._tracker.take_idle(self._baseline_frames)
 
-    def quickly(self, *_frames: Frame) -> Reading | None:
-        """Return nothing: what a tracker takes is not known beforehand, and `update` belongs in a thread."""
-        return None
+    def quickly(self, *frames: Frame) -> Reading | None:
+        """Return what `update` returns, or None where that takes more than some milliseconds: then call `update`."""
+        return self._read(frames, at_once=True) if self._is_quick else None
 
     def update(self, *frames: Frame) -> Reading:
         """Return what the frames of one moment say, one a side; those that say nothing come back with the reasons."""
+        reading = self._read(frames, at_once=False)
+        if reading is None:
+            raise AssertionError("only what has to be done at once may be left undone")
+        return reading
+
+    def _read(self, frames: tuple[Frame, ...], *, at_once: bool) -> Reading | None:
         if any(frame.repeated for frame in frames):
             return Reading(why=("the board sent the same frame again",))
+        estimate, first = self._estimate(frames)
+        if not estimate.valid:
+            return Reading(why=estimate.why, difference=first)
+        match: Match | None = None
+        if estimate.k is not None and estimate.sigma is not None and estimate.score is not None:
+            match = Match(estimate.k, estimate.sigma, (0, 0), estimate.score, estimate.runner_up, None)
+        elif self._scoring is not None and first is not None and first.any():
+            matcher = self._scoring.matcher
+            match = matcher.match_quickly(first) if at_once else matcher.match(first)
+            if match is None:
+                # The session has moved on by this frame already.
+                self._unmatched = frames, estimate, first
+                return None
+        return Reading(
+            match,
+            torque_nm=_interval(estimate.torque_nm, estimate.torque_low_nm, estimate.torque_high_nm),
+            diameter_mm=_interval(estimate.diameter_mm, estimate.diameter_low_mm, estimate.diameter_high_mm),
+            difference=first,
+        )
+
+    def _estimate(self, frames: tuple[Frame, ...]) -> tuple[Estimate, FloatArray | None]:
+        """Return the tracker's estimate, and the first side's difference; the same again of frames seen last."""
+        if self._unmatched is not None:
+            seen, estimate, first = self._unmatched
+            self._unmatched = None
+            if all(one is other for one, other in zip(seen, frames, strict=True)):
+                return estimate, first
         estimate = self._tracker.estimate(
             TactileFrame.of(
                 sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9,
@@ -68,28 +107,13 @@ class TrackedEstimator:
             )
         )
         difference = self._tracker.difference
-        first = None if difference is None else difference[0]
-        if not estimate.valid:
-            return Reading(why=estimate.why, difference=first)
-        return Reading(
-            self._match(estimate, first),
-            torque_nm=_interval(estimate.torque_nm, estimate.torque_low_nm, estimate.torque_high_nm),
-            diameter_mm=_interval(estimate.diameter_mm, estimate.diameter_low_mm, estimate.diameter_high_mm),
-            difference=first,
-        )
+        return estimate, None if difference is None else difference[0]
 
     def heatmap(self, reading: Reading) -> FloatArray | None:
         """Return the (K, S) scores of the first side's difference; None without a bank, or where there is none."""
         if self._scoring is None or reading.difference is None or not reading.difference.any():
             return None
         return self._scoring.matcher.heatmap(reading.difference)
-
-    def _match(self, estimate: Estimate, difference: FloatArray | None) -> Match | None:
-        if estimate.k is not None and estimate.sigma is not None and estimate.score is not None:
-            return Match(estimate.k, estimate.sigma, (0, 0), estimate.score, estimate.runner_up, None)
-        if self._scoring is None or difference is None or not difference.any():
-            return None
-        return self._scoring.matcher.match(difference)
 
 
 def _interval(value: float | None, low: float | None, high: float | None) -> Interval | None:

@@ -1,4 +1,5 @@
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -103,6 +104,39 @@ def test_a_bank_gives_k_sigma_and_heatmaps_beside(calibration: Calibration, tiny
     heatmap = estimator.heatmap(reading)
     assert heatmap is not None
     assert reading.match.score == pytest.approx(np.nanmax(heatmap), abs=1e-6)
+
+
+class Reluctant(FastZeroLagMatcher):
+    """Finds nothing quickly."""
+
+    def match_quickly(self, _difference: object) -> None:
+        return None
+
+
+@pytest.mark.parametrize("kind", [FastZeroLagMatcher, Reluctant])
+def test_readings_are_the_same_at_once_and_in_a_thread(kind, calibration: Calibration, tiny_bank: Path) -> None:
+    bank = Bank.open(tiny_bank)
+    slow, quick = (
+        TrackedEstimator(calibration, bank, Scoring(matcher.from_bank(bank), bank.model), baseline_frames=10)
+        for matcher in (FastZeroLagMatcher, kind)
+    )
+    left_undone = 0
+    for number, pair in enumerate(series(seed=3).channels[: int((IDLE_S + 14.0) / PERIOD_S)]):
+        frames = [frame(number, channels) for channels in pair]
+        found = quick.quickly(*frames)
+        if found is None:
+            left_undone += 1
+            found = quick.update(*frames)
+        expected = slow.update(*frames)
+        assert (found.match, found.torque_nm, found.why) == (expected.match, expected.torque_nm, expected.why)
+    assert (left_undone > 0) == (kind is Reluctant)
+
+
+@pytest.mark.parametrize(("name", "quick"), [("fused", True), ("reconstruction", False)])
+def test_only_what_takes_a_millisecond_is_not_left_to_a_thread(name, quick, calibration: Calibration) -> None:
+    estimator = TrackedEstimator(replace(calibration, estimator=name), None, None, baseline_frames=10)
+    found = estimator.quickly(*(frame(0, channels) for channels in series().channels[0]))
+    assert (found is not None) == quick
 
 
 def fingertip(**changes: object) -> Fingertip:

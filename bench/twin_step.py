@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from bench.plant import EIT, LOAD_CELL, Plant, Sensor, Tool, TwinPlant
 from bench.step_response import BAND, PERIOD_S, SOURCES, TARGET_NM, steps
-from daemon.control.creep import Creep, fit_creep
+from daemon.control.creep import Creep, Stretch, fit_creep
 from drivers.emulators.twin import Joint, Twin, TwinSettings
 
 FloatArray = NDArray[np.float64]
@@ -51,7 +51,7 @@ def calibrated_creep() -> Creep:
             rows += [(sample.t_mid_s, sample.torque_nm) for sample in plant.collect()]
         series.append(np.array(rows))
     (eit_s, shear_nm), (load_s, load_nm) = (table.T for table in series)
-    return fit_creep(eit_s, shear_nm, np.interp(eit_s, load_s, load_nm))
+    return fit_creep([Stretch(eit_s, shear_nm, np.interp(eit_s, load_s, load_nm))], scale_is_right=True).creep
 
 
 def rig_twin(sensor: Sensor, rng: np.random.Generator) -> Plant:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 
 THINGS = {
     "recording": ("daemon.cli.calibrated.recording", "an estimator, on recordings or folders of slices"),
+    "creep": ("daemon.cli.calibrated.creep", "what a gel's torque loses under a held twist, on recordings"),
     "load": ("daemon.cli.calibrated.load", "the load cell, with known masses on it"),
     "gripper": ("daemon.cli.calibrated.gripper", "the gripper's width, with objects of known diameter"),
 }

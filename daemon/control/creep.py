@@ -6,6 +6,7 @@ Properties of Polymers, 1980, chapter 1). What was learnt on one held twist besi
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,25 +51,69 @@ class Creep:
         self._crept_nm, self._t_ns, self._shear_nm = 0.0, None, 0.0
 
 
-def fit_creep(t_s: FloatArray, shear_nm: FloatArray, torque_nm: FloatArray) -> Creep:
-    """Return the creep of a gel from readings (n,) and the load cell's torque beside them (n,), gripped at the first.
+@dataclass(frozen=True, slots=True, eq=False)
+class Stretch:
+    """One grip: when its readings were (n,) in s, what they said (n,) and the torque beside them (n,), in N·m."""
 
-    For each time constant of a grid the share is a least-squares fit; the one that leaves least wins. Raises UserError
-    for fewer than twenty readings, and where the torque does not fall behind the readings.
+    t_s: FloatArray
+    shear_nm: FloatArray
+    torque_nm: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class FittedCreep:
+    """The creep of a gel, and how far readings are from the torque without it and with it (std, N·m)."""
+
+    creep: Creep
+    before_nm: float
+    after_nm: float
+
+
+def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> FittedCreep:
+    """Return the creep of a gel from grips, each of them begun with the gel at rest.
+
+    For each time constant of a grid share, scale and offset are a least-squares fit; the one that leaves least wins.
+    With `scale_is_right` the readings differ from the torque by creep and offset alone, and tell more of both.
+    Raises UserError for fewer than twenty readings, where the torque does not fall behind the readings, and where no
+    twist was held for long enough to tell.
     """
-    if t_s.size < _FEWEST:
-        raise UserError(f"creep: {t_s.size} readings are too few to learn it from; hold a twist for a minute")
-    best: tuple[float, float, float] | None = None
+    if sum(grip.t_s.size for grip in grips) < _FEWEST:
+        count = sum(grip.t_s.size for grip in grips)
+        raise UserError(f"creep: {count} readings are too few to learn it from; hold a twist for a minute")
+    shear, torque = (np.concatenate([getattr(grip, name) for grip in grips]) for name in ("shear_nm", "torque_nm"))
+    best: FittedCreep | None = None
+    without = np.ones((shear.size, 1)) if scale_is_right else np.column_stack([shear, np.ones_like(shear)])
+    before_nm = _left(without, torque - shear)[1]
     for time_s in _TIMES_S:
-        creep = Creep(0.0, float(time_s))
-        crept = np.empty_like(t_s)
-        for index, (at_s, shear) in enumerate(zip(t_s, shear_nm, strict=True)):
-            creep.torque_nm(float(shear), round(at_s * 1e9))
-            crept[index] = creep._crept_nm
-        share = float(crept @ (shear_nm - torque_nm) / (crept @ crept))
-        left = float(np.sum((shear_nm - torque_nm - share * crept) ** 2))
-        if best is None or left < best[0]:
-            best = (left, share, float(time_s))
-    if best is None or not 0.0 <= best[1] < 1.0:
+        crept = np.concatenate([_crept(grip, float(time_s)) for grip in grips])
+        # A factor and a constant between the two are the estimator's scale and the zero's, and no creep.
+        if scale_is_right:
+            (fallen, _), after_nm = _left(np.column_stack([-crept, np.ones_like(shear)]), torque - shear)
+            scale = 1.0
+        else:
+            (scale, fallen, _), after_nm = _left(np.column_stack([shear, -crept, np.ones_like(shear)]), torque)
+        # What no gel does is noise that happens to fit.
+        if 0.0 <= fallen < scale and (best is None or after_nm < best.after_nm):
+            best = FittedCreep(Creep(float(fallen / scale), float(time_s)), before_nm, after_nm)
+    if best is None:
         raise UserError("creep: the torque does not fall behind the readings; is the load cell's zero right?")
-    return Creep(best[1], best[2])
+    if best.creep.time_s == _TIMES_S[-1]:
+        raise UserError(
+            "creep: the torque falls behind the readings for as long as it was recorded, as it does where the "
+            "estimates themselves drift; hold some twists for a minute"
+        )
+    return best
+
+
+def _left(columns: FloatArray, wanted: FloatArray) -> tuple[FloatArray, float]:
+    """Return the least-squares coefficients of columns (n, m), and the standard deviation of what they leave."""
+    coefficients: FloatArray = np.linalg.lstsq(columns, wanted, rcond=None)[0].astype(np.float64)
+    return coefficients, float((wanted - columns @ coefficients).std())
+
+
+def _crept(grip: Stretch, time_s: float) -> FloatArray:
+    creep, crept = Creep(0.0, time_s), np.empty_like(grip.t_s)
+    for index, (at_s, shear) in enumerate(zip(grip.t_s, grip.shear_nm, strict=True)):
+        creep.torque_nm(float(shear), round(at_s * 1e9))
+        crept[index] = creep._crept_nm
+    return crept

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from daemon.control.creep import Creep, fit_creep
+from daemon.control.creep import Creep, Stretch, fit_creep
 from daemon.errors import UserError
 from drivers.emulators.twin import Twin, TwinSettings
 
@@ -27,9 +27,27 @@ def test_without_noise_the_torque_of_the_rigs_gel_comes_back_from_its_shear() ->
 
 
 def test_ten_noisy_twists_tell_the_creep() -> None:
-    creep = fit_creep(*twisted(600.0, 0.003))
-    assert creep.share == pytest.approx(0.08, abs=0.02)
-    assert creep.time_s == pytest.approx(20.0, rel=0.5)
+    found = fit_creep([Stretch(*twisted(600.0, 0.003))])
+    assert found.creep.share == pytest.approx(0.08, abs=0.02)
+    assert found.creep.time_s == pytest.approx(20.0, rel=0.5)
+    assert found.after_nm == pytest.approx(0.003, rel=0.15)
+    assert found.before_nm > 1.1 * found.after_nm
+
+
+def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep() -> None:
+    times, shears, torques = twisted(600.0)
+    found = fit_creep([Stretch(times, 1.1 * shears, torques)])
+    assert found.creep.share == pytest.approx(0.08, abs=0.005)
+    assert found.creep.time_s == pytest.approx(20.0, rel=0.1)
+    fooled = fit_creep([Stretch(times, 1.1 * shears, torques)], scale_is_right=True)
+    assert fooled.creep.time_s < 5.0
+
+
+def test_several_grips_tell_as_much_as_one_long_one_and_a_wrong_zero_tells_nothing() -> None:
+    times, shears, torques = twisted(300.0)
+    found = fit_creep([Stretch(times, shears, torques + 0.02), Stretch(times + 1e4, shears, torques + 0.02)])
+    assert found.creep.share == pytest.approx(0.08, abs=0.005)
+    assert found.creep.time_s == pytest.approx(20.0, rel=0.1)
 
 
 def test_a_new_grip_finds_the_gel_at_rest() -> None:
@@ -44,8 +62,10 @@ def test_a_new_grip_finds_the_gel_at_rest() -> None:
 def test_what_is_no_creep_is_refused() -> None:
     times, shears, torques = twisted(120.0)
     with pytest.raises(UserError, match="too few"):
-        fit_creep(times[:10], shears[:10], torques[:10])
+        fit_creep([Stretch(times[:10], shears[:10], torques[:10])])
     with pytest.raises(UserError, match="does not fall behind"):
-        fit_creep(times, torques, shears)
+        fit_creep([Stretch(times, torques, shears)])
+    with pytest.raises(UserError, match="for as long as it was recorded"):
+        fit_creep([Stretch(times, shears, shears - 0.01 * np.cumsum(shears) / shears.size)])
     with pytest.raises(UserError, match="no gel's"):
         Creep(1.5, 20.0)

@@ -1,0 +1,51 @@
+"""`shearloop calibrate creep REC… --calibration CAL`: what a gel's torque loses under a held twist."""
+
+import argparse
+from pathlib import Path
+
+from daemon.cli.result import add_json, tell
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument(
+        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) of twists that are held, best ten"
+    )
+    parser.add_argument(
+        "--calibration", type=Path, required=True, metavar="CAL", help="of the estimator that is to drive the loop"
+    )
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank the calibration was made with, if any")
+    add_json(parser)
+    parser.epilog = "Prints the line `creep:` for the fingertip, or for `both`, in the configuration."
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate every frame, fit, and say what to write into the configuration."""
+    from bank.bank_file import Bank
+    from bank.estimators import Calibration
+    from daemon.control.creep import fit_creep
+    from daemon.recording.evaluation import follow
+    from daemon.recording.grips import grips_of
+    from daemon.recording.series import read_series
+
+    calibration = Calibration.load(args.calibration)
+    bank = Bank.open(args.bank) if args.bank else None
+    series = [one for path in args.recordings for one in read_series(path, calibration.sides)]
+    grips = [grip for one in series for grip in grips_of(follow(calibration, one, bank))]
+    found = fit_creep(grips)
+    share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
+    told = {
+        "share": share,
+        "time_s": time_s,
+        "grips": len(grips),
+        "frames": sum(grip.t_s.size for grip in grips),
+        "error_before_nm": found.before_nm,
+        "error_after_nm": found.after_nm,
+    }
+    sentences = [
+        f"creep: {{share: {share:g}, time_s: {time_s:g}}}",
+        f"From {told['frames']} frames of {len(grips)} grips: estimates follow the load cell within "
+        f"{1e3 * found.after_nm:.1f} mN·m instead of {1e3 * found.before_nm:.1f} (standard deviation).",
+    ]
+    tell(told, sentences, as_json=args.json)
+    return 0

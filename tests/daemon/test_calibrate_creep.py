@@ -1,0 +1,75 @@
+"""`calibrate creep`: from recordings of held twists to the line of the configuration."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bank.estimators import Estimate, FrameSeries
+from daemon.cli import main
+from daemon.config import CreepConfig
+from daemon.recording.evaluation import Track
+from daemon.recording.grips import grips_of
+from tests.daemon.control.test_creep import twisted
+
+
+def track(valid: np.ndarray | None = None) -> Track:
+    """Return estimates that see the shear of the rig's gel, beside its torque."""
+    times, shears, torques = twisted(600.0, 0.002)
+    valid = np.ones(times.size, bool) if valid is None else valid
+    nothing = np.full(times.size, np.nan)
+    series = FrameSeries("raw", ("right",), times, np.zeros((times.size, 1, 896)), times, torques, nothing)
+    estimates = [
+        Estimate(valid=True, torque_nm=float(shear), torque_low_nm=shear - 0.01, torque_high_nm=shear + 0.01)
+        if good
+        else Estimate(valid=False)
+        for shear, good in zip(shears, valid, strict=True)
+    ]
+    return Track(series, tuple(estimates), np.zeros(times.size))
+
+
+def test_a_grip_is_a_stretch_of_torques_and_single_frames_do_not_end_it() -> None:
+    valid = np.ones(1109, bool)
+    valid[[3, 500]] = False
+    valid[200:230] = valid[:2] = False
+    first, second = grips_of(track(valid))
+    assert (first.t_s.size, second.t_s.size) == (200 - 3, 1109 - 230 - 1)
+    assert np.isfinite(first.shear_nm).all()
+    np.testing.assert_array_equal(first.t_s[:2], track().series.t_s[[2, 4]])
+
+
+@dataclass
+class Loaded:
+    sides: tuple[str, ...] = ("right",)
+
+
+def test_it_prints_the_line_of_the_configuration(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    found = track()
+    monkeypatch.setattr("bank.estimators.Calibration.load", lambda _: Loaded())
+    monkeypatch.setattr("daemon.recording.series.read_series", lambda *_: [found.series])
+    monkeypatch.setattr("daemon.recording.evaluation.follow", lambda *_: found)
+    arguments = ["calibrate", "creep", str(tmp_path / "held.mcap"), "--calibration", "right.cal"]
+    assert main([*arguments, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["share"] == pytest.approx(0.08, abs=0.02)
+    assert (told["grips"], told["frames"]) == (1, 1109)
+    assert told["error_after_nm"] < told["error_before_nm"]
+    assert main(arguments) == 0
+    line = capsys.readouterr().out.splitlines()[0]
+    assert line == f"creep: {{share: {told['share']:g}, time_s: {told['time_s']:g}}}"
+    CreepConfig(share=told["share"], time_s=told["time_s"])
+
+
+def test_a_recording_without_held_twists_is_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = track(np.arange(1109) < 10)
+    monkeypatch.setattr("bank.estimators.Calibration.load", lambda _: Loaded())
+    monkeypatch.setattr("daemon.recording.series.read_series", lambda *_: [found.series])
+    monkeypatch.setattr("daemon.recording.evaluation.follow", lambda *_: found)
+    assert main(["calibrate", "creep", "held.mcap", "--calibration", "right.cal"]) == 2
+    assert "10 readings are too few to learn it from; hold a twist for a minute" in capsys.readouterr().err

@@ -19,7 +19,7 @@ import math
 import os
 import struct
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from bank.channels import CHANNEL_TABLE_HASH, N_CHANNELS, STIMULATION_CURRENT
 from bank.errors import BankFileError, ModelError
-from bank.models import MODELS, model_named
+from bank.models import MODELS, PLAIN, Variation, model_named
 
 FORMAT_VERSION = 1
 # A signal with a smaller norm than this (in the units of the homogeneous voltages, whose norm is about 20) has no
@@ -53,6 +53,7 @@ _TYPES = {
 class BankDefinition:
     """What a bank is of: the geometry's digest, the basis model, and the grids of k (K,) and σ (S,) in its units.
 
+    `variation` is what all of its cells have in common beside k and σ; without one it has no part in the identity.
     Raises ModelError for an unknown model, and for a grid that is empty, does not ascend or holds a σ ≤ 0.
     """
 
@@ -60,6 +61,7 @@ class BankDefinition:
     model: str
     k_grid: NDArray[np.float64]
     sigma_grid: NDArray[np.float64]
+    variation: Variation = PLAIN
 
     def __post_init__(self) -> None:
         """Take read-only copies of the grids and check all."""
@@ -85,7 +87,7 @@ class BankDefinition:
             # Twelve digits: the last of a grid's sixteen may differ between machines.
             "k": [f"{k:.11e}" for k in self.k_grid.tolist()],
             "sigma": [f"{sigma:.11e}" for sigma in self.sigma_grid.tolist()],
-        }
+        } | _told(self.variation)
         return hashlib.sha256(json.dumps(defining, sort_keys=True).encode()).hexdigest()
 
 
@@ -154,7 +156,11 @@ class Bank:
                     checksums = {name: str(header["arrays"][name]["sha256"]) for name in _TYPES}
                     identity = str(header["identity"])
                     definition = BankDefinition(
-                        header["geometry"], header["model"], arrays["k_grid"], arrays["sigma_grid"]
+                        header["geometry"],
+                        header["model"],
+                        arrays["k_grid"],
+                        arrays["sigma_grid"],
+                        Variation(**header.get("variation", {})),
                     )
                 except (KeyError, TypeError, ValueError, ModelError) as error:
                     raise _unusable(path, f"its header does not describe a bank ({error!r})") from error
@@ -228,6 +234,10 @@ def sync_directory(directory: Path) -> None:
         os.close(handle)
 
 
+def _told(variation: Variation) -> dict[str, Any]:
+    return {} if variation == PLAIN else {"variation": asdict(variation)}
+
+
 def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, int]]:
     offsets, end = {}, _PAGE
     for name, array in stored.items():
@@ -244,7 +254,7 @@ def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tupl
             name: {"type": _TYPES[name], "shape": array.shape, "offset": offsets[name], "sha256": _sha256(array)}
             for name, array in stored.items()
         },
-    }
+    } | _told(definition.variation)
     # About 1.4 kB whatever the bank: the grids are arrays, and nothing in it is of the user's length.
     return json.dumps(header).encode().ljust(_PAGE - _PREAMBLE.size), offsets
 

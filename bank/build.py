@@ -16,7 +16,7 @@ from bank.channels import N_CHANNELS
 from bank.errors import BankFileError
 from bank.journal import BankRow, RowJournal
 from bank.mesh import Mesh
-from bank.models import Conductivities
+from bank.models import PLAIN, Conductivities, Variation
 
 Progress = Callable[[int, int], None]
 Notice = Callable[[str], None]
@@ -33,7 +33,7 @@ class RowSolver:
     def __init__(self, mesh: Mesh, definition: BankDefinition) -> None:
         """Prepare the forward model and solve it for the homogeneous voltages."""
         self._forward = BatchForwardModel(mesh)
-        self._conductivities = Conductivities(mesh)
+        self._conductivities = Conductivities(mesh, definition.variation)
         self._definition = definition
         (self.homogeneous,) = self._forward.voltages(np.ones((1, len(mesh.triangles))))
 
@@ -58,6 +58,7 @@ def build_bank(
     sigma_grid: NDArray[np.float64],
     path: Path,
     *,
+    variation: Variation = PLAIN,
     jobs: int = 1,
     elsewhere: RowsSolver | None = None,
     on_row: Progress | None = None,
@@ -71,7 +72,7 @@ def build_bank(
     cannot be written or another build is at work on it. A bank that was there before is replaced only by a finished
     one.
     """
-    definition = BankDefinition(mesh.digest, model, k_grid, sigma_grid)
+    definition = BankDefinition(mesh.digest, model, k_grid, sigma_grid, variation)
     if path.is_dir():
         raise BankFileError(f"{path} is a directory; give the name of a file in it to --out")
     solver = RowSolver(mesh, definition)

@@ -1,6 +1,6 @@
 """The five basis models of a sheared fingertip: conductivity 1 + f(y; k, σ), y along the fingertip's height.
 
-Trehan et al. 2025, equations (1) to (5).
+Trehan et al. 2025, equations (1) to (5). A `Variation` beside k and σ scales f, adds to it, or turns the axis.
 """
 
 from collections.abc import Callable
@@ -29,6 +29,30 @@ class BasisModel:
     k_unit: str
     sigma_unit: str
     function: Callable[[Values, float, float, float], Values]
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """What else a conductivity may depend on: 1 + offset + amplitude · f(y′; k, σ).
+
+    y′ is the height along an axis that is turned by tilt_deg about the fingertip's centre, towards x. Raises ModelError
+    for what is not finite, and for a tilt of a quarter turn or more.
+    """
+
+    amplitude: float = 1.0
+    offset: float = 0.0
+    tilt_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what describes no conductivity."""
+        if not np.isfinite([self.amplitude, self.offset, self.tilt_deg]).all() or abs(self.tilt_deg) >= _QUARTER_DEG:
+            raise ModelError(
+                f"amplitude, offset and tilt must be finite, and the tilt within ±{_QUARTER_DEG:g}°, not {self}"
+            )
+
+
+_QUARTER_DEG = 90.0
+PLAIN = Variation()
 
 
 def _step(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - all five have one signature
@@ -83,45 +107,54 @@ def averaging_points() -> NDArray[np.float64]:
     return (3.0 * np.array(steps) + 1.0) / (3 * n)
 
 
-def conductivity(mesh: "Mesh", model: str, k: float, sigma: float) -> NDArray[np.float64]:
+def conductivity(mesh: "Mesh", model: str, k: float, sigma: float, variation: Variation = PLAIN) -> NDArray[np.float64]:
     """Return the (T,) conductivity of a mesh's triangles: 1 + the mean of f over the triangle's averaging points.
 
     It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
     """
-    values: NDArray[np.float64] = _mean(_averaging_heights(mesh), _centre(mesh), model, k, sigma)
+    heights = _heights(mesh, variation)[mesh.triangles] @ averaging_points().T
+    values: NDArray[np.float64] = _mean(heights, _centre(mesh), model, k, sigma, variation)
     return values
 
 
 class Conductivities:
     """What `conductivity` returns, to the bit, for many parameters on one mesh: triangles alike are averaged once."""
 
-    def __init__(self, mesh: "Mesh") -> None:
+    def __init__(self, mesh: "Mesh", variation: Variation = PLAIN) -> None:
         """Find the triangles whose corners have the same heights."""
-        corners = mesh.nodes[:, 1][mesh.triangles]
+        heights = _heights(mesh, variation)
+        corners = heights[mesh.triangles]
         _, first, self._alike = np.unique(corners, axis=0, return_index=True, return_inverse=True)
-        self._heights = _averaging_heights(mesh)[first]
+        self._heights = (corners @ averaging_points().T)[first]
         self._centre = _centre(mesh)
+        self._variation = variation
 
     def of(self, model: str, k: float, sigma: float) -> NDArray[np.float64]:
         """Return the (T,) conductivity; errors as of `conductivity`."""
-        values: NDArray[np.float64] = _mean(self._heights, self._centre, model, k, sigma)[self._alike]
+        values: NDArray[np.float64] = _mean(self._heights, self._centre, model, k, sigma, self._variation)[self._alike]
         return values
 
 
-def _averaging_heights(mesh: "Mesh") -> Values:
-    heights: Values = mesh.nodes[:, 1][mesh.triangles] @ averaging_points().T
-    return heights
+def _heights(mesh: "Mesh", variation: Variation) -> Values:
+    """Return the (N,) heights of the nodes along the axis, in cm."""
+    x, y = mesh.nodes.T
+    if variation.tilt_deg == 0:
+        return np.asarray(y)
+    turn = np.deg2rad(variation.tilt_deg)
+    middle = (x.min() + x.max()) / 2
+    return np.asarray(_centre(mesh) + (y - _centre(mesh)) * np.cos(turn) + (x - middle) * np.sin(turn))
 
 
 def _centre(mesh: "Mesh") -> float:
     return float((mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2)
 
 
-def _mean(heights: Values, centre: float, model: str, k: float, sigma: float) -> Values:
+def _mean(heights: Values, centre: float, model: str, k: float, sigma: float, variation: Variation) -> Values:
     basis = model_named(model)
     if not (np.isfinite(k) and np.isfinite(sigma)):
         raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
     if sigma <= 0 and basis.sigma_unit != "not used":
         raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
-    values: Values = 1.0 + basis.function(heights, k, sigma, centre).mean(axis=1)
+    shape = basis.function(heights, k, sigma, centre).mean(axis=1)
+    values: Values = 1.0 + variation.offset + variation.amplitude * shape
     return values

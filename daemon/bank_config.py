@@ -1,17 +1,19 @@
 """The configuration of banks and fingertips: what `config/banks/*.yaml` and `config/fingertips/*.yaml` may say."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from bank.errors import GeometryError
 from bank.fingertip import ElectrodePlace, Fingertip, Side
 from bank.mesh import Mesh, load_mesh
-from daemon.config_file import ConfigModel, load_yaml_model
+from bank.models import PLAIN, Variation
+from daemon.config_file import ConfigModel, load_yaml_model, mistakes
 from daemon.errors import UserError
 
 ModelName = Literal["step", "linear", "cut_linear", "gaussian_derivative", "modulated_gaussian"]
@@ -43,8 +45,40 @@ class MeshFileConfig(ConfigModel):
     file: Path
 
 
+class OverConfig(ConfigModel):
+    """Further parameters: a bank for each of their values, and each combination of them.
+
+    amplitude, offset and tilt_deg vary the conductivity (1 + offset + amplitude · f along a turned axis); the others
+    take the place of the fingertip's.
+    """
+
+    amplitude: GridConfig | None = None
+    offset: GridConfig | None = None
+    tilt_deg: GridConfig | None = None
+    width_cm: GridConfig | None = None
+    height_cm: GridConfig | None = None
+    electrode_width_cm: GridConfig | None = None
+    contact_impedance: GridConfig | None = None
+
+    def values(self) -> list[dict[str, float]]:
+        """Return every combination by name, the last parameter changing first."""
+        grids = {name: grid for name in type(self).model_fields if (grid := getattr(self, name)) is not None}
+        return [
+            dict(zip(grids, chosen, strict=True))
+            for chosen in product(*(grid.values().tolist() for grid in grids.values()))
+        ]
+
+
+# More banks than this fill a disk before anyone notices.
+_MOST_BANKS = 1000
+_VARIED = tuple(field.name for field in fields(Variation))
+
+
 class BankConfig(ConfigModel):
-    """What a bank is of. Paths are relative to the file that names them; mesh_size_cm overrides the fingertip's."""
+    """What a bank is of. Paths are relative to the file that names them; mesh_size_cm overrides the fingertip's.
+
+    With `over` it is a folder of banks.
+    """
 
     mesh: MeshFileConfig | None = None
     fingertip: Path | None = None
@@ -52,6 +86,7 @@ class BankConfig(ConfigModel):
     model: ModelName
     k: GridConfig
     sigma: GridConfig
+    over: OverConfig | None = None
 
     @model_validator(mode="after")
     def _is_of_one_geometry(self) -> Self:
@@ -61,7 +96,17 @@ class BankConfig(ConfigModel):
             raise ValueError("`mesh_size_cm` is for a `fingertip`; a `mesh` that is read from a file has its own")
         if self.sigma.low <= 0 and self.model != "step":
             raise ValueError(f"`sigma.low` must be above 0 for the model {self.model}, not {self.sigma.low:g}")
+        if self.over is not None:
+            self._has_what_it_is_over(self.over)
         return self
+
+    def _has_what_it_is_over(self, over: OverConfig) -> None:
+        banks = over.values()
+        if len(banks) > _MOST_BANKS:
+            raise ValueError(f"`over` makes {len(banks)} banks; take fewer values, {_MOST_BANKS} at most")
+        geometry = [name for name in banks[0] if name not in _VARIED]
+        if geometry and self.fingertip is None:
+            raise ValueError(f"`over` the {geometry[0]} needs a `fingertip`; a `mesh` that is read has its own")
 
 
 class ElectrodeRunConfig(ConfigModel):
@@ -101,6 +146,7 @@ class BankPlan:
     model: str
     k_grid: NDArray[np.float64]
     sigma_grid: NDArray[np.float64]
+    variation: Variation = PLAIN
 
 
 def load_bank_plan(
@@ -108,19 +154,44 @@ def load_bank_plan(
 ) -> BankPlan:
     """Read a bank's configuration and its mesh; what is given besides takes the place of what the file says.
 
-    Raises UserError and GeometryError with the file and the key to mend.
+    Raises UserError and GeometryError with the file and the key to mend, also for a configuration of several banks.
+    """
+    plans = load_bank_plans(path, model=model, k=k, sigma=sigma)
+    if set(plans) != {""}:
+        raise UserError(f"{path}: `over` makes {len(plans)} banks, and here one is wanted; leave it out")
+    return plans[""]
+
+
+def load_bank_plans(
+    path: Path, *, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
+) -> dict[str, BankPlan]:
+    """Read a configuration as `load_bank_plan` does, and return the banks that it is `over` by their names.
+
+    A name tells the parameters, `amplitude=0.5,tilt_deg=2`; a configuration without `over` is one bank, without a name.
     """
     config = load_yaml_model(path, BankConfig)
     model, k, sigma = model or config.model, k or config.k, sigma or config.sigma
     if sigma.low <= 0 and model != "step":
         raise UserError(f"{path}: sigma must begin above 0 for the model {model}, not at {sigma.low:g}")
+    meshes: dict[tuple[tuple[str, float], ...], Mesh] = {}
+    plans = {}
+    for chosen in config.over.values() if config.over is not None else [{}]:
+        varied = {name: value for name, value in chosen.items() if name in _VARIED}
+        geometry = {name: value for name, value in chosen.items() if name not in _VARIED}
+        key = tuple(geometry.items())
+        if key not in meshes:
+            meshes[key] = _mesh_of(path, config, geometry)
+        plans[_shown(chosen)] = BankPlan(meshes[key], model, k.values(), sigma.values(), Variation(**varied))
+    return plans
+
+
+def _mesh_of(path: Path, config: BankConfig, geometry: dict[str, float]) -> Mesh:
     if config.mesh is not None:
-        mesh = load_geometry(path.parent / config.mesh.file)
-    elif config.fingertip is not None:
-        mesh = _fingertip_mesh(path.parent / config.fingertip, config.mesh_size_cm)
-    else:
+        return load_geometry(path.parent / config.mesh.file)
+    if config.fingertip is None:
         raise UserError(f"{path}: give either `mesh` or `fingertip`")
-    return BankPlan(mesh, model, k.values(), sigma.values())
+    size = {} if config.mesh_size_cm is None else {"mesh_size_cm": config.mesh_size_cm}
+    return _fingertip_mesh(path.parent / config.fingertip, **geometry, **size)
 
 
 def load_geometry(path: Path) -> Mesh:
@@ -130,10 +201,15 @@ def load_geometry(path: Path) -> Mesh:
     return _fingertip_mesh(path)
 
 
-def _fingertip_mesh(path: Path, mesh_size_cm: float | None = None) -> Mesh:
+def _fingertip_mesh(path: Path, **changed: float) -> Mesh:
     config = load_yaml_model(path, FingertipConfig)
     try:
-        fingertip = config.fingertip()
-        return (fingertip if mesh_size_cm is None else replace(fingertip, mesh_size_cm=mesh_size_cm)).mesh()
+        return FingertipConfig.model_validate(config.model_dump() | changed).fingertip().mesh()
+    except ValidationError as error:
+        raise UserError(f"{path}, with {_shown(changed)}: {mistakes(error, FingertipConfig)}") from error
     except GeometryError as error:
-        raise GeometryError(f"{path}: {error}") from error
+        raise GeometryError(f"{path}{f', with {_shown(changed)}' if changed else ''}: {error}") from error
+
+
+def _shown(chosen: dict[str, float]) -> str:
+    return ",".join(f"{name}={value:.6g}" for name, value in chosen.items())

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from bank.errors import ModelError
 from bank.mesh import Mesh
-from bank.models import MODELS, Conductivities, averaging_points, conductivity
+from bank.models import MODELS, Conductivities, Variation, averaging_points, conductivity
 
 
 def test_the_averaging_points_are_those_of_the_reference(shared):
@@ -85,3 +85,26 @@ def test_many_conductivities_are_those_of_one_to_the_bit(name, fingertip, paper_
             np.testing.assert_array_equal(many.of(name, k, sigma), conductivity(mesh, name, k, sigma))
     with pytest.raises(ModelError, match="finite"):
         many.of(name, np.nan, 1.0)
+
+
+@given(amplitude=st.floats(-2, 2), offset=st.floats(-0.5, 2), tilt_deg=st.floats(-80, 80))
+def test_a_variation_scales_adds_and_turns(fingertip, amplitude, offset, tilt_deg):
+    """The field along a turned axis is the plain one on a fingertip that is turned back, about the same centre."""
+    centre = (fingertip.nodes.min(axis=0) + fingertip.nodes.max(axis=0)) / 2
+    turn = np.deg2rad(tilt_deg)
+    turned = centre + (fingertip.nodes - centre) @ np.array(
+        [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    )
+    y = turned[fingertip.triangles, 1] @ averaging_points().T
+    expected = 1 + offset + amplitude * MODELS["gaussian_derivative"].function(y, 1.4, 0.8, centre[1]).mean(axis=1)
+    variation = Variation(amplitude, offset, tilt_deg)
+    found = conductivity(fingertip, "gaussian_derivative", 1.4, 0.8, variation)
+    np.testing.assert_allclose(found, expected, atol=1e-11)
+    many = Conductivities(fingertip, variation).of("gaussian_derivative", 1.4, 0.8)
+    np.testing.assert_array_equal(many, found)
+
+
+@pytest.mark.parametrize("wrong", [{"tilt_deg": 90.0}, {"tilt_deg": -120.0}, {"amplitude": np.nan}, {"offset": np.inf}])
+def test_a_variation_that_describes_nothing_is_refused(wrong):
+    with pytest.raises(ModelError, match="the tilt within"):
+        Variation(**wrong)

@@ -13,6 +13,7 @@ from bank.bank_file import Bank
 from bank.forward import ForwardModel
 from bank.mesh import load_mesh
 from bank.models import conductivity
+from daemon.bank_config import load_bank_plans
 from daemon.cli import main
 from daemon.cli.bank import build as build_command
 from tests.daemon.test_bank_config import BANK, FINGERTIP
@@ -82,6 +83,35 @@ def test_a_build_that_is_interrupted_says_so_and_the_same_command_goes_on(
     assert main(build) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["c.bank"]
     assert out.read_bytes() == (folder / "a.bank").read_bytes()
+
+
+def test_banks_over_more_parameters_lie_in_a_folder_and_a_second_build_solves_only_what_is_missing(
+    folder, tmp_path, capsys
+):
+    capsys.readouterr()
+    (folder / "over.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0.5, high: 1, count: 2}}}}\n")
+    build = ["bank", "build", "--config", f"{folder}/over.yaml", "--out", f"{tmp_path}/banks", "--jobs", "1", "--json"]
+    assert main(build) == 0
+    told = json.loads(capsys.readouterr().out)["banks"]
+    half, plain = tmp_path / "banks" / "amplitude=0.5.bank", tmp_path / "banks" / "amplitude=1.bank"
+    assert [one["path"] for one in told] == [str(half), str(plain)]
+    # With nothing varied it is the same bank as ever.
+    assert plain.read_bytes() == (folder / "a.bank").read_bytes()
+    bank, mesh = Bank.open(half), load_bank_plans(folder / "over.yaml")["amplitude=0.5"].mesh
+    i, j = np.argwhere(bank.valid)[0]
+    forward = ForwardModel(mesh)
+    f = conductivity(mesh, bank.model, bank.k_grid[i], bank.sigma_grid[j]) - 1
+    np.testing.assert_allclose(
+        bank.signals[i, j], forward.voltages(1 + 0.5 * f) - forward.homogeneous(), rtol=1e-5, atol=1e-6
+    )
+    kept = half.stat().st_mtime_ns
+    plain.unlink()
+    assert main(build) == 0
+    assert half.stat().st_mtime_ns == kept
+    assert plain.read_bytes() == (folder / "a.bank").read_bytes()
+    capsys.readouterr()
+    assert main(["bank", "info", str(half)]) == 0
+    assert "amplitude 0.5, offset 0, tilt_deg 0" in capsys.readouterr().out
 
 
 def test_info_checks_the_bank_and_says_what_it_is_of(folder, capsys):

@@ -129,6 +129,24 @@ def test_a_bank_has_the_same_bytes_from_a_cluster(banks: tuple[Path, Path]) -> N
     assert banks[0].read_bytes() == banks[1].read_bytes()
 
 
+@pytest.fixture(scope="session")
+def varied(banks: tuple[Path, Path], scheduler: str) -> tuple[Path, Path]:
+    """Return folders of banks over tilt and amplitude, built here and on the cluster."""
+    folder = banks[0].parent
+    over = "over: {tilt_deg: {low: -5, high: 5, count: 2}, amplitude: {low: 0.5, high: 1, count: 2}}"
+    (folder / "over.yaml").write_text(f"{BANK}{over}\n")
+    for name, options in (("over-here", ["--jobs", "1"]), ("over-there", ["--cluster", scheduler])):
+        command = ["bank", "build", "--config", str(folder / "over.yaml"), "--out", str(folder / name), *options]
+        assert main(command) == 0
+    return folder / "over-here", folder / "over-there"
+
+
+def test_banks_over_more_parameters_have_the_same_bytes_from_a_cluster(varied: tuple[Path, Path]) -> None:
+    here, there = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in varied)
+    assert len(set(here.values())) == 4
+    assert here == there
+
+
 def test_recordings_are_evaluated_to_the_same_figures_on_a_cluster_that_a_worker_is_killed_of(
     scheduler: str, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], killed: list[int]
 ) -> None:

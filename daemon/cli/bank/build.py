@@ -1,11 +1,11 @@
-"""`shearloop bank build`: solve every cell of a grid and write the bank."""
+"""`shearloop bank build`: solve every cell of a grid and write the bank, or a folder of them over more parameters."""
 
 import argparse
 import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, Self
+from typing import TYPE_CHECKING, Any, NoReturn, Self
 
 from daemon.cli import EXIT_INTERRUPTED
 from daemon.cli.cluster import add_cluster
@@ -19,13 +19,15 @@ if TYPE_CHECKING:
     from bank.bank_file import BankDefinition
     from bank.journal import BankRow
     from bank.mesh import Mesh
-    from daemon.bank_config import GridConfig
+    from daemon.bank_config import BankPlan, GridConfig
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="what the bank is of (YAML)")
-    parser.add_argument("--out", type=Path, required=True, metavar="PATH", help="the bank file to write")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="PATH", help="the bank file to write; with `over`, the folder"
+    )
     add_overrides(parser)
     parser.add_argument("--jobs", type=int, metavar="N", help="threads that solve (default: one per core)")
     add_cluster(parser)
@@ -46,22 +48,24 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         kept = args.out.with_name(f"{args.out.name}.part")
         rest = f"its finished rows are in {kept}, and the same command goes on from there" if kept.exists() else ""
+        if args.out.is_dir():
+            rest = "its finished banks and rows are in it, and the same command goes on from there"
         print(f"shearloop bank: interrupted: {args.out} was not written; {rest or 'nothing is left'}", file=sys.stderr)
         return EXIT_INTERRUPTED
 
 
 def _build(args: argparse.Namespace) -> int:
-    from bank.bank_file import Bank
     from bank.build import build_bank, solve_row
-    from daemon.bank_config import load_bank_plan
+    from daemon.bank_config import load_bank_plans
     from daemon.workers import workers
 
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
     if jobs < 1:
         raise UserError(f"--jobs must be 1 or more, not {jobs}")
     model, k, sigma = overrides(args)
-    plan = load_bank_plan(args.config, model=model, k=k, sigma=sigma)
-    with _Progress(args.out.name) as progress, workers(args.cluster, jobs) as pool:
+    plans = load_bank_plans(args.config, model=model, k=k, sigma=sigma)
+    paths = _paths(args.out, list(plans))
+    with workers(args.cluster, jobs) as pool:
 
         def on_cluster(
             mesh: "Mesh", definition: "BankDefinition", rows: "Sequence[int]"
@@ -69,32 +73,65 @@ def _build(args: argparse.Namespace) -> int:
             for number, cells in pool.map(solve_row, (mesh, definition), rows):
                 yield rows[number], cells
 
-        build_bank(
-            plan.mesh,
-            plan.model,
-            plan.k_grid,
-            plan.sigma_grid,
-            args.out,
-            jobs=jobs,
-            elsewhere=on_cluster if args.cluster is not None else None,
-            on_row=progress.show,
-            on_notice=lambda sentence: print(sentence, file=sys.stderr),
-        )
-    bank = Bank.open(args.out)
-    result = {
-        "path": str(args.out),
+        for path, plan in zip(paths, plans.values(), strict=True):
+            if len(paths) > 1 and _is_built(path, plan):
+                continue
+            with _Progress(path.name) as progress:
+                build_bank(
+                    plan.mesh,
+                    plan.model,
+                    plan.k_grid,
+                    plan.sigma_grid,
+                    path,
+                    variation=plan.variation,
+                    jobs=jobs,
+                    elsewhere=on_cluster if args.cluster is not None else None,
+                    on_row=progress.show,
+                    on_notice=lambda sentence: print(sentence, file=sys.stderr),
+                )
+    results = [_result(path) for path in paths]
+    if args.json:
+        print(json.dumps(results[0] if args.out == paths[0] else {"banks": results}))
+    else:
+        for one in results:
+            print(f"{one['path']}: {one['valid_cells']} of {one['cells']} cells valid, identity {one['identity'][:12]}")
+    return 0
+
+
+def _paths(out: Path, names: list[str]) -> list[Path]:
+    """Return where the banks go: to `out` the only one without a name, into it those with one."""
+    if names == [""]:
+        return [out]
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out}: the banks need a folder there: {error.strerror}; choose another --out") from error
+    return [out / f"{name}.bank" for name in names]
+
+
+def _is_built(path: Path, plan: "BankPlan") -> bool:
+    """Return whether an earlier build of a folder has finished this bank of it."""
+    from bank.bank_file import Bank, BankDefinition
+
+    if not path.exists():
+        return False
+    definition = BankDefinition(plan.mesh.digest, plan.model, plan.k_grid, plan.sigma_grid, plan.variation)
+    return Bank.open(path).identity == definition.identity
+
+
+def _result(path: Path) -> dict[str, Any]:
+    from bank.bank_file import Bank
+
+    bank = Bank.open(path)
+    return {
+        "path": str(path),
         "identity": bank.identity,
         "model": bank.model,
         "shape": list(bank.signals.shape),
         "valid_cells": int(bank.valid.sum()),
         "cells": bank.valid.size,
-        "bytes": args.out.stat().st_size,
+        "bytes": path.stat().st_size,
     }
-    if args.json:
-        print(json.dumps(result))
-    else:
-        print(f"{args.out}: {result['valid_cells']} of {bank.valid.size} cells valid, identity {bank.identity[:12]}")
-    return 0
 
 
 def overrides(args: argparse.Namespace) -> "tuple[str | None, GridConfig | None, GridConfig | None]":

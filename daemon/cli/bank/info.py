@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 
@@ -24,6 +25,7 @@ def run(args: argparse.Namespace) -> int:
         "format_version": FORMAT_VERSION,
         "identity": bank.identity,
         "model": bank.model,
+        "variation": asdict(bank.definition.variation),
         "geometry_hash": bank.geometry_hash,
         "channel_table_hash": CHANNEL_TABLE_HASH,
         "signals_sha256": bank.signals_sha256,
@@ -47,6 +49,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _sentences(facts: dict[str, object]) -> str:
     def shown(value: object) -> str:
+        if isinstance(value, dict) and "count" not in value:
+            return ", ".join(f"{name} {one:g}" for name, one in value.items())
         if isinstance(value, dict):
             return f"{value['count']} values from {value['low']:g} to {value['high']:g} ({value['unit']})"
         if isinstance(value, list):

@@ -25,6 +25,10 @@ NEEDS_BANK: tuple[Name, ...] = ("paper", "bank")
 _LEAST_MARGIN_K_CM = 0.05
 
 
+# A tool whose diameter is further off than this share is another one.
+_LARGEST_TOOL_SHARE = 0.15
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
     """How one quantity is read: its reader, and for differences the guard of those it was fitted to.
@@ -55,7 +59,8 @@ class Calibration:
     """All that an estimator knows of its fingertips; `source` says in words what it was fitted to.
 
     guards and motion are there for raw frames; scale (m, 896) divides differences channel by channel; image (p, 896)
-    turns them into pixels. bank_identity is empty for an estimator without a bank.
+    turns them into pixels. bank_identity is empty for an estimator without a bank. tool_mm is the diameter of the one
+    tool that all was recorded with, NaN where it is not known or not one.
     """
 
     estimator: Name
@@ -63,6 +68,7 @@ class Calibration:
     sides: tuple[str, ...]
     source: str
     bank_identity: str
+    tool_mm: float
     registration: Registration
     scale: FloatArray
     guards: tuple[SideGuard, ...]
@@ -140,9 +146,19 @@ PAPER_COLUMNS = {"torque": slice(1, 3), "diameter": slice(0, 1)}
 class Tracker:
     """Follows one session: `estimate` takes every frame in order and keeps what must be remembered, causally."""
 
-    def __init__(self, calibration: Calibration, bank: Bank | None = None) -> None:
-        """Begin a session; raises CalibrationError for a bank that is missing or another one."""
+    def __init__(self, calibration: Calibration, bank: Bank | None = None, tool_mm: float = np.nan) -> None:
+        """Begin a session; raises CalibrationError for a bank that is missing or another one.
+
+        Where the tool's diameter is known it is compared with the calibration's: the same motion of the gel is another
+        torque on another tool, four times as much on one of 10 mm as on one of 20 mm.
+        """
         self.calibration = calibration
+        self._other_tool: tuple[str, ...] = ()
+        if abs(tool_mm - calibration.tool_mm) > _LARGEST_TOOL_SHARE * calibration.tool_mm:
+            self._other_tool = (
+                f"the tool is of {tool_mm:g} mm and the calibration of one of {calibration.tool_mm:g} mm, and its "
+                "torque does not carry over; calibrate on this tool",
+            )
         self._locator = calibration.locator(bank)
         self.tare()
 
@@ -201,6 +217,8 @@ class Tracker:
             if task is None:
                 continue
             why = task.guard.refuse(difference[0], usable[0]) if task.guard is not None else ()
+            if name == "torque":
+                why = (*why, *self._other_tool)
             if name == "diameter" and self._memory is not None and not self._memory.own_baseline:
                 # Where the gel stands means nothing without knowing where it stood.
                 if calibration.torque is None:

@@ -29,7 +29,7 @@ from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Censored, Curve, Ridge, Rows, later_origins
 from bank.estimators.memory import Memory, Motion
-from bank.estimators.physics import NOT_TURNED, Locator, Registration, image_matrix, register
+from bank.estimators.physics import NOT_TURNED, Locator, Registration, image_matrix, register, settle_half_turn
 from bank.estimators.reader import (
     STRENGTHS,
     Difficulty,
@@ -107,6 +107,7 @@ def fit(
         sides=sides,
         source=source,
         bank_identity=physics.bank.identity if physics.bank is not None and name in NEEDS_BANK else "",
+        tool_mm=next(iter(tools)) if len(tools := _tools(recordings)) == 1 else np.nan,
         registration=NOT_TURNED,
         scale=np.ones((len(sides), N_CHANNELS)),
         guards=(),
@@ -205,8 +206,11 @@ def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics
         gripped = [one.channels[part[1]] for one, part in zip(recordings, parts, strict=True)]
         motion = replace(Motion.fit(gripped, guards, N_DIRECTIONS, N_LAGS), placed=True)
         calibration = replace(calibration, motion=motion)
-    if blank.estimator == "bank" and physics.bank is not None:
-        calibration = replace(calibration, registration=register(guards[0].idle, physics.bank.homogeneous))
+    if physics.bank is not None:
+        # Whatever reads the torque, the place in the bank is shown beside it.
+        found = register(guards[0].idle, physics.bank.homogeneous)
+        touch = guards[0].gripped - guards[0].idle
+        calibration = replace(calibration, registration=settle_half_turn(found, touch, physics.bank))
     locator = _locator(calibration, physics)
     every = _thinning(calibration, recordings)
     rows = [row for i, one in enumerate(recordings) for row in _replayed(calibration, locator, i, one, every)]
@@ -279,8 +283,13 @@ def _diameter_task(calibration: Calibration, rows: list["_Row"]) -> Task | None:
 
 def _undetermined(recordings: list[FrameSeries], unexplained: float) -> bool:
     """Return whether tools of different diameters turn so differently that no torque is common to them."""
-    tools = {float(one.diameter_mm[0]) for one in recordings if len(one.t_s) and np.isfinite(one.diameter_mm[0])}
-    return len(tools) > 1 and unexplained > _TOOLS_MAY_LEAVE
+    return len(_tools(recordings)) > 1 and unexplained > _TOOLS_MAY_LEAVE
+
+
+def _tools(recordings: Sequence[FrameSeries]) -> set[float]:
+    """Return the known diameters of raw recordings' tools in mm."""
+    known = [one.diameter_mm[0] for one in recordings if one.kind == "raw" and len(one.t_s)]
+    return {float(one) for one in known if np.isfinite(one)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

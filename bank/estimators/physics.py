@@ -7,7 +7,7 @@ is kept. `image_matrix` is the traditional way: one step of Gauss–Newton from 
 NOSER prior (Cheney et al. 1990).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -116,6 +116,16 @@ def register(idle: FloatArray, homogeneous: FloatArray) -> Registration:
     # Half a turn swaps the two ends of every injection and changes no magnitude of a symmetric tip.
     other = [score for key, score in scores.items() if key[1] != best[1] or (key[0] - best[0]) % 16]
     return Registration(best[0], best[1], scores[best], max(other))
+
+
+def settle_half_turn(found: Registration, touch: FloatArray, bank: Bank) -> Registration:
+    """Return the numbering or its half turn, whichever places a touch in the bank better; idle frames cannot tell.
+
+    touch (896,) is what a grip changed of the idle frame, in volts.
+    """
+    turned = replace(found, rotation=(found.rotation + N_ELECTRODES // 2) % N_ELECTRODES)
+    scores = [NearestCell(bank, one).locate(touch).score for one in (found, turned)]
+    return turned if scores[1] > scores[0] + _ALIKE else found
 
 
 class NearestCell:

@@ -7,7 +7,7 @@ from bank.bank_file import Bank, BankDefinition, write_bank
 from bank.channels import CHANNELS
 from bank.errors import CalibrationError
 from bank.estimators import FrameSeries, Physics, TactileFrame, Tracker, fit
-from bank.estimators.physics import NOT_TURNED, NearestCell, Registration, image_matrix, register
+from bank.estimators.physics import NOT_TURNED, NearestCell, Registration, image_matrix, register, settle_half_turn
 from bank.forward import ForwardModel
 
 
@@ -43,6 +43,14 @@ def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
     assert sorted(turned.model_channels()) == list(range(896))
     np.testing.assert_array_equal(np.sort(model[:, :2]), np.sort(electrode[:, :2]))
     np.testing.assert_array_equal(np.sort(model[:, 2:]), np.sort(electrode[:, 2:]))
+
+
+@pytest.mark.parametrize("rotation", [5, 21])
+def test_a_touch_settles_the_half_turn(bank, rotation):
+    true = Registration(rotation, False, 0.9, 0.5)
+    touch = np.abs(bank.signals[4, 7].astype(np.float64))[true.model_channels()]
+    for found in (true, Registration((rotation + 16) % 32, False, 0.9, 0.5)):
+        assert settle_half_turn(found, touch, bank).rotation == rotation
 
 
 def test_a_place_between_cells_is_found_to_a_fraction_of_one(bank):

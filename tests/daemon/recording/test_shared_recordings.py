@@ -42,11 +42,20 @@ def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders):
     idle_s, held_s = 7.0, (24.5, 87.0)
     for fitted in cylinders.values():
         calibration = fit("fused", [fitted], "one cylinder")
-        for other in cylinders.values():
+        for cylinder in cylinders.values():
+            other = replace(cylinder, diameter_mm=np.full(len(cylinder.t_s), np.nan))
             estimates = follow(calibration, other).estimates
             held = (other.t_s > held_s[0]) & (other.t_s < held_s[1])
             assert not any("no grip" in why for one in np.array(estimates)[held] for why in one.why)
             assert not any(one.valid for one in np.array(estimates)[(other.t_s < idle_s) | (other.t_s > 97.5)])
+
+
+def test_the_torque_of_one_tool_is_not_read_as_that_of_another(cylinders):
+    calibration = fit("fused", [cylinders[20]], "one cylinder")
+    estimates = follow(calibration, cylinders[10]).estimates
+    assert not any(one.valid for one in estimates)
+    assert "the tool is of 10 mm and the calibration of one of 20 mm" in estimates[80].why[0]
+    assert np.mean([one.valid for one in follow(calibration, cylinders[20]).estimates]) > 0.6
 
 
 def test_cylinders_that_turn_differently_give_a_diameter_and_no_torque(cylinders):

@@ -21,7 +21,7 @@ from drivers.ur.messages import Enable, MoveLinear, Reply, RobotState, Stop, Unl
 
 WRENCH = "wrench"
 WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04, of_the_arm=True)
-# The brain is asked at each state of the robot, and no less often than this when there is none.
+# The brain is asked at each state of the robot while an experiment runs, and no less often than this without a state.
 LONGEST_TICK_S = 0.02
 # Every fifth state is published, and speaks as the torque of the wrench: 25 of 125 a second.
 PUBLISH_EVERY = 5
@@ -77,6 +77,8 @@ class LoopTask:
                 self._brain.senses.died = dict(self._died())
                 if state is not None:
                     self._sense(state)
+                    if self._nothing_to_decide():
+                        continue
                 self._carry_out(self._brain.tick(now_ns))
                 await self._tell(now_ns)
         finally:
@@ -142,6 +144,15 @@ class LoopTask:
                 Torque(WRENCH, -state.wrist_torque_nm, "", state.t_mono_ns - state.age_ns, self._clock.now_ns())
             )
             self._publisher.publish(_message(state))
+
+    def _nothing_to_decide(self) -> bool:
+        """Return whether the brain may be asked later: nothing moves or is about to, and the arm was told to stop.
+
+        Then it is asked as often as states are published.
+        """
+        experiment = self._brain.experiment
+        running = experiment is not None and experiment.running
+        return self._stopped and not running and self._states % PUBLISH_EVERY != 0
 
     def _carry_out(self, orders: Orders) -> None:
         if orders.stop:

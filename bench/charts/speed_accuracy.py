@@ -20,6 +20,7 @@ from bench.charts.windows import GAIN, LOOPS, Followed, followed
 # Noise that the loop's identification copes with; a sensor worse than that never closes the loop.
 _LARGEST_LOOP_NOISE_NM = 0.02
 _SLICE_ESTIMATORS: tuple[Name, ...] = ("bank", "regression", "reconstruction", "fused")
+_MOST_VALID = 0.9
 # Families whose points are one thing at several settings are joined by a line.
 _JOINED = {"zero lag, bank of rank r": "rank", "regression on the best n channels": "channels"}
 
@@ -109,7 +110,8 @@ def _draw_methods(axes: Axes, compared: Compared) -> None:
                 markerfacecolor=shade if i in best else "white", linestyle="none", zorder=2 + (i in best),
                 label=family if i == members[0] else None,
             )  # fmt: skip
-    _label(axes, [(one.latency_ms, one.rmse_nm, _short(one)) for one in methods])
+    most = max(one.valid_fraction for one in methods)
+    _label(axes, [(one.latency_ms, one.rmse_nm, _short(one, most)) for one in methods])
     frames = len(compared.split.future.t_s)
     axes.set(
         title=f"{compared.split.title}; judged on the {frames} frames that follow",
@@ -123,9 +125,11 @@ def _draw_methods(axes: Axes, compared: Compared) -> None:
     axes.legend(fontsize=8, loc="lower right", title="filled: on the frontier", title_fontsize=8, ncols=2)
 
 
-def _short(one: Measured) -> str:
+def _short(one: Measured, most_valid: float) -> str:
+    """Return a label, with the valid share where that is clearly less than the others': the error is of those alone."""
     short = one.name.removeprefix("rank ").removesuffix(" channels").replace("zero lag, ", "").replace("all lags, ", "")
-    return short.replace("paper: reference", "paper").replace("fast and exact", "fast").replace(", right", "")
+    short = short.replace("paper: reference", "paper").replace("fast and exact", "fast").replace(", right", "")
+    return short if one.valid_fraction > _MOST_VALID * most_valid else f"{short} ({one.valid_fraction:.0%} valid)"
 
 
 def _label(axes: Axes, points: list[tuple[float, float, str]]) -> None:

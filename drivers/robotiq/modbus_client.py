@@ -1,5 +1,7 @@
 """The gripper by way of its USB adapter: Modbus RTU with pymodbus, as the paper's authors drove it."""
 
+import logging
+
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
@@ -8,6 +10,9 @@ from drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
 from drivers.robotiq import registers
 from drivers.robotiq.messages import GoTo, Readout, Request
 from drivers.serial_port import find_port
+
+# What it would say of a late or broken answer is told here, by the error that it leads to.
+logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 # An exchange takes 3 ms; a USB adapter may hold bytes back for 16 ms.
 REPLY_DEADLINE_S = 0.3

@@ -1,5 +1,8 @@
 """The gripper's two languages and its widths: the manual's examples, any slices, odd answers."""
 
+import subprocess
+import sys
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -171,3 +174,10 @@ def test_gauges_give_the_line_they_were_measured_on_and_its_scatter() -> None:
 def test_gauges_that_make_no_line_are_refused(gauges: list[tuple[float, float]], said: str) -> None:
     with pytest.raises(CalibrationError, match=said):
         WidthCalibration.of_gauges(gauges)
+
+
+def test_what_pymodbus_has_to_say_does_not_come_between_our_lines() -> None:
+    said = "import drivers.robotiq.modbus_client; from pymodbus.logging import Log; Log.error('received pdu')"
+    # Where pytest listens to every logger, nobody would print it anyway.
+    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "")

@@ -7,18 +7,16 @@ power loses a frame.
 
 import asyncio
 import itertools
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from random import Random
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.emulators.board import PlayedBoard
 from drivers.emulators.outage import Outage
-from drivers.emulators.pty_port import PtyPort
 
 # The mean over two recordings of 832 frames each.
 FRAME_PERIOD_S = 0.5408
@@ -86,7 +84,7 @@ def read_fault(text: str) -> Fault:
     return Fault(kind, duration_s)
 
 
-class EitKitBoard:
+class EitKitBoard(PlayedBoard[Fault]):
     """One board: sends `frames` (1024 values in volts each) and then is silent.
 
     A frame is asked for when its acquisition is over, so that an iterator can make it from what has happened by then.
@@ -104,27 +102,13 @@ class EitKitBoard:
         on_port: Callable[[str], None] = lambda _: None,
         seed: int = 0,
     ) -> None:
+        super().__init__(period_s, link, on_port, seed, self._received)
         self._frames = frames
-        self._period_s = period_s
         self._faults = dict(faults or {})
-        self._injected: deque[Fault] = deque()
-        self._on_port = on_port
-        self._random = Random(seed)
-        self._port = PtyPort(self._received, link)
         self._started = asyncio.Event()
         self._outage = Outage()
         self._waits_for_restart = False
-        self.sent = 0
         self.finished = asyncio.Event()
-
-    @property
-    def path(self) -> str:
-        """Where the port is now."""
-        return self._port.path
-
-    def inject(self, fault: Fault) -> None:
-        """Let a fault befall the next frame; several befall one frame each."""
-        self._injected.append(fault)
 
     def recover(self) -> None:
         """End every fault that lasts or awaits a frame; a port that was unplugged is plugged in again."""
@@ -172,7 +156,7 @@ class EitKitBoard:
                 await self._unplug(line, 1.0 if seconds is None else seconds)
                 return
             case Fault(FaultKind.GARBAGE):
-                await self._port.write(bytes(self._random.choices(range(128, 256), k=700)) + b"\n")
+                await self._port.write(self._garbage(700) + b"\n")
             case Fault(FaultKind.FLOOD):
                 await self._port.write(bytes(self._random.choices(b"0123456789., ", k=FLOOD_BYTES)) + b"\n")
             case Fault(FaultKind.REPEAT):
@@ -218,5 +202,4 @@ class EitKitBoard:
         # Without power the board forgets that it was started.
         self._started.clear()
         await self._outage.last(seconds)
-        self._port.plug()
-        self._on_port(self.path)
+        self._plug()

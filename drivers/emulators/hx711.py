@@ -1,14 +1,12 @@
 """The load cell's board, played: a line for each conversion through a pseudo-terminal, at its pace or a multiple."""
 
 import asyncio
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from random import Random
 
-from drivers.emulators.pty_port import PtyPort
+from drivers.emulators.board import PlayedBoard
 
 # The mean over 4882 lines of the paper's rig.
 PERIOD_S = 1 / 10.9
@@ -86,7 +84,7 @@ def read_fault(text: str) -> Fault:
     raise ValueError(f"{name} does not take {amount!r}; write {name}, {name}:SECONDS for a lasting fault, or jump:NM")
 
 
-class Hx711Board:
+class Hx711Board(PlayedBoard[Fault]):
     """One board: converts what `torque_nm` returns, until it raises StopIteration; then it stays plugged in and silent.
 
     `inject` makes a fault befall what comes next. `on_port` hears the port's path whenever it appears. `sent` counts
@@ -103,28 +101,14 @@ class Hx711Board:
         on_port: Callable[[str], None] = lambda _: None,
         seed: int = 0,
     ) -> None:
+        super().__init__(period_s, link, on_port, seed)
         self._torque_nm = torque_nm
         self._sketch = sketch or Sketch()
-        self._period_s = period_s
-        self._on_port = on_port
-        self._random = Random(seed)
-        self._port = PtyPort(lambda _: None, link)
-        self._injected: deque[Fault] = deque()
         self._lasting: FaultKind | None = None
         self._lasts_until_s = 0.0
         self._frozen = b""
         self._offset_nm = 0.0
-        self.sent = 0
         self.finished = asyncio.Event()
-
-    @property
-    def path(self) -> str:
-        """Where the port is now."""
-        return self._port.path
-
-    def inject(self, fault: Fault) -> None:
-        """Let a fault befall the next line, or all from there on."""
-        self._injected.append(fault)
 
     def recover(self) -> None:
         """End every fault that lasts or awaits a line; a port that was unplugged is plugged in again."""
@@ -173,7 +157,7 @@ class Hx711Board:
     def _befall(self, fault: Fault, line: bytes, now_s: float) -> bytes:
         match fault.kind:
             case FaultKind.GARBAGE:
-                return bytes(self._random.choices(range(128, 256), k=12)) + b"\r\n"
+                return self._garbage(12) + b"\r\n"
             case FaultKind.SPIKE:
                 return b"%d\r\n" % CORRUPTED
             case FaultKind.TORN:
@@ -192,6 +176,5 @@ class Hx711Board:
 
     def _end_lasting(self) -> None:
         if self._lasting is FaultKind.UNPLUG:
-            self._port.plug()
-            self._on_port(self.path)
+            self._plug()
         self._lasting = None

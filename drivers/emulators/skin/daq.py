@@ -1,12 +1,11 @@
 """What reads the gauges' voltages, played: a scanning multimeter, and a cheap converter board. Byte for byte."""
 
 import asyncio
-from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
-from drivers.emulators.pty_port import PtyPort
+from drivers.emulators.board import PlayedBoard
 from drivers.emulators.skin.circuit import Circuit
 from drivers.emulators.skin.scpi_face import ILLEGAL_VALUE, ScpiError, ScpiFace, number
 from drivers.emulators.skin.servers import time_of
@@ -83,7 +82,7 @@ LASTING = ("silence", "stuck", "unplug")
 BOARD_COMMANDS = f"{', '.join(ONE_LINE)}, {' [SECONDS], '.join(LASTING)} [SECONDS]"
 
 
-class AdcBoard:
+class AdcBoard(PlayedBoard[str]):
     """A converter board on a pseudo-terminal: a line `v1,v2` in volts at each period, whoever listens.
 
     `on_port` hears the port's path whenever it appears; `sent` counts the sound lines.
@@ -100,29 +99,19 @@ class AdcBoard:
         on_port: Callable[[str], None] = lambda _: None,
         seed: int = 0,
     ) -> None:
+        super().__init__(period_s, link, on_port, seed)
         self._circuit = circuit
         self._now_s = now_s
-        self._period_s = period_s
         self._noise_v = noise_v
-        self._on_port = on_port
-        self._random = Random(seed)
-        self._port = PtyPort(lambda _: None, link)
-        self._injected: deque[str] = deque()
         self._lasting = ""
         self._lasts_until_s = 0.0
         self._line = b""
-        self.sent = 0
-
-    @property
-    def path(self) -> str:
-        """Where the port is now."""
-        return self._port.path
 
     def command(self, text: str) -> None:
         """Let something befall the next line, or what follows; ValueError for a line that says nothing known."""
         match text.split():
             case [kind] if kind in ONE_LINE:
-                self._injected.append(kind)
+                self.inject(kind)
             case [kind, *seconds] if kind in LASTING and len(seconds) < 2:
                 self._end_lasting()
                 self._lasting = kind
@@ -164,7 +153,7 @@ class AdcBoard:
             case "missing":
                 return b""
             case "garbage":
-                return bytes(self._random.choices(range(128, 256), k=12)) + b"\r\n"
+                return self._garbage(12) + b"\r\n"
             case "torn":
                 return self._line[len(self._line) // 2 :]
         return self._line
@@ -175,6 +164,5 @@ class AdcBoard:
 
     def _end_lasting(self) -> None:
         if self._lasting == "unplug":
-            self._port.plug()
-            self._on_port(self.path)
+            self._plug()
         self._lasting = ""

@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 import zmq
 
+from daemon.addresses import PUBLISH_ADDRESS
 from daemon.clock import Clock
 from daemon.handbook.pages import ROOT, pages
 from daemon.handbook.sentences import raised, split, told
@@ -102,6 +104,21 @@ async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
             await process.communicate()
             await asyncio.sleep(0)
             publisher.close()
+
+
+@pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
+def test_a_subscriber_asks_for_topics_and_keys_that_there_are(name: str) -> None:
+    """MATLAB is on no machine of ours, so what its subscriber reads is held to the schema of the messages."""
+    program = (ROOT / "docs/examples" / name).read_text()
+    topics = set(re.findall(r'"((?:eit|load|skin|robot|gripper|loop)\.[a-z]*)"', program))
+    assert topics
+    assert all(any(topic.startswith(beginning) for topic in TOPICS) for beginning in topics)
+    assert f"{PUBLISH_ADDRESS}" in program
+    reads = set(re.findall(r'message\["(\w+)"\]|message\.(\w+)', program))
+    named = {key.removesuffix("_shape") for pair in reads for key in pair if key}
+    assert "timestamp" in named
+    known = {item.name for topic in ("eit.estimate", "eit.frame") for item in dataclasses.fields(TOPICS[topic])}
+    assert named - {"timestamp", "seq"} <= known
 
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])

@@ -2,7 +2,8 @@
 
 It takes the frames of a multipart message one by one, gives each to its msgpack parser (nlohmann/json, which refuses
 bytes that are left over), and plots the numbers and booleans of the map; `timestamp` is the time, where asked for.
-Its sources: plotjuggler_plugins/DataStreamZMQ/datastream_zmq.cpp and plotjuggler_app/nlohmann_parsers.cpp.
+Its sources: plotjuggler_plugins/DataStreamZMQ/datastream_zmq.cpp and plotjuggler_app/nlohmann_parsers.cpp. Later ones
+take the first of two frames as the topic, which names the series; a third would have to be a time as text.
 """
 
 from collections.abc import Iterator

@@ -71,7 +71,7 @@ def test_folders_hidden_by_the_unit_are_known() -> None:
     assert hidden_folder(Path("/opt/shearloop/bin/shearloop")) == ""
 
 
-def test_a_wheel_carries_every_file_of_the_service(tmp_path: Path) -> None:
+def test_a_wheel_carries_every_file_of_the_service_and_of_the_page(tmp_path: Path) -> None:
     build = "from setuptools import build_meta; import sys; print(build_meta.build_wheel(sys.argv[1]))"
     source = tmp_path / "source"
     source.mkdir()
@@ -86,6 +86,10 @@ def test_a_wheel_carries_every_file_of_the_service(tmp_path: Path) -> None:
     with zipfile.ZipFile(wheel) as archive:
         for name in (*PLACES, "realtime.conf", "shearloop.yaml"):
             assert archive.read(f"daemon/service_files/{name}").decode() == service_file(name)
+        assets = sorted((ROOT / "daemon" / "view" / "assets").iterdir())
+        assert {"index.html", "app.js", "uPlot.LICENSE.txt"} <= {path.name for path in assets}
+        for path in assets:
+            assert archive.read(f"daemon/view/assets/{path.name}") == path.read_bytes()
 
 
 # ---- udev ---------------------------------------------------------------------------------------------------------

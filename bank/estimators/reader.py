@@ -20,7 +20,7 @@ Difficulty: TypeAlias = Callable[[Rows, Rows], FloatArray]
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
 # Future data lies further from the past than one part of a recording from the next, unless what was left out was the
 # future itself.
-_INFLATION = 1.1
+_INFLATION = 1.05
 # Origins have fewer frames before them than the calibration has, of which a curve with its drift makes the most: where
 # misfit is taken account of, 97 % of later slices lie within this share of what was left out (docs/decisions/0042).
 _CURVE_INFLATION = 0.81

@@ -83,7 +83,7 @@ def test_later_twists(twists, sides, r, rmse_nm):
     figures = judge([follow(fit("fused", [part_of(series, 0, HALF)], "earlier"), part_of(series, HALF - 0.015, 1))])
     assert figures["r"] >= r
     assert figures["rmse_nm"] <= rmse_nm
-    assert 0.90 <= figures["coverage_95"] <= 0.995
+    assert 0.90 <= figures["coverage_95"] <= 0.98
     assert 0.6 <= figures["valid_fraction"] <= 0.75
 
 

@@ -27,8 +27,9 @@ from bank.estimators.values import BoolArray, FloatArray, TactileFrame
 _BASELINE_FRAMES = 10
 # Frames further apart than this many periods of 0.54 s have lost the thread.
 _LARGEST_GAP_S = 1.4
-# A session's baseline is made of at least so many frames before a grip is looked for.
-_LEAST_IDLE = 5
+# A session's baseline is made of at least so many frames before a grip is looked for that is not half as strong as the
+# calibration's.
+_LEAST_IDLE, _OUTRIGHT = 5, 0.5
 # A grip has ended when its score is below this share of its mean over so many frames.
 _LOOSE_SHARE, _LEVEL_FRAMES = 0.5, 60
 # Bridged frames among those remembered: more, and the memory is made up.
@@ -120,6 +121,11 @@ class Grip:
         self._floor = 0.0
         self._level: float | None = None
         self._frames = 0
+
+    @property
+    def held(self) -> bool:
+        """Whether it was gripped at the last frame."""
+        return self._level is not None
 
     def see(self, score: float) -> bool:
         """Take the next frame's score and return whether it is gripped."""
@@ -249,11 +255,7 @@ class Memory:
 
     def _judged(self, channels: FloatArray, usable: BoolArray) -> Moment:
         assert self._baselines is not None  # noqa: S101 - set by _learn_baseline just before
-        held = [
-            not 0 < len(self._idle[layer]) < _LEAST_IDLE
-            and grip.see(guard.grip(channels[layer], self._baselines[layer]))
-            for layer, (guard, grip) in enumerate(zip(self._guards, self._grips, strict=True))
-        ]
+        held = [self._holds(layer, channels[layer]) for layer in range(len(self._guards))]
         loose = [guard.side for layer, guard in enumerate(self._guards) if self._let_go[layer] or not held[layer]]
         difference = self._difference(channels, usable) / self._gains()
         if loose:
@@ -268,6 +270,14 @@ class Memory:
         if sum(self._bridged) > _LARGEST_BRIDGED:
             return Moment(channels, difference, ("too many of the last frames were disturbed",), usable)
         return Moment(channels, difference, (), usable)
+
+    def _holds(self, layer: int, channels: FloatArray) -> bool:
+        """Return whether a fingertip is gripped; with a baseline of a few frames only an outright grip is one."""
+        assert self._baselines is not None  # noqa: S101 - set by _learn_baseline before
+        guard, grip = self._guards[layer], self._grips[layer]
+        score = guard.grip(channels, self._baselines[layer])
+        learning = 0 < len(self._idle[layer]) < _LEAST_IDLE and not grip.held
+        return grip.see(score) if not learning or score > max(_OUTRIGHT, guard.grip_threshold) else False
 
     def _notice_release(self, channels: FloatArray) -> None:
         self._passed.append(channels)
@@ -330,7 +340,7 @@ class Memory:
             idle = self._idle[layer]
             begun = first and guard.idle_like(channels[layer])
             # One frame is a poor baseline: the first few are taken unless they look gripped outright.
-            limit = 0.5 * guard.grip_threshold if len(idle) >= _LEAST_IDLE else max(0.5, guard.grip_threshold)
+            limit = 0.5 * guard.grip_threshold if len(idle) >= _LEAST_IDLE else max(_OUTRIGHT, guard.grip_threshold)
             following = bool(idle) and guard.grip(channels[layer], self._baselines[layer]) < limit
             if (begun or following) and not self._recent:
                 idle.append(channels[layer])

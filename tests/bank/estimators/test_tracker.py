@@ -68,6 +68,21 @@ def test_another_session_takes_its_own_baseline(fused_calibration, twisting, gri
     assert coverage > 0.85
 
 
+@pytest.mark.parametrize("told", [False, True])
+def test_three_idle_frames_are_a_baseline_for_an_outright_grip(fused_calibration, twisting, told):
+    other = twisting(seed=22)
+    first = int(np.flatnonzero(other.t_s > 20)[0]) - 3
+    tracker = Tracker(fused_calibration)
+    if told:
+        tracker.take_idle(3)
+    valid = [
+        tracker.estimate(TactileFrame.of(float(t), x)).valid
+        for t, x in zip(other.t_s[first:230], other.channels[first:230], strict=True)
+    ]
+    assert not any(valid[:3])
+    assert np.mean(valid[25:]) > 0.95
+
+
 def test_a_session_that_begins_gripped_is_read_from_its_motion(fused_calibration, twisting):
     later = twisting(seed=21).between(60, 240)
     estimates = follow(fused_calibration, later)

@@ -118,12 +118,18 @@ def daemon(config: Path, folder: Path) -> Iterator[tuple[int, float]]:
 
 @contextlib.contextmanager
 def subscription(folder: Path, topic: str) -> Iterator["zmq.Socket[bytes]"]:
-    """Subscribe to a topic of the daemon, with no bound on what waits."""
+    """Subscribe to a topic of the daemon, with no bound on what waits; begins when the daemon knows of it."""
     with zmq.Context() as context, context.socket(zmq.SUB) as subscriber:
         subscriber.setsockopt(zmq.RCVHWM, 0)
         subscriber.setsockopt(zmq.RCVTIMEO, 10_000)
         subscriber.connect(f"ipc://{folder}/publish")
         subscriber.setsockopt(zmq.SUBSCRIBE, topic.encode())
+        # Health comes once a second; when it comes here, so does all else that was subscribed to before.
+        subscriber.setsockopt(zmq.SUBSCRIBE, b"health")
+        while subscriber.recv_multipart()[0] != b"health":
+            continue
+        if topic != "health":
+            subscriber.setsockopt(zmq.UNSUBSCRIBE, b"health")
         yield subscriber
 
 

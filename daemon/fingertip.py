@@ -16,6 +16,8 @@ from drivers.eit_kit import EitKit, Frame
 # Frames that may wait for the estimator. When they are this many the port is read no further: the board's own
 # buffer and then the board wait, and nothing is lost.
 LARGEST_BACKLOG = 8
+# So much later than its estimate a frame is published, where frames come slowly enough to have the time.
+FRAME_LATER_S, LONG_PERIOD_S = 0.001, 0.02
 
 
 async def _at_once() -> None:
@@ -64,7 +66,12 @@ class FingertipTask:
                 taken = _Taken(frame)
                 if self._idle and self._backlog.empty():
                     self._estimate_at_once(taken)
-                self._publisher.publish(frame_message(self.name, frame))
+                try:
+                    if taken.reading is not None and self._board.period_s > LONG_PERIOD_S:
+                        # The socket's own thread, which sends the estimate, may want the core that we are on.
+                        await asyncio.sleep(FRAME_LATER_S)
+                finally:
+                    self._publisher.publish(frame_message(self.name, frame))
                 await self._backlog.put(taken)
                 await self._room()
 

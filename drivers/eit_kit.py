@@ -99,6 +99,11 @@ class EitKit:
             self._on_frame(frame)
         return frames
 
+    @property
+    def period_s(self) -> float:
+        """The board's period as it was measured, or as it was given until it is."""
+        return self._parser.clock.period_ns / 1e9
+
     def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
         """Return what health tells of the board; counts are since the process began."""
         parser, clock = self._parser, self._parser.clock

@@ -43,6 +43,8 @@ def frame(number: int) -> Frame:
 class Board:
     """Four frames, then silence."""
 
+    period_s = 0.54
+
     async def frames(self) -> AsyncGenerator[Frame]:
         for number in range(4):
             yield frame(number)

@@ -7,6 +7,7 @@ compresses decides how long it takes, never what comes out.
 
 from abc import abstractmethod
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -37,6 +38,8 @@ _FEW_LAGS = 128
 _FEW_CELLS = 48
 # Fewer than this are matched before a thread has begun.
 _FEWEST_PER_THREAD = 4
+# With fewer cells at all lags, leaving out what cannot be the maximum costs more than the whole heatmap.
+FEWEST_PRUNED = 300
 # Scoring more than this takes longer than about a millisecond.
 _QUICK_SCORES = 1 << 13
 
@@ -47,6 +50,9 @@ class _Undecided(Exception):  # noqa: N818 - it is not an error
 
 class _PruningMatcher(Matcher):
     """What all lags and one have in common: the search, and settling in float64 what the bounds leave."""
+
+    # With fewer cells nothing is searched: the whole heatmap is made.
+    _fewest = 0
 
     def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank, which takes about a second for 10⁴ cells; arguments as of any matcher.
@@ -63,6 +69,9 @@ class _PruningMatcher(Matcher):
 
         Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
         """
+        if len(self._cells) < self._fewest:
+            match = super().match(difference)
+            return match if runner_up else replace(match, runner_up=None, runner_up_cell=None)
         frame = unit_magnitude(difference)
         try:
             return self._search(frame, runner_up)
@@ -74,6 +83,8 @@ class _PruningMatcher(Matcher):
 
         Frames unlike any of the bank's may leave most of its cells to be scored, which takes half a second.
         """
+        if len(self._cells) < self._fewest:
+            return super().match(difference)
         try:
             return self._search(unit_magnitude(difference), runner_up=True, quick=True)
         except (_Undecided, TakesLongError):
@@ -196,6 +207,8 @@ class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
 
 class FastMatcher(_PruningMatcher, ReferenceMatcher):
     """Matches at all lags; its heatmaps are those of the reference, at the reference's price."""
+
+    _fewest = FEWEST_PRUNED
 
     def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as of `FastZeroLagMatcher`."""

@@ -42,7 +42,13 @@ def pair(slow: type[Matcher], fast: type[Matcher], bank: tuple[np.ndarray, np.nd
     return slow(*bank, *grids), fast(*bank, *grids)
 
 
-KINDS = ((ReferenceMatcher, FastMatcher), (ZeroLagMatcher, FastZeroLagMatcher))
+class Searching(FastMatcher):
+    """Searches however few cells there are."""
+
+    _fewest = 0
+
+
+KINDS = ((ReferenceMatcher, Searching), (ZeroLagMatcher, FastZeroLagMatcher))
 BANK = smooth_bank()
 PAIRS = [pair(*kind, BANK) for kind in KINDS]
 both = pytest.mark.parametrize(("slow", "fast"), PAIRS, ids=["all lags", "zero lag"])
@@ -58,6 +64,18 @@ def assert_same(fast: Match, slow: Match) -> None:
     if slow.runner_up is not None:
         assert fast.runner_up == pytest.approx(slow.runner_up, abs=1e-13)
     assert (fast.k, fast.sigma) == (slow.k, slow.sigma)
+
+
+def test_a_bank_of_few_cells_is_not_searched_and_matches_the_same() -> None:
+    signals, valid = BANK[0][:6], BANK[1][:6]
+    assert 0 < valid.sum() < fast_matching.FEWEST_PRUNED <= BANK[1].sum()
+    slow, fast = pair(ReferenceMatcher, FastMatcher, (signals, valid))
+    frame = np.random.default_rng(3).normal(size=N_CHANNELS)
+    assert fast.match(frame) == fast.match_quickly(frame) == slow.match(frame)
+    assert fast.match(frame, runner_up=False) == dataclasses.replace(
+        slow.match(frame), runner_up=None, runner_up_cell=None
+    )
+    assert fast.matches([frame])[0].cell == slow.match(frame).cell
 
 
 @both

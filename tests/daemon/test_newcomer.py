@@ -136,7 +136,7 @@ def tree(tmp_path: Path) -> Iterator[Tree]:
     tree.change("demo.yaml", demo)
     tree.change("demo_ur.yaml", lambda content: content.update(host=HOST))
     tree.change("experiments/hold_torque.yaml", experiment)
-    tree.change("banks/demo.yaml", lambda content: [content[axis].update(count=16) for axis in ("k", "sigma")])
+    tree.change("banks/demo.yaml", lambda content: [content[axis].update(count=32) for axis in ("k", "sigma")])
     yield tree
     # Shown where the test has failed.
     if tree.log.exists():

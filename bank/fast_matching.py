@@ -6,7 +6,6 @@ compresses decides how long it takes, never what comes out.
 """
 
 from abc import abstractmethod
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -36,8 +35,6 @@ _ROUNDING_32 = 6e-5
 _FEW_LAGS = 128
 # With fewer cells, sorting them out in float32 costs more than scoring them.
 _FEW_CELLS = 48
-# Fewer than this are matched before a thread has begun.
-_FEWEST_PER_THREAD = 4
 # With fewer cells at all lags, leaving out what cannot be the maximum costs more than the whole heatmap.
 FEWEST_PRUNED = 300
 # Scoring more than this takes longer than about a millisecond.
@@ -90,22 +87,14 @@ class _PruningMatcher(Matcher):
         except (_Undecided, TakesLongError):
             return None
 
-    def matches(self, differences: ArrayLike, *, threads: int = 1) -> list[Match]:
+    def matches(self, differences: ArrayLike) -> list[Match]:
         """Return what `match` returns of each of (n, 896) differences, without the runner-ups.
 
-        Several threads share them, each a run of neighbours: most of the work is done without the interpreter's lock.
         Raises MatchingError as `heatmaps` does.
         """
         frames = np.asarray(differences, dtype=np.float64)
-        # Wrong input is told before any thread is at work.
+        # Wrong input is told before any work.
         unit_magnitudes(frames)
-        if threads == 1 or len(frames) < _FEWEST_PER_THREAD * threads:
-            return self._in_turn(frames)
-        with ThreadPoolExecutor(threads) as pool:
-            parts = pool.map(self._in_turn, np.array_split(frames, threads))
-            return [match for part in parts for match in part]
-
-    def _in_turn(self, frames: FloatArray) -> list[Match]:
         return [self.match(frame, runner_up=False) for frame in frames]
 
     @abstractmethod

@@ -66,7 +66,7 @@ def main() -> None:
                 batched.append(quick.cell)
                 same += (slow.cell, slow.runner_up_cell) == (quick.cell, quick.runner_up_cell)
                 furthest = max(furthest, abs(slow.score - quick.score))
-            in_batches += [match.cell for match in fast.matches(part, threads=2)] == batched
+            in_batches += [match.cell for match in fast.matches(part)] == batched
             batches += 1
         found[kind] = {"frames": frames, "same": same, "largest_difference_of_scores": furthest,
             "batches": batches, "same_batches": in_batches}  # fmt: skip

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
-from bank import bounds, fast_matching
+from bank import batch_matching, bounds, fast_matching
+from bank.batch_matching import BatchMatcher
 from bank.channels import N_CHANNELS, channels_of_line
 from bank.errors import MatchingError
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
@@ -173,18 +175,29 @@ def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
     assert sum(read) < BANK[1].sum() / 4
 
 
+@pytest.fixture(scope="module")
+def tracker() -> None:
+    """Start what the first spawned process starts and leaves running, with its pipe."""
+    resource_tracker.ensure_running()
+
+
 @both
-def test_a_batch_is_its_frames_in_their_order_in_any_number_of_threads(slow, fast) -> None:
+@pytest.mark.usefixtures("tracker")
+def test_a_batch_is_its_frames_in_their_order(slow, fast, monkeypatch) -> None:
     random = np.random.default_rng(5)
     frames = random.normal(size=(19, N_CHANNELS)) + 3 * BANK[0][BANK[1]][random.integers(0, BANK[1].sum(), 19)]
     alone = [fast.match(frame, runner_up=False) for frame in frames]
     assert [match.cell for match in alone] == [slow.match(frame).cell for frame in frames]
-    for threads in (1, 2, 3, 7):
-        assert fast.matches(frames, threads=threads) == alone
-    assert fast.matches(frames[:0], threads=2) == []
-    frames[-1] = 0.0
-    with pytest.raises(MatchingError, match="zero in all channels"):
-        fast.matches(frames, threads=2)
+    assert fast.matches(frames) == alone
+    assert fast.matches(frames[:0]) == []
+    monkeypatch.setattr(batch_matching, "_FRAMES_PER_TASK", 5)
+    with BatchMatcher(fast, 2) as batch:
+        assert batch.matches(frames) == alone
+        assert batch.matches(frames[:0]) == []
+        frames[-1] = 0.0
+        for wrong in (fast, batch):
+            with pytest.raises(MatchingError, match="zero in all channels"):
+                wrong.matches(frames)
 
 
 @both

@@ -14,6 +14,7 @@ from typing import Self
 import numpy as np
 
 from bank.channels import N_CHANNELS
+from bank.estimators.grip import Grip
 from bank.estimators.guard import (
     LARGEST_JUMPING_SHARE,
     LARGEST_UNUSABLE_SHARE,
@@ -30,8 +31,6 @@ _LARGEST_GAP_S = 1.4
 # A session's baseline is made of at least so many frames before a grip is looked for that is not half as strong as the
 # calibration's.
 _LEAST_IDLE, _OUTRIGHT = 5, 0.5
-# A grip has ended when its score is below this share of its mean over so many frames.
-_LOOSE_SHARE, _LEVEL_FRAMES = 0.5, 60
 # Bridged frames among those remembered: more, and the memory is made up.
 _LARGEST_BRIDGED = 3
 
@@ -108,40 +107,6 @@ def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: Floa
     return np.asarray(found @ shapes)
 
 
-class Grip:
-    """Whether one fingertip is gripped, from the grip's score (0 idle, 1 as at calibration), frame by frame.
-
-    A grip begins with a rise by the threshold above the lowest score since the last one (a gel that recovers from a
-    release scores less and less), and ends below half of that, or below a share of this grip's own mean score: today's
-    grip may be a fifth or three times as strong as the one at calibration.
-    """
-
-    def __init__(self, threshold: float) -> None:
-        self._threshold = threshold
-        self._floor = 0.0
-        self._level: float | None = None
-        self._frames = 0
-
-    @property
-    def held(self) -> bool:
-        """Whether it was gripped at the last frame."""
-        return self._level is not None
-
-    def see(self, score: float) -> bool:
-        """Take the next frame's score and return whether it is gripped."""
-        if self._level is None:
-            self._floor = min(self._floor, max(score, 0.0))
-            if score - self._floor > self._threshold:
-                self._level, self._frames = score, 1
-            return self._level is not None
-        if score < max(self._floor + 0.5 * self._threshold, _LOOSE_SHARE * self._level):
-            self._level, self._floor = None, max(score, 0.0)
-            return False
-        self._frames = min(self._frames + 1, _LEVEL_FRAMES)
-        self._level += (score - self._level) / self._frames
-        return True
-
-
 class Memory:
     """The state of one session; every frame goes through `see` in order."""
 
@@ -152,7 +117,9 @@ class Memory:
         self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
         self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
         self._idle: list[deque[FloatArray]] = [deque(maxlen=_BASELINE_FRAMES) for _ in guards]
-        self._baselines: FloatArray | None = None
+        # The calibration's, until the session has its own.
+        self._baselines: FloatArray = np.array([guard.idle for guard in guards])
+        self._begun = False
         self._before: FloatArray | None = None
         self._refused: FloatArray | None = None
         self._t_s = -np.inf
@@ -185,7 +152,7 @@ class Memory:
 
     def _gains(self) -> FloatArray:
         """Return the (m, 1) gain of each fingertip's idle frame of this session against the calibration's."""
-        if self._baselines is None or not self.own_baseline:
+        if not self.own_baseline:
             return np.ones((len(self._guards), 1))
         return np.array([[guard.gain(one)] for guard, one in zip(self._guards, self._baselines, strict=True)])
 
@@ -235,7 +202,7 @@ class Memory:
         self._idle_taken.append(channels)
         taken, wanted = len(self._idle_taken), self._idle_wanted
         if taken == wanted:
-            self._baselines = np.mean(self._idle_taken, axis=0)
+            self._baselines, self._begun = np.mean(self._idle_taken, axis=0), True
             for layer, idle in enumerate(self._idle):
                 idle.extend(one[layer] for one in self._idle_taken)
             self._idle_wanted, self._idle_taken = 0, []
@@ -245,7 +212,6 @@ class Memory:
 
     def _difference(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the (m, 896) difference to the idle frame; what is not usable goes by what is."""
-        assert self._baselines is not None  # noqa: S101 - set by _learn_baseline before
         difference = channels - self._baselines
         if self._motion is not None and not usable.all():
             for layer, guard in enumerate(self._guards):
@@ -254,7 +220,6 @@ class Memory:
         return difference
 
     def _judged(self, channels: FloatArray, usable: BoolArray) -> Moment:
-        assert self._baselines is not None  # noqa: S101 - set by _learn_baseline just before
         held = [self._holds(layer, channels[layer]) for layer in range(len(self._guards))]
         loose = [guard.side for layer, guard in enumerate(self._guards) if self._let_go[layer] or not held[layer]]
         difference = self._difference(channels, usable) / self._gains()
@@ -273,7 +238,6 @@ class Memory:
 
     def _holds(self, layer: int, channels: FloatArray) -> bool:
         """Return whether a fingertip is gripped; with a baseline of a few frames only an outright grip is one."""
-        assert self._baselines is not None  # noqa: S101 - set by _learn_baseline before
         guard, grip = self._guards[layer], self._grips[layer]
         score = guard.grip(channels, self._baselines[layer])
         learning = 0 < len(self._idle[layer]) < _LEAST_IDLE and not grip.held
@@ -281,7 +245,7 @@ class Memory:
 
     def _notice_release(self, channels: FloatArray) -> None:
         self._passed.append(channels)
-        if self._baselines is None or len(self._passed) <= STEP_FRAMES:
+        if len(self._passed) <= STEP_FRAMES:
             return
         gains = self._gains()
         for layer, guard in enumerate(self._guards):
@@ -331,11 +295,7 @@ class Memory:
 
     def _learn_baseline(self, channels: FloatArray) -> None:
         """Follow the idle frame while nothing is gripped; a session that begins gripped has the calibration's."""
-        first = self._baselines is None
-        if self._baselines is None:
-            self._baselines = np.array(
-                [one if guard.idle_like(one) else guard.idle for one, guard in zip(channels, self._guards, strict=True)]
-            )
+        first, self._begun = not self._begun, True
         for layer, guard in enumerate(self._guards):
             idle = self._idle[layer]
             begun = first and guard.idle_like(channels[layer])

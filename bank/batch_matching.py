@@ -2,12 +2,14 @@
 
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bank.bank_file import Bank
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
 from bank.matching import FloatArray, Match, unit_magnitudes
 
@@ -16,11 +18,16 @@ _FRAMES_PER_TASK = 250
 
 
 class BatchMatcher:
-    """A matcher in processes of their own, spawned, so that none inherits our files, threads or locks."""
+    """Matchers of a bank in processes of their own, spawned, so that none inherits our files, threads or locks.
 
-    def __init__(self, matcher: FastMatcher | FastZeroLagMatcher, processes: int) -> None:
-        """Send each process the matcher once, which takes it about a second."""
-        self._pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=_take, initargs=(matcher,))
+    Each opens the bank itself, whose pages they share, and takes about a second for it.
+    """
+
+    def __init__(self, kind: type[FastMatcher | FastZeroLagMatcher], bank: Path, processes: int) -> None:
+        """Take the bank's file; raises BankFileError as `Bank.open` does."""
+        # Here, and not in each process.
+        Bank.open(bank)
+        self._pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=_open, initargs=(kind, bank))
 
     def matches(self, differences: ArrayLike) -> list[Match]:
         """Return what the matcher's `matches` returns of (n, 896) differences, in their order; errors are the same."""
@@ -41,12 +48,12 @@ class BatchMatcher:
         self._pool.shutdown(cancel_futures=True)
 
 
-_taken: list[FastMatcher | FastZeroLagMatcher] = []
+_opened: list[FastMatcher | FastZeroLagMatcher] = []
 
 
-def _take(matcher: FastMatcher | FastZeroLagMatcher) -> None:
-    _taken[:] = [matcher]
+def _open(kind: type[FastMatcher | FastZeroLagMatcher], bank: Path) -> None:
+    _opened[:] = [kind.from_bank(Bank.open(bank))]
 
 
 def _matches(frames: FloatArray) -> list[Match]:
-    return _taken[0].matches(frames)
+    return _opened[0].matches(frames)

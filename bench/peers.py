@@ -161,12 +161,14 @@ def frames_of(bank: Bank, recordings: Path | None) -> Floats:
     return chosen + random.normal(0, 0.3 / np.sqrt(N_CHANNELS), chosen.shape)
 
 
-def batches_a_minute(bank: Bank, frames: Floats, turns: int) -> dict[str, Any]:
+def batches_a_minute(bank: Path, frames: Floats, turns: int) -> dict[str, Any]:
     """Return how many frames a minute are matched in batches, in one process and in two; those start beforehand."""
     many = np.tile(frames, (-(-BATCH // len(frames)), 1))[:BATCH]
     found: dict[str, Any] = {}
-    for name, matcher in (("all lags", FastMatcher.from_bank(bank)), ("zero lag", FastZeroLagMatcher.from_bank(bank))):
-        with BatchMatcher(matcher, 2) as two:
+    kinds: dict[str, type[FastMatcher | FastZeroLagMatcher]] = {"all lags": FastMatcher, "zero lag": FastZeroLagMatcher}
+    for name, kind in kinds.items():
+        matcher = kind.from_bank(Bank.open(bank))
+        with BatchMatcher(kind, bank, 2) as two:
             seconds = take_turns(
                 {
                     f"{name}, one process": (lambda: matcher.matches(many), BATCH),  # noqa: B023 - runs in its turn
@@ -239,7 +241,7 @@ def main() -> None:
             "EIDORS, seconds per cell": EIDORS_CELL_S,
             f"EIDORS / {own}": EIDORS_CELL_S / statistics.median(seconds[own]),
         },
-        "batches_a_minute": batches_a_minute(bank, frames, args.turns),
+        "batches_a_minute": batches_a_minute(args.bank, frames, args.turns),
         "error_against_direct": error,
         f"matches_like_the_reference_of_{N_CHECKED}": same,
         "left_out": [

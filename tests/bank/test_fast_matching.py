@@ -13,9 +13,10 @@ from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
 from bank import batch_matching, bounds, fast_matching
+from bank.bank_file import BankDefinition, write_bank
 from bank.batch_matching import BatchMatcher
 from bank.channels import N_CHANNELS, channels_of_line
-from bank.errors import MatchingError
+from bank.errors import BankFileError, MatchingError
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
 from bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher
 
@@ -183,7 +184,7 @@ def tracker() -> None:
 
 @both
 @pytest.mark.usefixtures("tracker")
-def test_a_batch_is_its_frames_in_their_order(slow, fast, monkeypatch) -> None:
+def test_a_batch_is_its_frames_in_their_order(slow, fast, monkeypatch, tmp_path) -> None:
     random = np.random.default_rng(5)
     frames = random.normal(size=(19, N_CHANNELS)) + 3 * BANK[0][BANK[1]][random.integers(0, BANK[1].sum(), 19)]
     alone = [fast.match(frame, runner_up=False) for frame in frames]
@@ -191,13 +192,18 @@ def test_a_batch_is_its_frames_in_their_order(slow, fast, monkeypatch) -> None:
     assert fast.matches(frames) == alone
     assert fast.matches(frames[:0]) == []
     monkeypatch.setattr(batch_matching, "_FRAMES_PER_TASK", 5)
-    with BatchMatcher(fast, 2) as batch:
+    path = tmp_path / "smooth.bank"
+    definition = BankDefinition("ab" * 32, "gaussian_derivative", fast.k_grid, fast.sigma_grid)
+    write_bank(path, definition, np.ones(N_CHANNELS), np.ones(SHAPE), BANK[1], BANK[0])
+    with BatchMatcher(type(fast), path, 2) as batch:
         assert batch.matches(frames) == alone
         assert batch.matches(frames[:0]) == []
         frames[-1] = 0.0
         for wrong in (fast, batch):
             with pytest.raises(MatchingError, match="zero in all channels"):
                 wrong.matches(frames)
+    with pytest.raises(BankFileError, match="none"):
+        BatchMatcher(type(fast), tmp_path / "none.bank", 2)
 
 
 @both

@@ -162,9 +162,9 @@ class SideGuard:
         return float(np.mean(np.abs(frame - before)[usable] > limit[usable])) if usable.any() else 1.0
 
 
-def at_rail(channels: FloatArray) -> BoolArray:
-    """Return which (896,) channels share the frame's largest value with too many others to be chance: saturated."""
-    top = channels >= channels.max()
+def at_rail(channels: FloatArray, usable: BoolArray) -> BoolArray:
+    """Return which usable (896,) channels share the largest value with too many others to be chance: saturated."""
+    top = usable & (channels >= channels.max(initial=-np.inf, where=usable))
     return top if np.count_nonzero(top) >= _FEWEST_AT_RAIL else np.zeros_like(top)
 
 

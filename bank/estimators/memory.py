@@ -162,7 +162,9 @@ class Memory:
             self._forget()
         self._t_s = frame.t_s
         told = TactileFrame(
-            frame.t_s, frame.channels, frame.usable & ~np.array([at_rail(one) for one in frame.channels])
+            frame.t_s,
+            frame.channels,
+            frame.usable & ~np.array(list(map(at_rail, frame.channels, frame.usable))),
         )
         channels = self._filled(told)
         why = [
@@ -229,8 +231,8 @@ class Memory:
             return Moment(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
         self._recent.append(channels)
         self._bridged.append(False)
-        if self.recent is None:
-            missing = (self._recent.maxlen or 0) - len(self._recent)
+        missing = (self._recent.maxlen or 0) - len(self._recent)
+        if missing:
             return Moment(channels, difference, (f"gripped too lately: {missing} more frames are needed",), usable)
         if sum(self._bridged) > _LARGEST_BRIDGED:
             return Moment(channels, difference, ("too many of the last frames were disturbed",), usable)

@@ -53,12 +53,18 @@ def test_channels_at_a_rail_are_found_and_done_without(fused_calibration, twisti
     clipped = replace(whole, channels=np.minimum(whole.channels, rail))
     found = estimates(fused_calibration, clipped)
     assert rms_error(found, clipped) < 0.02 * 0.06
-    assert at_rail(clipped.channels[100, 0]).mean() == pytest.approx(0.1, abs=0.05)
+    frame, usable = clipped.channels[100, 0].copy(), np.ones(896, dtype=np.bool_)
+    clipped_ones = at_rail(frame, usable)
+    assert clipped_ones.mean() == pytest.approx(0.1, abs=0.05)
+    # A channel that is dead already hides nothing by what it reads.
+    frame[3], usable[3] = 5.0, False
+    np.testing.assert_array_equal(at_rail(frame, usable), clipped_ones & usable)
+    assert not at_rail(frame, np.zeros_like(usable)).any()
 
 
 def test_an_ordinary_frame_is_at_no_rail(twisting):
     frame = np.floor(twisting(seed=34).channels[50, 0] / STEP_V) * STEP_V
-    assert not at_rail(frame).any()
+    assert not at_rail(frame, np.ones(896, dtype=np.bool_)).any()
 
 
 def test_a_drift_does_not_lead_a_regression_astray(twisting):

@@ -6,6 +6,7 @@ compresses decides how long it takes, never what comes out.
 """
 
 from abc import abstractmethod
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -66,14 +67,12 @@ class _PruningMatcher(Matcher):
 
         Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
         """
-        if len(self._cells) < self._fewest:
-            match = super().match(difference)
-            return match if runner_up else replace(match, runner_up=None, runner_up_cell=None)
-        frame = unit_magnitude(difference)
-        try:
-            return self._search(frame, runner_up)
-        except _Undecided:
-            return super().match(difference)
+        if len(self._cells) >= self._fewest:
+            frame = unit_magnitude(difference)
+            with suppress(_Undecided):
+                return self._search(frame, runner_up)
+        match = super().match(difference)
+        return match if runner_up else replace(match, runner_up=None, runner_up_cell=None)
 
     def match_quickly(self, difference: ArrayLike) -> Match | None:
         """Return what `match` returns, or None where that takes more than a few milliseconds.

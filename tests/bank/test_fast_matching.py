@@ -150,6 +150,7 @@ def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, mo
     monkeypatch.setattr(fast_matching, "_ROUNDING_64", 2.0)
     assert_same(fast.match(frame), expected)
     assert len(scored) == 1
+    assert_same(fast.match(frame, runner_up=False), dataclasses.replace(expected, runner_up=None, runner_up_cell=None))
 
 
 @both

@@ -135,7 +135,8 @@ def designed(scene: Scene, fingertip: Fingertip) -> Design:
     model = min(models, key=lambda one: one.penalised).model
     settings, own = signals[model]
     k_range, sigma_range = _ranges(scene, settings, own)
-    middle = Setting(sum(k_range) / 2, sum(sigma_range) / 2)
+    # Of the searched settings, which are positive everywhere, the nearest to the middle of the ranges.
+    middle = min(settings, key=lambda one: abs(one.k - sum(k_range) / 2) + abs(one.sigma - sum(sigma_range) / 2))
     noise = scene.relative_noise
     return Design(
         noise, models, model, k_range, sigma_range,
@@ -230,17 +231,20 @@ def _count_choice(
     name: str,
 ) -> Choice:
     """Choose how many cells lie between the ends: the error is that of a frame half-way between two cells."""
-    homogeneous = forward.homogeneous()
-
-    def signal(value: float) -> Floats:
-        return np.abs(forward.voltages(conductivity(forward.mesh, model, *at(value))) - homogeneous)
-
     steps = []
     for count in COUNTS:
         spacing = (ends[1] - ends[0]) / (count - 1)
         # Half a cell to either side of places all over the range; the worst of them counts.
         places = np.linspace(ends[0] + spacing, ends[1] - spacing, 4)
-        added = max(_off(signal(v), signal(v + spacing / 2)) for v in places.tolist())
+        pairs = (_signals(forward, model, [at(v), at(v + spacing / 2)])[1] for v in places.tolist())
+        # Where a conductivity would not be positive there is no cell.
+        found = [_off(*pair) for pair in pairs if len(pair) == 2]
+        if not found:
+            raise CalibrationError(
+                f"the {model} model is positive nowhere along {name} from {ends[0]:.3g} to {ends[1]:.3g}: these frames "
+                "lie at the rim of what it can describe; record a grip that is less strong"
+            )
+        added = max(found)
         steps.append(Step(count, added / noise, f"{spacing:.3g} cm apart"))
     return Choice(f"cells along {name}", "cells", tuple(steps))
 

@@ -110,10 +110,12 @@ def held(bank: Path, calibration: Calibration, seeds: Sequence[int]) -> tuple[ND
         rows.append(run(plant, started(plant, found, settings_for(found, source)), HOLD_S).torque_nm)
         plants.append(plant)
     table = np.array([row[: min(map(len, rows))] for row in rows])
-    estimated = sum(plant.estimated for plant in plants)
+    estimated, not_valid = (
+        sum(counts) for counts in zip(*((one.estimated, one.not_valid) for one in plants), strict=True)
+    )
     return table, {
-        "not_valid_share": sum(plant.not_valid for plant in plants) / max(estimated, 1),
-        "coverage_95": 1.0 - sum(plant.outside for plant in plants) / max(estimated, 1),
+        "not_valid_share": not_valid / (estimated + not_valid),
+        "coverage_95": 1.0 - sum(plant.outside for plant in plants) / estimated if estimated else np.nan,
         "held_nm_mean": float(table[:, round(SETTLED_S / PERIOD_S) :].mean()),
         "held_nm_worst": float(np.abs(table[:, round(SETTLED_S / PERIOD_S) :].mean(axis=1) - TARGET_NM).max()),
     }

@@ -159,6 +159,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for recordings and calibrations")
     parser.add_argument("--seed", type=int, default=7)
     args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
     recordings = []
     for diameter_mm, recorded in record(args.bank, args.seed):
         path = args.out / f"rig-{diameter_mm:g}mm.mcap"

@@ -51,6 +51,10 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--jobs must be 1 or more, not {args.jobs}")
     if args.name == "speed-accuracy" and (args.cluster is not None or args.jobs > 1):
         raise UserError("speed-accuracy measures times, one thread on this machine: leave out --cluster and --jobs")
+    if args.name == "scene" and (args.bank is not None or args.mesh is not None):
+        raise UserError(
+            "scene chooses mesh and bank by itself, on the fingertip of the paper: leave out --bank and --mesh"
+        )
     try:
         import matplotlib as _  # noqa: F401 - so that its absence is told before anything is measured
     except ModuleNotFoundError as error:
@@ -68,16 +72,14 @@ def run(args: argparse.Namespace) -> int:
 def _speed_accuracy(args: argparse.Namespace) -> list[Path]:
     from bench.charts.sources import bank_of, mesh_of, splits
     from bench.charts.speed_accuracy import chart
-    from daemon.bank_config import load_geometry
 
     scratch = args.out / "banks"
     mesh = mesh_of(args.mesh)
-    own = load_geometry(args.mesh) if args.mesh else None
     return chart(
         splits(args.recordings, args.split, scratch),
         bank_of(args.bank, mesh, scratch),
         mesh,
-        own,
+        mesh if args.mesh else None,
         args.out,
         args.rounds,
     )

@@ -3,7 +3,7 @@
 An estimator with a memory of seconds cannot tell by its error: what the load was a second ago, its frames still know.
 But a load that changes moves the gel within the same frame. How far single frames move, along the directions in which
 they move most, is regressed on the torque's change over the same time, which is shifted against it; where that explains
-most, on stretches of time that were left out, is how late the torques are. Recorded twists say 0.15 to 0.3 s, wherever
+most, on stretches of time that were left out, is how late the torques are. Recorded twists say 0.12 to 0.24 s, wherever
 they are cut, with a peak half a frame wide; half of it is the filter of the load cell's converter, whose output settles
 within 0.4 s (HX711 at ten samples a second).
 """
@@ -68,7 +68,7 @@ def _of_side(series: FrameSeries, part: slice, layer: int) -> Alignment | None:
     explained = _explained(moves, np.array([_changes(series, middles + late, span_s) for late in _SHIFTS_S]).T)
     best = int(np.argmax(explained))
     others = explained[np.abs(_SHIFTS_S - _SHIFTS_S[best]) > _APART_S]
-    if explained[best] < max(_LEAST_EXPLAINED, _ABOVE_OTHERS * float(others.max())):
+    if not explained[best] >= max(_LEAST_EXPLAINED, _ABOVE_OTHERS * float(others.max())):
         return None
     return Alignment(float(_SHIFTS_S[best]), float(explained[best]))
 
@@ -79,7 +79,8 @@ def _moves(t_s: FloatArray, channels: FloatArray) -> tuple[FloatArray, FloatArra
     moved = np.diff(frames, axis=0)
     size = np.linalg.norm(moved, axis=1)
     limit = _LARGEST_MOVE * float(np.median(size))
-    moved *= np.minimum(1.0, limit / np.maximum(size, limit * 1e-9))[:, None]
+    if limit > 0:  # else most frames repeat the one before
+        moved *= np.minimum(1.0, limit / np.maximum(size, limit * 1e-9))[:, None]
     moved -= moved.mean(axis=0)
     # Of n frames the n × n products have the same directions, for a tenth of the work.
     values, vectors = np.linalg.eigh(moved @ moved.T)

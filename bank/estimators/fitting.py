@@ -51,6 +51,8 @@ N_DIRECTIONS, N_LAGS = 4, 12
 # torque's the mean error over six origins (19 to 44 of 49 slices, judged on all that follow) was least for these
 # (docs/decisions/0042).
 TORQUE_CURVE, DIAMETER_CURVE = (3, 3, True), (1, 1, False)
+# With a block left out, as many are left as it takes to know what is familiar.
+_LEAST_TORQUE_SLICES = 10
 # A hundred features of a few directions need little holding back.
 _MOTION_STRENGTHS = (1e-6, 1e-5, 1e-4)
 # A full heatmap over all lags takes a good part of a second: more frames than this are thinned out to calibrate on.
@@ -134,6 +136,10 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
         known = np.isfinite(values) & (np.isfinite(diameter) if name == "diameter" else ~np.isfinite(diameter))
         if not known.any():
             continue
+        if name == "torque" and known.sum() < _LEAST_TORQUE_SLICES:
+            raise CalibrationError(
+                f"{known.sum()} slices with a torque are too few to calibrate on; record {_LEAST_TORQUE_SLICES} or more"
+            )
         differences = np.abs(frames[known])
         features = np.array(
             [

@@ -242,7 +242,7 @@ def left_out_blocks(n: int) -> Iterator[tuple[Rows, Rows]]:
 def later_origins(n: int) -> list[tuple[Rows, Rows]]:
     """Return pairs of (earlier, all later) parts of n rows, from six tenths of the time on: what is yet to come.
 
-    None where the first has fewer rows than tell how good this calibration is.
+    There are none where the first has fewer rows than tell how good this calibration is.
     """
     first = round(FIRST_ORIGIN * n)
     if first < LEAST_BEFORE_ORIGIN:

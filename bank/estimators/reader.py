@@ -98,7 +98,6 @@ def fit_reader(
     *,
     strengths: tuple[float, ...] = STRENGTHS,
     limit_reach: bool = False,
-    edges: tuple[float, ...] = (),
     left_out: Sequence[tuple[Rows, Rows]] = (),
     difficulty: Difficulty | None = None,
 ) -> Reader:
@@ -132,8 +131,7 @@ def fit_reader(
     if difficulty is not None:
         hardness = np.concatenate([difficulty(past, future) for past, future in blocks])
     head = head_of(features, values, strength)
-    if isinstance(head, Censored):
-        edges = (-head.sigma, 0.0, 0.4 * float(np.abs(values).max()))
+    edges = (-head.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(head, Censored) else ()
     inflation = 1.0 if left_out or isinstance(head, Curve) else _INFLATION
     if left_out and difficulty is not None and isinstance(head, Curve):
         inflation = _CURVE_INFLATION

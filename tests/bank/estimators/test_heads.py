@@ -135,13 +135,13 @@ def test_a_curve_needs_enough_frames():
         Curve.fit(rng.normal(size=(4, 9)), np.array([1.0, 1.0, 2.0, 2.0]), 2, 1)
 
 
-@pytest.mark.parametrize("n", [8, 13, 49, 500])
+@pytest.mark.parametrize("n", [8, 13, 19, 20, 49, 500])
 def test_what_is_judged_comes_later_or_is_left_out(n):
     for past, future in [*later_splits(n), *later_origins(n)]:
         assert past.max() < future.min()
     assert all(future.max() == n - 1 for _, future in later_origins(n))
     assert len(later_origins(n)) <= 11
-    assert bool(later_origins(n)) == (n > 13)
+    assert bool(later_origins(n)) == (n >= 20)
     blocks = [block for _, block in left_out_blocks(n)]
     np.testing.assert_array_equal(np.concatenate(blocks), np.arange(n))
     assert all(not set(rest) & set(block) for rest, block in left_out_blocks(n))

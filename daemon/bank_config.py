@@ -22,16 +22,18 @@ Measure = Annotated[float, Field(gt=0, le=100)]
 
 
 class GridConfig(ConfigModel):
-    """`count` values from `low` to `high`, both included."""
+    """`count` values from `low` to `high`, both included; a single one where the two are the same."""
 
     low: Annotated[float, Field(ge=-1000, le=1000)]
     high: Annotated[float, Field(ge=-1000, le=1000)]
-    count: Annotated[int, Field(ge=2, le=2000)]
+    count: Annotated[int, Field(ge=1, le=2000)]
 
     @model_validator(mode="after")
     def _ascends(self) -> Self:
-        if self.low >= self.high:
+        if self.count > 1 and self.low >= self.high:
             raise ValueError(f"low must be below high, but low is {self.low:g} and high is {self.high:g}")
+        if self.count == 1 and self.low != self.high:
+            raise ValueError(f"a count of 1 needs low and high to be the same, not {self.low:g} and {self.high:g}")
         return self
 
     def values(self) -> NDArray[np.float64]:

@@ -1,10 +1,12 @@
 """A design follows from the noise: more noise, less model; and it finds the model that made the frames."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from bank.batch_forward import BatchForwardModel
 from bank.channels import CHANNELS
 from bank.design import ALLOWED, Choice, Scene, Step, _board_choices, designed
 from bank.errors import CalibrationError
@@ -42,9 +44,13 @@ def quiet(clean, fingertip):
     return designed(scene(clean, 2e-5), fingertip)
 
 
-def test_more_noise_asks_for_less_of_everything(clean, fingertip, quiet) -> None:
-    noisy = designed(scene(clean, 2e-4), fingertip)
-    assert noisy.relative_noise == pytest.approx(10 * quiet.relative_noise, rel=0.05)
+@pytest.fixture(scope="module")
+def noisy(clean, fingertip):
+    return designed(scene(clean, 6e-5), fingertip)
+
+
+def test_more_noise_asks_for_less_of_everything(quiet, noisy) -> None:
+    assert noisy.relative_noise == pytest.approx(3 * quiet.relative_noise, rel=0.05)
     assert noisy.mesh.chosen.setting > quiet.mesh.chosen.setting
     assert noisy.k_count.chosen.setting < quiet.k_count.chosen.setting
     assert noisy.rank.chosen.setting < quiet.rank.chosen.setting
@@ -57,11 +63,114 @@ def test_the_model_that_made_the_frames_is_the_one_that_they_support(quiet) -> N
     assert quiet.k_range[0] < PLACES[0][0] < PLACES[-1][0] < quiet.k_range[1]
 
 
-def test_every_choice_is_the_coarsest_that_adds_less_than_a_third_of_the_noise(quiet) -> None:
-    for choice in (quiet.mesh, quiet.k_count, quiet.sigma_count, quiet.rank, quiet.channels, quiet.injections):
-        before = choice.steps[: choice.steps.index(choice.chosen)]
-        assert all(step.added > ALLOWED for step in before)
-        assert choice.chosen.added <= ALLOWED or choice.chosen is choice.steps[-1]
+def left_over(frames: np.ndarray, signals: np.ndarray) -> np.ndarray:
+    """Return the (n,) relative errors of frames that the best multiple of the best signal leaves."""
+    units = signals / np.linalg.norm(signals, axis=1, keepdims=True)
+    cosine = (frames @ units.T).max(axis=1) / np.linalg.norm(frames, axis=1)
+    return np.asarray(np.sqrt(np.maximum(1.0 - cosine**2, 0.0)))
+
+
+@pytest.fixture(scope="module")
+def signals_at(fingertip):
+    """Return the magnitudes of places."""
+    forward = BatchForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh())
+
+    def solved(places: list[tuple[float, float]]) -> np.ndarray:
+        cells = [conductivity(forward.mesh, "gaussian_derivative", *place) for place in places]
+        found = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *cells]))
+        return np.abs(found[1:] - found[0])
+
+    return solved
+
+
+def before(choice: Choice) -> float:
+    """Return the setting before the chosen one."""
+    return choice.steps[choice.steps.index(choice.chosen) - 1].setting
+
+
+def test_a_bank_with_as_many_cells_as_chosen_misses_no_frame_by_more_than_a_third_of_the_noise(
+    quiet, signals_at
+) -> None:
+    """Frames between the cells are looked for in the whole bank: with fewer cells some are further off than that."""
+    ends = {"k": quiet.k_range, "sigma": quiet.sigma_range}
+    middle = {name: sum(one) / 2 for name, one in ends.items()}
+    for name, choice in (("k", quiet.k_count), ("sigma", quiet.sigma_count)):
+
+        def worst(count: float, name: str = name) -> float:
+            places = np.linspace(*ends[name], 2 * int(count) - 1)
+            found = signals_at([tuple((middle | {name: value}).values()) for value in places.tolist()])
+            return float(left_over(found[1::2], found[::2]).max()) / quiet.relative_noise
+
+        assert worst(choice.chosen.setting) <= 1.15 * ALLOWED
+        assert worst(before(choice)) > 0.85 * ALLOWED
+
+
+def test_the_mesh_is_within_a_third_of_the_noise_of_a_much_finer_one_and_the_one_before_is_not(
+    noisy, fingertip
+) -> None:
+    place = (sum(noisy.k_range) / 2, sum(noisy.sigma_range) / 2)
+
+    def signal(size: float) -> np.ndarray:
+        forward = ForwardModel(mesh := replace(fingertip, mesh_size_cm=size).mesh())
+        voltages = forward.voltages(conductivity(mesh, "gaussian_derivative", *place))
+        return np.abs(voltages - forward.homogeneous())[None]
+
+    truth = signal(0.03)
+    off = [float(left_over(truth, signal(size))[0]) for size in (noisy.mesh.chosen.setting, before(noisy.mesh))]
+    assert off[0] <= ALLOWED * noisy.relative_noise
+    # The finer one is not converged either, by a fifth of that.
+    assert off[1] > 0.8 * ALLOWED * noisy.relative_noise
+
+
+def test_so_many_directions_as_chosen_carry_places_that_they_were_not_made_from(quiet, signals_at) -> None:
+    rng = np.random.default_rng(8)
+    places = np.column_stack([rng.uniform(*ends, 600) for ends in (quiet.k_range, quiet.sigma_range)]).tolist()
+    signals = signals_at(places)
+    signals /= np.linalg.norm(signals, axis=1, keepdims=True)
+    known, frames = signals[:500], signals[500:]
+    vectors = np.linalg.eigh(known.T @ known)[1]
+
+    def off(rank: float) -> float:
+        basis = vectors[:, -int(rank) :]
+        return float(np.sqrt(((frames - frames @ basis @ basis.T) ** 2).sum(axis=1).mean())) / quiet.relative_noise
+
+    assert off(quiet.rank.chosen.setting) <= ALLOWED < off(before(quiet.rank))
+    stated = {step.setting: step.added for step in quiet.rank.steps}
+    for rank in (4, 8, 12, 16):
+        assert stated[rank] == pytest.approx(off(rank), rel=0.25)
+
+
+def test_injections_cost_what_generalised_least_squares_loses_without_them() -> None:
+    """By the true slope, drift and noise, and the whole covariance: nothing of it is known to the choice."""
+    rng = np.random.default_rng(6)
+    slope, other = 1e-3 * rng.normal(size=(2, 896)) * (1 + CHANNELS[:, 0] % 5)
+    drift = np.where(CHANNELS[:, 0] % 2 == 0, 2 * slope, 0.2 * slope) + other
+    torque, shift = rng.normal(size=(2, 1500))
+    frames = 0.1 + np.outer(torque, slope) + np.outer(shift, drift) + rng.normal(0, 3e-3, (1500, 896))
+    _, injections = _board_choices(Scene(frames, 3e-3, torque))
+
+    def spread(taken: list[int]) -> float:
+        rows = np.isin(CHANNELS[:, 0], taken)
+        covariance = 9e-6 * np.eye(int(rows.sum())) + np.outer(drift[rows], drift[rows])
+        return float((slope[rows] @ np.linalg.solve(covariance, slope[rows])) ** -0.5)
+
+    for step in injections.steps[3::7]:
+        taken = [int(one) for one in step.cost.split("injections ")[1].split(", ")]
+        expected = np.sqrt((spread(taken) / spread(list(range(32)))) ** 2 - 1)
+        assert step.added == pytest.approx(expected, rel=0.1, abs=0.01)
+
+
+def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip) -> None:
+    mesh = replace(fingertip, mesh_size_cm=0.2).mesh()
+    forward = ForwardModel(mesh)
+    cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 10).tolist()]
+    frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+    design = designed(scene(frames, 4e-4), fingertip)
+    assert design.model == "step"
+    assert design.sigma_count.chosen.setting == 1
+    assert design.sigma_count.enough
+    assert design.sigma_range[0] == design.sigma_range[1]
+    assert design.k_count.chosen.setting > 1
 
 
 def test_all_injections_lose_nothing_and_half_of_them_are_twice_as_fast(quiet) -> None:
@@ -87,6 +196,15 @@ def test_a_choice_that_nothing_is_good_enough_for_says_so() -> None:
     assert not choice.enough
     assert choice.chosen.setting == 0.1
     assert choice.next_step is None
+
+
+def test_what_is_good_enough_by_luck_is_not_chosen() -> None:
+    """A step falls between the nodes of one mesh as it should, and of the next finer one not."""
+    choice = Choice(
+        "mesh size", "cm", (Step(0.5, 3.0, ""), Step(0.2, 0.1, ""), Step(0.1, 0.5, ""), Step(0.05, 0.2, ""))
+    )
+    assert choice.chosen.setting == 0.05
+    assert Choice("", "", choice.steps[:3]).chosen.setting == 0.1
 
 
 def test_too_few_frames_are_refused(clean) -> None:

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 
 from bank.bank_file import Bank
-from daemon.bank_config import load_bank_plan
+from bank.build import build_bank
+from bank.design import Scene, designed
+from bank.estimators.physics import NOT_TURNED, NearestCell
+from bank.forward import ForwardModel
+from bank.models import conductivity
+from daemon.bank_config import FingertipConfig, load_bank_plan, load_geometry
 from daemon.cli import main
+from daemon.config_file import load_yaml_model
+from daemon.reproduce.banks import OWN_FINGERTIP
+from daemon.scene import design_yaml
 
 
 @pytest.fixture(scope="session")
@@ -30,6 +38,23 @@ def test_a_design_is_a_configuration_that_builds(built: Path) -> None:
     bank = Bank.open(built / "scene.bank")
     np.testing.assert_array_equal(bank.k_grid, plan.k_grid)
     assert bank.valid.any()
+
+
+def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Path) -> None:
+    mesh = load_geometry(OWN_FINGERTIP)
+    forward = ForwardModel(mesh)
+    cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
+    frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+    frames += np.random.default_rng(0).normal(0.0, 4e-4, frames.shape)
+    design = designed(Scene(frames, 4e-4, None), load_yaml_model(OWN_FINGERTIP, FingertipConfig).fingertip())
+    config = tmp_path / "step.yaml"
+    config.write_text(design_yaml(design, OWN_FINGERTIP, tmp_path))
+    plan = load_bank_plan(config)
+    assert plan.model == "step"
+    assert len(plan.sigma_grid) == 1
+    build_bank(plan.mesh, plan.model, plan.k_grid, plan.sigma_grid, tmp_path / "step.bank")
+    place = NearestCell(Bank.open(tmp_path / "step.bank"), NOT_TURNED).locate(frames[4])
+    assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.k_grid)[0]
 
 
 def test_a_recording_that_is_none_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -92,7 +92,7 @@ class Daemon:
                 config,
                 self.publisher,
                 self._clock,
-                _sources(config),
+                _sources(config, estimators, both),
                 self._tare_to_the_end,
                 self.supervisor.deaths,
                 self._tap,
@@ -301,15 +301,22 @@ class Daemon:
         return " ".join(filter(None, await asyncio.gather(*tares)))
 
 
-def _sources(config: DaemonConfig) -> dict[str, Source]:
+def _sources(
+    config: DaemonConfig, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None
+) -> dict[str, Source]:
     """Return how often each sensor's torque comes; the mean of several frames speaks of a longer time."""
     sources = {
-        name: Source(name=name, period_s=own.frame_period_s, window_s=own.frame_period_s * own.average_frames)
+        name: Source(
+            name=name,
+            period_s=own.frame_period_s,
+            window_s=own.frame_period_s * own.average_frames,
+            measures_torque=estimators[name].measures_torque,
+        )
         for name, own in config.fingertips.items()
     }
-    if config.both is not None:
+    if both is not None:
         period_s = max(own.frame_period_s for own in config.fingertips.values())
-        sources[BOTH] = Source(name=BOTH, period_s=period_s, window_s=period_s)
+        sources[BOTH] = Source(name=BOTH, period_s=period_s, window_s=period_s, measures_torque=both.measures_torque)
     skin = skin_source(config.skin) if config.skin is not None else None
     return sources if skin is None else {**sources, skin.name: skin}
 

@@ -155,6 +155,11 @@ class Estimator:
         return self._matcher.k_grid, self._matcher.sigma_grid
 
     @property
+    def measures_torque(self) -> bool:
+        """Whether a torque can be read from its frames at all."""
+        return self._calibration is not None and self._calibration.torque_fit is not None
+
+    @property
     def baseline_complete(self) -> bool:
         """Whether the homogeneous frame has been taken."""
         return self._baseline.complete

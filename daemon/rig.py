@@ -90,7 +90,7 @@ def make_brain(
     required: tuple[str, ...],
     creep: Mapping[str, Creep] = MappingProxyType({}),
 ) -> Brain:
-    """Return the brain for these torques; every one of them may drive."""
+    """Return the brain for these torques; every one of them may drive that is measured at all."""
     tune = TuneSettings(
         allowed_noise_nm=config.allowed_noise_nm,
         kp=config.kp,
@@ -104,7 +104,8 @@ def make_brain(
         actuation_s=config.actuation_s,
         required=RequiredMargins(gain=config.gain_margin, phase_deg=config.phase_margin_deg),
     )
-    wrists = {name: Wrist(source, settings, partial(tuned, tune)) for name, source in sources.items()}
+    measured = {name: source for name, source in sources.items() if source.measures_torque}
+    wrists = {name: Wrist(source, settings, partial(tuned, tune)) for name, source in measured.items()}
     watch = WatchSettings(
         disagreement_nm=config.disagreement_nm, jump_nm=config.jump_nm, freshness_s=config.freshness_s
     )

@@ -36,6 +36,8 @@ class TrackedEstimator:
         """Begin a session; raises CalibrationError for a bank that is needed and missing, or another one."""
         self.sides = calibration.sides
         self.name = calibration.estimator
+        # One of diameters alone does not.
+        self.measures_torque = calibration.torque is not None
         self.model = scoring.model if scoring is not None else ""
         self._tracker = Tracker(calibration, bank)
         self._scoring = scoring

@@ -64,7 +64,9 @@ class Source:
     """A torque that can drive or supervise: how often it comes, and over what time it averages.
 
     `sticks` where friction hides it within a band: then it says nothing while the wrist turns through the band.
-    `of_the_arm` where it comes with the arm's state, whose age is watched already.
+    `of_the_arm` where it comes with the arm's state, whose age is watched already. `measures_torque` is false where
+    nothing makes a torque of what it measures, as of a fingertip without a calibration: that it is silent is told all
+    the same.
     """
 
     name: str
@@ -72,6 +74,7 @@ class Source:
     window_s: float = 0.0
     sticks: bool = False
     of_the_arm: bool = False
+    measures_torque: bool = True
 
 
 @dataclass(slots=True)

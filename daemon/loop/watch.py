@@ -45,7 +45,7 @@ def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: in
     """Yield everything that is wrong at t_ns, in the order of the table."""
     if watched.torque_needed:
         yield from _torque(senses, watched, settings, t_ns)
-    yield from _limits(senses, watched, t_ns)
+    yield from _limits(senses, watched, settings, t_ns)
     yield from _arm_and_hand(senses, watched, t_ns)
     for name, why in senses.lost.items():
         if name in watched.required:
@@ -62,14 +62,14 @@ def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: in
 
 def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
     source = watched.driving
+    for other in watched.supervising:
+        # The wrench comes with the arm's state, which is watched by itself.
+        if not other.of_the_arm:
+            yield from _unusable(senses, other, settings, t_ns)
+    driving = list(_unusable(senses, source, settings, t_ns))
+    yield from driving
     latest = senses.torques.get(source.name)
-    for each in (source, *(other for other in watched.supervising if not other.of_the_arm)):
-        if why := _not_fresh(senses, each, settings, t_ns):
-            yield Trouble(Event.ESTIMATE_STALE, why)
-    if latest is None or _not_fresh(senses, source, settings, t_ns):
-        return
-    if latest.torque_nm is None:
-        yield Trouble(Event.ESTIMATE_INVALID, f"{source.name} says: {latest.why or 'nothing'}")
+    if driving or latest is None or latest.torque_nm is None:
         return
     if watched.expected_nm is not None and abs(latest.torque_nm - watched.expected_nm) > settings.jump_nm:
         yield Trouble(
@@ -77,7 +77,17 @@ def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int
             f"{source.name} says {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was to be expected",
         )
     for other in watched.supervising:
-        yield from _disagreement(senses, source, other, settings.disagreement_nm, t_ns)
+        yield from _disagreement(senses, source, other, settings, t_ns)
+
+
+def _unusable(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
+    """Yield why a source says nothing about the torque of now: it is silent, late or gone, or what it says is void."""
+    if why := _not_fresh(senses, source, settings, t_ns):
+        yield Trouble(Event.ESTIMATE_STALE, why)
+        return
+    latest = senses.torques[source.name]
+    if latest.torque_nm is None and source.measures_torque:
+        yield Trouble(Event.ESTIMATE_INVALID, f"{source.name} says: {latest.why or 'nothing'}")
 
 
 def _not_fresh(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> str:
@@ -87,41 +97,50 @@ def _not_fresh(senses: Senses, source: Source, settings: WatchSettings, t_ns: in
     latest = senses.torques.get(source.name)
     if latest is None:
         return f"{source.name} has not measured anything yet"
-    age_s = (t_ns - latest.t_ns) / 1e9
-    allowed_s = max(STALE_AFTER_PERIODS * source.period_s, settings.freshness_s)
-    if age_s > allowed_s:
-        return f"the last torque of {source.name} came {age_s:.1f} s ago, {allowed_s:.1f} s are allowed"
+    came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
+    allowed_s = _fresh_for_s(source, settings)
+    if came_s > allowed_s:
+        return f"the last torque of {source.name} came {came_s:.1f} s ago, {allowed_s:.1f} s are allowed"
+    # What belongs to the middle of an acquisition is half of it old when that ends. The rest is for its way here: a
+    # board or an estimator that runs ever later sends in time, and of a past that is over.
+    oldest_s = allowed_s + 0.5 * max(source.window_s, source.period_s)
+    if measured_s > oldest_s:
+        return (
+            f"the last torque of {source.name} was measured {measured_s:.1f} s ago, {oldest_s:.1f} s are allowed; "
+            f"it took {measured_s - came_s:.1f} s to come"
+        )
     return ""
 
 
-def _disagreement(senses: Senses, one: Source, other: Source, allowed_nm: float, t_ns: int) -> Iterator[Trouble]:
+def _fresh_for_s(source: Source, settings: WatchSettings) -> float:
+    """Return how long a torque of a source speaks of the present after it has come."""
+    return max(STALE_AFTER_PERIODS * source.period_s, settings.freshness_s)
+
+
+def _disagreement(senses: Senses, one: Source, other: Source, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
     """Compare two torques at the time of the slower one's latest frame, over its own window."""
     slow, fast = sorted((one, other), key=lambda source: source.period_s, reverse=True)
     latest = senses.torques.get(slow.name)
-    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > STALE_AFTER_PERIODS * slow.period_s * 1e9:
+    if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > _fresh_for_s(slow, settings) * 1e9:
         return
     half_ns = round(max(slow.window_s, fast.period_s) * 0.5e9)
     beside_nm = senses.mean_torque_nm(fast.name, latest.t_mid_ns - half_ns, latest.t_mid_ns + half_ns)
     if beside_nm is None:
         return
     apart_nm = abs(latest.torque_nm - beside_nm)
-    if apart_nm > allowed_nm:
+    if apart_nm > settings.disagreement_nm:
         yield Trouble(
             Event.TORQUES_DISAGREE,
             f"{slow.name} says {latest.torque_nm:+.3f} N·m and {fast.name} {beside_nm:+.3f} N·m, "
-            f"{apart_nm:.3f} N·m apart where {allowed_nm:g} are allowed",
+            f"{apart_nm:.3f} N·m apart where {settings.disagreement_nm:g} are allowed",
         )
 
 
-def _limits(senses: Senses, watched: Watched, t_ns: int) -> Iterator[Trouble]:
+def _limits(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
     limit_nm, limit_rad = watched.limits.torque_nm, watched.limits.angle_rad
     for source in (watched.driving, *watched.supervising):
         torque = senses.torques.get(source.name)
-        if (
-            torque is None
-            or torque.torque_nm is None
-            or t_ns - torque.t_ns > STALE_AFTER_PERIODS * source.period_s * 1e9
-        ):
+        if torque is None or torque.torque_nm is None or t_ns - torque.t_ns > _fresh_for_s(source, settings) * 1e9:
             continue
         if abs(torque.torque_nm) > limit_nm:
             yield Trouble(

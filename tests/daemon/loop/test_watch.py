@@ -1,0 +1,93 @@
+from dataclasses import replace
+
+import pytest
+
+from daemon.experiment.steps import Limits
+from daemon.loop.senses import Arm, Senses, Source, Torque
+from daemon.loop.watch import Watched, WatchSettings, troubles
+from daemon.safety import Event
+
+EIT = Source(name="right", period_s=0.5412, window_s=0.5412)
+LOAD = Source(name="load_cell", period_s=1 / 10.9)
+WRENCH = Source(name="wrench", period_s=0.04, of_the_arm=True)
+NOW_NS = 100_000_000_000
+
+
+def torque(
+    source: Source, torque_nm: float | None, *, came_s: float = 0.0, way_s: float = 0.0, why: str = ""
+) -> Torque:
+    """Return a torque that came so long ago, and took so long to come once its acquisition had ended."""
+    t_ns = NOW_NS - round(came_s * 1e9)
+    acquired_s = 0.5 * max(source.window_s, source.period_s)
+    return Torque(source.name, torque_nm, why, t_ns - round((acquired_s + way_s) * 1e9), t_ns)
+
+
+def found(
+    *torques: Torque, driving: Source = EIT, supervising: tuple[Source, ...] = (LOAD, WRENCH)
+) -> dict[Event, str]:
+    senses = Senses(arm=Arm(0.0, 0.0, NOW_NS))
+    for each in torques:
+        senses.hear(each)
+    watched = Watched(
+        driving=driving,
+        supervising=supervising,
+        limits=Limits(),
+        torque_needed=True,
+        gripped=True,
+        twisted_rad=0.0,
+    )
+    return {each.event: each.sentence for each in troubles(senses, watched, WatchSettings(), NOW_NS)}
+
+
+def test_nothing_is_wrong_while_all_torques_are_new_valid_and_alike() -> None:
+    assert found(torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, 0.1)) == {}
+
+
+def test_a_supervising_sensor_whose_torque_is_void_holds_the_wrist_and_says_why() -> None:
+    saturated = torque(LOAD, None, why="the reading is at the end of its range")
+    events = found(torque(EIT, 0.1), saturated)
+    assert set(events) == {Event.ESTIMATE_INVALID}
+    assert "load_cell says: the reading is at the end of its range" in events[Event.ESTIMATE_INVALID]
+
+
+def test_a_driving_sensor_whose_torque_is_void_is_named_too() -> None:
+    events = found(torque(EIT, None, why="no signal"), torque(LOAD, 0.1))
+    assert "right says: no signal" in events[Event.ESTIMATE_INVALID]
+
+
+def test_what_measures_no_torque_is_watched_for_silence_alone() -> None:
+    left = Source(name="left", period_s=0.5412, measures_torque=False)
+    heard = torque(EIT, 0.1), torque(LOAD, 0.1)
+    supervising = (LOAD, left)
+    assert found(*heard, torque(left, None, why="no calibration"), supervising=supervising) == {}
+    silent = found(*heard, torque(left, None, came_s=2.0), supervising=supervising)
+    assert "the last torque of left came 2.0 s ago" in silent[Event.ESTIMATE_STALE]
+
+
+def test_the_wrench_is_watched_with_the_state_that_it_comes_with() -> None:
+    assert found(torque(EIT, 0.1), torque(LOAD, 0.1), torque(WRENCH, None)) == {}
+
+
+@pytest.mark.parametrize("source", [EIT, LOAD])
+def test_a_torque_that_comes_in_time_but_is_of_long_ago_is_stale(source: Source) -> None:
+    """As from an estimator that has fallen behind: eight frames wait for it, and one comes in each period."""
+    fresh = {one.name: torque(one, 0.1) for one in (EIT, LOAD)}
+    late = torque(source, 0.1, way_s=8 * source.period_s)
+    events = found(*{**fresh, source.name: late}.values())
+    assert events.keys() == {Event.ESTIMATE_STALE}
+    assert f"the last torque of {source.name} was measured" in events[Event.ESTIMATE_STALE]
+    assert f"it took {8.5 * source.period_s:.1f} s to come" in events[Event.ESTIMATE_STALE]
+
+
+@pytest.mark.parametrize("source", [EIT, LOAD, replace(EIT, window_s=5 * EIT.period_s)])
+def test_a_frame_that_is_missed_and_a_mean_of_several_are_borne(source: Source) -> None:
+    """Half an acquisition, a tenth of a period on the way, and two periods since: one frame was missed."""
+    patient = torque(source, 0.1, came_s=2.0 * source.period_s, way_s=0.1 * source.period_s)
+    assert found(patient, driving=source, supervising=()) == {}
+
+
+def test_a_torque_that_counts_as_new_is_held_against_its_limit() -> None:
+    """Beyond 2.5 of its short periods, and younger than `freshness_s`."""
+    quick = replace(LOAD, period_s=0.005)
+    beyond = torque(quick, 0.9, came_s=0.05)
+    assert found(beyond, driving=quick, supervising=()).keys() == {Event.TORQUE_LIMIT}

@@ -1,7 +1,6 @@
 """The task that closes the loop: the robot's states in, the brain's orders out, 125 times a second."""
 
 import asyncio
-import math
 from collections.abc import Awaitable, Callable, Mapping
 
 import numpy as np
@@ -10,14 +9,15 @@ import structlog
 from daemon.clock import Clock
 from daemon.experiment.machine import Experiment
 from daemon.experiment.steps import ExperimentFile
-from daemon.experiment.wishes import Action, GripTo, MoveTo, TakeZero
 from daemon.gripper_task import GripperTask
 from daemon.loop.brain import Brain, Orders
 from daemon.loop.senses import Arm, Source, Torque
+from daemon.loop_actions import DeviceActions
 from daemon.messages import LoopState, RobotStateMessage, Scalar
 from daemon.publisher import Publisher
+from daemon.supervisor import LONGEST_ERROR
 from drivers.ur.client import UrRobot
-from drivers.ur.messages import Enable, MoveLinear, Reply, RobotState, Stop, Unlock, WristSpeed, ZeroForceTorque
+from drivers.ur.messages import Enable, Reply, RobotState, Stop, Unlock, WristSpeed
 
 WRENCH = "wrench"
 WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04, of_the_arm=True)
@@ -25,13 +25,12 @@ WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04, of_the_arm=True)
 LONGEST_TICK_S = 0.02
 # Every fifth state is published, and speaks as the torque of the wrench: 25 of 125 a second.
 PUBLISH_EVERY = 5
-LINEAR_ACCELERATION_M_PER_S2 = 0.3
 # Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
 # take the first one's place.
 MOST_UNANSWERED = 1
 LOOP_STATE_PERIOD_S = 1.0
-# A wrist that was told to stand rests within this time, or something else moves the arm.
-COMES_TO_REST_S = 2.0
+# A loop that died tells the arm to stop, and waits no longer than this for the answer.
+BRAKE_S = 0.5
 
 
 class LoopTask:
@@ -52,14 +51,16 @@ class LoopTask:
         self._brain = brain
         self._robot = robot
         self._gripper = gripper
-        self._take_zero = take_zero
         self._publisher = publisher
         self._clock = clock
         self._died = died
         self._acceleration_rad_per_s2 = acceleration_rad_per_s2
         self._states = 0
         self._unanswered: set[asyncio.Task[None]] = set()
+        self._actions = DeviceActions(robot, gripper, take_zero, lambda: bool(self._sent_rad_per_s or self._unanswered))
         self._action: asyncio.Task[None] | None = None
+        # What the loop, or a command of it, died of since the brain was told last.
+        self._own_death = ""
         self._sent_rad_per_s = 0.0
         self._stopped = True
         self._told: tuple[object, ...] = ()
@@ -67,25 +68,35 @@ class LoopTask:
         self._news = asyncio.Condition()
 
     async def drive(self) -> None:
-        """Ask the brain and carry out what it says, until cancelled; the robot stands still afterwards."""
+        """Ask the brain and carry out what it says, until cancelled; the robot stands still afterwards.
+
+        Where something unexpected ends it, the arm is told to stop; begun again, it stops the experiment.
+        """
         try:
             while True:
                 began_ns = self._clock.now_ns()
                 state = await self._next_state()
                 now_ns = self._clock.now_ns()
                 self._brain.senses.late_s = max(0.0, (now_ns - began_ns) / 1e9 - LONGEST_TICK_S)
-                self._brain.senses.died = dict(self._died())
+                self._brain.senses.died = self._deaths()
                 if state is not None:
                     self._sense(state)
                     if self._nothing_to_decide():
                         continue
                 self._carry_out(self._brain.tick(now_ns))
                 await self._tell(now_ns)
+        except Exception as error:
+            self._own_death = _said(error)
+            await self._brake()
+            raise
         finally:
             await self._end()
 
     async def start(self, file: ExperimentFile) -> str | None:
         """Begin an experiment, or return why it cannot be begun."""
+        if self._running():
+            # What stopped the arm of the experiment that runs is not to be forgiven by the way.
+            return self._brain.start(file, self._clock.now_ns())
         reply = await self._robot.send(Enable())
         if not reply.accepted:
             return reply.refused
@@ -150,9 +161,18 @@ class LoopTask:
 
         Then it is asked as often as states are published.
         """
+        return self._stopped and not self._running() and self._states % PUBLISH_EVERY != 0
+
+    def _running(self) -> bool:
         experiment = self._brain.experiment
-        running = experiment is not None and experiment.running
-        return self._stopped and not running and self._states % PUBLISH_EVERY != 0
+        return experiment is not None and experiment.running
+
+    def _deaths(self) -> dict[str, str]:
+        """Return what each dead task died of, and what the loop itself did; that, once."""
+        died = dict(self._died())
+        if self._own_death:
+            died["loop"], self._own_death = self._own_death, ""
+        return died
 
     def _carry_out(self, orders: Orders) -> None:
         if orders.stop:
@@ -161,11 +181,15 @@ class LoopTask:
                 self._cancel_action()
                 self._send(Stop(self._acceleration_rad_per_s2))
             if orders.release and self._gripper is not None:
-                self._begin(self._gripper.release())
+                self._begin(self._gripper.release(), self._released)
             return
         self._stopped = False
+        if not orders.hold:
+            self._actions.let_go()
+        elif self._actions.hold_back():
+            self._send(Stop(self._acceleration_rad_per_s2))
         if orders.begin is not None:
-            self._begin(self._performed(orders.begin))
+            self._begin(self._actions.perform(orders.begin), self._brain.action_ended)
         speed = orders.wrist_rad_per_s
         if speed == 0.0 and self._sent_rad_per_s == 0.0:
             return
@@ -174,8 +198,11 @@ class LoopTask:
 
     def _send(self, command: WristSpeed | Stop) -> None:
         async def sent() -> None:
-            reply = await self._robot.send(command)
-            self._answered(reply)
+            try:
+                self._answered(await self._robot.send(command))
+            except Exception as error:  # noqa: BLE001 - told by the next tick, which ends the experiment
+                structlog.get_logger().exception("a command to the robot died", command=repr(command))
+                self._own_death = _said(error)
 
         task = asyncio.create_task(sent(), name="robot command")
         self._unanswered.add(task)
@@ -187,68 +214,28 @@ class LoopTask:
         self._sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
         self._brain.sent(self._sent_rad_per_s)
 
-    def _begin(self, action: Awaitable[str]) -> None:
-        """Carry an action out beside the loop; how it ended is told to the brain."""
+    def _begin(self, action: Awaitable[str], tell: Callable[[str], None]) -> None:
+        """Carry an action out beside the loop; `tell` hears why it went wrong, or an empty text."""
         self._cancel_action()
 
         async def carried_out() -> None:
-            self._brain.action_ended(await action)
+            try:
+                failure = await action
+            except Exception as error:  # noqa: BLE001 - the step has failed, whatever of
+                structlog.get_logger().exception("an action of the devices died")
+                failure = f"it died of {_said(error)}; the log has more"
+            tell(failure)
 
         self._action = asyncio.create_task(carried_out(), name="action")
+
+    def _released(self, failure: str) -> None:
+        if failure:
+            structlog.get_logger().error("the gripper was told to open and did not", why=failure)
+        self._brain.release_ended(failure)
 
     def _cancel_action(self) -> None:
         if self._action is not None:
             self._action.cancel()
-
-    async def _performed(self, action: Action) -> str:
-        match action:
-            case MoveTo():
-                return await self._move(action)
-            case GripTo():
-                if self._gripper is None:
-                    return "no gripper is configured; add a `gripper` section to the configuration"
-                return await self._gripper.grip(action)
-            case TakeZero():
-                return await self._zero()
-            case _:
-                raise TypeError(f"{action} is not carried out by devices")
-
-    async def _rest(self) -> str:
-        """Wait until the wrist has come to rest after the step before; return why it did not, or an empty text."""
-        try:
-            async with asyncio.timeout(COMES_TO_REST_S):
-                state = await self._robot.next_state()
-                while self._sent_rad_per_s or self._unanswered or not state.rests:
-                    state = await self._robot.next_state()
-        except TimeoutError:
-            return f"the arm did not come to rest within {COMES_TO_REST_S:g} s; see what moves it"
-        return ""
-
-    async def _zero(self) -> str:
-        if why := await self._rest():
-            return why
-        reply = await self._robot.send(ZeroForceTorque())
-        return reply.refused if not reply.accepted else await self._take_zero()
-
-    async def _move(self, action: MoveTo) -> str:
-        if why := await self._rest():
-            return why
-        here = self._robot.state
-        if here is None:
-            return "the robot is not connected"
-        pose = action.pose_m_rad or along_tool(here.tcp_pose, action.along_tool_m)
-        x, y, z, rx, ry, rz = pose
-        command = MoveLinear((x, y, z, rx, ry, rz), action.speed_m_per_s, LINEAR_ACCELERATION_M_PER_S2)
-        before = here.motion_id
-        reply = await self._robot.send(command)
-        if not reply.accepted:
-            return reply.refused
-        for why in reply.clipped:
-            structlog.get_logger().warning("the move was clipped", why=why)
-        while True:
-            state = await self._robot.next_state()
-            if state.motion_id != before and state.ended:
-                return "" if state.ended == "arrived" else f"the move ended early: {state.ended}"
 
     async def _tell(self, now_ns: int) -> None:
         standing, experiment = self._brain.standing, self._brain.experiment
@@ -306,6 +293,15 @@ class LoopTask:
             reasons=" ".join((*standing.verdict.reasons, *standing.turn.reasons)),
         )
 
+    async def _brake(self) -> None:
+        """Tell the arm to stop, whatever it does: nobody renews a wrist's speed now, but a straight move would end."""
+        self._stopped = False
+        try:
+            async with asyncio.timeout(BRAKE_S):
+                await self._robot.send(Stop(self._acceleration_rad_per_s2))
+        except Exception:  # noqa: BLE001 - what the loop died of is raised again
+            structlog.get_logger().exception("the arm could not be told to stop")
+
     async def _end(self) -> None:
         self._cancel_action()
         tasks = [task for task in (*self._unanswered, self._action) if task is not None]
@@ -314,15 +310,8 @@ class LoopTask:
         await asyncio.gather(*tasks, return_exceptions=True)
 
 
-def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:
-    """Return the pose (x, y, z in m, rotation vector in rad) that lies so far along the tool's axis."""
-    x, y, z, *turned = pose
-    # Rodrigues' formula for (0, 0, 1); scipy's rotations would lengthen the daemon's start by a tenth of a second.
-    angle_rad = math.hypot(*turned)
-    u, v, w = (part / angle_rad for part in turned) if angle_rad > 0 else (0.0, 0.0, 1.0)
-    sine, rest = math.sin(angle_rad), 1.0 - math.cos(angle_rad)
-    dx, dy, dz = v * sine + u * w * rest, -u * sine + v * w * rest, 1.0 - (u * u + v * v) * rest
-    return (x + dx * distance_m, y + dy * distance_m, z + dz * distance_m, *turned)
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"[:LONGEST_ERROR]
 
 
 def _message(state: RobotState) -> RobotStateMessage:

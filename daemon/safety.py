@@ -32,6 +32,7 @@ class Event(Enum):
     EMERGENCY_STOP = "emergency stop"
     GRIPPER_FAULT = "gripper fault"
     GRIP_LOST = "grip lost"
+    NOT_RELEASED = "not released"
     STATE_STALE = "state stale"
     DEVICE_LOST = "device lost"
     TASK_DIED = "task died"
@@ -107,6 +108,11 @@ TABLE: Mapping[Event, Rule] = {
         _KEEP,
         "the gripper no longer holds an object: {detail}.",
         "Put the tool back and start the experiment again.",
+    ),
+    Event.NOT_RELEASED: Rule(
+        _KEEP,
+        "the gripper was told to open and did not, the tool is still gripped: {detail}.",
+        "Open it by hand and clear what it names, then `shearloop command unlock`.",
     ),
     Event.STATE_STALE: Rule(
         _HOLD,

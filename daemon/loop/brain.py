@@ -24,7 +24,7 @@ from daemon.experiment.wishes import (
     Wish,
 )
 from daemon.loop.senses import Senses, Source, Torque
-from daemon.loop.watch import Watched, WatchSettings, troubles
+from daemon.loop.watch import Watched, WatchSettings, compared_for_s, troubles
 from daemon.loop.wrist import Wrist, WristTurn
 from daemon.safety import Event, Response, SafetyGate, Trouble, Verdict
 
@@ -34,10 +34,14 @@ NO_LIMITS = Limits()
 
 @dataclass(frozen=True, slots=True)
 class Orders:
-    """What is to be told to the devices now; `begin` and `release` are for this tick alone."""
+    """What is to be told to the devices now; `begin` and `release` are for this tick alone.
+
+    `hold` is not the end as `stop` is: whatever moves the arm brakes, and goes on afterwards.
+    """
 
     wrist_rad_per_s: float = 0.0
     stop: bool = False
+    hold: bool = False
     begin: Action | None = None
     release: bool = False
 
@@ -67,7 +71,7 @@ class Brain:
 
         `creep` tells of the sources that see a gel's shear and not its torque.
         """
-        self.senses = Senses()
+        self.senses = Senses(kept_s=compared_for_s(supervisors.values(), watch))
         self.gate = SafetyGate()
         self.experiment: Experiment | None = None
         self.standing = Standing("idle", "", WristTurn(), Verdict(Response.NOTE))
@@ -84,6 +88,8 @@ class Brain:
         # Whether a tool is meant to be between the fingers.
         self._grips = False
         self._released = False
+        # Why the gripper did not open when a stop asked for it, until the operator has seen to it.
+        self._unreleased = ""
         self._notes: list[Trouble] = []
 
     def hear(self, torque: Torque) -> None:
@@ -142,6 +148,7 @@ class Brain:
 
     def acknowledge(self) -> None:
         """Let a stop go, on the operator's word."""
+        self._unreleased = ""
         self.gate.acknowledge()
 
     def note_refusal(self, sentence: str) -> None:
@@ -162,6 +169,10 @@ class Brain:
             case _:
                 pass
 
+    def release_ended(self, failure: str = "") -> None:
+        """Tell that the gripper has opened after a stop, or why it has not."""
+        self._unreleased = failure
+
     def sent(self, wrist_rad_per_s: float) -> None:
         """Tell what wrist speed was really sent, after all clipping."""
         if self.experiment is not None:
@@ -174,6 +185,8 @@ class Brain:
         drive = experiment.file.drive if experiment is not None else next(iter(self._wrists))
         found = [*self._troubles(limits, drive, t_ns), *self._notes]
         self._notes.clear()
+        if self._unreleased:
+            found.append(Trouble(Event.NOT_RELEASED, self._unreleased))
         if experiment is None or not experiment.running:
             # Nothing moves: what is wrong is told, and only what stopped an experiment waits for the operator.
             return self._ended(self.gate.look(found))
@@ -218,13 +231,14 @@ class Brain:
         self._wish = experiment.wish
         if not experiment.running:
             return self._ended(verdict)
-        begin = self._begin(experiment, t_ns, wrist_rad)
+        still = held or experiment.phase is Phase.PAUSED
+        begin = None if still else self._begin(experiment, t_ns, wrist_rad)
         if not experiment.running:
             return self._ended(verdict)
-        turn = self._turn(t_ns, wrist_rad, still=held or experiment.phase is Phase.PAUSED)
+        turn = self._turn(t_ns, wrist_rad, still=still)
         phase = "held" if held else experiment.phase.value
         self.standing = Standing(phase, experiment.progress().doing, turn, verdict)
-        return Orders(turn.speed_rad_per_s, begin=begin)
+        return Orders(turn.speed_rad_per_s, hold=still, begin=begin)
 
     def _begin(self, experiment: Experiment, t_ns: int, wrist_rad: float) -> Action | None:
         """Begin what the wish asks for the first time: an action of the devices, an identification, a closed loop."""

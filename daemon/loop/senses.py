@@ -1,11 +1,8 @@
 """The latest of everything that the loop goes by, with the times that say how old it is. Values only."""
 
 import math
-from collections import deque
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
-
-# Torques kept of each source: more than two periods of the slowest at the rate of the fastest.
-MOST_RECENT = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,12 +75,36 @@ class Source:
 
 
 @dataclass(slots=True)
-class Senses:
-    """The latest values. `lost` and `died` map a device or task to a sentence while it is gone."""
+class _Recent:
+    """The valid torques of one source, in order of the time that they belong to."""
 
+    t_mid_ns: list[int] = field(default_factory=list)
+    torque_nm: list[float] = field(default_factory=list)
+
+    def add(self, t_mid_ns: int, torque_nm: float, kept_ns: int) -> None:
+        """Append one; those before `kept_ns` are forgotten when they are as many as the others, which is cheap."""
+        self.t_mid_ns.append(t_mid_ns)
+        self.torque_nm.append(torque_nm)
+        if self.t_mid_ns[0] < t_mid_ns - 2 * kept_ns:
+            old = bisect_left(self.t_mid_ns, t_mid_ns - kept_ns)
+            del self.t_mid_ns[:old], self.torque_nm[:old]
+
+    def mean(self, from_ns: int, to_ns: int) -> float | None:
+        """Return the mean of those between two times, ends included; None where there is none."""
+        first, end = bisect_left(self.t_mid_ns, from_ns), bisect_right(self.t_mid_ns, to_ns)
+        return sum(self.torque_nm[first:end]) / (end - first) if end > first else None
+
+
+@dataclass(slots=True)
+class Senses:
+    """The latest values. `lost` and `died` map a device or task to a sentence while it is gone.
+
+    Valid torques are kept for `kept_s`, to compare two sources at the same time, whatever their rates.
+    """
+
+    kept_s: float = 10.0
     torques: dict[str, Torque] = field(default_factory=dict)
-    # The valid torques of the last seconds, to compare two sources at the same time.
-    recent: dict[str, deque[Torque]] = field(default_factory=dict)
+    recent: dict[str, _Recent] = field(default_factory=dict)
     arm: Arm | None = None
     hand: Hand | None = None
     lost: dict[str, str] = field(default_factory=dict)
@@ -98,13 +119,10 @@ class Senses:
             return
         self.torques[torque.source] = torque
         if torque.torque_nm is not None:
-            self.recent.setdefault(torque.source, deque(maxlen=MOST_RECENT)).append(torque)
+            recent = self.recent.setdefault(torque.source, _Recent())
+            recent.add(torque.t_mid_ns, torque.torque_nm, round(self.kept_s * 1e9))
 
     def mean_torque_nm(self, source: str, from_ns: int, to_ns: int) -> float | None:
         """Return the mean of a source's valid torques that belong to a time, or None where there is none."""
-        found = [
-            torque.torque_nm
-            for torque in self.recent.get(source, ())
-            if from_ns <= torque.t_mid_ns <= to_ns and torque.torque_nm is not None
-        ]
-        return sum(found) / len(found) if found else None
+        known = self.recent.get(source)
+        return None if known is None else known.mean(from_ns, to_ns)

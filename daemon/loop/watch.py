@@ -1,6 +1,6 @@
 """From what is sensed to what is wrong: the events of the safety table, with the numbers of this moment."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from daemon.experiment.steps import Limits
@@ -115,6 +115,11 @@ def _not_fresh(senses: Senses, source: Source, settings: WatchSettings, t_ns: in
 def _fresh_for_s(source: Source, settings: WatchSettings) -> float:
     """Return how long a torque of a source speaks of the present after it has come."""
     return max(STALE_AFTER_PERIODS * source.period_s, settings.freshness_s)
+
+
+def compared_for_s(sources: Iterable[Source], settings: WatchSettings) -> float:
+    """Return for how long torques are compared with others: the oldest that counts as new, with its acquisition."""
+    return max(_fresh_for_s(one, settings) + 2.0 * max(one.window_s, one.period_s) for one in sources)
 
 
 def _disagreement(senses: Senses, one: Source, other: Source, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:

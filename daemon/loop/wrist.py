@@ -13,6 +13,8 @@ from daemon.control.tuning import RequiredMargins, refusal
 from daemon.experiment.wishes import GoTo, MeasureTool, Still, Track, Turn, WristWish
 from daemon.loop.senses import Source, Torque
 
+# Torques that wait for an angle: while the wrist stands they may be many, and the latest say what has become of it.
+MOST_HEARD = 64
 # A loop that was away for longer than this does not know what it sent last.
 LONGEST_STEP_NS = 50_000_000
 
@@ -56,7 +58,7 @@ class Wrist:
         self._tracked: Track | None = None
         self._held = False
         # A torque that is newer than the latest angle waits for the next one: it is compared with the angle it had.
-        self._heard: list[Torque] = []
+        self._heard: deque[Torque] = deque(maxlen=MOST_HEARD)
         self._measuring: IdentifyStep | None = None
         # Speeds sent in the last `actuation_s`, each with when it was taken over and for how long it held.
         self._under_way: deque[tuple[int, float, float]] = deque()
@@ -189,6 +191,8 @@ class Wrist:
         return self._bounded(math.copysign(min(abs(wanted), speed_rad_per_s), missing_rad))
 
     def _bounded(self, speed_rad_per_s: float) -> WristTurn:
+        if not math.isfinite(speed_rad_per_s):
+            return WristTurn(0.0, ("no speed follows from what is not a number",))
         limit = self._settings.speed_limit_rad_per_s
         bounded = max(-limit, min(limit, speed_rad_per_s))
         if bounded == speed_rad_per_s:

@@ -1,8 +1,31 @@
+"""The loop's task over the real pilot, with an arm and a gripper of this process: what it does when things go wrong."""
+
+import asyncio
 import math
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Any
 
 import pytest
 
-from daemon.loop_task import along_tool
+from daemon.clock import Clock
+from daemon.experiment.machine import Phase
+from daemon.experiment.steps import ExperimentFile
+from daemon.experiment.wishes import GripTo
+from daemon.loop.brain import Brain
+from daemon.loop.senses import Hand, Torque
+from daemon.loop.tune import TuneSettings, tuned
+from daemon.loop.watch import WatchSettings
+from daemon.loop.wrist import Wrist, WristSettings
+from daemon.loop_actions import along_tool
+from daemon.loop_task import WRENCH, WRENCH_SOURCE, LoopTask
+from daemon.safety import Event
+from drivers.ur.client import UrRobot
+from drivers.ur.messages import Command, MoveLinear, Reply, RobotState, Stop, WristSpeed
+from tests.drivers.ur.test_pilot import CYCLE_NS, SETTINGS, Flight
+
+SPEED_M_PER_S = 0.1
 
 
 @pytest.mark.parametrize(
@@ -19,3 +42,283 @@ def test_along_the_tool_is_where_its_own_axis_points(
     x, y, z, *same = along_tool((0.4, -0.1, 0.3, *turned), 0.03)
     assert (x - 0.4, y + 0.1, z - 0.3) == pytest.approx(moved, abs=1e-12)
     assert tuple(same) == turned
+
+
+class Robot(UrRobot):
+    """The client with the pilot in the same process, and an arm that moves in straight lines too."""
+
+    def __init__(self) -> None:
+        super().__init__(SETTINGS)
+        self.flight = Flight()
+        self.commands: list[Command] = []
+        self.dies_of: Exception | None = None
+        self._goal: MoveLinear | None = None
+        self.flight.fly(5)
+
+    async def send(self, command: Command) -> Reply:
+        self.commands.append(command)
+        if self.dies_of is not None:
+            raise self.dies_of
+        await asyncio.sleep(0)
+        if isinstance(command, MoveLinear):
+            self._goal = command
+        return self.flight.ask(command)
+
+    def cycle(self) -> None:
+        """Let 8 ms pass, and tell who waits for the next state."""
+        arm = self.flight.arm
+        if arm.reading.moving_linearly and self._goal is not None:
+            step_m = SPEED_M_PER_S * CYCLE_NS / 1e9
+            z = arm.reading.tcp_pose[2]
+            missing_m = self._goal.pose[2] - z
+            z += math.copysign(min(step_m, abs(missing_m)), missing_m)
+            arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
+        arm.be(t_mono_ns=self.flight.now_ns)
+        self.flight.fly(1)
+        self.take(0, self.flight.state)
+
+    @property
+    def end_m(self) -> float:
+        assert self._goal is not None
+        return self._goal.pose[2]
+
+    @property
+    def z_m(self) -> float:
+        return self.flight.arm.reading.tcp_pose[2]
+
+
+class StepClock(Clock):
+    """The robot's time, which stands between its cycles."""
+
+    def __init__(self, flight: Flight) -> None:
+        super().__init__()
+        self._flight = flight
+
+    def now_ns(self) -> int:
+        return self._flight.now_ns
+
+
+class Gripper:
+    """A gripper's task as the loop knows it; `answers` is what it says, or raises."""
+
+    def __init__(self) -> None:
+        self.answers: str | Exception = ""
+
+    async def grip(self, _wish: GripTo) -> str:
+        if isinstance(self.answers, Exception):
+            raise self.answers
+        return self.answers
+
+    async def release(self) -> str:
+        return await self.grip(GripTo(140.0, 100.0, 10.0, expect_object=False))
+
+    async def unlock(self) -> str:
+        return ""
+
+
+class Published:
+    """What is published, as a list."""
+
+    def __init__(self) -> None:
+        self.messages: list[Any] = []
+
+    def publish(self, message: Any) -> None:
+        self.messages.append(message)
+
+    @property
+    def reasons(self) -> str:
+        return next(one.reasons for one in reversed(self.messages) if one.topic == "loop.state")
+
+
+class Cell:
+    """Robot, gripper and loop, whose time passes in `cycles`."""
+
+    def __init__(self) -> None:
+        self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
+        wrist = Wrist(WRENCH_SOURCE, WristSettings(), partial(tuned, TuneSettings()))
+        self.brain = Brain({WRENCH: wrist}, WatchSettings(), {WRENCH: WRENCH_SOURCE}, ("robot",))
+        self.died: Mapping[str, str] = {}
+
+        async def no_zero() -> str:
+            return ""
+
+        self.loop = LoopTask(
+            self.brain,
+            self.robot,
+            self.gripper,  # type: ignore[arg-type]
+            no_zero,
+            self.published,  # type: ignore[arg-type]
+            StepClock(self.robot.flight),
+            lambda: self.died,
+        )
+        self.task: asyncio.Task[None] | None = None
+
+    def drive(self) -> None:
+        self.task = asyncio.create_task(self.loop.drive())
+
+    async def cycles(self, count: int) -> None:
+        for _ in range(count):
+            self.brain.senses.hand = Hand(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
+            self.robot.cycle()
+            # A state is sensed, decided upon and answered within a few turns of the event loop.
+            for _ in range(8):
+                await asyncio.sleep(0)
+
+    async def start(self, *steps: Mapping[str, Any]) -> None:
+        file = ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": list(steps)})
+        starting = asyncio.create_task(self.loop.start(file))
+        while not starting.done():
+            await self.cycles(1)
+        assert starting.result() is None
+
+    async def until_ended(self, most: int = 500) -> None:
+        for _ in range(most):
+            await self.cycles(1)
+            if self.phase not in (Phase.RUNNING, Phase.PAUSED):
+                return
+        raise AssertionError("the experiment goes on and on")
+
+    @property
+    def phase(self) -> Phase:
+        assert self.brain.experiment is not None
+        return self.brain.experiment.phase
+
+    @property
+    def why(self) -> str:
+        assert self.brain.experiment is not None
+        return self.brain.experiment.why
+
+    @property
+    def state(self) -> RobotState:
+        return self.robot.flight.state
+
+
+@asynccontextmanager
+async def driven() -> AsyncIterator[Cell]:
+    cell = Cell()
+    cell.drive()
+    await cell.cycles(10)
+    try:
+        yield cell
+    finally:
+        assert cell.task is not None
+        cell.task.cancel()
+        await asyncio.gather(cell.task, return_exceptions=True)
+
+
+MOVE = {"do": "approach", "along_tool_m": 0.1, "speed_m_per_s": SPEED_M_PER_S}
+GRIP = {"do": "grip", "width_mm": 10.0}
+TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}
+
+
+async def test_an_action_that_dies_fails_its_step_and_is_told() -> None:
+    async with driven() as cell:
+        cell.gripper.answers = RuntimeError("no such register")
+        await cell.start(GRIP)
+        await cell.until_ended(50)
+        assert "step 1 (grip) failed: it died of RuntimeError: no such register" in cell.why
+
+
+@pytest.mark.parametrize("answer", ["the gripper does not answer", OSError("the gripper does not answer")])
+async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_operator_says_unlock(
+    answer: str | Exception,
+) -> None:
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        cell.gripper.answers = answer
+        now_ns = cell.robot.flight.now_ns
+        cell.brain.hear(Torque(WRENCH, 0.9, "", now_ns, now_ns))
+        await cell.until_ended(10)
+        await cell.cycles(50)
+        assert "the gripper was told to open and did not" in cell.published.reasons
+        assert "the gripper does not answer" in cell.published.reasons
+        assert "the torque is beyond its limit" in cell.published.reasons, "and why it was to open"
+        unlocking = asyncio.create_task(cell.loop.unlock())
+        await cell.cycles(30)
+        assert await unlocking is None
+        assert cell.published.reasons == ""
+
+
+async def test_a_command_that_dies_ends_the_experiment() -> None:
+    async with driven() as cell:
+        await cell.start(TWIST)
+        await cell.cycles(50)
+        assert cell.state.motion == "wrist"
+        cell.robot.dies_of = ValueError("not a float")
+        await cell.until_ended(10)
+        assert "loop: ValueError: not a float" in cell.why
+        cell.robot.dies_of = None
+        await cell.cycles(60)
+        assert cell.state.rests
+
+
+async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() -> None:
+    async with driven() as cell:
+        await cell.start(MOVE)
+        await cell.cycles(40)
+        end_m = cell.robot.end_m
+        assert cell.brain.pause() is None
+        await cell.cycles(5)
+        paused_m = cell.robot.z_m
+        assert abs(paused_m - end_m) > 0.05, "it is under way"
+        await cell.cycles(100)
+        assert cell.robot.z_m == paused_m, "it stands"
+        assert cell.phase is Phase.PAUSED
+        assert sum(isinstance(command, Stop) for command in cell.robot.commands[-20:]) == 1
+        assert cell.brain.resume() is None
+        await cell.until_ended()
+        assert cell.phase is Phase.DONE, cell.why
+        assert cell.robot.z_m == pytest.approx(end_m), "where it was to go from the start"
+
+
+async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> None:
+    async with driven() as cell:
+        starting = asyncio.create_task(
+            cell.loop.start(ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": [MOVE]}))
+        )
+        while not starting.done():
+            await cell.cycles(1)
+            cell.brain.pause()
+        await cell.cycles(50)
+        assert not any(isinstance(command, MoveLinear) for command in cell.robot.commands)
+        cell.brain.resume()
+        await cell.until_ended()
+        assert cell.phase is Phase.DONE, cell.why
+
+
+async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experiment(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with driven() as cell:
+        await cell.start(MOVE)
+        await cell.cycles(40)
+        assert cell.state.motion == "linear"
+
+        def no_tick(_t_ns: int) -> Any:
+            raise ZeroDivisionError("a tick went wrong")
+
+        monkeypatch.setattr(cell.brain, "tick", no_tick)
+        await cell.cycles(1)
+        assert cell.task is not None
+        with pytest.raises(ZeroDivisionError):
+            await cell.task
+        await cell.cycles(5)
+        assert cell.state.motion == "idle"
+        stopped_m = cell.robot.z_m
+        monkeypatch.undo()
+        cell.drive()
+        await cell.cycles(20)
+        assert cell.phase is Phase.STOPPED
+        assert "loop: ZeroDivisionError: a tick went wrong" in cell.why
+        assert cell.robot.z_m == stopped_m
+        assert Event.TASK_DIED in {trouble.event for trouble in cell.brain.standing.verdict.troubles}
+
+
+async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refused() -> None:
+    async with driven() as cell:
+        await cell.start(TWIST)
+        await cell.cycles(10)
+        before = len(cell.robot.commands)
+        file = ExperimentFile.model_validate({"name": "other", "drive": WRENCH, "steps": [MOVE]})
+        assert "is still running" in (await cell.loop.start(file) or "")
+        assert all(isinstance(command, WristSpeed) for command in cell.robot.commands[before:])

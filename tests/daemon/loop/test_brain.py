@@ -285,3 +285,12 @@ def test_no_fault_at_any_time_makes_the_wrist_faster_than_its_limit_or_move_afte
                 rig.twin.kick_nm = 0.1 - rig.twin.kick_nm
             case name:
                 rig.silent ^= {name}
+
+
+def test_a_wrist_angle_that_is_not_a_number_turns_nothing() -> None:
+    rig = started(Rig(brain()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
+    rig.run(5)
+    assert rig.speed > 0
+    rig.wrist_rad = float("nan")
+    rig._sense(0.0)
+    assert rig.brain.tick(rig.t_ns + 1).wrist_rad_per_s == 0.0

@@ -11,7 +11,7 @@ from daemon.experiment.machine import Phase
 from daemon.experiment.steps import ExperimentFile
 from daemon.experiment.wishes import Action, GripTo, MoveTo
 from daemon.loop.senses import Arm, Hand, Torque
-from daemon.loop_task import along_tool
+from daemon.loop_actions import along_tool
 from daemon.safety import Response
 from drivers.emulators.twin import Twin, TwinSettings
 from drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed

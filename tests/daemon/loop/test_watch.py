@@ -4,7 +4,7 @@ import pytest
 
 from daemon.experiment.steps import Limits
 from daemon.loop.senses import Arm, Senses, Source, Torque
-from daemon.loop.watch import Watched, WatchSettings, troubles
+from daemon.loop.watch import Watched, WatchSettings, compared_for_s, troubles
 from daemon.safety import Event
 
 EIT = Source(name="right", period_s=0.5412, window_s=0.5412)
@@ -22,13 +22,8 @@ def torque(
     return Torque(source.name, torque_nm, why, t_ns - round((acquired_s + way_s) * 1e9), t_ns)
 
 
-def found(
-    *torques: Torque, driving: Source = EIT, supervising: tuple[Source, ...] = (LOAD, WRENCH)
-) -> dict[Event, str]:
-    senses = Senses(arm=Arm(0.0, 0.0, NOW_NS))
-    for each in torques:
-        senses.hear(each)
-    watched = Watched(
+def watched(driving: Source, supervising: tuple[Source, ...]) -> Watched:
+    return Watched(
         driving=driving,
         supervising=supervising,
         limits=Limits(),
@@ -36,7 +31,16 @@ def found(
         gripped=True,
         twisted_rad=0.0,
     )
-    return {each.event: each.sentence for each in troubles(senses, watched, WatchSettings(), NOW_NS)}
+
+
+def found(
+    *torques: Torque, driving: Source = EIT, supervising: tuple[Source, ...] = (LOAD, WRENCH)
+) -> dict[Event, str]:
+    senses = Senses(arm=Arm(0.0, 0.0, NOW_NS))
+    for each in torques:
+        senses.hear(each)
+    events = troubles(senses, watched(driving, supervising), WatchSettings(), NOW_NS)
+    return {each.event: each.sentence for each in events}
 
 
 def test_nothing_is_wrong_while_all_torques_are_new_valid_and_alike() -> None:
@@ -91,3 +95,17 @@ def test_a_torque_that_counts_as_new_is_held_against_its_limit() -> None:
     quick = replace(LOAD, period_s=0.005)
     beyond = torque(quick, 0.9, came_s=0.05)
     assert found(beyond, driving=quick, supervising=()).keys() == {Event.TORQUE_LIMIT}
+
+
+@pytest.mark.parametrize("rate_hz", [10.9, 80.0, 1000.0])
+def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz: float) -> None:
+    """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
+    quick = replace(LOAD, period_s=1.0 / rate_hz)
+    senses = Senses(kept_s=compared_for_s((EIT, quick), WatchSettings()), arm=Arm(0.0, 0.0, NOW_NS))
+    frame = torque(EIT, 0.1, came_s=2.4 * EIT.period_s)
+    senses.hear(frame)
+    for number in range(round(60 * rate_hz), 0, -1):
+        senses.hear(torque(quick, 0.3, came_s=(number - 1) / rate_hz))
+    (trouble,) = troubles(senses, watched(EIT, (quick,)), WatchSettings(), NOW_NS)
+    assert trouble.event is Event.TORQUES_DISAGREE
+    assert len(senses.recent[LOAD.name].torque_nm) <= 10 * rate_hz, "and the rest is forgotten"

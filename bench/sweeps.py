@@ -188,6 +188,7 @@ async def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
             finally:
                 daemon.stop()
                 await task
+                slices.close()
     found["slices"] = dict(slices.written)
     found["missed"] = dict(slices.missed)
     found["held"] = ends.held

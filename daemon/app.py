@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import structlog
@@ -73,7 +74,7 @@ class Daemon:
             if self._recorder is not None:
                 opened.callback(self._recorder.close)
             self._wire(estimators, both)
-            self._health = self._make_health()
+            self.health = self._make_health()
             commands = self._make_commands()
             self._commands = CommandServer(context, config.commands, commands.handlers(), keys)
             opened.callback(self._commands.close)
@@ -145,7 +146,7 @@ class Daemon:
             experiment=self._config.experiment,
             begin=self._begin,
             give_up_waiting=self._give_up_waiting,
-            tasks=self._health.tasks,
+            tasks=self.health.tasks,
             stop=self.stop,
         )
 
@@ -226,7 +227,7 @@ class Daemon:
             yield supervised("keys", self._gate.run)
         if self._open_stop is not None:
             yield supervised("open_stop", self._open_stop.run)
-        yield supervised("health", self._health.run)
+        yield supervised("health", self.health.run)
 
     async def _run_experiment(self) -> None:
         """Start the configured experiment as soon as it can be started, and see it to its end."""
@@ -350,13 +351,22 @@ def _board(
     )
 
 
-async def run_daemon(config: DaemonConfig, listeners: tuple[Listener, ...] = ()) -> None:
-    """Run a daemon until SIGINT, SIGTERM or the command `stop`."""
+async def run_daemon(
+    config: DaemonConfig,
+    listeners: tuple[Listener, ...] = (),
+    facts: Mapping[str, Callable[[], TaskFacts]] = MappingProxyType({}),
+) -> None:
+    """Run a daemon until SIGINT, SIGTERM or the command `stop`.
+
+    `listeners` hear every message; `facts` are what health tells of them, by name.
+    """
     loop = asyncio.get_running_loop()
     with zmq.asyncio.Context() as context:
         daemon = Daemon(config, context)
         for listener in listeners:
             daemon.publisher.listen(listener)
+        for name, told in facts.items():
+            daemon.health.add(name, told)
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, daemon.stop)
         try:

@@ -5,19 +5,25 @@ homogeneous frame, without its sign; beside it the load cell's torque over the s
 mean of the frames of the latest `tare` step.
 """
 
+import io
 import re
+import threading
 from collections import Counter, deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import structlog
 from numpy.typing import NDArray
 from scipy.io import savemat
 
 from bank.channels import channels_of_line
 from daemon.errors import UserError
+from daemon.messages import Scalar
+from daemon.replaced import replaced
 
 FloatArray = NDArray[np.float64]
 
@@ -50,7 +56,8 @@ class _Hold:
 class SliceRecorder:
     """Listens to every message of a daemon, and writes a file for each hold of an experiment that asks for slices.
 
-    `written` counts the files by kind, `missed` the holds without one by reason.
+    `written` counts the files by kind, `missed` the holds without one by reason. Files are written in a thread of their
+    own, for no frame may wait for a disk; `close` waits for the last.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -62,6 +69,9 @@ class SliceRecorder:
         self.written: Counter[str] = Counter()
         self.missed: Counter[str] = Counter()
         self._folder = folder
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix="slices")
+        # Of the two counters, which the thread counts in too.
+        self._counting = threading.Lock()
         self._frames: dict[str, deque[_Frame]] = {}
         self._torques: deque[tuple[int, float]] = deque(maxlen=MOST_TORQUES)
         self._taring: dict[str, list[FloatArray]] = {}
@@ -75,8 +85,19 @@ class SliceRecorder:
     @property
     def summary(self) -> str:
         """What was kept and what was not, in a sentence."""
-        kept = ", ".join(f"{count} {kind} slices" for kind, count in self.written.items()) or "no slice was kept"
-        return kept + "".join(f"; {count} missed: {why}" for why, count in self.missed.items())
+        with self._counting:
+            kept = ", ".join(f"{count} {kind} slices" for kind, count in self.written.items()) or "no slice was kept"
+            return kept + "".join(f"; {count} missed: {why}" for why, count in self.missed.items())
+
+    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return what health tells of the slices."""
+        with self._counting:
+            missed = dict(self.missed)
+            return {"slices": self.written.total(), "errors": missed, "trouble": next(reversed(missed), "")}
+
+    def close(self) -> None:
+        """Wait until everything that was kept is written."""
+        self._writer.shutdown()
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
         """Take one message in."""
@@ -141,10 +162,10 @@ class SliceRecorder:
         frames = [frame for frame in known if hold.from_ns + half_ns <= frame.t_ns <= hold.to_ns - half_ns]
         torques = np.array([row for row in self._torques if hold.from_ns < row[0] < hold.to_ns]).reshape(-1, 2)
         if hold.source not in self._homogeneous:
-            self.missed["no `tare` step came before the hold"] += 1
+            self._miss("no `tare` step came before the hold")
             return
         if len(frames) < FEWEST_FRAMES or not len(torques):
-            self.missed[f"fewer than {FEWEST_FRAMES} frames, or no torque, while it was held"] += 1
+            self._miss(f"fewer than {FEWEST_FRAMES} frames, or no torque, while it was held")
             return
         homogeneous, homogeneous_line = self._homogeneous[hold.source]
         times = np.array([frame.t_ns for frame in frames], float)
@@ -155,32 +176,58 @@ class SliceRecorder:
         near = np.exp(-0.5 * ((torques[:, 0] - middle) / (STD_FRAMES * float(np.diff(times).mean()))) ** 2)
         torque_nm = float(near @ torques[:, 1] / near.sum())
         difference = np.abs(smoothed - homogeneous)
-        if hold.kind == "diameter":
-            self._save_diameter(difference, torque_nm)
+        if hold.kind != "diameter":
+            line = frames[len(frames) // 2].line
+            self._writer.submit(self._saved, self._save_torque, difference, torque_nm, line, homogeneous_line)
+        elif self._diameter_mm is None:
+            self._miss("the gripper measured no diameter")
         else:
-            self._save_torque(difference, torque_nm, frames[len(frames) // 2].line, homogeneous_line)
+            self._writer.submit(self._saved, self._save_diameter, difference, torque_nm, self._diameter_mm)
 
-    def _save_torque(self, difference: FloatArray, torque_nm: float, line: FloatArray, rest: FloatArray) -> None:
+    def _miss(self, why: str) -> None:
+        with self._counting:
+            self.missed[why] += 1
+            first = self.missed[why] == 1
+        if first:
+            structlog.get_logger().warning("a slice is missed", why=why)
+
+    def _saved(self, save: Callable[..., str], *slice_: Any) -> None:
+        """Write one slice, in the thread of its own: count it, or why it could not be."""
+        try:
+            kind = save(*slice_)
+        except OSError as error:
+            self._miss(f"{self._folder} cannot be written ({error.strerror})")
+        except Exception as error:  # noqa: BLE001 - in a thread of its own nobody else would hear of it
+            structlog.get_logger().exception("a slice could not be written")
+            self._miss(f"writing it died of {type(error).__name__}: {error}")
+        else:
+            with self._counting:
+                self.written[kind] += 1
+
+    def _save_torque(self, difference: FloatArray, torque_nm: float, line: FloatArray, rest: FloatArray) -> str:
         folder = self._folder / TORQUE_FOLDER
         number = _next(folder, r"Data_Slice_(\d+)\.mat")
-        savemat(folder / f"Data_Slice_{number}.mat", {"data_diff": difference[None], "torque_value": [[torque_nm]]})
-        self.written["torque"] += 1
+        _save(folder / f"Data_Slice_{number}.mat", data_diff=difference[None], torque_value=[[torque_nm]])
         if abs(torque_nm) > self._largest_nm:
-            self._largest_nm = abs(torque_nm)
             # One raw frame and its homogeneous frame, clipped as the paper's were.
-            savemat(folder / "TorqueSlice.mat", {"clipped_data": np.clip(line, 0.0, CLIPPED_V)[None]})
-            savemat(folder / "TorqueSliceHom.mat", {"clipped_data_hom": np.clip(rest, 0.0, CLIPPED_V)[None]})
+            _save(folder / "TorqueSlice.mat", clipped_data=np.clip(line, 0.0, CLIPPED_V)[None])
+            _save(folder / "TorqueSliceHom.mat", clipped_data_hom=np.clip(rest, 0.0, CLIPPED_V)[None])
+            self._largest_nm = abs(torque_nm)
+        return "torque"
 
-    def _save_diameter(self, difference: FloatArray, torque_nm: float) -> None:
-        if self._diameter_mm is None:
-            self.missed["the gripper measured no diameter"] += 1
-            return
-        folder, diameter = self._folder / DIAMETER_FOLDER, f"{self._diameter_mm:.0f}"
+    def _save_diameter(self, difference: FloatArray, torque_nm: float, diameter_mm: float) -> str:
+        folder, diameter = self._folder / DIAMETER_FOLDER, f"{diameter_mm:.0f}"
         number = _next(folder, rf"{diameter}mm_Data_(\d+)\.mat")
-        savemat(
-            folder / f"{diameter}mm_Data_{number}.mat", {"data_diff": difference[None], "mean_torque": [[torque_nm]]}
-        )
-        self.written["diameter"] += 1
+        _save(folder / f"{diameter}mm_Data_{number}.mat", data_diff=difference[None], mean_torque=[[torque_nm]])
+        return "diameter"
+
+
+def _save(path: Path, **arrays: Any) -> None:
+    """Write a MATLAB file, whole or not at all; raises OSError where it cannot be."""
+    content = io.BytesIO()
+    savemat(content, arrays)  # type: ignore[arg-type]  # any file will do
+    with replaced(path) as file:
+        file.write(content.getbuffer())
 
 
 def _array(wire: bytes) -> FloatArray:

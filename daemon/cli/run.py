@@ -85,9 +85,12 @@ def run(args: argparse.Namespace) -> int:
             happenings = Happenings(config.emulators, processes)
             summary = RunSummary(print_summary, truth.torques, lambda: happenings.happened)
             listeners = (Deaths(config.emulators, processes), happenings, *listeners)
-            asyncio.run(run_daemon(config, (*listeners, *((Show(), summary) if args.show else ()))))
+            facts = {"slices": slices.facts} if slices is not None else {}
+            asyncio.run(run_daemon(config, (*listeners, *((Show(), summary) if args.show else ())), facts))
     finally:
         truth.close()
+        if slices is not None:
+            slices.close()
     if slices is not None:
         print(f"{args.slices}: {slices.summary}")
     return 0

@@ -1,3 +1,6 @@
+import errno
+import os
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +68,7 @@ class Sweep:
 
     def done(self) -> None:
         self._loop(phase="done")
+        self.recorder.close()
 
 
 def test_each_hold_of_a_torque_sweep_becomes_a_slice_that_reproduce_reads(tmp_path: Path) -> None:
@@ -129,3 +133,49 @@ def test_a_folder_that_cannot_be_made_is_said_so(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
         SliceRecorder(tmp_path / "file" / "slices")
+
+
+@pytest.fixture(params=["full", "gone"])
+def unwritable(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return a folder in which nothing can be written, or not to its end."""
+    if request.param == "gone":
+        # Whoever runs the tests may write everywhere, but in no folder that is none.
+        (tmp_path / "torque_slices").write_text("")
+    else:
+
+        def full(_descriptor: int) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr("daemon.replaced.os.fsync", full)
+    return tmp_path
+
+
+def test_a_folder_that_cannot_be_written_kills_nobody_and_is_told(unwritable: Path) -> None:
+    sweep = Sweep(unwritable)
+    sweep.hold(1, 0.1)
+    sweep.hold(2, 0.1)
+    sweep.done()
+    assert f"no slice was kept; 2 missed: {unwritable} cannot be written (" in sweep.recorder.summary
+    facts = sweep.recorder.facts()
+    assert facts["slices"] == 0
+    assert facts["errors"] == sweep.recorder.missed
+    assert "cannot be written" in str(facts["trouble"])
+    assert not list(unwritable.glob("torque_slices/*")), "nothing half written is left"
+
+
+def test_no_message_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    let_go, threads = threading.Event(), set()
+
+    def slow(_file: object, _arrays: object) -> None:
+        threads.add(threading.current_thread())
+        assert let_go.wait(60)
+
+    monkeypatch.setattr("daemon.slices.savemat", slow)
+    sweep = Sweep(tmp_path)
+    sweep.hold(1, 0.1)
+    sweep.hold(2, 0.1)
+    assert not sweep.recorder.written, "and the messages have been heard"
+    let_go.set()
+    sweep.done()
+    assert sweep.recorder.written["torque"] == 2
+    assert threads.isdisjoint({threading.current_thread()})

@@ -182,11 +182,14 @@ class Daemon:
                 for task in running:
                     task.cancel()
         finally:
-            if self._recorder is not None:
-                # It may have to wait for the disk.
-                await asyncio.to_thread(self._recorder.close)
-            self._close()
-        self._tell_of_recordings()
+            try:
+                if self._recorder is not None:
+                    # It may have to wait for the disk.
+                    await asyncio.to_thread(self._recorder.close)
+            finally:
+                # What the other parts left open, each though an earlier one could not be closed.
+                self._close()
+                self._tell_of_recordings()
         structlog.get_logger().info("stopped")
 
     def stop(self) -> None:

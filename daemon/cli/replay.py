@@ -28,7 +28,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     printed.add_argument("--show", action="store_true", help="print the estimates as they come")
     add_json(printed)
     parser.add_argument(
-        "--check", action="store_true", help="exit with status 1 where an estimate is not the recorded one, bit for bit"
+        "--check",
+        action="store_true",
+        help="exit with status 1 where an estimate is not the recorded one, bit for bit, and where there is none",
     )
 
 
@@ -47,8 +49,12 @@ def run(args: argparse.Namespace) -> int:
         print(line, file=sys.stderr)
     if args.json:
         counts = {"compared": dict(comparison.compared), "different": dict(comparison.different)}
-        tell({**counts, "examples": comparison.examples, "same_code": same_code}, (), as_json=True)
-    return 1 if args.check and comparison.different else 0
+        tell(
+            {**counts, "unrecorded": comparison.unrecorded, "examples": comparison.examples, "same_code": same_code},
+            (),
+            as_json=True,
+        )
+    return 1 if args.check and (comparison.different or not comparison.compared) else 0
 
 
 def parsed_speed(text: str) -> float:
@@ -93,12 +99,14 @@ async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, ar
 
 def _told(comparison: "Comparison", same_code: bool) -> list[str]:
     if not comparison.compared:
-        return ["The recording has no estimates to compare with."]
+        return ["Nothing was compared: the recording has no estimates with the bytes that they were made from."]
     lines = []
     for topic, count in sorted(comparison.compared.items()):
         different = comparison.different[topic]
         lines.append(f"{topic}: {count - different} of {count} are the same as recorded, bit for bit")
     lines += comparison.examples
+    if comparison.unrecorded:
+        lines.append(f"{comparison.unrecorded} messages were made that are not in the recording.")
     if comparison.different and not same_code:
         lines.append("The recording was made by other code than this, whose results may be others.")
     return lines

@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from scipy.io import savemat
 
 from daemon.errors import UserError
-from daemon.recording.salvage import is_closed
+from daemon.recording.opened import opened
 from daemon.recording.schema import completed, schema_of
 
 # A MATLAB name is at most 63 characters long; ours are far shorter.
@@ -23,16 +21,8 @@ Progress = Callable[[int], None]
 
 def topics_of(path: Path) -> dict[str, int]:
     """Return the topics of a recording with their numbers of messages; raises UserError for one not to be read."""
-    if not is_closed(path):
-        raise UserError(
-            f"{path}: this recording cannot be read, or was not closed; `shearloop recording repair {path}` may save it"
-        )
-    with path.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    if summary is None or summary.statistics is None:
-        raise UserError(f"{path}: this recording does not say what is in it; `shearloop recording repair` may mend it")
-    counts = summary.statistics.channel_message_counts
-    return {channel.topic: counts.get(channel.id, 0) for channel in summary.channels.values()}
+    with opened(path) as recording:
+        return recording.counts
 
 
 def export(path: Path, form: str, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:
@@ -46,7 +36,10 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
             structs = {}
             for topic in topics:
                 structs[topic.replace(".", "_").replace("-", "_")] = _matlab(rows_of(path, topic, progress))
-            savemat(out, structs, long_field_names=True, oned_as="column", do_compression=True)
+            # Opened here: the library has a sentence of its own for what it cannot open, and another name.
+            with out.open("wb") as file:
+                # Its stubs know of names alone.
+                savemat(file, structs, long_field_names=True, oned_as="column", do_compression=True)  # type: ignore[arg-type]
             return [out]
         out.mkdir(parents=True, exist_ok=True)
         write = {"csv": _write_csv, "parquet": _write_parquet}[form]
@@ -61,19 +54,14 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
 
 def rows_of(path: Path, topic: str, progress: Progress = lambda _: None) -> Rows:
     """Return a topic's messages in order of time, log_time_ns first, nested maps as JSON text, None for no value."""
-    wire = schema_of(topic)
     rows = []
-    try:
-        with path.open("rb") as file:
-            for _, _, message in make_reader(file, validate_crcs=True).iter_messages([topic]):
-                content = completed(wire, json.loads(message.data))
-                row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
-                rows.append({_LOG_TIME: message.log_time, **row})
-                progress(1)
-    except (McapError, ValueError, AttributeError) as error:
-        raise UserError(
-            f"{path}: {topic} is damaged ({error!r}); `shearloop recording repair {path}` saves what is sound"
-        ) from error
+    with opened(path) as recording:
+        wire = schema_of(topic)
+        for _, message in recording.messages([topic]):
+            content = completed(wire, json.loads(message.data))
+            row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
+            rows.append({_LOG_TIME: message.log_time, **row})
+            progress(1)
     return rows
 
 

@@ -6,16 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.records import Channel, Message
 from numpy.typing import NDArray
 
 from bank.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
 from daemon.errors import UserError
+from daemon.recording.opened import opened
 from daemon.recording.schema import FORMAT_VERSION, FRAME_TOPIC, LOAD_TOPIC, METADATA
 
-_UNFINISHED = "it has no index at its end: it is still being written, or was not closed"
 # What every recording says of itself, beside the notes of this one.
 _IDENTITIES = ("format_version", "channel_table_hash", "software", "code_sha256")
 FloatArray = NDArray[np.float64]
@@ -46,24 +44,12 @@ class Recording:
 def read_recording(path: str | Path) -> Recording:
     """Read a recording whole; raises UserError, naming the file, for one that cannot be used."""
     path = Path(path)
-    try:
-        with path.open("rb") as file:
-            reader = make_reader(file, validate_crcs=True)
-            summary = reader.get_summary()
-            if summary is None:
-                raise _unusable(path, _UNFINISHED)
-            metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-            _check(path, metadata.get(METADATA))
-            topics = {channel.topic for channel in summary.channels.values()}
-            wanted = [topic for topic in topics if topic == LOAD_TOPIC or topic.startswith(f"{FRAME_TOPIC}.")]
-            messages = [(channel, message) for _, channel, message in reader.iter_messages(wanted)]
-    except OSError as error:
-        raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
-    # The library raises its own errors, and those of its decoders and of struct, on damaged files.
-    except (McapError, ValueError, EOFError, ArithmeticError, LookupError, TypeError, AttributeError) as error:
-        raise _unusable(path, f"it is not an MCAP file, or is truncated or damaged ({error!r})") from error
-    except Exception as error:
-        raise _unusable(path, f"it is damaged ({error!r})") from error
+    with opened(path) as recording:
+        metadata = recording.metadata()
+        _check(path, metadata.get(METADATA))
+        topics = recording.counts
+        wanted = [topic for topic in topics if topic == LOAD_TOPIC or topic.startswith(f"{FRAME_TOPIC}.")]
+        messages = list(recording.messages(wanted))
     return _sorted(path, metadata[METADATA], messages)
 
 
@@ -128,9 +114,6 @@ def _content(path: Path, channel: Channel, message: Message) -> dict[str, Any]:
 
 
 def _unusable(path: Path, why: str) -> UserError:
-    cure = (
-        f"`shearloop recording repair {path}` saves what is in it"
-        if why is _UNFINISHED
-        else "record it again, or import it with `shearloop import`"
+    return UserError(
+        f"{path}: this recording cannot be used: {why}; record it again, or import it with `shearloop import`"
     )
-    return UserError(f"{path}: this recording cannot be used: {why}; {cure}")

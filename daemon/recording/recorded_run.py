@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from pydantic import ValidationError
 
 from bank.channels import N_LINE_VALUES
@@ -18,7 +16,7 @@ from daemon.config import DaemonConfig
 from daemon.config_file import ConfigModel, mistakes
 from daemon.errors import UserError
 from daemon.recording.content import input_of
-from daemon.recording.export import topics_of
+from daemon.recording.opened import damaged, opened
 from daemon.recording.schema import (
     CLOCK_TOPIC,
     CONFIGURATION,
@@ -50,11 +48,10 @@ class RecordedRun:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.counts = topics_of(path)
-        with path.open("rb") as file:
-            reader = make_reader(file)
-            metadata = {record.name: dict(record.metadata) for record in reader.iter_metadata()}
-            self._attached = {one.name: one.data for one in reader.iter_attachments()}
+        with opened(path) as recording:
+            self.counts = recording.counts
+            metadata = recording.metadata()
+            self._attached = recording.attachments()
         if METADATA not in metadata:
             raise UserError(f"{path} is an MCAP file, but not a recording of shearloop, and cannot be replayed")
         self.metadata = metadata[METADATA]
@@ -72,13 +69,14 @@ class RecordedRun:
     @contextmanager
     def configuration(self) -> Iterator[DaemonConfig]:
         """Give the configuration that it was made with; the files that it names lie in a folder of their own."""
-        try:
-            content = json.loads(self._attached[CONFIGURATION])
-            config = DaemonConfig.model_validate(content)
-        except KeyError:
+        if CONFIGURATION not in self._attached:
             raise UserError(
                 f"{self.path} was not recorded by a daemon and has no configuration; give one with --config CONFIG"
-            ) from None
+            )
+        with damaged(self.path):
+            content = json.loads(self._attached[CONFIGURATION])
+        try:
+            config = DaemonConfig.model_validate(content)
         except ValidationError as error:
             raise UserError(
                 f"{self.path}: its configuration is not one of this version: {mistakes(error, DaemonConfig)}; "
@@ -93,17 +91,11 @@ class RecordedRun:
 
     def happenings(self) -> Iterator[Happened]:
         """Yield everything in the order in which it was recorded."""
-        try:
-            with self.path.open("rb") as file:
-                reader = make_reader(file, validate_crcs=True)
-                # An imported recording has a side after the other; one made live is in order as it is.
-                ordered = reader.iter_messages(log_time_order=not self.has_inputs)
-                for number, (_, channel, message) in enumerate(ordered):
-                    yield from self._happened(channel.topic, json.loads(message.data), message.log_time, number)
-        except (McapError, ValueError, KeyError, TypeError, AttributeError) as error:
-            raise UserError(
-                f"{self.path} is damaged ({error!r}); `shearloop recording repair {self.path}` saves what is sound"
-            ) from error
+        with opened(self.path) as recording:
+            # An imported recording has a side after the other; one made live is in order as it is.
+            messages = recording.messages(in_order_of_time=not self.has_inputs)
+            for number, (channel, message) in enumerate(messages):
+                yield from self._happened(channel.topic, json.loads(message.data), message.log_time, number)
 
     def tares(self) -> dict[str, set[int]]:
         """Return, by source, before which frames a zero was taken: it is asked for before the frames have come."""

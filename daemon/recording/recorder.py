@@ -165,12 +165,20 @@ class Recorder:
         with self._writing:
             if not self._ended:
                 self._ended = True
-                self._write()
-                if self._file.messages or self._experiment:
-                    self._finish(self._file)
-                else:
-                    # A daemon that did not get as far as its first message has nothing to keep.
-                    self._file.discard()
+                try:
+                    self._write()
+                finally:
+                    self._end()
+
+    def _end(self) -> None:
+        if self._file.messages or self._experiment:
+            self._finish(self._file)
+        else:
+            # A daemon that did not get as far as its first message has nothing to keep.
+            try:
+                self._file.discard()
+            except OSError as error:
+                self.failure = f"{self.path}: {error.strerror}"
 
     @property
     def _waiting_bytes(self) -> int:
@@ -190,8 +198,10 @@ class Recorder:
             item, size = self._queue.popleft()
             if self._begins_another(item):
                 self._begin_another()
-            self._put(item)
-            self._done_bytes += size
+            try:
+                self._put(item)
+            finally:
+                self._done_bytes += size
         self._flush()
 
     def _flush(self) -> bool:

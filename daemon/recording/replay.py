@@ -8,7 +8,7 @@ import asyncio
 import json
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,7 +20,7 @@ from daemon.publisher import Publisher
 from daemon.recording.chain import MADE_ANEW, Chain
 from daemon.recording.content import message_json
 from daemon.recording.recorded_run import Happened, RecordedRun
-from daemon.recording.schema import CLOCK_TOPIC
+from daemon.recording.schema import CLOCK_TOPIC, recorded_topic
 
 # These two say when a message was made and by which reading of the clocks, and not what was measured.
 NOT_COMPARED = ("latency_s", "timestamp")
@@ -53,16 +53,26 @@ class ReplayClock(Clock):
 
 @dataclass(slots=True)
 class Comparison:
-    """What was made anew beside what was recorded, message by message, bit for bit."""
+    """What was made anew beside what was recorded, message by message, bit for bit.
 
+    `unrecorded` counts, when all is replayed, the messages that were made now and not recorded, as those of the moment
+    in which the daemon was stopped. `there` are the recording's topics: what is in none of them is counted, not kept.
+    """
+
+    there: Collection[str] = ()
     compared: Counter[str] = field(default_factory=Counter)
     different: Counter[str] = field(default_factory=Counter)
     examples: list[str] = field(default_factory=list)
+    _foreign: int = 0
     _made: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
 
     def made(self, topic: str, content: Mapping[str, Any]) -> None:
         """Take in a message as it was published now."""
-        if topic in MADE_ANEW:
+        if topic not in MADE_ANEW:
+            return
+        if recorded_topic(topic, content["source"]) not in self.there:
+            self._foreign += 1
+        else:
             plain = json.loads(message_json(topic, content, 0))
             self._made.setdefault((topic, content["source"]), deque()).append(plain)
 
@@ -84,8 +94,8 @@ class Comparison:
 
     @property
     def unrecorded(self) -> int:
-        """Messages made now that were not recorded, as those of the moment in which the daemon was stopped."""
-        return sum(map(len, self._made.values()))
+        """Messages made now that were not recorded."""
+        return self._foreign + sum(map(len, self._made.values()))
 
     def _differs(self, happened: Happened, why: str) -> None:
         self.different[happened.topic] += 1
@@ -101,8 +111,10 @@ class Replay:
         self._chain = chain
         self._publisher = publisher
         self._clock = clock
-        self.comparison = Comparison()
-        publisher.listen(self.comparison.made)
+        self.comparison = Comparison(run.counts)
+        if run.has_inputs:
+            # Of a recording from elsewhere nothing is compared, and what was kept for it would be kept for ever.
+            publisher.listen(self.comparison.made)
 
     async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
         """Replay all of it, `speed` times as fast as it happened; math.inf waits for nothing."""

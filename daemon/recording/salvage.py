@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import IO
 
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
@@ -75,15 +74,6 @@ def condition_of(path: Path) -> Condition:
         return Condition(path.stat().st_size)
     except OSError as error:
         raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
-
-
-def is_closed(path: Path) -> bool:
-    """Return whether a recording has its index."""
-    try:
-        with path.open("rb") as file:
-            return make_reader(file).get_summary() is not None
-    except (McapError, OSError, ValueError, EOFError, struct.error):
-        return False
 
 
 def repair(source: Path, out: Path | None = None, progress: Progress = lambda _: None) -> Repaired:

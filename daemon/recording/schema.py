@@ -63,12 +63,15 @@ def input_topic(source: str) -> str:
 
 
 def schema_of(topic: str) -> str:
-    """Return the name of a recorded topic's schema."""
+    """Return the name of a recorded topic's schema; raises KeyError for a topic that is never recorded."""
     if topic == CLOCK_TOPIC or topic in TOPICS:
         return topic
     if topic.startswith(f"{INPUT}."):
         return INPUT
-    return next(wire for wire in _OF_FINGERTIPS if topic.startswith(f"{wire}."))
+    for wire in _OF_FINGERTIPS:
+        if topic.startswith(f"{wire}."):
+            return wire
+    raise KeyError(topic)
 
 
 @cache

@@ -5,15 +5,18 @@ import os
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+import zmq.asyncio
 from mcap.reader import make_reader
 
 from bank.channels import LINE_SLOTS, line_of_channels
+from daemon.app import Daemon
 from daemon.clock import Clock
+from daemon.config import load_daemon_config
 from daemon.errors import UserError
 from daemon.messages import EitFrame, LoadTorque, wire_map
 from daemon.recording import recorder as recorder_module
@@ -315,3 +318,32 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path) -> None
         last_ns = kept[-1]["t_mono_ns"] if kept else began_ns
         assert (accepted_ns - last_ns) / 1e9 < 1.0
     assert with_messages > 20
+
+
+def test_what_cannot_be_written_as_json_does_not_keep_the_file_from_being_closed(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock)
+    recorder.record("load.torque", torque(clock, 0))
+    recorder.record("load.torque", {**torque(clock, 1), "raw": object()})
+    with pytest.raises(TypeError, match="not JSON serializable"):
+        recorder.close()
+    (path,) = recorder.finished
+    assert len(topics(path)["load.torque"]) == 1
+    assert recorder.facts()["waiting_bytes"] == 0
+
+
+async def test_a_recording_that_cannot_be_closed_leaves_no_socket_open(
+    config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(config(recording={"folder": "recordings"})), context)
+        daemon.stop()
+        monkeypatch.setattr(Recorder, "_write", lambda _: os.truncate(tmp_path / "nowhere", 0))
+        with pytest.raises(FileNotFoundError):
+            await daemon.run()
+        # The address is free again, and the file has its end.
+        monkeypatch.undo()
+        again = Daemon(load_daemon_config(config(recording={"folder": "recordings"})), context)
+        again.stop()
+        await again.run()
+    assert not list((tmp_path / "recordings").iterdir()), "neither had anything to keep"

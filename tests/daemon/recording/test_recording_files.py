@@ -80,7 +80,7 @@ def test_damage_is_refused_by_name(content, tmp_path_factory, where, length, cut
 
 def test_foreign_and_stale_files_are_refused(tmp_path, monkeypatch):
     (tmp_path / "text.mcap").write_text("hello")
-    with pytest.raises(UserError, match=r"text\.mcap: this recording cannot be used"):
+    with pytest.raises(UserError, match=r"text\.mcap: this is not an MCAP file"):
         read_recording(tmp_path / "text.mcap")
     with (tmp_path / "other.mcap").open("wb") as file:
         other = Writer(file)

@@ -1,0 +1,181 @@
+"""What becomes of a recording whose bytes are spoilt or cut off: a sentence, or all that was in it."""
+
+import asyncio
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.cli import main
+from daemon.clock import Clock
+from daemon.config import load_daemon_config
+from daemon.errors import UserError
+from daemon.recording.export import export, topics_of
+from daemon.recording.identity import Attached, Identity, basic_identity
+from daemon.recording.importing import import_mat
+from daemon.recording.reader import read_recording
+from daemon.recording.recorded_run import RecordedRun
+from daemon.recording.recorder import Recorder
+from daemon.recording.salvage import repair
+from daemon.recording.summary import summarise
+from drivers.raw_input import InputKind, RawInput
+from tests.daemon.recording.test_recorder import frame, torque
+from tests.daemon.recording.test_replay import replayed
+
+CONFIGURATION = {"fingertips": {"right": {"device": {"path": "eit-right"}}}}
+
+
+@pytest.fixture(scope="module")
+def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """Return a recording as the daemon's own recorder makes it, of two chunks, with inputs and a configuration."""
+    folder, clock = tmp_path_factory.mktemp("whole"), Clock()
+    attached = Attached("configuration.json", "application/json", json.dumps(CONFIGURATION).encode())
+    recorder = Recorder(folder, Identity(basic_identity("a test"), (attached,)), clock)
+    tap = recorder.tap("right")
+    for number in range(4):
+        tap(RawInput(InputKind.DATA, clock.now_ns(), b"0.1, 0.2\r\n"))
+        recorder.record("eit.frame", frame(clock, number))
+        recorder.record("load.torque", torque(clock, number))
+        if number == 1:
+            recorder.write()
+    recorder.close()
+    (path,) = recorder.finished
+    return path.read_bytes()
+
+
+def happened(path: Path) -> list[Any]:
+    run = RecordedRun(path)
+    with run.configuration() as config:
+        assert list(config.fingertips) == ["right"]
+    run.tares()
+    return list(run.happenings())
+
+
+def exported(path: Path) -> list[bytes]:
+    return [one.read_bytes() for one in export(path, "csv", path.parent / "csv", sorted(topics_of(path)))]
+
+
+def told(path: Path) -> list[tuple[str, int]]:
+    found = summarise(path)
+    # What is torn or damaged is said so here, and is no mistake.
+    if found.closed and not found.damaged_chunks:
+        return sorted((name, topic.messages) for name, topic in found.topics.items())
+    return []
+
+
+def repaired(path: Path) -> int:
+    done = repair(path, path.with_name("repaired.mcap"))
+    assert sum(topics_of(done.path).values()) == done.messages
+    return 0
+
+
+def calibrated(path: Path) -> list[float]:
+    found = read_recording(path)
+    return [*found.torque_nm.tolist(), *found.sides["right"].lines.ravel().tolist()]
+
+
+READERS: list[Callable[[Path], Any]] = [happened, exported, calibrated, told, repaired]
+
+
+@pytest.fixture(scope="module")
+def sound(content: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    path = tmp_path_factory.mktemp("sound") / "x.mcap"
+    path.write_bytes(content)
+    return {read.__name__: read(path) for read in READERS}
+
+
+@settings(max_examples=200, deadline=None)
+@given(where=st.floats(0, 0.9999), length=st.integers(1, 30), cut=st.booleans(), reader=st.sampled_from(READERS))
+def test_damage_ends_in_a_sentence_that_names_the_file_or_does_no_harm(
+    content: bytes,
+    sound: dict[str, Any],
+    tmp_path_factory: pytest.TempPathFactory,
+    where: float,
+    length: int,
+    cut: bool,
+    reader: Callable[[Path], Any],
+) -> None:
+    at = int(where * len(content))
+    spoilt = bytes(255 - byte for byte in content[at : at + length])
+    path = tmp_path_factory.mktemp("damaged") / "x.mcap"
+    path.write_bytes(content[:at] if cut else content[:at] + spoilt + content[at + length :])
+    try:
+        found = reader(path)
+    except UserError as error:
+        said = str(error)
+    else:
+        assert found in (sound[reader.__name__], [])
+        assert not cut or reader in (told, repaired)
+        return
+    assert str(path) in said
+
+
+def spoilt(content: bytes, what: str) -> bytes:
+    changed = bytearray(content)
+    match what:
+        case "chunk":
+            # The second chunk's compressed bytes: zstd's magic number begins them.
+            at = content.rindex(b"\x28\xb5\x2f\xfd")
+            changed[at + 8 : at + 24] = bytes(16)
+        case "configuration":
+            at = content.index(b'{"fingertips"')
+            changed[at] = 0xFF
+        case "index":
+            changed[-200] ^= 0xFF
+        case "cut":
+            return content[: len(content) // 2]
+        case "short":
+            return content[:8]
+    return bytes(changed)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        *((["recording", "export", "{path}"], what) for what in ("chunk", "index", "cut", "short")),
+        *(
+            (["replay", "{path}", "--publish", "{address}"], what)
+            for what in ("chunk", "configuration", "cut", "short")
+        ),
+        *((["calibrate", "{path}", "--out", "{out}"], what) for what in ("chunk", "cut", "short")),
+    ],
+)
+def test_every_command_ends_with_status_2_and_one_sentence(
+    arguments: list[str], what: str, content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "x.mcap"
+    path.write_bytes(spoilt(content, what))
+    places = {"path": path, "address": f"ipc://{tmp_path}/replay", "out": tmp_path / "out.cal"}
+    assert main([one.format(**places) for one in arguments]) == 2
+    said = capsys.readouterr().err
+    assert f"{path}: the recording was not closed, or is damaged (" in said
+    assert f"`shearloop recording repair {path}`" in said
+    assert "Traceback" not in said
+
+
+def test_a_check_that_compared_nothing_is_not_passed(
+    config: Callable[..., Path], mat_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    imported = tmp_path / "imported.mcap"
+    import_mat([mat_folder()], imported)
+    arguments = ["--speed", "max", "--publish", f"ipc://{tmp_path}/replay", "--config", str(config())]
+    assert main(["replay", str(imported), *arguments]) == 0
+    assert "Nothing was compared" in capsys.readouterr().err
+    assert main(["replay", str(imported), *arguments, "--check"]) == 1
+
+
+def test_nothing_is_kept_of_what_is_not_compared(
+    config: Callable[..., Path], mat_folder: Callable[..., Path], tmp_path: Path
+) -> None:
+    imported = tmp_path / "imported.mcap"
+    import_mat([mat_folder()], imported)
+    configured = load_daemon_config(config())
+    published, comparison = asyncio.run(replayed(imported, math.inf, f"ipc://{tmp_path}/replay", configured))
+    assert sum(topic == "eit.estimate" for topic, _ in published) > 30
+    assert comparison.unrecorded == 0
+    assert comparison._made == {}

@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Mapping
 
 from bank.estimators import Measured, fused
+from bank.gaussian import TWO_SIDED_95
 from daemon.experiment.wishes import GripTo
 from daemon.loop.senses import Hand
 from daemon.messages import GripperStateMessage, Scalar
@@ -13,8 +14,6 @@ from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
 
 RELEASE_WIDTH_MM = 140.0
-# Standard deviations to either side that hold 95 % of a Gaussian.
-_TWO_SIDED_95 = 1.96
 
 
 class GripperTask:
@@ -79,7 +78,7 @@ class GripperTask:
                 diameter_mm=state.diameter_mm,
                 diameter_std_mm=state.diameter_std_mm,
                 tool_diameter_mm=tool.value if tool is not None else None,
-                tool_diameter_std_mm=tool.half_width / _TWO_SIDED_95 if tool is not None else None,
+                tool_diameter_std_mm=tool.half_width / TWO_SIDED_95 if tool is not None else None,
                 current_ma=state.current_ma,
                 object=state.object.text,
                 fault=state.fault.code,
@@ -97,7 +96,7 @@ def tool_diameter(state: GripperState, fingertips: Measured | None) -> Measured 
     if state.diameter_mm is None:
         return None
     std_mm = state.diameter_std_mm
-    return fused(Measured(state.diameter_mm, _TWO_SIDED_95 * std_mm) if std_mm else None, fingertips)
+    return fused(Measured(state.diameter_mm, TWO_SIDED_95 * std_mm) if std_mm else None, fingertips)
 
 
 def _hand(state: GripperState) -> Hand:

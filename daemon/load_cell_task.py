@@ -14,6 +14,8 @@ from drivers.load_cell import LoadCell
 LOAD_CELL = "load_cell"
 # Two seconds at 10.9 Hz; their mean is known ten times better than one reading moves.
 ZERO_SAMPLES = 22
+# A zero takes two seconds; what keeps it for longer than this does not go away by waiting.
+ZERO_DEADLINE_S = 15.0
 
 
 class LoadCellTask:
@@ -28,7 +30,8 @@ class LoadCellTask:
         self._clock = clock
         self._hear = hear
         self._zeroing: list[float] | None = None
-        self._zeroed: asyncio.Future[str] | None = None
+        self._zeroed: list[asyncio.Future[str]] = []
+        self._why = ""
 
     async def read(self) -> None:
         """Publish every sample and pass it on, until cancelled."""
@@ -48,23 +51,33 @@ class LoadCellTask:
 
     def tare(self) -> None:
         """Take the mean of the next samples for zero."""
-        self._begin_zero()
+        self._zeroing = []
 
     async def zero(self) -> str:
         """Take the mean of the next samples for zero; return why it could not be done, or an empty text."""
-        return await self._begin_zero()
-
-    def _begin_zero(self) -> asyncio.Future[str]:
-        self._zeroing = []
-        self._zeroed = asyncio.get_running_loop().create_future()
-        return self._zeroed
+        self.tare()
+        zeroed: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        # Who waits for a zero that was asked for before waits for this one, which is later still.
+        self._zeroed.append(zeroed)
+        try:
+            async with asyncio.timeout(ZERO_DEADLINE_S):
+                return await zeroed
+        except TimeoutError:
+            why = self._why or "nothing came"
+            return f"the load cell's zero could not be taken within {ZERO_DEADLINE_S:g} s: {why}"
+        finally:
+            self._zeroed = [other for other in self._zeroed if other is not zeroed]
+            if not self._zeroed:
+                # A zero that nobody waits for any longer would be taken at whatever load comes.
+                self._zeroing = None
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board."""
         return self._board.facts()
 
     def _take_zero(self, sample: LoadSample) -> None:
-        if self._zeroing is None or self._zeroed is None or self._zeroed.done():
+        self._why = "" if sample.trusted else _why(sample)
+        if self._zeroing is None:
             return
         if sample.trusted:
             self._zeroing.append(sample.raw)
@@ -72,7 +85,10 @@ class LoadCellTask:
             mean = sum(self._zeroing) / ZERO_SAMPLES
             self._board.tare(mean)
             self._zeroing = None
-            self._zeroed.set_result("")
+            for waiting in self._zeroed:
+                # Who gave up waiting has cancelled it.
+                if not waiting.done():
+                    waiting.set_result("")
 
 
 def load_message(sample: LoadSample) -> LoadTorque:

@@ -6,6 +6,7 @@ the drift since it was taken, and a gauge that reads what it cannot.
 
 from dataclasses import dataclass
 
+from bank.gaussian import TWO_SIDED_95
 from bank.skin.calibration import SkinCalibration
 from bank.skin.membrane import Direction, ShearInterval
 from bank.skin.tracking import DirectionFinder, ForceFollower
@@ -18,7 +19,7 @@ MOST_COMPRESSION = 0.15
 # Outside of that by more than this, and the zero is no longer one.
 MOST_ASTRAY = 0.02
 # The paper's drift, 1.48e-4 over an hour, as a 95 % bound.
-DRIFT_PER_HOUR = 1.96 * 1.48e-4
+DRIFT_PER_HOUR = TWO_SIDED_95 * 1.48e-4
 
 
 @dataclass(frozen=True, slots=True)

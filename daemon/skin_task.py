@@ -41,7 +41,7 @@ class SkinTask:
         self._clock = clock
         self._hear = hear
         self._radius_m = None if tool_radius_mm is None else tool_radius_mm * 1e-3
-        self._zeroed: asyncio.Future[str] | None = None
+        self._zeroed: list[asyncio.Future[str]] = []
         self._why = ""
         self._valid = 0
 
@@ -65,12 +65,16 @@ class SkinTask:
     async def zero(self) -> str:
         """Take a new zero and wait until it is there; return why it could not be taken, or an empty text."""
         self.tare()
-        self._zeroed = asyncio.get_running_loop().create_future()
+        zeroed: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        # Who waits for a zero that was asked for before waits for this one, which is later still.
+        self._zeroed.append(zeroed)
         try:
             async with asyncio.timeout(ZERO_DEADLINE_S):
-                return await self._zeroed
+                return await zeroed
         except TimeoutError:
             return f"the skin's zero could not be taken within {ZERO_DEADLINE_S:g} s: {self._why or 'nothing came'}"
+        finally:
+            self._zeroed = [other for other in self._zeroed if other is not zeroed]
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the voltages, the zero and the force."""
@@ -89,12 +93,16 @@ class SkinTask:
         return self._skin.source_facts()
 
     def _tell_zero(self) -> None:
-        if self._zeroed is None or self._zeroed.done():
-            return
         if self._estimator.refused:
-            self._zeroed.set_result(f"the skin's zero was refused: {self._estimator.refused}")
+            told = f"the skin's zero was refused: {self._estimator.refused}"
         elif self._estimator.zero is not None:
-            self._zeroed.set_result("")
+            told = ""
+        else:
+            return
+        for waiting in self._zeroed:
+            # Who gave up waiting has cancelled it.
+            if not waiting.done():
+                waiting.set_result(told)
 
     def _publish(self, sample: SkinSample, reading: SkinReading) -> None:
         now_ns = self._clock.now_ns()

@@ -12,6 +12,7 @@ import numpy as np
 
 from bank.errors import CalibrationError
 from bank.estimators.values import FloatArray
+from bank.gaussian import TWO_SIDED_95
 
 LEVEL = 0.95
 LEAST_IN_STRATUM = 20
@@ -61,7 +62,7 @@ class Intervals:
 def _quantile(absolute: FloatArray) -> float:
     """Return the conformal quantile; of few residuals the Gaussian one, since the largest of them says too little."""
     n = len(absolute)
-    gaussian = 1.96 * float(np.sqrt((absolute**2).mean()))
+    gaussian = TWO_SIDED_95 * float(np.sqrt((absolute**2).mean()))
     if n < 2 * LEAST_IN_STRATUM:
         return gaussian
     return float(np.quantile(absolute, min(LEVEL * (n + 1) / n, 1.0), method="higher"))

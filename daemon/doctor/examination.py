@@ -62,9 +62,9 @@ def ports_finding() -> Finding:
             "plug the boards in; look at `sudo dmesg | tail`",
         )
     shown = ", ".join(f"{port.path} ({port.serial_number or 'without a serial number'})" for port in ports)
-    denied = [port.path for port in ports if port.trouble]
+    denied = "; ".join(f"{port.path}: {port.trouble}" for port in ports if port.trouble)
     if denied:
-        return note("USB serial ports", shown, f"{', '.join(denied)}: {ports[0].trouble}", "see `shearloop ports`")
+        return note("USB serial ports", shown, denied, "see `shearloop ports`")
     return good("USB serial ports", shown)
 
 

@@ -13,11 +13,12 @@ import yaml
 from daemon.cli import main
 from daemon.doctor import machine
 from daemon.doctor.devices import channels_finding, rate_finding
-from daemon.doctor.examination import examine
+from daemon.doctor.examination import examine, ports_finding
 from daemon.doctor.files import bank_finding, keys_finding
 from daemon.doctor.finding import Finding, from_sentence
 from daemon.doctor.live import task_finding
 from daemon.keys import make_key_pair
+from daemon.ports import PortThere
 from daemon.subscriber import messages
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
@@ -192,3 +193,17 @@ def test_ports_are_listed_with_what_a_configuration_names_them_by(
     there[:] = [port(device="/dev/gone")]
     assert main(["ports"]) == 0
     assert "sudo usermod -aG dialout" in capsys.readouterr().out
+
+
+def test_each_port_that_is_denied_is_told_with_its_own_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+    def port(path: str, trouble: str) -> PortThere:
+        return PortThere(path, "1", "", "", "", "", trouble)
+
+    there = [
+        port("/dev/ttyACM0", ""),
+        port("/dev/ttyUSB0", "another program holds it"),
+        port("/dev/ttyUSB1", "no right"),
+    ]
+    monkeypatch.setattr("daemon.doctor.examination.ports_there", lambda: there)
+    found = ports_finding()
+    assert (found.state, found.means) == ("note", "/dev/ttyUSB0: another program holds it; /dev/ttyUSB1: no right")

@@ -105,6 +105,10 @@ def test_csv_parquet_and_matlab_hold_the_same(
         (["repair", "{folder}/text.mcap"], "is not an MCAP file"),
         (["export", "{recording}", "--topic", "eit.frame.left"], "it has eit.frame.right, load.torque"),
         (["export", "{recording}", "--out", "{folder}/text.mcap"], "the export cannot be written: File exists"),
+        (
+            ["export", "{recording}", "--format", "mat", "--out", "{folder}/no/where.mat"],
+            "no/where.mat: the export cannot be written: No such file or directory",
+        ),
     ],
 )
 def test_mistakes_end_in_one_sentence(

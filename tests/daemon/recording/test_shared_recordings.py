@@ -20,6 +20,8 @@ from daemon.recording.series import part_of, read_series, series_of
 
 # Five of the ten twists come before this share of the recording.
 HALF = 0.457
+# With three and with four of five repeats to fit: least r, largest RMSE in N·m and least coverage on the later ones.
+LATER_SLICES = {29: (0.97, 0.0150, 0.9), 39: (0.975, 0.0135, 0.9)}
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +119,10 @@ def test_later_torque_slices(shared):
     errors, covered = [], []
     for n in (19, 24, 29, 34, 39, 44):
         figures = judge([follow(fit("fused", [series.between(0, n)], "earlier"), series.between(n, 49))])
-        assert figures["r"] >= 0.96
+        r, rmse_nm, coverage = LATER_SLICES.get(n, (0.96, 0.018, 0.0))
+        assert figures["r"] >= r
+        assert figures["rmse_nm"] <= rmse_nm
+        assert figures["coverage_95"] >= coverage
         assert figures["valid_fraction"] == 1
         errors.append(figures["rmse_nm"])
         covered += [figures["coverage_95"]] * figures["frames"]

@@ -1,0 +1,90 @@
+import asyncio
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+
+from daemon.clock import Clock
+from daemon.load_cell_task import ZERO_SAMPLES, LoadCellTask
+from drivers.hx711 import LoadSample
+
+
+class Board:
+    """A load cell's board whose samples a test sends."""
+
+    def __init__(self) -> None:
+        self.sent: asyncio.Queue[LoadSample] = asyncio.Queue()
+        self.tares: list[float] = []
+        self._seq = 0
+
+    async def samples(self) -> AsyncGenerator[LoadSample]:
+        while True:
+            yield await self.sent.get()
+            self.sent.task_done()
+
+    def tare(self, raw_at_rest: float) -> None:
+        self.tares.append(raw_at_rest)
+
+    def facts(self) -> dict[str, int]:
+        return {}
+
+    async def send(self, raw: float, count: int = ZERO_SAMPLES, *, saturated: bool = False) -> None:
+        for _ in range(count):
+            self._seq += 1
+            self.sent.put_nowait(LoadSample(raw, 0.1, self._seq, self._seq, self._seq, saturated=saturated))
+        await self.sent.join()
+
+
+class Silent:
+    """A publisher to which nobody listens."""
+
+    def publish(self, _message: Any) -> None:
+        """Send nothing."""
+
+
+@asynccontextmanager
+async def reading() -> AsyncIterator[tuple[LoadCellTask, Board]]:
+    board = Board()
+    task = LoadCellTask(board, Silent(), Clock(), lambda _: None, 10.9)  # type: ignore[arg-type]
+    read = asyncio.create_task(task.read())
+    try:
+        yield task, board
+    finally:
+        read.cancel()
+        await asyncio.gather(read, return_exceptions=True)
+
+
+async def asked(task: LoadCellTask) -> asyncio.Task[str]:
+    zero = asyncio.create_task(task.zero())
+    await asyncio.sleep(0)
+    return zero
+
+
+async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile() -> None:
+    async with reading() as (task, board):
+        first = await asked(task)
+        await board.send(5.0, ZERO_SAMPLES // 2)
+        second = await asked(task)
+        await board.send(7.0)
+        async with asyncio.timeout(10):
+            assert await asyncio.gather(first, second) == ["", ""]
+        assert board.tares == [7.0], "a zero is of the samples after it was asked for"
+
+
+async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.load_cell_task.ZERO_DEADLINE_S", 0.05)
+    async with reading() as (task, board):
+        zero = await asked(task)
+        await board.send(8388607.0, saturated=True)
+        why = await zero
+        assert "the load cell's zero could not be taken within 0.05 s: the reading is at the end of its range" in why
+        await board.send(9.0)
+        assert board.tares == [], "nor at whatever load comes later"
+
+
+async def test_the_operators_tare_is_taken_from_the_next_samples() -> None:
+    async with reading() as (task, board):
+        task.tare()
+        await board.send(3.0)
+        assert board.tares == [3.0]

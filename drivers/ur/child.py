@@ -12,6 +12,7 @@ import select
 import signal
 import sys
 import time
+import traceback
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, NoReturn
 
@@ -107,11 +108,14 @@ def main() -> NoReturn:
     stdout = os.dup(1)
     os.dup2(2, 1)
     pipe = Pipe(0, stdout)
-    settings = _configuration(pipe)
-    if settings is None:
-        _leave(EXIT_DONE)
-    arm = _connect(pipe, settings)
-    _fly(pipe, settings, arm)
+    try:
+        settings = _configuration(pipe)
+        if settings is None:
+            _leave(EXIT_DONE)
+        _fly(pipe, settings, _connect(pipe, settings))
+    except Exception:  # noqa: BLE001 - told, and the end of the process all the same
+        traceback.print_exc()
+        _leave(EXIT_FAILED)
 
 
 def _configuration(pipe: Pipe) -> UrSettings | None:
@@ -174,7 +178,9 @@ def _fly(pipe: Pipe, settings: UrSettings, arm: "Arm") -> NoReturn:
             pipe.send(decided[1], decided[0])
         pipe.send_latest(pilot.state(reading))
         if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
-            if reading.program_running:
+            _alarm(settings.hang_timeout_s)
+            # This cycle may have started a program; none is left running.
+            if arm.read().program_running:
                 arm.end_program()
             _leave(EXIT_DONE)
         # A late cycle is not caught up with: two commands at once are no use to anyone.

@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -48,6 +48,10 @@ FAREWELL_S = 3.0
 GRACE_S = 1.0
 # What a stuck process leaves unread; some hundred commands.
 MOST_UNSENT = 1 << 15
+# Of what a process prints the end is kept: enough for the last lines of a traceback, and for one sentence.
+LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
+# What a process printed before its end arrives after that at times, but no later than this.
+LAST_WORDS_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +238,8 @@ class _Conversation:
         self._heard_s = time.monotonic()
         # Done when the process has no more to say, or has said what ends the conversation.
         self._over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._said: deque[str] = deque(maxlen=8)
+        self._said = b""
+        self._said_all = asyncio.Event()
         self._doing = "starting"
         self._stdin.write(encode(Configure(robot.settings)))
 
@@ -302,9 +307,10 @@ class _Conversation:
             self._stdin.write(beat)
 
     async def collect_stderr(self) -> None:
-        """Keep the last lines that the process printed: after a crash they are all there is."""
-        while line := await self._stderr.readline():
-            self._said.append(line.decode("utf-8", "replace").strip())
+        """Keep the end of what the process printed: after a crash it is all there is."""
+        while data := await self._stderr.read(1 << 16):
+            self._said = (self._said + data)[-LAST_WORDS_BYTES:]
+        self._said_all.set()
 
     async def end(self) -> None:
         """End the process: in good order while it listens, and in any case within `FAREWELL_S`."""
@@ -333,25 +339,34 @@ class _Conversation:
 
     async def _died(self) -> "_LostError":
         status = await self._process.wait()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(LAST_WORDS_S):
+                await self._said_all.wait()
         if status == -signal.SIGALRM:
             return _LostError("hung", self._hung(self._settings.hang_timeout_s))
         died_of = f"died of {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
         # What ur-rtde does when it loses the controller.
         why = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
-        said = f" Its last words: {' / '.join(self._said)}." if self._said else ""
         return _LostError(
             "crashed",
             f"The robot's process {died_of} while {self._doing}{why}. The robot's watchdog ends the motion; the "
-            f"process is started again with motion disabled.{said}",
+            f"process is started again with motion disabled.{self._last_words()}",
         )
 
     def _hung(self, seconds: float) -> str:
         if self._robot.state is None:
-            return sentences.silent(self._settings.host, self._settings.connect_timeout_s, self._doing)
-        return (
-            f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "
-            "motion; the process is started again with motion disabled."
-        )
+            sentence = sentences.silent(self._settings.host, self._settings.connect_timeout_s, self._doing)
+        else:
+            sentence = (
+                f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "
+                "motion; the process is started again with motion disabled."
+            )
+        return sentence + self._last_words()
+
+    def _last_words(self) -> str:
+        lines = [line.strip() for line in self._said.decode("utf-8", "replace").splitlines()]
+        said = " / ".join([line for line in lines if line][-LAST_WORDS_LINES:])
+        return f" Its last words: {said}." if said else ""
 
 
 async def _drain(stream: asyncio.StreamReader) -> None:

@@ -8,6 +8,8 @@ from drivers.ur.messages import MoveLinear, Reading, Stop, WristSpeed
 from drivers.ur.settings import Bound, Limits
 
 WRIST = 5
+# However gently a stop is asked for.
+LONGEST_STOP_S = 1.0
 # Close to the end the speed is distance/t, taking hold late by the reaction time: x'(s) = -x(s - reaction)/t, which
 # creeps up to the end without passing it only for t ≥ e·reaction.
 _NO_OVERSHOOT = math.e
@@ -60,8 +62,12 @@ def clip_wrist(asked: WristSpeed, reading: Reading, limits: Limits, reaction_s: 
 
 
 def clip_stop(asked: Stop, reading: Reading, limits: Limits, reaction_s: float) -> Stop:
-    """Return the stop with a deceleration between what the wrist's range needs and the hard limit of acceleration."""
-    safe = _safe_ramp(asked.deceleration_rad_per_s2, 0.0, reading, limits, reaction_s)
+    """Return the stop with a deceleration between what is needed and the hard limit of acceleration.
+
+    Needed is what keeps the wrist's range, and what ends the fastest joint's motion within `LONGEST_STOP_S`.
+    """
+    brisk = max(asked.deceleration_rad_per_s2, reading.fastest_rad_per_s / LONGEST_STOP_S)
+    safe = _safe_ramp(brisk, 0.0, reading, limits, reaction_s)
     return Stop(min(safe, limits.wrist_acceleration_rad_per_s2.hard))
 
 

@@ -134,6 +134,11 @@ class Reading:
         return all(abs(speed) < REST_RAD_PER_S for speed in self.qd_rad_per_s)
 
     @property
+    def fastest_rad_per_s(self) -> float:
+        """The speed of the fastest joint."""
+        return max(map(abs, self.qd_rad_per_s))
+
+    @property
     def wrist_rad(self) -> float:
         """The angle of wrist 3, about which the tool twists."""
         return self.q_rad[5]

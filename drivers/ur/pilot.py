@@ -2,11 +2,11 @@
 
 No clock, no pipe, no ur-rtde: the arm is a port and the time an argument, so that every rule here is tested without a
 robot. One cycle is `tick`; commands come between cycles through `request`. Whatever ends a motion, nothing begins one
-but a command given after it.
+but a command given after it. A motion that does not end as it should ends by the robot's watchdog: nothing is sent to
+the program any more, and only `Unlock` starts another.
 """
 
 import math
-from typing import Protocol
 
 from drivers.ur import sentences
 from drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation, violation
@@ -26,35 +26,15 @@ from drivers.ur.messages import (
     WristSpeed,
     ZeroForceTorque,
 )
-from drivers.ur.recovery import CureArm, Outcome, Recovery
+from drivers.ur.motion import longest_move_s, longest_stop_s, tool_axis_torque
+from drivers.ur.ports import PilotArm
+from drivers.ur.recovery import Outcome, Recovery
 from drivers.ur.settings import Six, UrSettings
 
-# How long a linear move may take beyond its nominal time before it is stopped.
-LINEAR_SLACK, LINEAR_SLACK_S = 1.5, 2.0
 # A linear move may be too short to be seen under way: who rests at its end (in m and rad) after so long has arrived.
 ARRIVED, ARRIVED_AFTER_S = 2e-3, 0.2
-
-
-class PilotArm(CureArm, Protocol):
-    """What flying needs of the robot."""
-
-    def wrist(self, command: WristSpeed) -> bool:
-        """Turn wrist 3."""
-
-    def end_speed(self, deceleration_rad_per_s2: float) -> bool:
-        """End the speed thread of an arm at rest."""
-
-    def move(self, command: MoveLinear) -> bool:
-        """Begin a linear move."""
-
-    def stop_move(self, deceleration_rad_per_s2: float) -> None:
-        """Begin to end a linear move."""
-
-    def kick(self) -> bool:
-        """Tell the robot's watchdog that we live."""
-
-    def zero_wrench(self) -> bool:
-        """Take the present wrench as zero."""
+# An arm that nothing was asked of may tremble, but not move as fast as this for so long.
+ASTRAY_RAD_PER_S, ASTRAY_S = 0.05, 0.2
 
 
 class Pilot:
@@ -66,12 +46,15 @@ class Pilot:
         self._limits = settings.limits
         self._arm = arm
         self._held = sentences.NOT_ENABLED
+        # Why the program on the robot is not ours to send anything to, as long as it is not.
+        self._not_ours = sentences.NOT_OURS
+        self._leaving = False
         self._motion: MotionKind = "idle"
         self._motion_id = 0
         self._ended = ""
-        self._asked: WristSpeed | Stop = Stop(0.0)
+        self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
         self._speed_thread = False
-        self._asked_ns = self._heard_ns = now_ns
+        self._asked_ns = self._heard_ns = self._rested_ns = now_ns
         self._deadline_ns = self._move_ns = 0
         self._move_seen = False
         self._move_end: Six = (0.0,) * 6
@@ -98,9 +81,11 @@ class Pilot:
 
     def request(self, number: int, command: Command, reading: Reading, now_ns: int) -> Reply | None:
         """Return the reply to a command; None when it comes later, from `tick` (`Unlock`)."""
+        if self._leaving and not isinstance(command, Stop | Disconnect):
+            return Reply(refused=sentences.LEAVING)
         match command:
             case Stop():
-                return self._stop_on_command(number, command, reading)
+                return self._stop_on_command(number, command, reading, now_ns)
             case Enable():
                 return self._enable(reading)
             case Unlock():
@@ -112,35 +97,41 @@ class Pilot:
             case MoveLinear():
                 return self._move(number, command, reading, now_ns)
             case Disconnect():
-                self._stop(reading, "the daemon disconnects")
-                return Reply()
+                return self._leave(reading, now_ns)
 
     def tick(self, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
         """Let one cycle pass: judge the reading, send what is due; return the reply to an `Unlock` that is decided."""
+        if self._motion != "idle" or reading.fastest_rad_per_s < ASTRAY_RAD_PER_S:
+            self._rested_ns = now_ns
         if self._recovery is not None:
             return self._recover(self._recovery, reading, now_ns)
         trouble = self._unfit(reading)
         if trouble:
             # Nothing can be sent. The arm stops by itself, or by its watchdog, which is no longer kicked.
             self._held = trouble
-            self._end(trouble)
-            self._speed_thread = False
+            if self._motion != "idle":
+                # The program turns the wrist on where it knows of no trouble, and again when it is resumed.
+                self._let_go(trouble)
+            if not reading.program_running:
+                self._not_ours = sentences.NOT_OURS
             return None
         beyond = self._violation(reading)
         if beyond:
             self._held = beyond
-            self._stop(reading, beyond)
+            self._stop(reading, now_ns, beyond)
         elif now_ns - self._heard_ns > self._settings.silence_timeout_s * 1e9:
-            self._stop(reading, f"the daemon was silent for {self._settings.silence_timeout_s:g} s")
+            self._stop(reading, now_ns, f"the daemon was silent for {self._settings.silence_timeout_s:g} s")
+        if self._not_ours:
+            return None
         match self._motion:
             case "wrist":
                 self._keep_turning(reading, now_ns)
             case "linear":
                 self._watch_move(reading, now_ns)
             case "stopping":
-                self._keep_stopping(reading)
+                self._keep_stopping(reading, now_ns)
             case "idle":
-                self._arm.kick()
+                self._keep_resting(now_ns)
         return None
 
     def state(self, reading: Reading) -> RobotState:
@@ -184,7 +175,7 @@ class Pilot:
         self._begin("wrist", number)
         self._asked, self._asked_ns = asked, now_ns
         if not self._send_wrist(reading):
-            return self._not_taken(reading, "wrist speed")
+            return Reply(refused=self._not_ours)
         return Reply(sent=self._sent, clipped=self._clipped)
 
     def _move(self, number: int, asked: MoveLinear, reading: Reading, now_ns: int) -> Reply:
@@ -199,24 +190,36 @@ class Pilot:
         sent, clipped = clip_linear(asked, self._limits)
         self._begin("linear", number)
         self._sent, self._clipped = sent, clipped
-        self._deadline_ns = now_ns + int(1e9 * _longest_s(sent, reading))
+        self._deadline_ns = now_ns + int(1e9 * longest_move_s(sent, reading))
         self._move_seen = False
         self._move_ns, self._move_end = now_ns, sent.pose
         if not self._arm.move(sent):
-            return self._not_taken(reading, "linear move")
+            self._let_go(sentences.not_taken("linear move"))
+            return Reply(refused=self._not_ours)
         return Reply(sent=sent, clipped=clipped)
 
-    def _stop_on_command(self, number: int, asked: Stop, reading: Reading) -> Reply:
+    def _stop_on_command(self, number: int, asked: Stop, reading: Reading, now_ns: int) -> Reply:
         if asked.deceleration_rad_per_s2 <= 0:
             return Reply(refused=f"A deceleration of {asked.deceleration_rad_per_s2:g} rad/s² is not above 0.")
+        if self._recovery is not None and self._unlock_number is not None:
+            self._recovery.give_up("Unlocking was ended by a stop.")
         trouble = self._unfit(reading)
         if trouble:
             return Reply(refused=f"Nothing can be sent, and the arm stops by itself. {trouble}")
         sent = clip_stop(asked, reading, self._limits, self._settings.reaction_s)
+        if self._motion == "stopping":
+            sent = _harder(sent, self._braking)
         self._motion_id = number
-        self._stop(reading, "stopped on command", sent)
         self._sent, self._clipped = sent, ()
-        return Reply(sent=sent)
+        self._stop_now(reading, now_ns, "stopped on command", sent)
+        return Reply(refused=self._not_ours) if self._not_ours else Reply(sent=sent)
+
+    def _leave(self, reading: Reading, now_ns: int) -> Reply:
+        self._leaving = True
+        if self._recovery is not None:
+            self._recovery.give_up(sentences.LEAVING)
+        self._stop_now(reading, now_ns, "the daemon disconnects")
+        return Reply()
 
     def _enable(self, reading: Reading) -> Reply:
         why = self._unfit(reading) or self._violation(reading)
@@ -233,6 +236,7 @@ class Pilot:
             return self._enable(reading)
         self._end(self._unfit(reading))
         self._speed_thread = False
+        self._not_ours = self._not_ours or sentences.NOT_OURS
         self._unlock_number = number
         self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
         return None
@@ -250,17 +254,21 @@ class Pilot:
     def _keep_turning(self, reading: Reading, now_ns: int) -> None:
         if now_ns - self._asked_ns > self._settings.command_timeout_s * 1e9:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
-            self._stop(reading, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
-            self._keep_stopping(reading)
+            self._stop_now(reading, now_ns, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
         else:
             self._send_wrist(reading)
 
     def _send_wrist(self, reading: Reading) -> bool:
-        if not isinstance(self._asked, WristSpeed):
-            return False
         self._sent, self._clipped = clip_wrist(self._asked, reading, self._limits, self._settings.reaction_s)
+        return self._speed(self._sent)
+
+    def _speed(self, command: WristSpeed) -> bool:
         self._speed_thread = True
-        return self._arm.wrist(self._sent)
+        taken = self._arm.wrist(command)
+        if not taken:
+            # An earlier speed may still hold.
+            self._let_go(sentences.not_taken("wrist speed"))
+        return taken
 
     def _watch_move(self, reading: Reading, now_ns: int) -> None:
         self._move_seen = self._move_seen or reading.moving_linearly
@@ -270,7 +278,7 @@ class Pilot:
         if not reading.moving_linearly and (self._move_seen or self._is_there(reading, now_ns)):
             self._end("arrived")
         elif why:
-            self._stop(reading, why)
+            self._stop(reading, now_ns, why)
             return
         self._arm.kick()
 
@@ -278,28 +286,44 @@ class Pilot:
         waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
         return waited and reading.rests and math.dist(reading.tcp_pose, self._move_end) < ARRIVED
 
-    def _keep_stopping(self, reading: Reading) -> None:
-        if isinstance(self._asked, Stop) and self._speed_thread:
-            deceleration = clip_stop(self._asked, reading, self._limits, self._settings.reaction_s)
-            self._arm.wrist(WristSpeed(0.0, deceleration.deceleration_rad_per_s2))
-            if reading.rests:
+    def _keep_resting(self, now_ns: int) -> None:
+        if now_ns - self._rested_ns > ASTRAY_S * 1e9:
+            self._ended = "it moved although nothing was asked of it"
+            self._let_go(sentences.ASTRAY)
+        else:
+            self._arm.kick()
+
+    def _keep_stopping(self, reading: Reading, now_ns: int) -> None:
+        if now_ns > self._deadline_ns:
+            self._let_go(sentences.NOT_STOPPING)
+        elif self._speed_thread:
+            braking = clip_stop(self._braking, reading, self._limits, self._settings.reaction_s)
+            if self._speed(WristSpeed(0.0, braking.deceleration_rad_per_s2)) and reading.rests:
                 self._end_speed_thread()
                 self._motion = "idle"
-            return
-        self._arm.kick()
-        if not reading.moving_linearly and reading.rests:
-            self._motion = "idle"
+        else:
+            self._arm.kick()
+            if not reading.moving_linearly and reading.rests:
+                self._motion = "idle"
 
-    def _stop(self, reading: Reading, why: str, stop: Stop | None = None) -> None:
-        """Begin to stop, as hard as may be unless told how; a stop under way goes on unless another is asked for."""
-        if self._motion == "idle" or (self._motion == "stopping" and stop is None):
+    def _stop_now(self, reading: Reading, now_ns: int, why: str, stop: Stop | None = None) -> None:
+        """Begin to stop, and send it: the next cycle may be a whole one away."""
+        self._stop(reading, now_ns, why, stop)
+        if self._motion == "stopping" and self._speed_thread:
+            self._keep_stopping(reading, now_ns)
+
+    def _stop(self, reading: Reading, now_ns: int, why: str, stop: Stop | None = None) -> None:
+        """Begin to stop, as hard as may be unless told how; of two stops the harder one counts."""
+        asked = stop or Stop(self._limits.wrist_acceleration_rad_per_s2.hard)
+        if self._motion == "idle" or (self._motion == "stopping" and _harder(self._braking, asked) is self._braking):
             return
         if self._motion != "stopping":
             self._ended = why
         self._motion = "stopping"
-        self._asked = stop or Stop(self._limits.wrist_acceleration_rad_per_s2.hard)
-        if not self._speed_thread and not self._unfit(reading):
-            self._arm.stop_move(self._asked.deceleration_rad_per_s2)
+        self._braking = asked
+        self._deadline_ns = now_ns + int(1e9 * longest_stop_s(asked, reading))
+        if not self._speed_thread and not self._arm.stop_move(asked.deceleration_rad_per_s2):
+            self._let_go(sentences.not_taken("stop"))
 
     def _begin(self, motion: MotionKind, number: int) -> None:
         self._motion, self._motion_id, self._ended = motion, number, ""
@@ -315,16 +339,16 @@ class Pilot:
             self._arm.end_speed(self._limits.wrist_acceleration_rad_per_s2.inner)
             self._speed_thread = False
 
-    def _not_taken(self, reading: Reading, what: str) -> Reply:
-        # An earlier speed may still hold: whatever the arm does now, it is to stop.
-        why = f"The robot did not take the {what}: its control program does not answer."
-        self._stop(reading, why)
-        return Reply(refused=why)
+    def _let_go(self, why: str) -> None:
+        """Send nothing to this program any more: whatever it does now, the robot's watchdog ends it."""
+        self._end(why)
+        self._speed_thread = False
+        self._not_ours = sentences.left_to_watchdog(why)
 
     # ---- judging --------------------------------------------------------------------------------------------------
 
     def _unfit(self, reading: Reading) -> str:
-        return sentences.unfit(reading, self._settings.host, self._settings.state_timeout_s)
+        return sentences.unfit(reading, self._settings.host, self._settings.state_timeout_s) or self._not_ours
 
     def _violation(self, reading: Reading) -> str:
         """Return `violation` of a reading, which several rules ask for in one cycle."""
@@ -338,12 +362,14 @@ class Pilot:
         return self._unfit(reading) or self._violation(reading) or self._held
 
     def _recover(self, recovery: Recovery, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
-        if not reading.connected or reading.age_ns > self._settings.state_timeout_s * 1e9:
+        if not recovery.why and (not reading.connected or reading.age_ns > self._settings.state_timeout_s * 1e9):
             return None
         outcome = recovery.advance(reading, now_ns)
         if outcome is Outcome.UNDER_WAY:
             return None
         self._recovery = None
+        if outcome is Outcome.DONE:
+            self._not_ours = ""
         number, self._unlock_number = self._unlock_number, None
         if number is None:
             self._held = recovery.why or self._held
@@ -353,22 +379,5 @@ class Pilot:
         return number, Reply(refused=recovery.why)
 
 
-def _longest_s(move: MoveLinear, reading: Reading) -> float:
-    """Return how long a linear move may take: distance or turn at its speed, the pendant's speed slider, and slack."""
-    distance_m = math.dist(move.pose[:3], reading.tcp_pose[:3])
-    # At most half a turn; a move that only turns takes its speed as rad/s.
-    way = max(distance_m, math.pi if distance_m < 1e-3 else 0.0)
-    nominal_s = way / move.speed_m_per_s + move.speed_m_per_s / move.acceleration_m_per_s2
-    return LINEAR_SLACK * nominal_s / max(reading.speed_scaling, 0.05) + LINEAR_SLACK_S
-
-
-def tool_axis_torque(reading: Reading) -> float:
-    """Return the torque about the tool's z axis: the third column of the pose's rotation, times the torque."""
-    x, y, z = reading.tcp_pose[3:]
-    angle = math.sqrt(x * x + y * y + z * z)
-    if angle < 1e-12:
-        return reading.wrench[5]
-    x, y, z = x / angle, y / angle, z / angle
-    sine, versine = math.sin(angle), 1 - math.cos(angle)
-    _, _, _, tx, ty, tz = reading.wrench
-    return (x * z * versine + y * sine) * tx + (y * z * versine - x * sine) * ty + (1 - (x * x + y * y) * versine) * tz
+def _harder(one: Stop, other: Stop) -> Stop:
+    return one if one.deceleration_rad_per_s2 >= other.deceleration_rad_per_s2 else other

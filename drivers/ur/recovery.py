@@ -20,34 +20,7 @@ from drivers.ur.messages import (
     SAFETY_REDUCED,
     Reading,
 )
-
-
-class CureArm(Protocol):
-    """What recovering needs of the robot."""
-
-    def unlock(self) -> None:
-        """Unlock a protective stop."""
-
-    def close_popups(self) -> None:
-        """Close what the pendant shows."""
-
-    def power_on(self) -> None:
-        """Begin to switch the arm's power on."""
-
-    def release_brakes(self) -> None:
-        """Begin to release the brakes."""
-
-    def stop_program(self) -> None:
-        """Stop whatever program runs or is paused."""
-
-    def clear_command(self) -> None:
-        """Clear the register that holds the last command."""
-
-    def upload(self) -> bool:
-        """Send the control script."""
-
-    def arm_watchdog(self) -> bool:
-        """Have the robot end its program when it hears nothing."""
+from drivers.ur.ports import CureArm
 
 
 class Outcome(enum.Enum):
@@ -75,8 +48,14 @@ class Recovery:
         self._cleared = self._uploaded = False
         self.why = ""
 
+    def give_up(self, why: str) -> None:
+        """Do nothing more, and say so when asked again."""
+        self.why = why
+
     def advance(self, reading: Reading, now_ns: int) -> Outcome:
         """Do what is due in this cycle."""
+        if self.why:
+            return Outcome.REFUSED
         if now_ns > self._deadline_ns:
             return self._refuse(
                 f"The robot did not get ready within {self._timeout_s:g} s (robot mode {reading.robot_mode}, safety "

@@ -15,6 +15,14 @@ NOT_INSTALLED = (
 )
 NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
 BEING_MADE_READY = "The robot is being made ready (safety, power, control program): ask again in a second."
+LEAVING = "The daemon disconnects from the robot: start it again to go on."
+NOT_OURS = (
+    "A program runs on the robot that someone else started or resumed: unlock to start the control program instead."
+)
+NOT_STOPPING = (
+    "The arm did not come to rest in time after it was told to stop: keep clear of it, look at the teach pendant."
+)
+ASTRAY = "The arm moved although nothing was asked of it: look whether somebody or something else moves it."
 
 _SAFETY = {
     4: "The robot is in recovery mode: move it back within its safety limits at the teach pendant.",
@@ -63,6 +71,16 @@ def local_control(host: str) -> str:
 def refused_by_client(host: str, text: str) -> str:
     """Return the sentence for what ur-rtde says in its own words."""
     return f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”."
+
+
+def not_taken(what: str) -> str:
+    """Return the sentence for a command that the control program did not take."""
+    return f"The robot did not take the {what}: its control program does not answer."
+
+
+def left_to_watchdog(why: str) -> str:
+    """Return the sentence for a control program that is sent nothing any more, for the reason in a sentence."""
+    return f"{why} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
 
 
 def unfit(reading: Reading, host: str, state_timeout_s: float) -> str:

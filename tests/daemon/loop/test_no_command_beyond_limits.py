@@ -17,8 +17,8 @@ from drivers.emulators.twin import Twin, TwinSettings
 from drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
 from drivers.ur.pilot import Pilot
 from tests.daemon.loop.test_brain import EIT, brain
+from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm
 from tests.drivers.ur.test_limits import LIMITS
-from tests.drivers.ur.test_pilot import CYCLE_NS, SETTINGS, FakeArm
 
 SPEEDS = st.floats(0.01, 3.14)
 STEPS = st.one_of(

@@ -1,91 +1,31 @@
 """The whole driver over real TCP: the real ur-rtde in its process, an emulated controller in another."""
 
 import asyncio
-import contextlib
-import dataclasses
 import os
 import signal
 import sys
 import time
-from collections.abc import AsyncIterator, Callable
-from pathlib import Path
 
 import pytest
 
-from drivers.errors import DriverError
-from drivers.ur.client import LinkEvent, UrRobot
+from drivers.ur.client import UrRobot
 from drivers.ur.messages import (
     Enable,
     MoveLinear,
-    RobotState,
     Stop,
     Unlock,
     WristSpeed,
     ZeroForceTorque,
 )
-from drivers.ur.settings import UrSettings, read_settings
+from tests.drivers.ur.robots import ROOT, Link, enable, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
 pytestmark = pytest.mark.real_time
 
 pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
 
-ROOT = Path(__file__).parents[3]
 # What the issue asks of a twist whose client dies: the robot has stopped.
 STOPPED_WITHIN_S = 0.2
-
-
-class Link:
-    """A robot's link events, to be waited for."""
-
-    def __init__(self) -> None:
-        self.events: list[LinkEvent] = []
-        self._changed = asyncio.Event()
-
-    def __call__(self, event: LinkEvent) -> None:
-        self.events.append(event)
-        self._changed.set()
-
-    async def down(self, number: int = 1, within_s: float = 15.0) -> LinkEvent:
-        """Return the loss of this number."""
-        async with asyncio.timeout(within_s):
-            while len(losses := [event for event in self.events if event.status == "down"]) < number:
-                self._changed.clear()
-                await self._changed.wait()
-        return losses[number - 1]
-
-
-def settings_for(host: str, **changes: object) -> UrSettings:
-    delivered = read_settings(ROOT / "config" / "ur.yaml")
-    return dataclasses.replace(delivered, host=host, **changes)  # type: ignore[arg-type]
-
-
-@contextlib.asynccontextmanager
-async def running(settings: UrSettings, link: Link | None = None) -> AsyncIterator[UrRobot]:
-    robot = UrRobot(settings, link)
-    task = asyncio.create_task(robot.run())
-    try:
-        yield robot
-    finally:
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-
-async def until(robot: UrRobot, condition: Callable[[RobotState], bool], within_s: float = 15.0) -> RobotState:
-    state = robot.state
-    try:
-        async with asyncio.timeout(within_s):
-            while not (state and condition(state)):
-                state = await robot.next_state()
-    except TimeoutError:
-        raise AssertionError(f"never came about; link {robot.link}, state {state}") from None
-    return state
-
-
-async def enable(robot: UrRobot) -> None:
-    await until(robot, lambda state: state.program_running and not state.recovering)
-    assert (await robot.send(Enable())).accepted
 
 
 async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5) -> None:
@@ -163,6 +103,23 @@ async def test_twist_stops_when_the_client_is_killed(controller: ControllerProce
         await controller.event("watchdog-armed", stopped["t_mono_ns"])
         assert not controller.happened("motion-started", killed_ns), "a second motion"
         await enable(robot)
+        await turn(robot, controller)
+
+
+async def test_data_that_stall_for_a_moment_end_the_motion(controller: ControllerProcess) -> None:
+    """Longer than data are believed, and back before the robot's watchdog has noticed: the program must not turn on."""
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        await turn(robot, controller)
+        stalled_ns = await controller.fault(f"silence {robot.settings.state_timeout_s + 0.04}")
+        # Wanted until the data are no longer believed.
+        assert (await robot.send(WristSpeed(0.5, 4.0))).accepted
+        stopped = await controller.event("motion-stopped", stalled_ns)
+        assert stopped_after_s(stopped, stalled_ns) <= robot.settings.state_timeout_s + STOPPED_WITHIN_S
+        state = await until(robot, lambda state: state.age_ns < 100_000_000)
+        assert state.blocked
+        assert (await robot.send(Unlock())).accepted
+        assert not controller.happened("motion-started", stalled_ns)
         await turn(robot, controller)
 
 
@@ -282,15 +239,6 @@ async def test_connection_that_is_refused_is_explained(
         assert said in (await robot.send(Enable())).refused
 
 
-async def test_absent_controller_is_explained() -> None:
-    link = Link()
-    async with running(settings_for("127.0.0.254"), link):
-        loss = await link.down()
-        assert loss.kind == "unreachable"
-        assert "No UR controller at 127.0.0.254" in loss.sentence
-        assert "refused" in loss.sentence
-
-
 async def test_leaving_stops_the_arm_and_ends_the_program(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
@@ -306,7 +254,7 @@ DAEMON = """
 import asyncio, sys
 from drivers.ur.client import UrRobot
 from drivers.ur.messages import Enable, WristSpeed
-from tests.drivers.ur.test_client import settings_for, until
+from tests.drivers.ur.robots import settings_for, until
 
 async def main():
     robot = UrRobot(settings_for(sys.argv[1]))
@@ -345,9 +293,3 @@ async def test_daemon_killed_in_the_middle_of_a_twist_leaves_a_robot_at_rest_and
         os.close(child)
     assert (await controller.event("program-ended", killed_ns))["detail"] == "the client ended it"
     await daemon.communicate()
-
-
-async def test_without_ur_rtde_the_user_is_told_which_python(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
-    with pytest.raises(DriverError, match=r"none for 3\.13"):
-        await UrRobot(settings_for("127.0.0.254")).run()

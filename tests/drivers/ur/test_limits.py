@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.ur.limits import beyond, clip_linear, clip_stop, clip_wrist, line_violation, violation, within
 from drivers.ur.messages import MoveLinear, Reading, Stop, WristSpeed
-from drivers.ur.pilot import tool_axis_torque
+from drivers.ur.motion import tool_axis_torque
 from drivers.ur.settings import Bound, JointRange, Limits, Workspace
 
 CYCLE_S, REACTION_S = 0.008, 0.04

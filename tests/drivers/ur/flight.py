@@ -1,0 +1,208 @@
+"""A pilot that flies an arm of a test's own, cycle by cycle."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.ur.messages import Command, Enable, MoveLinear, Reading, Reply, RobotState, WristSpeed
+from drivers.ur.pilot import Pilot
+from drivers.ur.settings import UrSettings
+from tests.drivers.ur.test_limits import AT_REST, LIMITS
+
+SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS)
+CYCLE_NS, WATCHDOG_NS = 8_000_000, 100_000_000
+POSE = (-0.5, -0.1, 0.45, 0.0, math.pi, 0.0)
+
+
+class FakeArm:
+    """A wrist that follows speeds, a controller with modes and a watchdog, and a list of everything that was called.
+
+    As the real program's, its speed thread goes on until it is ended, whatever else is sent, and after a pause too.
+    """
+
+    def __init__(self) -> None:
+        self.calls: list[str] = []
+        self.reading = dataclasses.replace(AT_REST, runtime_state=1)
+        self.target, self.acceleration = 0.0, 4.0
+        self.takes = True
+        self.stops_moves = True
+        self.unlockable = True
+        self.stale_command = False
+        self._resumed_target = 0.0
+        self._watched = False
+        self._unheard_ns = 0
+
+    def cycle(self) -> None:
+        if self.reading.runtime_state == 2:
+            self._unheard_ns += CYCLE_NS
+            if self._watched and self._unheard_ns > WATCHDOG_NS:
+                self.end_program()
+        wrist, speed = self.reading.q_rad[5], self.reading.qd_rad_per_s[5]
+        step = self.acceleration * CYCLE_NS / 1e9
+        now = speed + min(max(self.target - speed, -step), step)
+        wrist += 0.5 * (now + speed) * CYCLE_NS / 1e9
+        self.reading = dataclasses.replace(
+            self.reading,
+            t_mono_ns=self.reading.t_mono_ns + CYCLE_NS,
+            q_rad=(*self.reading.q_rad[:5], wrist),
+            qd_rad_per_s=(0.0, 0.0, 0.0, 0.0, 0.0, now),
+        )
+
+    def be(self, **changes: object) -> None:
+        self.reading = dataclasses.replace(self.reading, **changes)  # type: ignore[arg-type]
+
+    def read(self) -> Reading:
+        return self.reading
+
+    def end_program(self) -> None:
+        self.target = self._resumed_target = 0.0
+        self._watched = False
+        self.be(runtime_state=1, moving_linearly=False)
+
+    def protective_stop(self) -> None:
+        self._resumed_target = self.target
+        self.target, self.acceleration = 0.0, 20.0
+        self.be(safety_mode=3, runtime_state=4 if self.reading.runtime_state == 2 else 1)
+
+    def be_resumed_at_the_pendant(self) -> None:
+        self.target = self._resumed_target
+        self.be(safety_mode=1, runtime_state=2)
+
+    def hear(self, call: str) -> None:
+        self.calls.append(call)
+        self._unheard_ns = 0
+
+    def wrist(self, command: WristSpeed) -> bool:
+        self.hear("wrist")
+        if self.takes:
+            self.target, self.acceleration = command.rad_per_s, command.acceleration_rad_per_s2
+            self.stale_command = True
+        return self.takes
+
+    def end_speed(self, deceleration_rad_per_s2: float) -> bool:
+        self.hear("end_speed")
+        self.target, self.acceleration = 0.0, deceleration_rad_per_s2
+        return True
+
+    def move(self, _command: MoveLinear) -> bool:
+        self.hear("move")
+        self.be(moving_linearly=self.takes)
+        return self.takes
+
+    def stop_move(self, _deceleration_rad_per_s2: float) -> bool:
+        self.hear("stop_move")
+        if self.stops_moves:
+            self.be(moving_linearly=False)
+        return self.takes
+
+    def kick(self) -> bool:
+        self.hear("kick")
+        return True
+
+    def clear_command(self) -> None:
+        self.calls.append("clear_command")
+        self.stale_command = False
+
+    def zero_wrench(self) -> bool:
+        self.hear("zero_wrench")
+        return True
+
+    def unlock(self) -> None:
+        self.calls.append("unlock")
+        if not self.unlockable:
+            raise DriverError("not in the first 5 s")
+        self.be(safety_mode=1)
+
+    def close_popups(self) -> None:
+        self.calls.append("close_popups")
+
+    def power_on(self) -> None:
+        self.calls.append("power_on")
+        self.be(robot_mode=5)
+
+    def release_brakes(self) -> None:
+        self.calls.append("release_brakes")
+        self.be(robot_mode=7)
+
+    def stop_program(self) -> None:
+        self.calls.append("stop_program")
+        self.end_program()
+
+    def upload(self) -> bool:
+        self.calls.append("upload")
+        if self.stale_command:
+            self.target = 0.8
+        self._watched = False
+        self.be(runtime_state=2)
+        return True
+
+    def arm_watchdog(self) -> bool:
+        self.hear("arm_watchdog")
+        self._watched = True
+        return True
+
+
+class Flight:
+    """A pilot, its arm and the time."""
+
+    def __init__(self, settings: UrSettings = SETTINGS) -> None:
+        self.arm = FakeArm()
+        self.now_ns = 10**12
+        self.number = 0
+        self.decided: dict[int, Reply] = {}
+        self.pilot = Pilot(settings, self.arm, self.now_ns)
+
+    def ask(self, command: Command) -> Reply:
+        """Send a command and return its reply, letting cycles pass until it comes."""
+        self.number += 1
+        reply = self.pilot.request(self.number, command, self.arm.reading, self.now_ns)
+        for _ in range(6000):
+            if reply is not None or self.number in self.decided:
+                break
+            self.fly(1)
+        return reply or self.decided[self.number]
+
+    def fly(self, cycles: int, *, daemon_alive: bool = True) -> None:
+        for _ in range(cycles):
+            if daemon_alive:
+                self.pilot.heard(self.now_ns)
+            decided = self.pilot.tick(self.arm.reading, self.now_ns)
+            if decided is not None:
+                assert decided[0] not in self.decided
+                self.decided[decided[0]] = decided[1]
+            self.arm.cycle()
+            self.now_ns += CYCLE_NS
+
+    def fly_until(self, condition: Callable[[RobotState], bool], cycles: int = 1000) -> RobotState:
+        for _ in range(cycles):
+            if condition(self.state):
+                return self.state
+            self.fly(1)
+        raise AssertionError(f"never came about; now {self.state}")
+
+    @property
+    def state(self) -> RobotState:
+        return self.pilot.state(self.arm.reading)
+
+    @property
+    def wrist_speed(self) -> float:
+        return self.arm.reading.qd_rad_per_s[5]
+
+
+def flying() -> Flight:
+    flight = Flight()
+    flight.fly(5)
+    assert flight.ask(Enable()).accepted
+    flight.arm.calls.clear()
+    return flight
+
+
+def turning(speed: float = 0.5) -> Flight:
+    flight = flying()
+    assert flight.ask(WristSpeed(speed, 4.0)).accepted
+    flight.fly(30)
+    assert flight.wrist_speed == pytest.approx(speed)
+    return flight

@@ -1,0 +1,66 @@
+"""A robot as the daemon has it, with the settings that are delivered."""
+
+import asyncio
+import contextlib
+import dataclasses
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+from drivers.ur.client import LinkEvent, UrRobot
+from drivers.ur.messages import Enable, RobotState
+from drivers.ur.settings import UrSettings, read_settings
+
+ROOT = Path(__file__).parents[3]
+
+
+class Link:
+    """A robot's link events, to be waited for."""
+
+    def __init__(self) -> None:
+        self.events: list[LinkEvent] = []
+        self._changed = asyncio.Event()
+
+    def __call__(self, event: LinkEvent) -> None:
+        self.events.append(event)
+        self._changed.set()
+
+    async def down(self, number: int = 1, within_s: float = 15.0) -> LinkEvent:
+        """Return the loss of this number."""
+        async with asyncio.timeout(within_s):
+            while len(losses := [event for event in self.events if event.status == "down"]) < number:
+                self._changed.clear()
+                await self._changed.wait()
+        return losses[number - 1]
+
+
+def settings_for(host: str, **changes: object) -> UrSettings:
+    delivered = read_settings(ROOT / "config" / "ur.yaml")
+    return dataclasses.replace(delivered, host=host, **changes)  # type: ignore[arg-type]
+
+
+@contextlib.asynccontextmanager
+async def running(settings: UrSettings, link: Link | None = None) -> AsyncIterator[UrRobot]:
+    robot = UrRobot(settings, link)
+    task = asyncio.create_task(robot.run())
+    try:
+        yield robot
+    finally:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def until(robot: UrRobot, condition: Callable[[RobotState], bool], within_s: float = 15.0) -> RobotState:
+    state = robot.state
+    try:
+        async with asyncio.timeout(within_s):
+            while not (state and condition(state)):
+                state = await robot.next_state()
+    except TimeoutError:
+        raise AssertionError(f"never came about; link {robot.link}, state {state}") from None
+    return state
+
+
+async def enable(robot: UrRobot) -> None:
+    await until(robot, lambda state: state.program_running and not state.recovering)
+    assert (await robot.send(Enable())).accepted

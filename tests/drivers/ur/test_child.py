@@ -1,0 +1,148 @@
+"""The robot's own process without a robot: how it leaves, and what it does to an arm before."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
+
+import pytest
+
+from drivers.ur import child
+from drivers.ur.messages import (
+    Command,
+    Decoder,
+    Disconnect,
+    Enable,
+    Message,
+    Reading,
+    Reply,
+    Unlock,
+    WristSpeed,
+    encode,
+)
+from tests.drivers.ur.flight import SETTINGS, FakeArm
+
+ROOT = Path(__file__).parents[3]
+
+
+class LeftError(Exception):
+    """The process would have ended here."""
+
+
+class Daemon:
+    """The daemon's ends of the two pipes."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        its_stdin, self._stdin = os.pipe()
+        self._stdout, its_stdout = os.pipe()
+        os.set_blocking(self._stdout, False)
+        self._all = [its_stdin, self._stdin, self._stdout, its_stdout]
+        self.pipe = child.Pipe(its_stdin, its_stdout)
+        monkeypatch.setattr(child, "_alarm", lambda _seconds: None)
+        monkeypatch.setattr(child, "_leave", self._left)
+
+    @staticmethod
+    def _left(_status: int) -> NoReturn:
+        raise LeftError
+
+    def say(self, *commands: Command) -> None:
+        for number, command in enumerate(commands, 1):
+            os.write(self._stdin, encode(command, number))
+
+    def hear(self) -> list[tuple[int, Message]]:
+        return Decoder().feed(os.read(self._stdout, 1 << 20))
+
+    def close(self) -> None:
+        for descriptor in self._all:
+            os.close(descriptor)
+
+
+class CyclingArm(FakeArm):
+    """An arm that goes through a cycle whenever it is read."""
+
+    def read(self) -> Reading:
+        self.cycle()
+        return super().read()
+
+    def end_program(self) -> None:
+        self.calls.append("end_program")
+        super().end_program()
+
+
+@pytest.fixture
+def daemon(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
+    daemon = Daemon(monkeypatch)
+    yield daemon
+    daemon.close()
+
+
+def fly(daemon: Daemon, arm: CyclingArm) -> None:
+    with pytest.raises(LeftError):
+        child._fly(daemon.pipe, SETTINGS, arm)  # type: ignore[arg-type]  # an arm in all that counts
+
+
+def test_disconnecting_while_the_robot_is_made_ready_starts_nothing(daemon: Daemon) -> None:
+    arm = CyclingArm()
+    daemon.say(Disconnect())
+    fly(daemon, arm)
+    assert arm.calls == []
+
+
+def test_unlocking_that_a_disconnection_ends_is_answered(daemon: Daemon) -> None:
+    arm = CyclingArm()
+    arm.be(robot_mode=3)
+    daemon.say(Unlock(), Disconnect())
+    fly(daemon, arm)
+    assert arm.calls == []
+    replies = {number: message for number, message in daemon.hear() if isinstance(message, Reply)}
+    assert "disconnects" in replies[1].refused
+    assert replies[2].accepted
+
+
+def test_nothing_that_comes_after_a_disconnection_is_carried_out(daemon: Daemon) -> None:
+    arm = CyclingArm()
+    daemon.say(Disconnect(), Enable(), WristSpeed(0.5, 4.0), Unlock())
+    fly(daemon, arm)
+    assert arm.calls == []
+    replies = [message for _, message in daemon.hear() if isinstance(message, Reply)]
+    assert [reply.accepted for reply in replies] == [True, False, False, False]
+
+
+def test_program_that_this_very_cycle_started_is_ended(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever started it: what counts is what runs when the process leaves, not when its last cycle began."""
+    arm = CyclingArm()
+
+    def starts_a_program(*_: object) -> None:
+        arm.upload()
+
+    monkeypatch.setattr("drivers.ur.pilot.Pilot.tick", starts_a_program)
+    daemon.say(Disconnect())
+    fly(daemon, arm)
+    assert arm.calls == ["upload", "end_program"]
+    assert not arm.reading.program_running
+
+
+CRASHING = """
+import threading
+from drivers.ur import child
+from tests.drivers.ur.flight import SETTINGS, FakeArm
+
+class Arm(FakeArm):
+    def read(self):
+        raise ValueError("what nobody thought of")
+
+# As the client's threads may, this one keeps the interpreter from ending.
+threading.Thread(target=threading.Event().wait).start()
+child._configuration = lambda pipe: SETTINGS
+child._connect = lambda pipe, settings: Arm()
+child.main()
+"""
+
+
+def test_exception_ends_the_process_at_once_and_is_told() -> None:
+    command = [sys.executable, "-c", CRASHING]
+    ended = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, timeout=30, check=False)
+    assert ended.returncode == child.EXIT_FAILED
+    assert b"ValueError: what nobody thought of" in ended.stderr

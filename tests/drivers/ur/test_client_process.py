@@ -1,0 +1,61 @@
+"""The daemon's end of the robot where there is no controller: what is said of a process that ends."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from drivers.errors import DriverError
+from drivers.ur.client import LAST_WORDS_BYTES, UrRobot
+from tests.drivers.ur.robots import Link, running, settings_for
+
+
+async def test_absent_controller_is_explained() -> None:
+    pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
+    link = Link()
+    async with running(settings_for("127.0.0.254"), link):
+        loss = await link.down()
+        assert loss.kind == "unreachable"
+        assert "No UR controller at 127.0.0.254" in loss.sentence
+        assert "refused" in loss.sentence
+
+
+async def test_without_ur_rtde_the_user_is_told_which_python(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    with pytest.raises(DriverError, match=r"none for 3\.13"):
+        await UrRobot(settings_for("127.0.0.254")).run()
+
+
+@pytest.fixture
+def play(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], None]:
+    """Have shell commands run instead of the robot's process."""
+
+    def write(commands: str) -> None:
+        script = tmp_path / "process"
+        script.write_text(f"#!/bin/sh\n{commands}\n")
+        script.chmod(0o700)
+        monkeypatch.setattr("importlib.util.find_spec", lambda _name: True)
+        monkeypatch.setattr(sys, "executable", str(script))
+
+    return write
+
+
+async def test_last_words_of_a_process_that_its_own_alarm_ended_are_told(play: Callable[[str], None]) -> None:
+    play("echo 'waiting for the dashboard' >&2; kill -ALRM $$")
+    link = Link()
+    async with running(settings_for("127.0.0.254"), link):
+        loss = await link.down()
+    assert loss.kind == "hung"
+    assert loss.sentence.endswith("Its last words: waiting for the dashboard.")
+
+
+async def test_long_line_of_a_process_is_heard_and_told_in_short(play: Callable[[str], None]) -> None:
+    play("head -c 300000 /dev/zero | tr '\\0' x >&2; echo >&2; echo 'no memory' >&2; exit 3")
+    link = Link()
+    async with running(settings_for("127.0.0.254"), link):
+        loss = await link.down()
+    assert loss.kind == "crashed"
+    assert "ended with status 3" in loss.sentence
+    assert loss.sentence.endswith("xxx / no memory.")
+    assert len(loss.sentence) < LAST_WORDS_BYTES + 400

@@ -1,0 +1,93 @@
+"""Whatever happens in whatever order, no motion begins by itself or goes on by itself."""
+
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+from drivers.ur.messages import Enable, Stop, Unlock, WristSpeed
+from tests.drivers.ur.flight import Flight
+from tests.drivers.ur.test_limits import LIMITS
+
+
+class AnyFlight(RuleBasedStateMachine):
+    """Whatever happens in whatever order: commands within the limits, and no motion that was not asked for just now."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.flight = Flight()
+        self.allowed_until_ns = 0
+
+    @initialize()
+    def start(self) -> None:
+        self.fly(5)
+
+    @rule(speed=st.floats(-5, 5), acceleration=st.floats(1e-3, 100), enabled=st.booleans())
+    def turn(self, speed: float, acceleration: float, enabled: bool) -> None:
+        if enabled:
+            self.flight.ask(Enable())
+        if self.flight.ask(WristSpeed(speed, acceleration)).accepted:
+            self.allowed_until_ns = self.flight.now_ns + 700_000_000
+
+    @rule()
+    def enable(self) -> None:
+        self.flight.ask(Enable())
+
+    @rule()
+    def stop(self) -> None:
+        self.flight.ask(Stop(4.0))
+
+    @rule()
+    def unlock(self) -> None:
+        if self.flight.arm.reading.safety_mode != 7:
+            self.flight.ask(Unlock())
+
+    @rule(cycles=st.integers(1, 120), daemon_alive=st.booleans())
+    def fly(self, cycles: int, daemon_alive: bool = True) -> None:
+        for _ in range(cycles):
+            self.flight.fly(1, daemon_alive=daemon_alive)
+            self.moves_only_as_asked()
+
+    @rule()
+    def protective_stop(self) -> None:
+        if self.flight.arm.reading.safety_mode == 1:
+            self.flight.arm.protective_stop()
+
+    @precondition(lambda self: self.flight.arm.reading.runtime_state == 4)
+    @rule()
+    def someone_resumes_the_program(self) -> None:
+        self.flight.arm.be_resumed_at_the_pendant()
+        # What the program did before it was paused it may do until its watchdog ends it.
+        self.allowed_until_ns = self.flight.now_ns + 500_000_000
+        self.fly(100)
+
+    @rule(cycles=st.integers(1, 10))
+    def hear_nothing_new(self, cycles: int) -> None:
+        self.flight.arm.be(age_ns=300_000_000)
+        self.fly(cycles)
+        self.flight.arm.be(age_ns=0)
+        self.fly(100)
+
+    @rule()
+    def program_ends(self) -> None:
+        self.flight.arm.end_program()
+
+    @precondition(lambda self: not self.flight.arm.reading.wrench[0])
+    @rule(force_n=st.floats(0, 100))
+    def push(self, force_n: float) -> None:
+        self.flight.arm.be(wrench=(force_n, 0.0, 0.0, 0.0, 0.0, 0.0))
+
+    @rule()
+    def let_go(self) -> None:
+        self.flight.arm.be(wrench=(0.0,) * 6)
+
+    @invariant()
+    def moves_only_as_asked(self) -> None:
+        arm = self.flight.arm
+        assert abs(arm.target) <= LIMITS.wrist_speed_rad_per_s.inner
+        assert abs(arm.reading.wrist_rad) <= 1.9 + 1e-6
+        if self.flight.now_ns > self.allowed_until_ns:
+            assert arm.reading.qd_rad_per_s[5] == 0, "it moves, and nobody asked"
+
+
+AnyFlight.TestCase.settings = hypothesis_settings(max_examples=60, stateful_step_count=25, deadline=None)
+TestAnyFlight = AnyFlight.TestCase

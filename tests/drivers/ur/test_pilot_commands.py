@@ -1,0 +1,60 @@
+"""What the pilot sends and refuses: nothing moves before it is enabled, and what is sent is told."""
+
+import dataclasses
+
+import pytest
+
+from drivers.ur.messages import Command, Enable, MoveLinear, Reading, Stop, WristSpeed, ZeroForceTorque
+from tests.drivers.ur.flight import POSE, Flight, flying, turning
+
+
+def test_start_clears_the_last_command_uploads_and_arms_the_watchdog_in_this_order() -> None:
+    flight = Flight()
+    flight.fly(5)
+    assert flight.arm.calls == ["clear_command", "upload", "arm_watchdog", "kick", "kick"]
+
+
+def test_nothing_moves_before_it_is_enabled() -> None:
+    flight = Flight()
+    assert "made ready" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    flight.fly(5)
+    assert "not been enabled" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert "not been enabled" in flight.ask(MoveLinear(POSE, 0.1, 0.1)).refused
+    assert flight.state.blocked
+    assert {"wrist", "move"}.isdisjoint(flight.arm.calls)
+    assert flight.ask(Enable()).accepted
+    assert not flight.state.blocked
+    flight.fly(100)
+    assert {"wrist", "move"}.isdisjoint(flight.arm.calls)
+
+
+def test_what_was_sent_after_clipping_is_returned_and_reported() -> None:
+    flight = flying()
+    reply = flight.ask(WristSpeed(3.0, 2.0))
+    assert reply.sent == WristSpeed(0.8, 2.0)
+    assert reply.clipped == ("wrist speed is limited to 0.8 rad/s",)
+    assert (flight.state.sent, flight.state.clipped) == (reply.sent, reply.clipped)
+    assert (flight.state.motion, flight.state.motion_id) == ("wrist", flight.number)
+
+
+@pytest.mark.parametrize(
+    "command", [WristSpeed(0.1, 0.0), MoveLinear(POSE, 0.0, 0.1), MoveLinear(POSE, 0.1, -1.0), Stop(0.0)]
+)
+def test_senseless_numbers_are_refused_in_a_sentence(command: Command) -> None:
+    flight = flying()
+    assert "above 0" in flight.ask(command).refused
+    assert not flight.arm.calls
+
+
+def test_wrench_is_zeroed_at_rest_only() -> None:
+    flight = turning()
+    assert "only at rest" in flight.ask(ZeroForceTorque()).refused
+    flight.fly_until(lambda state: state.motion == "idle")
+    assert flight.ask(ZeroForceTorque()).accepted
+    assert flight.arm.calls[-1] == "zero_wrench"
+
+
+def test_reading_is_part_of_the_state() -> None:
+    flight = flying()
+    for field in dataclasses.fields(Reading):
+        assert getattr(flight.state, field.name) == getattr(flight.arm.reading, field.name)

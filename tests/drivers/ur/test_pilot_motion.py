@@ -1,0 +1,122 @@
+"""How motions go on and end: turning, linear moves, stops."""
+
+import pytest
+
+from drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
+from tests.drivers.ur.flight import POSE, flying, turning
+from tests.drivers.ur.test_limits import LIMITS
+
+
+def test_wrist_speed_is_sent_every_cycle_and_ends_when_it_is_not_renewed() -> None:
+    flight = turning(0.5)
+    flight.fly(5)
+    assert flight.arm.calls[-5:] == ["wrist"] * 5
+    state = flight.fly_until(lambda state: state.motion == "idle")
+    assert state.ended == "the wrist speed was not renewed within 0.3 s"
+    assert flight.wrist_speed == 0
+    # 0.3 s of turning, then 0.5/4 s of braking, then the speed thread is ended and the watchdog kicked.
+    assert state.wrist_rad == pytest.approx(0.5 * 0.3, abs=0.03)
+    assert flight.arm.calls[-1] == "end_speed"
+    flight.fly(3)
+    assert flight.arm.calls[-3:] == ["kick"] * 3
+
+
+def test_silence_of_the_daemon_ends_whatever_moves() -> None:
+    flight = flying()
+    assert flight.ask(MoveLinear(POSE, 0.05, 0.1)).accepted
+    flight.fly(30, daemon_alive=False)
+    assert flight.state.motion == "linear"
+    flight.fly(30, daemon_alive=False)
+    assert flight.state.motion == "idle"
+    assert "silent" in flight.state.ended
+    assert "stop_move" in flight.arm.calls
+
+
+def test_linear_move_is_kicked_along_and_its_arrival_told() -> None:
+    flight = flying()
+    reply = flight.ask(MoveLinear((-2.0, *POSE[1:]), 9.0, 0.1))
+    assert reply.sent == MoveLinear((-0.78, *POSE[1:]), 0.1, 0.1)
+    assert len(reply.clipped) == 2
+    flight.fly(20)
+    assert flight.arm.calls == ["move"] + ["kick"] * 20
+    assert "linear move is under way" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    flight.arm.be(moving_linearly=False)
+    flight.fly(1)
+    assert (flight.state.motion, flight.state.ended) == ("idle", "arrived")
+
+
+def test_linear_move_has_a_deadline_and_inner_limits() -> None:
+    flight = flying()
+    flight.ask(MoveLinear(POSE, 0.1, 0.5))
+    state = flight.fly_until(lambda state: state.motion == "idle")
+    assert "did not end within its time" in state.ended
+    flight.ask(MoveLinear(POSE, 0.1, 0.5))
+    flight.fly(3)
+    flight.arm.be(wrench=(0.0, 0.0, 45.0, 0.0, 0.0, 0.0))
+    flight.fly(2)
+    assert "force of 45.00 N is above the inner limit" in flight.state.ended
+    assert flight.arm.calls.count("stop_move") == 2
+
+
+def test_stop_ends_turning_before_anything_else_may_begin() -> None:
+    flight = turning(0.5)
+    reply = flight.ask(Stop(2.0))
+    assert reply.sent == Stop(2.0)
+    flight.fly(1)
+    assert flight.state.motion == "stopping"
+    assert "still stopping" in flight.ask(WristSpeed(0.5, 1.0)).refused
+    assert "stop it before" in flight.ask(MoveLinear(POSE, 0.1, 0.1)).refused
+    state = flight.fly_until(lambda state: state.motion == "idle")
+    assert state.ended == "stopped on command"
+    assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
+
+
+def test_stop_is_sent_at_once() -> None:
+    flight = turning(0.5)
+    flight.arm.calls.clear()
+    assert flight.ask(Stop(2.0)).accepted
+    assert flight.arm.calls == ["wrist"]
+    assert flight.arm.target == 0.0
+
+
+def test_gentle_stop_becomes_a_hard_one_when_the_daemon_falls_silent() -> None:
+    flight = turning(0.5)
+    assert flight.ask(Stop(0.6)).accepted
+    flight.fly(1)
+    assert flight.arm.acceleration == 0.6
+    flight.fly(40, daemon_alive=False)
+    assert flight.arm.acceleration == LIMITS.wrist_acceleration_rad_per_s2.hard
+
+
+def test_of_two_stops_the_harder_one_counts() -> None:
+    flight = turning(0.5)
+    assert flight.ask(Stop(4.0)).sent == Stop(4.0)
+    assert flight.ask(Stop(1.0)).sent == Stop(4.0)
+    assert flight.ask(Stop(6.0)).sent == Stop(6.0)
+    assert flight.arm.acceleration == 6.0
+
+
+def test_however_gently_it_is_asked_a_stop_ends_within_a_second() -> None:
+    flight = turning(0.5)
+    assert flight.ask(Stop(1e-3)).sent == Stop(0.5)
+    flight.fly(130)
+    assert flight.state.motion == "idle"
+    assert flight.wrist_speed == 0
+
+
+def test_speed_thread_is_ended_before_a_linear_move() -> None:
+    flight = flying()
+    flight.ask(WristSpeed(0.0, 1.0))
+    flight.fly(2)
+    assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
+    assert flight.arm.calls[-2:] == ["end_speed", "move"]
+
+
+def test_disconnecting_stops_first() -> None:
+    flight = turning()
+    flight.arm.calls.clear()
+    assert flight.ask(Disconnect()).accepted
+    assert flight.arm.calls == ["wrist"], "at once, not in the next cycle"
+    assert not flight.pilot.at_rest
+    flight.fly_until(lambda _state: flight.pilot.at_rest)
+    assert flight.wrist_speed == 0

@@ -1,0 +1,213 @@
+"""What the pilot does when the robot stops, is stopped or does not follow, and the way back on the operator's word."""
+
+import pytest
+
+from drivers.ur.messages import Disconnect, Enable, MoveLinear, Stop, Unlock, WristSpeed
+from tests.drivers.ur.flight import POSE, Flight, flying, turning
+
+
+@pytest.mark.parametrize("command", [WristSpeed(0.1, 1.0), Stop(4.0)])
+def test_robot_that_does_not_take_a_command_is_left_to_its_watchdog(command: WristSpeed | Stop) -> None:
+    flight = turning()
+    flight.arm.takes = False
+    assert "does not answer" in flight.ask(command).refused
+    flight.arm.calls.clear()
+    flight.fly(50)
+    assert flight.arm.calls == []
+    assert (flight.wrist_speed, flight.arm.reading.program_running) == (0, False)
+    flight.arm.takes = True
+    assert "unlock" in flight.ask(Enable()).refused.lower()
+    assert flight.ask(Unlock()).accepted
+    assert flight.ask(WristSpeed(0.1, 1.0)).accepted
+
+
+def test_linear_move_that_does_not_stop_is_left_to_the_watchdog() -> None:
+    flight = flying()
+    flight.ask(MoveLinear(POSE, 0.1, 0.5))
+    flight.fly(3)
+    flight.arm.stops_moves = False
+    assert flight.ask(Stop(4.0)).accepted
+    flight.fly_until(lambda state: "did not come to rest" in state.blocked, 200)
+    flight.fly(20)
+    assert not flight.arm.reading.program_running
+
+
+def test_linear_move_that_does_not_take_its_stop_is_left_to_the_watchdog() -> None:
+    flight = flying()
+    flight.ask(MoveLinear(POSE, 0.1, 0.5))
+    flight.fly(3)
+    flight.arm.takes = False
+    flight.arm.stops_moves = False
+    flight.fly(60, daemon_alive=False)
+    assert not flight.arm.reading.program_running
+    assert "silent" in flight.state.ended
+
+
+def test_arm_that_moves_unasked_is_left_to_the_watchdog() -> None:
+    flight = flying()
+    flight.arm.target = 0.1
+    flight.fly(20)
+    assert flight.state.motion == "idle"
+    state = flight.fly_until(lambda state: bool(state.blocked), 30)
+    assert "although nothing was asked" in state.blocked
+    flight.fly(30)
+    assert flight.wrist_speed == 0
+    assert "unlock" in flight.ask(WristSpeed(0.1, 1.0)).refused.lower()
+
+
+def test_program_that_someone_resumes_is_not_kept_going() -> None:
+    flight = turning()
+    flight.arm.protective_stop()
+    flight.fly(100)
+    flight.arm.be_resumed_at_the_pendant()
+    flight.arm.calls.clear()
+    flight.fly(1)
+    assert flight.state.blocked.startswith("A program runs on the robot that someone else started or resumed")
+    assert "someone else" in flight.ask(Enable()).refused
+    flight.fly(40)
+    assert flight.arm.calls == []
+    assert flight.wrist_speed == 0
+    assert not flight.arm.reading.program_running
+    assert flight.ask(Unlock()).accepted
+
+
+def test_program_that_was_not_started_here_is_sent_nothing() -> None:
+    flight = Flight()
+    flight.arm.be(safety_mode=3)
+    flight.fly(5)
+    flight.arm.be(safety_mode=1, runtime_state=2)
+    flight.fly(5)
+    assert "someone else" in flight.ask(Enable()).refused
+    assert flight.arm.calls == []
+    assert flight.ask(Unlock()).accepted
+    assert flight.arm.calls[:4] == ["close_popups", "stop_program", "clear_command", "upload"]
+
+
+def test_hard_limit_stops_and_holds_until_enabled_anew() -> None:
+    flight = turning()
+    flight.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, 6.5))
+    flight.fly(1)
+    assert flight.state.motion == "stopping"
+    flight.fly_until(lambda state: state.motion == "idle")
+    assert "Torque is 6.50 N m" in flight.ask(Enable()).refused
+    flight.arm.be(wrench=(0.0,) * 6)
+    flight.fly(50)
+    assert "Torque is 6.50 N m" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert flight.ask(Enable()).accepted
+    assert flight.ask(WristSpeed(0.1, 1.0)).accepted
+
+
+def test_protective_stop_ends_motion_and_is_cured_on_the_operators_word() -> None:
+    flight = turning()
+    flight.arm.be(safety_mode=3, runtime_state=4)
+    flight.arm.target = 0.0
+    flight.arm.calls.clear()
+    flight.fly(100)
+    assert flight.state.protective_stop
+    assert flight.state.blocked.startswith("Protective stop")
+    assert flight.arm.calls == [], "nothing is sent, and above all nothing is unlocked"
+    assert "Protective stop" in flight.ask(Enable()).refused
+
+    flight.arm.unlockable = False
+    assert "first 5 s" in flight.ask(Unlock()).refused
+    flight.arm.unlockable = True
+    flight.arm.calls.clear()
+    assert flight.ask(Unlock()).accepted
+    assert flight.arm.calls == ["unlock", "close_popups", "stop_program", "clear_command", "upload", "arm_watchdog"]
+    flight.fly(100)
+    assert flight.wrist_speed == 0, "the speed from before the stop is not taken up again"
+    assert flight.ask(WristSpeed(0.1, 1.0)).accepted
+
+
+def test_emergency_stop_is_cured_after_the_button_is_released() -> None:
+    flight = turning()
+    flight.arm.end_program()
+    flight.arm.be(safety_mode=7, robot_mode=3)
+    flight.fly(10)
+    assert flight.state.emergency_stop
+    assert "still pressed" in flight.ask(Unlock()).refused
+    flight.arm.be(safety_mode=1)
+    flight.fly(10)
+    assert "not powered" in flight.state.blocked
+    flight.arm.calls.clear()
+    assert flight.ask(Unlock()).accepted
+    assert flight.arm.calls == [
+        "close_popups", "power_on", "release_brakes", "clear_command", "upload", "arm_watchdog",
+    ]  # fmt: skip
+
+
+def test_connecting_to_a_robot_in_a_protective_stop_waits_for_the_operator() -> None:
+    flight = Flight()
+    flight.arm.be(safety_mode=3)
+    flight.fly(100)
+    assert flight.arm.calls == []
+    assert flight.ask(Unlock()).accepted
+    assert flight.ask(WristSpeed(0.1, 1.0)).accepted
+
+
+def test_program_that_ended_is_said_and_started_again_on_the_operators_word() -> None:
+    flight = turning()
+    flight.arm.end_program()
+    flight.fly(50)
+    assert "does not run" in flight.state.blocked
+    assert "does not run" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert flight.ask(Unlock()).accepted
+
+
+def test_recovery_gives_up_in_time_and_says_where_it_stands() -> None:
+    flight = flying()
+    flight.arm.end_program()
+    flight.arm.upload = lambda: True  # type: ignore[method-assign]  # an upload that never takes
+    begun_ns = flight.now_ns
+    reply = flight.ask(Unlock())
+    assert "within 30 s" in reply.refused
+    assert "program state 1" in reply.refused
+    assert flight.now_ns - begun_ns == pytest.approx(30e9, rel=0.01)
+
+
+def test_old_data_is_not_believed() -> None:
+    flight = turning()
+    flight.arm.be(age_ns=300_000_000)
+    flight.arm.calls.clear()
+    flight.fly(10)
+    assert flight.arm.calls == [], "without a kick the robot's watchdog stops it"
+    assert "nothing new for 0.30 s" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    flight.arm.be(age_ns=0)
+    flight.fly(40)
+    assert flight.state.blocked, "what came back is not trusted by itself"
+    assert flight.wrist_speed == 0, "the program turned on, and was kept going"
+
+
+def test_old_data_of_an_arm_at_rest_needs_no_other_program() -> None:
+    flight = flying()
+    flight.arm.be(age_ns=300_000_000)
+    flight.fly(10)
+    flight.arm.be(age_ns=0)
+    flight.fly(10)
+    assert "nothing new" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert flight.ask(Enable()).accepted
+    assert flight.ask(WristSpeed(0.1, 1.0)).accepted
+
+
+@pytest.mark.parametrize("command", [Disconnect(), Stop(4.0)])
+def test_unlocking_is_ended_by_disconnecting_and_by_a_stop(command: Disconnect | Stop) -> None:
+    flight = flying()
+    flight.arm.be(robot_mode=3, runtime_state=1)
+    flight.fly(1)
+    flight.arm.calls.clear()
+    assert flight.pilot.request(98, Unlock(), flight.arm.reading, flight.now_ns) is None
+    flight.pilot.request(99, command, flight.arm.reading, flight.now_ns)
+    flight.fly(300)
+    assert flight.arm.calls == []
+    assert not flight.pilot.recovering
+    assert not flight.decided[98].accepted
+
+
+def test_starting_the_program_is_ended_by_disconnecting() -> None:
+    flight = Flight()
+    assert flight.ask(Disconnect()).accepted
+    flight.fly(300)
+    assert flight.arm.calls == []
+    assert flight.pilot.at_rest
+    for command in (Enable(), Unlock(), WristSpeed(0.1, 1.0)):
+        assert "disconnects" in flight.ask(command).refused

@@ -23,7 +23,7 @@ from daemon.loop_task import WRENCH, WRENCH_SOURCE, LoopTask
 from daemon.safety import Event
 from drivers.ur.client import UrRobot
 from drivers.ur.messages import Command, MoveLinear, Reply, RobotState, Stop, WristSpeed
-from tests.drivers.ur.test_pilot import CYCLE_NS, SETTINGS, Flight
+from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
 
 SPEED_M_PER_S = 0.1
 

@@ -128,7 +128,15 @@ class Keithley6430(Polled[SourceReading]):
         off = read_reply(OUTPUT, await self._session.ask(OUTPUT))
         if off is not None:
             return off
-        reply = await self._session.ask(READ)
+        try:
+            reply = await self._session.ask(READ)
+        except DeviceLostError:
+            # With its output off it answers READ with an error, which is silence: so where somebody switched it off
+            # since it was asked. It must not be opened anew for that, and thereby switched on again.
+            off = read_reply(OUTPUT, await self._session.ask(OUTPUT))
+            if off is None:
+                raise
+            return off
         return read_elements(reply.text, reply.t_arrival_ns)
 
     async def _leave(self) -> None:

@@ -9,8 +9,13 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 import structlog
+
+# How long an example takes on a busy machine says nothing about what is tested.
+hypothesis.settings.register_profile("shearloop", deadline=None)
+hypothesis.settings.load_profile("shearloop")
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 

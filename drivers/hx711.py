@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 from drivers.calibration_file import CalibrationModel, Finite, Positive
-from drivers.lines import LineCutter
+from drivers.lines import LineCutter, transfer_ns
 from drivers.raw_input import InputKind, RawInput
 
 BAUD_RATE = 115200
@@ -25,8 +25,6 @@ PERIOD_NS = round(1e9 / RATE_HZ)
 COUNTS_MAX, COUNTS_MIN = 8388607, -8388608
 # "-8388608" is 8 characters and a float printed by an Uno at most 15; anything longer is several lines run together.
 MAX_LINE_BYTES = 32
-# Eight data bits, start and stop.
-NS_PER_BYTE = 10 * 10**9 // BAUD_RATE
 # Its own noise moves a live converter: no value stood more than three times in a row in 10 274 real ones.
 STUCK_AFTER = 20
 
@@ -162,9 +160,9 @@ class Despiker:
 class LoadParser:
     """Turns the board's bytes, in whatever slices they come, into samples; counts by kind what it refuses."""
 
-    def __init__(self, calibration: LoadCalibration, limits: LoadLimits | None = None) -> None:
+    def __init__(self, calibration: LoadCalibration) -> None:
         """Start before the first byte after the port was opened."""
-        self._limits = limits or LoadLimits()
+        self._limits = LoadLimits()
         self._lines = LineCutter(MAX_LINE_BYTES)
         self._refused: Counter[str] = Counter()
         self._seq = 0
@@ -228,7 +226,7 @@ class LoadParser:
 
     def _sample(self, raw: float, n_bytes: int, t_arrival_ns: int, *, partial: bool) -> LoadSample:
         torque_nm = self._calibration.torque_nm(raw)
-        t_mid_ns = t_arrival_ns - n_bytes * NS_PER_BYTE - PERIOD_NS // 2
+        t_mid_ns = t_arrival_ns - transfer_ns(n_bytes, BAUD_RATE) - PERIOD_NS // 2
         if self._last_mid_ns is not None:
             t_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
         self._last_mid_ns = t_mid_ns

@@ -1,11 +1,16 @@
 """Cuts what a device sends, in whatever slices it comes, into lines. No I/O."""
 
 
+def transfer_ns(n_bytes: int, baud: int) -> int:
+    """Return how long so many bytes take over a serial line: ten bits each, with start and stop."""
+    return n_bytes * (10 * 10**9 // baud)
+
+
 class LineCutter:
     """Gives each line once it is complete; one that is too long is counted once, and left out whole.
 
-    `too_long` and `unfinished` count since the beginning: lines beyond `longest_bytes`, and lines that had begun when
-    the port was opened again.
+    `too_long` and `unfinished` count since the beginning: lines beyond `longest_bytes`, and other lines that had begun
+    when the port was opened again.
     """
 
     def __init__(self, longest_bytes: int) -> None:
@@ -23,7 +28,8 @@ class LineCutter:
 
     def restart(self) -> None:
         """Begin anew: the port was opened, and what was half received stays so."""
-        self.unfinished += bool(self._begun.strip())
+        # What was too long has been counted as that.
+        self.unfinished += self.begun and not self._flooded
         self._begun = b""
         self._flooded = False
 

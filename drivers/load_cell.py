@@ -5,7 +5,7 @@ import time
 from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import aclosing
 
-from drivers.hx711 import BAUD_RATE, PERIOD_NS, LoadCalibration, LoadLimits, LoadParser, LoadSample, refusals
+from drivers.hx711 import BAUD_RATE, PERIOD_NS, LoadCalibration, LoadParser, LoadSample, refusals
 from drivers.raw_input import InputKind, Tap, no_tap
 from drivers.sending_board import SendingBoard
 from drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
@@ -17,7 +17,6 @@ class LoadCell:
     def __init__(
         self,
         calibration: LoadCalibration,
-        limits: LoadLimits | None = None,
         *,
         serial_number: str | None = None,
         path: str | os.PathLike[str] | None = None,
@@ -33,7 +32,7 @@ class LoadCell:
             policy=policy,
             on_event=on_event,
         )
-        self._parser = LoadParser(calibration, limits)
+        self._parser = LoadParser(calibration)
         self._board = SendingBoard(
             link,
             self._parser.take,

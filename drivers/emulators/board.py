@@ -1,5 +1,6 @@
 """What all played boards have in common: a pseudo-terminal, a pace, and faults that wait for their turn."""
 
+import asyncio
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -36,6 +37,11 @@ class PlayedBoard(Generic[FaultT]):
     def path(self) -> str:
         """Where the port is now."""
         return self._port.path
+
+    @property
+    def held_up(self) -> asyncio.Event:
+        """Set while what it sends waits for a reader."""
+        return self._port.held_up
 
     def inject(self, fault: FaultT) -> None:
         """Let a fault befall what comes next; several befall one each, in order."""

@@ -24,8 +24,6 @@ N_VALUES = 1024
 FLOOD_BYTES = 100_000
 # Lateness of this process that it makes up for, so that a fast pace is kept on the average.
 CATCH_UP_S = 0.05
-# How long a port that is about to be unplugged waits for a reader that may not be there.
-UNREAD_S = 0.5
 
 
 def format_line(values: NDArray[np.float64]) -> bytes:
@@ -196,9 +194,7 @@ class EitKitBoard(PlayedBoard[Fault]):
 
     async def _unplug(self, line: bytes, seconds: float) -> None:
         await self._port.write(line[: len(line) // 2])
-        # What has been sent is with the reader already; a pseudo-terminal would take it back.
-        await self._port.drained(UNREAD_S)
-        self._port.unplug()
+        await self._port.break_off()
         # Without power the board forgets that it was started.
         self._started.clear()
         await self._outage.last(seconds)

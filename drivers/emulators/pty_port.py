@@ -14,6 +14,8 @@ from typing import Self
 
 READ_BYTES = 4096
 HANDED_OVER_S = 0.02
+# How long a port that is about to hang up waits for a reader that may not be there.
+UNREAD_S = 0.5
 
 
 class PtyPort:
@@ -32,6 +34,8 @@ class PtyPort:
         self._slave = -1
         self._terminal = ""
         self._room = asyncio.Event()
+        # Set while what is being written waits for the other side to read.
+        self.held_up = asyncio.Event()
 
     @property
     def path(self) -> str:
@@ -92,7 +96,9 @@ class PtyPort:
             except BlockingIOError:
                 self._room.clear()
                 asyncio.get_running_loop().add_writer(self._master, self._room_again, self._master)
+                self.held_up.set()
                 await self._room.wait()
+                self.held_up.clear()
 
     async def drained(self, timeout_s: float) -> None:
         """Wait until the other side has read what was written, or for so long."""
@@ -105,6 +111,11 @@ class PtyPort:
             await asyncio.sleep(0.001)
             if self._master is not None and self._unread_bytes():
                 empty_since_s = loop.time()
+
+    async def break_off(self) -> None:
+        """Hang up once the other side has read what was written; a pseudo-terminal would take it back."""
+        await self.drained(UNREAD_S)
+        self.unplug()
 
     def _unread_bytes(self) -> int:
         return int.from_bytes(fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)), sys.byteorder)

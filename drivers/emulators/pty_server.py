@@ -7,9 +7,6 @@ from pathlib import Path
 
 from drivers.emulators.pty_port import PtyPort
 
-# How long a port that is about to hang up waits for a reader that may not be there.
-UNREAD_S = 0.5
-
 
 class PtyServer(ABC):
     """One port. `on_port` hears its path whenever it appears."""
@@ -55,9 +52,7 @@ class PtyServer(ABC):
 
     async def _break_off(self, reply: bytes) -> None:
         await self._port.write(reply[: len(reply) // 2])
-        # A pseudo-terminal would take back what is not yet read.
-        await self._port.drained(UNREAD_S)
-        await self.lose()
+        await self._port.break_off()
         await self.bring_back()
 
     def _received(self, data: bytes) -> None:

@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
 from contextlib import aclosing
 
-from drivers.lines import LineCutter
+from drivers.lines import LineCutter, transfer_ns
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.sending_board import SendingBoard
 from drivers.serial_port import Link
@@ -14,7 +14,6 @@ from drivers.shear_skin.daq import RATE_HZ, Voltages
 BAUD_RATE = 115200
 # "-0.123456,-0.123456" is 19 characters; anything longer than this is several lines run together.
 MAX_LINE_BYTES = 40
-NS_PER_BYTE = 10 * 10**9 // BAUD_RATE
 # The range of an ADS1220 at gain 4 with its own reference: 5 mA × 100 Ω.
 FULL_SCALE_V = 0.512
 # A value this near the end of the range is at the end of the range.
@@ -31,7 +30,10 @@ REFUSED_LINES = {
 
 
 class PairParser:
-    """Turns the board's bytes, in whatever slices they come, into voltages; counts by kind what it refuses. No I/O."""
+    """Turns the board's bytes, in whatever slices they come, into voltages; counts by kind what it refuses. No I/O.
+
+    Counted apart, being nobody's fault: `first_partials`, lines that may have been under way when listening began.
+    """
 
     def __init__(self, rate_hz: float = RATE_HZ, full_scale_v: float = FULL_SCALE_V) -> None:
         self._lines = LineCutter(MAX_LINE_BYTES)
@@ -87,7 +89,7 @@ class PairParser:
         return float(match[1]), float(match[2])
 
     def _voltages(self, v1_v: float, v2_v: float, n_bytes: int, t_sent_ns: int, t_arrival_ns: int) -> Voltages:
-        t_mid_ns = t_sent_ns - n_bytes * NS_PER_BYTE - self._period_ns // 2
+        t_mid_ns = t_sent_ns - transfer_ns(n_bytes, BAUD_RATE) - self._period_ns // 2
         # Where lines waited for the reader by pairs, time still goes forward.
         self._last_mid_ns = t_mid_ns if self._last_mid_ns is None else max(t_mid_ns, self._last_mid_ns + 1)
         return Voltages(
@@ -131,6 +133,7 @@ class AdcBoard:
         return {
             **self._board.facts(),
             "lines": self._lines,
+            "first_partials": self._parser.first_partials,
             "errors": dict(refused),
             "refusals": " ".join(refusals),
         }

@@ -1,5 +1,7 @@
 """Lines come through whole in any slices; what is no line is counted once."""
 
+import tracemalloc
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,7 +20,17 @@ def test_slices_change_nothing_and_every_line_is_given_or_counted(slices: list[b
     assert expected == [line if len(line) <= LONGEST else None for line in ended]
     assert whole.too_long == sliced.too_long == sum(len(line) > LONGEST for line in [*ended, rest])
     assert sliced.begun == whole.begun == (bool(rest.strip()) or len(rest) > LONGEST)
-    assert len(sliced._begun) <= LONGEST
+
+
+def test_memory_stays_bounded_where_no_line_ever_ends() -> None:
+    lines, slice_ = LineCutter(LONGEST), b"7" * 1000
+    tracemalloc.start()
+    for _ in range(1000):
+        assert lines.feed(slice_) == []
+    _, peak_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak_bytes < 10 * len(slice_)
+    assert (lines.too_long, lines.begun) == (1, True)
 
 
 def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten() -> None:
@@ -28,3 +40,11 @@ def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten(
     lines.restart()
     assert (lines.unfinished, lines.begun) == (1, False)
     assert lines.feed(b"3\n") == [b"3"]
+
+
+def test_line_that_is_too_long_is_counted_once_where_the_port_is_opened_again_before_its_end() -> None:
+    lines = LineCutter(LONGEST)
+    lines.feed(b"7" * 20)
+    lines.feed(b"7")
+    lines.restart()
+    assert (lines.too_long, lines.unfinished) == (1, 0)

@@ -18,7 +18,6 @@ import json
 import math
 import os
 import struct
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,6 +28,7 @@ from numpy.typing import NDArray
 from bank.channels import CHANNEL_TABLE_HASH, N_CHANNELS, STIMULATION_CURRENT
 from bank.errors import BankFileError, ModelError
 from bank.models import MODELS, PLAIN, Variation, model_named
+from bank.stored import replaced
 
 FORMAT_VERSION = 1
 # A signal with a smaller norm than this (in the units of the homogeneous voltages, whose norm is about 20) has no
@@ -192,7 +192,7 @@ def write_bank(
     valid: NDArray[np.bool_],
     signals: NDArray[np.float32],
 ) -> None:
-    """Write a bank file: under a temporary name, flushed to the disk, then renamed over what was there.
+    """Write a bank file over what was there.
 
     Raises BankFileError where it cannot be written; a file that was there before is then untouched.
     """
@@ -207,31 +207,14 @@ def write_bank(
     stored = {name: np.ascontiguousarray(arrays[name], dtype=kind) for name, kind in _TYPES.items()}
     header, offsets = _layout(definition, stored)
     preamble = _PREAMBLE.pack(_MAGIC, FORMAT_VERSION, hashlib.sha256(header).digest())
-    # A fixed name, so that what an interrupted build leaves is used up by the next one.
-    temporary = path.with_name(f"{path.name}.tmp")
     try:
-        with temporary.open("wb") as file:
+        with replaced(path) as file:
             file.write(preamble + header)
             for key, array in stored.items():
                 file.write(b"\0" * (offsets[key] - file.tell()))
                 file.write(array.data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        sync_directory(path.parent)
     except OSError as error:
-        with suppress(OSError):
-            temporary.unlink()
         raise BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out") from error
-
-
-def sync_directory(directory: Path) -> None:
-    """Flush a directory's entries to the disk, so that a rename in it outlives a loss of power."""
-    handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _told(variation: Variation) -> dict[str, Any]:

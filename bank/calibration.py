@@ -5,8 +5,6 @@ every k and σ whether it was made for them. The file is YAML, for reading; its 
 """
 
 import hashlib
-import os
-from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -15,10 +13,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from bank.bank_file import sync_directory
 from bank.channels import CHANNEL_TABLE_HASH
 from bank.errors import CalibrationError
 from bank.polynomial import Interval, Polynomial
+from bank.stored import check_made_with, check_version, replaced
 
 FloatArray = NDArray[np.float64]
 
@@ -86,24 +84,17 @@ class Calibration:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write the calibration: under a temporary name, flushed, then renamed over what was there.
+        """Write the calibration over what was there.
 
         Equal calibrations are equal bytes. Raises CalibrationError where the file cannot be written.
         """
         path = Path(path)
         body = self._body()
         text = _HEAD + _yaml(body | {"checksum": _checksum(body)})
-        temporary = path.with_name(f"{path.name}.tmp")
         try:
-            with temporary.open("w", encoding="utf-8") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-            sync_directory(path.parent)
+            with replaced(path) as file:
+                file.write(text.encode())
         except OSError as error:
-            with suppress(OSError):
-                temporary.unlink()
             raise CalibrationError(
                 f"{path}: the calibration cannot be written: {error.strerror}; choose another place"
             ) from error
@@ -116,16 +107,11 @@ class Calibration:
         channel table.
         """
         path = Path(path)
-        body = _read_body(path)
-        expected = {"channel_table_hash": ("channel table", CHANNEL_TABLE_HASH)}
+        made_with = {"channel_table_hash": CHANNEL_TABLE_HASH}
         if bank_identity is not None:
-            expected["bank_identity"] = ("bank", bank_identity)
-        for key, (what, wanted) in expected.items():
-            if body.get(key) != wanted:
-                raise CalibrationError(
-                    f"{path}: the calibration was made with the {what} {str(body.get(key))[:12]}…, "
-                    f"expected {wanted[:12]}…; calibrate again with the bank that is configured"
-                )
+            made_with["bank_identity"] = bank_identity
+        body = _read_body(path)
+        check_made_with(path, body, made_with)
         try:
             return cls(
                 bank_identity=str(body["bank_identity"]),
@@ -185,11 +171,7 @@ def _read_body(path: Path) -> dict[str, Any]:
         raise CalibrationError(f"{path}: this is not YAML, so no calibration; calibrate again") from error
     if not isinstance(found, dict) or found.get("kind") != _KIND:
         raise CalibrationError(f"{path}: this is not a calibration: expected a file with `kind: {_KIND}`")
-    if found.get("format_version") != FORMAT_VERSION:
-        raise CalibrationError(
-            f"{path}: the calibration has format version {found.get('format_version')}, expected {FORMAT_VERSION}; "
-            "calibrate again"
-        )
+    check_version(path, found, FORMAT_VERSION)
     checksum = found.pop("checksum", None)
     if checksum != _checksum(found):
         raise CalibrationError(

@@ -52,3 +52,13 @@ def line_of_channels(channels: NDArray[np.float64]) -> NDArray[np.float64]:
     values = np.zeros((*channels.shape[:-1], N_LINE_VALUES))
     values[..., LINE_SLOTS] = channels
     return values
+
+
+# The paper's window along the channels: a Gaussian over nine, standard deviation 9/5; less of it at both ends.
+_WINDOW = np.exp(-0.5 * (np.arange(-4, 5) / (9 / 5)) ** 2)
+_WINDOW_WITHIN = np.convolve(np.ones(N_CHANNELS), _WINDOW, "same")
+
+
+def smoothed_along_channels(differences: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (n, 896) differences averaged over nine channels, as the paper did with its cylinders (its section 2)."""
+    return np.asarray(np.array([np.convolve(row, _WINDOW, "same") for row in differences]) / _WINDOW_WITHIN)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
-from scipy.optimize import linear_sum_assignment
 
 from bank.errors import CalibrationError
 
@@ -35,8 +34,9 @@ def place_in_series(values: FloatArray) -> Series | None:
     """Return the places of (n,) values, in the order of time, that run through one rising series again and again.
 
     A series begins anew where the value falls by more than half of the whole range. The longest series have all
-    levels; the values of a shorter one are given to the levels whose means, over the longest, they are nearest to in
-    the sum of squares. None where there are no two such series of three levels or more.
+    levels; the values of a shorter one are given, in their order, to the levels whose means, over the longest, they are
+    nearest to in the sum of squares. A value of a shorter series that is nearer to a level which that lacks than to its
+    own goes there: nothing tells the two apart. None where there are no two such series of three levels or more.
     """
     falls = np.diff(values) < -_RESTART_SHARE * np.ptp(values)
     repeat = np.concatenate([[0], np.cumsum(falls)]).astype(np.int64)
@@ -49,8 +49,26 @@ def place_in_series(values: FloatArray) -> Series | None:
     level = np.empty(len(values), dtype=np.int64)
     for each in range(len(length)):
         members = np.flatnonzero(repeat == each)
-        _, level[members] = linear_sum_assignment((values[members, None] - means) ** 2)
+        level[members] = _rising_levels((values[members, None] - means) ** 2)
     return Series(repeat, level)
+
+
+def _rising_levels(cost: FloatArray) -> Labels:
+    """Return the rising levels (n,) of n values that cost least in all, (n, m) being what each level costs each."""
+    n, m = cost.shape
+    # The least cost of the first i values on the first j levels: the last level is the last value's, or nobody's.
+    least = np.full((n + 1, m + 1), np.inf)
+    least[0] = 0.0
+    for i in range(1, n + 1):
+        for j in range(i, m + 1):
+            least[i, j] = min(least[i, j - 1], least[i - 1, j - 1] + cost[i - 1, j - 1])
+    levels, j = np.empty(n, dtype=np.int64), m
+    for i in range(n, 0, -1):
+        while least[i, j - 1] == least[i, j]:
+            j -= 1
+        j -= 1
+        levels[i - 1] = j
+    return levels
 
 
 def kmeans_groups(points: FloatArray, n_groups: int, seed: int = 0) -> Labels:

@@ -18,13 +18,13 @@ from bank.channels import channels_of_line
 from bank.estimators import Calibration, TactileFrame, Tracker
 from bench.closed_loop import run
 from bench.plant import EIT, Plant, Sample, Tool
-from bench.rig_twists import FORCE_COUNTS, IDLE_S, SETTLE_S, calibrate, record
+from bench.rig_twists import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from bench.step_response import PERIOD_S, SOURCES, TARGET_NM, identified, judged, settings_for, started
 from bench.twin_step import AMPLITUDE_RAD
 from daemon.cli.emulated.frames import frame_maker
-from drivers.emulators.eit_kit import FRAME_PERIOD_S
+from drivers.eit_format import FRAME_PERIOD_S
 from drivers.emulators.rig import SIDES, FrameOf
-from drivers.emulators.robotiq.gripper import Command, Gripper
+from drivers.emulators.robotiq.gripper import Gripper
 from drivers.emulators.scene import Scene
 
 DIAMETER_MM = 25.0
@@ -50,11 +50,11 @@ class RigPlant(Plant):
         Plant.__post_init__(self)
         gripper = Gripper(between=lambda _: DIAMETER_MM)
         self.scene = Scene(gripper)
-        gripper.command = Command(act=True)
+        gripper.command = ACTIVATE
         while gripper.sta != 3:
             self.step(0.0)
         self._still(IDLE_S)
-        gripper.command = Command(act=True, gto=True, pos=255, spe=128, force=FORCE_COUNTS)
+        gripper.command = GRIP
         self._still(SETTLE_S)
         self.not_valid = self.estimated = self.outside = 0
 
@@ -78,9 +78,8 @@ class RigPlant(Plant):
         if self.t_s < self._next_end_s:
             return
         self._next_end_s += FRAME_PERIOD_S
-        seen, t_mid_s = self.scene.frame(FRAME_PERIOD_S), self.t_s - FRAME_PERIOD_S / 2
+        lines, t_mid_s = lines_of(self.scene, self.frame_of), self.t_s - FRAME_PERIOD_S / 2
         true_nm = self.scene.conversion_nm(FRAME_PERIOD_S)
-        lines = [self.frame_of(seen.grip, sign * seen.shear_torque_nm, seen.diameter_mm) for sign in SIDES.values()]
         estimate = self.tracker.estimate(TactileFrame.of(t_mid_s, np.array([channels_of_line(one) for one in lines])))
         if estimate.torque_nm is None or estimate.torque_low_nm is None or estimate.torque_high_nm is None:
             self.not_valid += 1

@@ -42,13 +42,8 @@ def niced() -> None:
 
 
 def one_core() -> None:
-    """CPUAffinity= with one core, on which the others may run too."""
+    """CPUAffinity= with one core; whether the others may run on it too is for whoever starts those."""
     os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
-
-
-def own_core() -> None:
-    """CPUAffinity= with a core that is kept free of the others."""
-    one_core()
 
 
 def locked() -> None:
@@ -62,12 +57,14 @@ def real_time_locked() -> None:
     real_time()
 
 
+# The way in which the others leave that core free.
+_OWN_CORE = "affinity, core of its own"
 WAYS: dict[str, Callable[[], None]] = {
     "ordinary": ordinary,
     "memory locked": locked,
     "niceness -10": niced,
     "affinity, shared core": one_core,
-    "affinity, core of its own": own_core,
+    _OWN_CORE: one_core,
     "SCHED_FIFO": real_time,
     "SCHED_FIFO, memory locked": real_time_locked,
 }
@@ -105,7 +102,7 @@ async def _wakings(seconds: float) -> tuple[list[float], int]:
 def lateness_of(way: str, seconds: float) -> tuple[list[float], int]:
     """Return what one way measures while the computer is busy."""
     cores = os.sched_getaffinity(0)
-    left = cores - {max(cores)} if way == "affinity, core of its own" and len(cores) > 1 else cores
+    left = cores - {max(cores)} if way == _OWN_CORE and len(cores) > 1 else cores
     context = multiprocessing.get_context("spawn")
     burners = [context.Process(target=busy, args=(left,), daemon=True) for _ in range(2 * len(cores))]
     here, there = context.Pipe()

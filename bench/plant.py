@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from daemon.control.creep import Creep
+from drivers.eit_format import FRAME_PERIOD_S
 from drivers.emulators.twin import Twin
 
 
@@ -44,8 +45,8 @@ class Sensor:
 GRIP_FORCE_N = 60.0
 
 EIT = Sensor(
-    period_s=0.5412,
-    window_s=0.5412,
+    period_s=FRAME_PERIOD_S,
+    window_s=FRAME_PERIOD_S,
     transfer_s=0.05,
     jitter_s=0.02,
     noise_nm=0.012,

@@ -31,6 +31,7 @@ import yaml
 import zmq
 from numpy.typing import NDArray
 
+from bench.rig_configuration import write_configuration
 from daemon.messages import decode
 from daemon.request import request
 from daemon.service.priority import first_in_line
@@ -88,7 +89,8 @@ class Bench:
         )
         self._unread = b""
         self._events: list[dict[str, Any]] = []
-        self.daemon = stack.enter_context(_process("run", str(_configuration(folder, args))))
+        config = write_configuration(folder, args.bank, args.calibration, args.host)
+        self.daemon = stack.enter_context(_process("run", str(config)))
         context = stack.enter_context(zmq.Context())
         self._socket: zmq.Socket[bytes] = stack.enter_context(context.socket(zmq.SUB))
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -171,24 +173,6 @@ def _process(*arguments: str, **options: Any) -> Iterator["subprocess.Popen[byte
         for stream in (process.stdin, process.stdout):
             if stream is not None:
                 stream.close()
-
-
-def _configuration(folder: Path, args: argparse.Namespace) -> Path:
-    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
-    (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": args.host}))
-    tip = {"bank": str(args.bank.resolve()), "calibration": str(args.calibration.resolve()), "matching": "zero_lag"}
-    content = {
-        "publish": f"ipc://{folder}/publish",
-        "commands": f"ipc://{folder}/commands",
-        "fingertips": {"right": {"device": {"path": "eit-right"}, **tip}},
-        "load_cell": {"device": {"path": "load-cell"}},
-        "robot": "ur.yaml",
-        "gripper": {"socket": {"host": args.host}},
-        "loop": {"disagreement_nm": 1.0, "jump_nm": 1.0},
-    }
-    path = folder / "config.yaml"
-    path.write_text(yaml.safe_dump(content))
-    return path
 
 
 def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:

@@ -9,7 +9,7 @@ for both fingertips together, and one calibration for each of them alone.
 import argparse
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,7 @@ from daemon.recording.reader import read_recording
 from daemon.recording.schema import DIAMETER_NOTE
 from daemon.recording.series import series_of
 from daemon.recording.writer import RecordingWriter
-from drivers.emulators.eit_kit import FRAME_PERIOD_S
+from drivers.eit_format import FRAME_PERIOD_S
 from drivers.emulators.hx711 import PERIOD_S
 from drivers.emulators.rig import NOISE_NM, SIDES, FrameOf
 from drivers.emulators.robotiq.gripper import Command, Gripper
@@ -36,10 +36,17 @@ IDLE_S, SETTLE_S = 12.0, 10.0
 N_TWISTS = 12
 # What the wrist does in a grip: angles from here to there, so fast, and held so long.
 ANGLES_RAD, SPEEDS_RAD_PER_S, HOLDS_S = (-0.12, 0.25), (0.05, 0.5), (1.0, 15.0)
-# Of a gripper that is to hold a tool with about 60 N.
-FORCE_COUNTS = 110
+# Of a gripper that wakes up, holds a tool with about 60 N, and lets go.
+ACTIVATE, GRIP = Command(act=True), Command(act=True, gto=True, pos=255, spe=128, force=110)
+_OPEN = replace(GRIP, pos=0)
 
 Sides = tuple[str, ...]
+
+
+def lines_of(scene: Scene, frame_of: FrameOf) -> list[NDArray[np.float64]]:
+    """Return the lines of both boards' frames that end now, each (1024,) in volts."""
+    seen = scene.frame(FRAME_PERIOD_S)
+    return [frame_of(seen.grip, sign * seen.shear_torque_nm, seen.diameter_mm) for sign in SIDES.values()]
 
 
 @dataclass(slots=True)
@@ -90,18 +97,18 @@ class Play:
 
     def run(self) -> None:
         """Idle, grip, twist, let go."""
-        self._gripper.command = Command(act=True)
+        self._gripper.command = ACTIVATE
         while self._gripper.sta != 3:
             self._step()
         self._still(IDLE_S)
-        self._gripper.command = Command(act=True, gto=True, pos=255, spe=128, force=FORCE_COUNTS)
+        self._gripper.command = GRIP
         self._still(SETTLE_S)
         for angle_rad in self._angles():
             self._turn_to(angle_rad, self._random.uniform(*SPEEDS_RAD_PER_S))
             self._still(self._random.uniform(*HOLDS_S))
         self._turn_to(0.0, 0.2)
         self._still(SETTLE_S)
-        self._gripper.command = Command(act=True, gto=True, pos=0, spe=128, force=FORCE_COUNTS)
+        self._gripper.command = _OPEN
         self._still(IDLE_S)
 
     def _angles(self) -> Iterator[float]:
@@ -126,11 +133,8 @@ class Play:
         now_s = self._scene.time_s
         if now_s >= self._due_frame_s:
             self._due_frame_s += FRAME_PERIOD_S
-            seen = self._scene.frame(FRAME_PERIOD_S)
             self.recorded.frame_s.append(now_s - FRAME_PERIOD_S / 2)
-            self.recorded.lines.append(
-                [self._frame_of(seen.grip, sign * seen.shear_torque_nm, seen.diameter_mm) for sign in SIDES.values()]
-            )
+            self.recorded.lines.append(lines_of(self._scene, self._frame_of))
         if now_s >= self._due_torque_s:
             self._due_torque_s += PERIOD_S
             self.recorded.torque_s.append(now_s - PERIOD_S / 2)

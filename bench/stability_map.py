@@ -25,17 +25,17 @@ from bench.plant import Plant, Sample, Sensor, Tool
 from daemon.control.controller import TwistController
 from daemon.control.margins import LoopModel, gain_limit, pulse_response, seen_through_window
 from daemon.control.settings import ControllerSettings
+from drivers.eit_format import FRAME_PERIOD_S
 
 FloatArray = NDArray[np.float64]
 
-FRAME_S = 0.5412
 COMMAND_S = 0.016
 ACTUATION_S = 0.02
 BANDWIDTH_PER_S = 4.0
 STIFFNESS = 0.25
 # The integral follows the gain as its square, as it does in the controller.
 KI_SHARE = 0.1
-EIT_AGE_S = 0.5 * FRAME_S + 0.06
+EIT_AGE_S = 0.5 * FRAME_PERIOD_S + 0.06
 AGES_S = tuple(np.round(np.geomspace(EIT_AGE_S, 3.0, 9), 3))
 CYCLE = 8
 LOST = tuple(range(7))
@@ -57,8 +57,8 @@ class Case:
     def model(self, age_s: float, kp: float = 0.1) -> LoopModel:
         """Return what the margins are computed from."""
         return LoopModel(
-            sample_period_s=FRAME_S,
-            window_s=FRAME_S,
+            sample_period_s=FRAME_PERIOD_S,
+            window_s=FRAME_PERIOD_S,
             age_s=age_s,
             actuation_s=ACTUATION_S,
             wrist_bandwidth_per_s=BANDWIDTH_PER_S,
@@ -73,15 +73,17 @@ class Case:
         """Return the real thing."""
         believed = STIFFNESS / self.stiffness_ratio
         if self.held_speed:
-            return HeldSpeed(stiffness_nm_per_rad=believed, sample_period_s=FRAME_S, kp=kp, ki=KI_SHARE * kp * kp)
+            return HeldSpeed(
+                stiffness_nm_per_rad=believed, sample_period_s=FRAME_PERIOD_S, kp=kp, ki=KI_SHARE * kp * kp
+            )
         if not self.compensated:
             return LateCorrection(
                 stiffness_nm_per_rad=believed, kp=kp, ki=KI_SHARE * kp * kp, wrist_bandwidth_per_s=BANDWIDTH_PER_S
             )
         settings = ControllerSettings(
             stiffness_nm_per_rad=believed,
-            sample_period_s=FRAME_S,
-            window_s=FRAME_S,
+            sample_period_s=FRAME_PERIOD_S,
+            window_s=FRAME_PERIOD_S,
             kp=kp,
             ki=KI_SHARE * kp * kp,
             wrist_bandwidth_per_s=BANDWIDTH_PER_S,
@@ -120,11 +122,11 @@ def simulated_boundary(case: Case, age_s: float, lost: int) -> float:
 
 
 def _grows(case: Case, age_s: float, lost: int, kp: float) -> bool:
-    sensor = Sensor(period_s=FRAME_S, window_s=FRAME_S, transfer_s=age_s - 0.5 * FRAME_S)
+    sensor = Sensor(period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, transfer_s=age_s - 0.5 * FRAME_PERIOD_S)
     tool = Tool(stiffness_nm_per_rad=STIFFNESS, relaxing_share=0.0, actuation_s=ACTUATION_S)
     plant = Plant(tool, sensor, np.random.default_rng(0), COMMAND_S, disturbance_nm=START_NM)
-    frames = FRAMES * CYCLE // (CYCLE - lost) + int(3 * age_s / FRAME_S)
-    trace = run(plant, case.loop(kp), frames * FRAME_S, _keep(lost), bound_nm=100.0 * START_NM)
+    frames = FRAMES * CYCLE // (CYCLE - lost) + int(3 * age_s / FRAME_PERIOD_S)
+    trace = run(plant, case.loop(kp), frames * FRAME_PERIOD_S, _keep(lost), bound_nm=100.0 * START_NM)
     if abs(trace.torque_nm[-1]) > 100.0 * START_NM:
         return True
     third = len(trace.torque_nm) // 3
@@ -192,8 +194,8 @@ def _response(case: Case, model: LoopModel) -> FloatArray:
     if not case.held_speed:
         return pulse_response(model)
     # A held speed brings the wrist evenly to its correction, over one frame period.
-    times = np.arange(0.0, FRAME_S + ACTUATION_S + 4 * COMMAND_S, COMMAND_S)
-    ramp = np.clip((times - ACTUATION_S) / FRAME_S, 0.0, 1.0)
+    times = np.arange(0.0, FRAME_PERIOD_S + ACTUATION_S + 4 * COMMAND_S, COMMAND_S)
+    ramp = np.clip((times - ACTUATION_S) / FRAME_PERIOD_S, 0.0, 1.0)
     return seen_through_window(ramp, model)
 
 
@@ -228,7 +230,7 @@ def main() -> None:
     cases = boundaries()
     worst = {name: {axis: worst_disagreement(rows) for axis, rows in axes.items()} for name, axes in cases.items()}
     result = {
-        "frame_period_s": FRAME_S,
+        "frame_period_s": FRAME_PERIOD_S,
         "eit_age_s": EIT_AGE_S,
         "boundaries": {name: {axis: _finite(rows) for axis, rows in axes.items()} for name, axes in cases.items()},
         "worst_disagreement": worst,

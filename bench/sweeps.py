@@ -23,16 +23,17 @@ import numpy as np
 import yaml
 import zmq.asyncio
 
+from bench.rig_configuration import write_configuration
 from daemon.app import Daemon
 from daemon.config import load_daemon_config
 from daemon.config_file import load_yaml_model
 from daemon.experiment.programme import expected_s
 from daemon.experiment.steps import ExperimentFile
 from daemon.slices import SliceRecorder
+from drivers.eit_format import FRAME_PERIOD_S
 
 EXPERIMENTS = Path("config/experiments")
 DIAMETERS_MM = (10, 20, 30, 40)
-FRAME_PERIOD_S = 0.5412
 # What is asked of the arm, which is played ARM_SPEED times as fast: up to ur-rtde's own bounds, and no faster in all
 # than a late command may be on a busy computer (3 rad/s).
 ARM_SPEED = 3.0
@@ -62,38 +63,24 @@ def planned_s(path: Path) -> float:
 
 def configuration(args: argparse.Namespace, folder: Path) -> Path:
     """Write the configuration of a rig that is `speed` times as fast, and return its path."""
-    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
-    robot["limits"]["wrist_speed_rad_per_s"] = {"inner": SPEED_RAD_PER_S, "hard": 1.5 * SPEED_RAD_PER_S}
-    bound = {"inner": ACCELERATION_RAD_PER_S2, "hard": 40.0}
-    robot["limits"]["wrist_acceleration_rad_per_s2"] = bound
-    (folder / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": args.host, "rate_hz": args.rate_hz}))
-    content = {
-        "publish": f"ipc://{folder}/publish",
-        "commands": f"ipc://{folder}/commands",
-        "fingertips": {
-            "right": {
-                "device": {"path": "eit-right"},
-                "bank": str(args.bank.resolve()),
-                "calibration": str(args.calibration.resolve()),
-                "matching": "zero_lag",
-                "frame_period_s": FRAME_PERIOD_S / args.speed,
-            }
-        },
-        "load_cell": {"device": {"path": "load-cell"}, "rate_hz": 10.9 * args.speed},
-        "robot": "ur.yaml",
-        "gripper": {"socket": {"host": args.host}},
-        "loop": {
-            "disagreement_nm": 1.0,
-            "jump_nm": 1.0,
+    limits: dict[str, Any] = yaml.safe_load(Path("config/ur.yaml").read_text())["limits"]
+    limits["wrist_speed_rad_per_s"] = {"inner": SPEED_RAD_PER_S, "hard": 1.5 * SPEED_RAD_PER_S}
+    limits["wrist_acceleration_rad_per_s2"] = {"inner": ACCELERATION_RAD_PER_S2, "hard": 40.0}
+    return write_configuration(
+        folder,
+        args.bank,
+        args.calibration,
+        args.host,
+        robot={"rate_hz": args.rate_hz, "limits": limits},
+        fingertip={"frame_period_s": FRAME_PERIOD_S / args.speed},
+        load_cell={"rate_hz": 10.9 * args.speed},
+        loop={
             "freshness_s": FRESHNESS_S,
             "angle_bandwidth_per_s": args.bandwidth_per_s,
             "wrist_speed_rad_per_s": SPEED_RAD_PER_S,
             "wrist_acceleration_rad_per_s2": ACCELERATION_RAD_PER_S2,
         },
-    }
-    path = folder / "config.yaml"
-    path.write_text(yaml.safe_dump(content))
-    return path
+    )
 
 
 class Ends:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bank.calibration import Calibration
+from bank.estimators.guard import LEAST_NOISE_V
 from bank.matching import Match, signal_above_noise
 from bank.polynomial import Interval
 from drivers.eit_kit import Frame
@@ -20,13 +21,10 @@ FloatArray: TypeAlias = NDArray[np.float64]
 
 # Above this share of unusable channels the match would be made of what is left over.
 LARGEST_UNUSABLE_SHARE = 0.10
-# One step of the board's converter (measured on recorded frames), whose rounding is the least noise there is.
-CONVERTER_STEP_V = 0.00215
 # After a longer gap than this between usable frames the mean begins anew: what was before it is not the present.
 LONGEST_GAP_NS = 3_000_000_000
 # Degrees of freedom with which the mean variance of all channels enters that of each.
 POOLED_FREEDOM = 30
-_LEAST_NOISE_V = CONVERTER_STEP_V / np.sqrt(12.0)
 
 
 class Matcher(Protocol):
@@ -116,7 +114,7 @@ class Baseline:
         freedom = self.taken - 1
         own = (self._sum_of_squares - self.taken * mean**2) / freedom
         variance = (freedom * own + POOLED_FREEDOM * own.mean()) / (freedom + POOLED_FREEDOM)
-        return np.asarray(np.sqrt(np.maximum(variance, _LEAST_NOISE_V**2)))
+        return np.asarray(np.sqrt(np.maximum(variance, LEAST_NOISE_V**2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

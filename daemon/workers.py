@@ -5,7 +5,7 @@ with it when it died is given to another one; only where tasks kill one worker a
 """
 
 import socket
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -94,6 +94,11 @@ class Cluster:
 
 def _itself(shared: S) -> S:
     return shared
+
+
+def in_order(found: Iterable[tuple[int, R]]) -> list[R]:
+    """Return what a map yields as its tasks are finished, in the order of their items."""
+    return [result for _, result in sorted(found, key=lambda pair: pair[0])]
 
 
 @contextmanager

@@ -20,6 +20,8 @@ LINE_BYTES = N_VALUES * CELL_BYTES
 LONGEST_LINE_BYTES = 2 * LINE_BYTES
 EXCERPT_BYTES = 60
 
+# The mean over two recordings of 832 frames each.
+FRAME_PERIOD_S = 0.5408
 ADC_REFERENCE_V = 2.2
 ADC_STEP_V = ADC_REFERENCE_V / 1024
 # The largest sine about mid-scale that the ADC can follow peaks at its rails; whatever reads more is clipped by them.

@@ -6,11 +6,9 @@ else stands in the header. Equal calibrations are equal bytes: fixed dates, fixe
 
 import hashlib
 import io
-import os
 import types
 import zipfile
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -19,8 +17,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from bank.bank_file import sync_directory
 from bank.errors import CalibrationError
+from bank.stored import check_made_with, check_version, replaced
 
 FORMAT_VERSION = 3
 _KIND = "shearloop estimator calibration"
@@ -31,7 +29,7 @@ T = TypeVar("T")
 
 
 def write_archive(path: str | Path, identities: Mapping[str, str], content: Any) -> None:
-    """Write a tree of dataclasses under a temporary name, flush it, and rename it; CalibrationError where it fails."""
+    """Write a tree of dataclasses over what was there; CalibrationError where it fails."""
     path = Path(path)
     arrays: dict[str, NDArray[Any]] = {}
     plain = _plain(content, "", arrays)
@@ -44,19 +42,11 @@ def write_archive(path: str | Path, identities: Mapping[str, str], content: Any)
         "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
     }
     text = yaml.safe_dump(header, sort_keys=False, allow_unicode=True, width=120).encode()
-    temporary = path.with_name(f"{path.name}.tmp")
     try:
-        with temporary.open("wb") as file:
-            with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
-                for name, data in {_HEADER: text, **members}.items():
-                    archive.writestr(zipfile.ZipInfo(name, _DATE), data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        sync_directory(path.parent)
+        with replaced(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            for name, data in {_HEADER: text, **members}.items():
+                archive.writestr(zipfile.ZipInfo(name, _DATE), data)
     except OSError as error:
-        with suppress(OSError):
-            temporary.unlink()
         raise CalibrationError(
             f"{path}: the calibration cannot be written: {error.strerror}; choose another --out"
         ) from error
@@ -72,17 +62,8 @@ def read_archive(path: str | Path, identities: Mapping[str, str], kind: type[T])
     header, arrays = _members(path)
     if header.get("kind") != _KIND:
         raise CalibrationError(f"{path} is not an estimator's calibration: make one with `shearloop calibrate`")
-    if header.get("format_version") != FORMAT_VERSION:
-        raise CalibrationError(
-            f"{path}: the calibration has format version {header.get('format_version')}, expected {FORMAT_VERSION}; "
-            "calibrate again"
-        )
-    for key, wanted in identities.items():
-        if header.get(key) != wanted:
-            raise CalibrationError(
-                f"{path}: the calibration was made with the {key.replace('_', ' ')} {str(header.get(key))[:12]}…, "
-                f"expected {wanted[:12]}…; calibrate again"
-            )
+    check_version(path, header, FORMAT_VERSION)
+    check_made_with(path, header, identities)
     try:
         restored: T = _restored(kind, header["content"], "", arrays)
     except (KeyError, TypeError, ValueError, IndexError) as error:

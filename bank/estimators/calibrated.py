@@ -8,7 +8,7 @@ from typing import Literal, Self
 import numpy as np
 
 from bank.bank_file import Bank
-from bank.channels import CHANNEL_TABLE_HASH
+from bank.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from bank.errors import CalibrationError
 from bank.estimators.archive import read_archive, write_archive
 from bank.estimators.familiar import DifferenceGuard
@@ -229,9 +229,12 @@ class Tracker:
                 wanted[name] = task
         if not wanted:
             return Estimate(valid=False, why=tuple(refused))
-        if task_guard := next((task.guard for task in wanted.values() if task.guard is not None), None):
-            # What a dead channel would have said is taken from the frames of the calibration.
-            difference = np.where(usable, difference, task_guard.mean)
+        guard = next((task.guard for task in wanted.values() if task.guard is not None), None)
+        if guard is not None and not usable.all():
+            # A curve does without dead channels; all else has to be told what they would have said.
+            curve = calibration.estimator == "fused"
+            said = np.full(N_CHANNELS, np.nan) if curve else guard.filled(difference[0], usable[0])
+            difference = np.where(usable, difference, said)
         seen = features_of(calibration, self._locator, difference, recent, t_s)
         if seen.place is not None and seen.place.ambiguous:
             return _with_place(

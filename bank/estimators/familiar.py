@@ -95,6 +95,11 @@ class DifferenceGuard:
         scores = np.linalg.lstsq(v.T, self._scaled(difference, usable), rcond=None)[0]
         return float((scores**2 / self.variances[:_REACHING]).sum())
 
+    def filled(self, difference: FloatArray, usable: BoolArray) -> FloatArray:
+        """Return a (896,) difference with unusable channels where the usable ones say, along the main directions."""
+        scores = np.linalg.lstsq(self.directions[:, usable].T, self._scaled(difference, usable), rcond=None)[0]
+        return np.where(usable, difference, np.maximum(self.mean + self.spread * (scores @ self.directions), 0.0))
+
     def _scaled(self, difference: FloatArray, usable: BoolArray) -> FloatArray:
         return np.asarray(((difference - self.mean) / self.spread)[usable])
 

@@ -125,6 +125,11 @@ def fit(
 
 
 def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:
+    if len(blank.sides) > 1:
+        raise CalibrationError(
+            f"slices of {len(blank.sides)} fingertips ({', '.join(blank.sides)}) do not go into one calibration; make "
+            "one for each"
+        )
     frames = np.concatenate([one.channels for one in recordings])
     times = _consecutive([one.t_s for one in recordings])
     torque = np.concatenate([one.torque_at_frames() for one in recordings])

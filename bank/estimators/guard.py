@@ -16,8 +16,8 @@ from bank.errors import CalibrationError
 from bank.estimators.values import BoolArray, FloatArray
 
 # One step of the board's converter, as measured on recorded frames; its rounding is the least noise there is.
-CONVERTER_STEP_V = 0.00215
-LEAST_NOISE_V = CONVERTER_STEP_V / np.sqrt(12.0)
+_CONVERTER_STEP_V = 0.00215
+LEAST_NOISE_V = float(_CONVERTER_STEP_V / np.sqrt(12.0))
 
 # Median relative deviation, after the common gain, beyond which this is not the fingertip of the calibration.
 LARGEST_DEVIATION = 0.12

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from bank.errors import CalibrationError
-from bank.estimators.values import BoolArray, FloatArray
+from bank.estimators.values import FloatArray
 
 # Readings below this share of the largest torque count as "the lever does not touch".
 CENSORED_SHARE = 0.02
@@ -186,13 +186,14 @@ class Curve:
         """Return the (n,) values of (n, d + 1) frames, the last column being their times."""
         return np.array([self.estimate(frame[:-1], float(frame[-1])) for frame in features])
 
-    def estimate(self, frame: FloatArray, t: float, usable: BoolArray | None = None) -> float:
-        """Return a (d,) frame's value at the time t; channels that are not usable are left out.
+    def estimate(self, frame: FloatArray, t: float) -> float:
+        """Return a (d,) frame's value at the time t; channels that are NaN are left out.
 
         A time before the last one that was fitted to is taken for that one: somebody counts from the beginning again.
         """
-        keep = np.ones(len(self.channels), dtype=np.bool_) if usable is None else usable[self.channels]
-        b, v, x = self.coefficients[:, keep].copy(), self.drift[:, keep], (frame[self.channels] / self.spread)[keep]
+        x = frame[self.channels] / self.spread
+        keep = np.isfinite(x)
+        b, v, x = self.coefficients[:, keep], self.drift[:, keep], x[keep]
         later = float(_age(np.array([max(t, self.last_t)]), self.first_t, self.last_t)[0])
         b[: len(self.trend)] += later * self.trend[:, keep]
         inner = np.linalg.inv(np.diag(self.noise**2 / self.drift_variance) + v @ v.T)

@@ -13,15 +13,13 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from bank.bank_file import Bank
-from bank.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from bank.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, smoothed_along_channels
 from bank.estimators.values import FloatArray
 from bank.fast_matching import FastMatcher
 
 if TYPE_CHECKING:
     from bank.mesh import Mesh
 
-# The paper's window along the channels: nine long, standard deviation 9/5.
-_WINDOW = np.exp(-0.5 * (np.arange(-4, 5) / 1.8) ** 2)
 # A cell that scores within this of the best one makes a match ambiguous when it is further away than this in k (an
 # eighth of the fingertip), or in sigma by this ratio.
 _ALIKE, _FAR_K_CM, _FAR_SIGMA = 0.002, 0.55, 1.5
@@ -136,14 +134,14 @@ class NearestCell:
         self._grids = (bank.k_grid, bank.sigma_grid)
         self._valid = np.asarray(bank.valid).ravel()
         signals = np.abs(bank.signals.reshape(-1, N_CHANNELS)[self._valid][:, registration.model_channels()])
-        smooth = np.array([_smoothed(signal) for signal in signals.astype(np.float64)])
+        smooth = smoothed_along_channels(signals.astype(np.float64))
         self._norms = np.linalg.norm(smooth, axis=1)
         self._shapes = (smooth / self._norms[:, None]).astype(np.float32)
         self._cells = np.flatnonzero(self._valid)
 
     def locate(self, difference: FloatArray) -> Place:
         """Return the refined place of the best cell."""
-        x = _smoothed(np.abs(difference))
+        (x,) = smoothed_along_channels(np.abs(difference)[None])
         norm = float(np.linalg.norm(x))
         scores = np.full(len(self._valid), -np.inf)
         scores[self._cells] = self._shapes @ (x / norm).astype(np.float32)
@@ -199,10 +197,6 @@ def image_matrix(mesh: "Mesh", smoothing: float = 0.05) -> FloatArray:
     normal = jacobian.T @ jacobian
     prior = np.diag(np.diag(normal)) * smoothing
     return np.asarray(np.linalg.solve(normal + prior, jacobian.T))
-
-
-def _smoothed(values: FloatArray) -> FloatArray:
-    return np.asarray(np.convolve(values, _WINDOW, "same") / np.convolve(np.ones(len(values)), _WINDOW, "same"))
 
 
 def _drop(heatmap: FloatArray, row: int, column: int) -> float:

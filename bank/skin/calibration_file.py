@@ -2,7 +2,6 @@
 
 import csv
 import math
-import os
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bank.errors import CalibrationError
 from bank.skin.calibration import CalibrationTable, SkinCalibration
+from bank.stored import replaced
 
 FORMAT = "shearloop skin calibration 1"
 # A load cell at rest may read a little less than nothing; a skin cannot be pulled off its core.
@@ -76,7 +76,7 @@ class _File(BaseModel):
 
 
 def save_calibration(calibration: SkinCalibration, path: Path) -> None:
-    """Write a calibration as YAML, under a temporary name first, so that no half of it is ever read."""
+    """Write a calibration as YAML over what was there, so that no half of it is ever read."""
     document = {
         "format": FORMAT,
         "friction": calibration.friction,
@@ -89,10 +89,9 @@ def save_calibration(calibration: SkinCalibration, path: Path) -> None:
         "rows_beyond": calibration.rows_beyond,
         "rest_ohm": list(calibration.rest_ohm),
     }
-    part = path.with_name(path.name + ".part")
     try:
-        part.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
-        os.replace(part, path)
+        with replaced(path) as file:
+            file.write(yaml.safe_dump(document, sort_keys=False).encode())
     except OSError as error:
         raise CalibrationError(f"{path}: the calibration cannot be written: {error}.") from error
 

@@ -12,7 +12,7 @@ from bank.fingertip import Fingertip
 from bench.charts.picture import SHADES, figure, save
 from bench.charts.sources import Split, own_fingertip
 from daemon.scene import choices_of, scene_of
-from daemon.workers import Workers
+from daemon.workers import Workers, in_order
 
 _MESH_SIZE_CM = 0.07
 _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
@@ -21,10 +21,10 @@ _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
 def chart(parts: Sequence[Split], out: Path, pool: Workers) -> list[Path]:
     """Design for the whole of each recording, draw and write; each recording is a task of its own."""
     scenes = [scene_of(split.whole) for split in parts]
-    found = sorted(pool.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes), key=lambda pair: pair[0])
+    found = in_order(pool.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
     return [
         path
-        for split, (_, design) in zip(parts, found, strict=True)
+        for split, design in zip(parts, found, strict=True)
         for path in write(split.title.split(",", maxsplit=1)[0], design, out)
     ]
 

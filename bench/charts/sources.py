@@ -17,6 +17,7 @@ from daemon.config_file import load_yaml_model
 from daemon.recording.series import part_of, read_series
 from daemon.reproduce.banks import OWN_FINGERTIP, Grid, cached_bank
 from daemon.synthetic import Synthesiser, TwistProgramme
+from drivers.eit_format import FRAME_PERIOD_S
 
 Floats = NDArray[np.float64]
 
@@ -28,7 +29,6 @@ MESH_SIZE_CM = 0.2
 # Synthetic frames come from a finer mesh than the bank they are matched with, from cells between that bank's.
 _PLAYED_GRID = Grid(np.linspace(3.07, 3.47, 5), np.linspace(1.03, 1.99, 17))
 PLAYED_MESH_SIZE_CM = 0.14
-_PERIOD_S = 0.5412
 _LARGEST_NM = 0.14
 _AVERAGED_FRAMES = 9
 _REST_S = 8.0
@@ -129,7 +129,7 @@ def synthetic_stream(scratch: Path, seed: int = 0, cycles: int = 8) -> FrameSeri
     programme = TwistProgramme(torque_nm=0.12, grip_s=1.0, cycles=cycles)
     gripped_s = programme.idle_s + programme.grip_s
     end_s = gripped_s + _REST_S + cycles * 2 * (programme.turn_s + programme.hold_s)
-    t_s = np.arange(0.5 * _PERIOD_S, end_s, _PERIOD_S)
+    t_s = np.arange(0.5 * FRAME_PERIOD_S, end_s, FRAME_PERIOD_S)
     # A rest after the grip, before the first twist.
     moments = [programme.at(t if t < gripped_s else max(t - _REST_S, gripped_s)) for t in t_s.tolist()]
     channels = np.empty((len(t_s), 2, N_CHANNELS))

@@ -13,7 +13,7 @@ from bank.estimators.guard import channel_noise
 from bench.charts.faults import FAULTS, Fault, Scene, Spoilt, scene_of
 from bench.charts.sources import Split
 from daemon.scene import residual_noise
-from daemon.workers import Workers
+from daemon.workers import Workers, in_order
 
 Floats = NDArray[np.float64]
 # Of valid estimates one in twenty may miss its 95 % interval; an estimator that is wrong so often says it is right
@@ -170,8 +170,8 @@ _MEAN_V = 0.13
 def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, pool: Workers) -> list[Curve]:
     """Return all estimators through all faults on one split; each estimator is a task of its own."""
     tasks = fitted(split, names, physics)
-    found = sorted(pool.map(swept, (scene_for(split, bank), str(bank.path.resolve())), tasks), key=lambda pair: pair[0])
-    return [one for _, curves in found for one in curves]
+    found = in_order(pool.map(swept, (scene_for(split, bank), str(bank.path.resolve())), tasks))
+    return [one for curves in found for one in curves]
 
 
 def swept(shared: tuple[Scene, str], calibration: Calibration) -> list[Curve]:

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from daemon.errors import UserError
     from daemon.recording.evaluation import followed, judge, reasons
     from daemon.recording.series import part_of, read_series
-    from daemon.workers import workers
+    from daemon.workers import in_order, workers
 
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
     parts = [part_of(one, start, stop) for one in series]
     shared = (calibration, None if bank is None else str(args.bank.resolve()))
     with workers(args.cluster) as pool:
-        tracks = [track for _, track in sorted(pool.map(followed, shared, parts), key=lambda pair: pair[0])]
+        tracks = in_order(pool.map(followed, shared, parts))
     figures = judge(tracks)
     if args.plot or args.out:
         out = args.out or args.calibration.with_suffix(".png")

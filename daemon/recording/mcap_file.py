@@ -9,7 +9,7 @@ from typing import Protocol
 
 from mcap.writer import CompressionType, Writer
 
-from bank.bank_file import sync_directory
+from bank.stored import sync_directory
 from daemon.recording.schema import PROFILE, schema_of, schemas
 
 PARTIAL = ".partial"

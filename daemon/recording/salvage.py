@@ -11,7 +11,7 @@ from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from bank.bank_file import sync_directory
+from bank.stored import replaced
 from daemon.errors import UserError
 from daemon.recording.mcap_file import PARTIAL
 from daemon.recording.schema import PROFILE
@@ -86,23 +86,18 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
     if out.exists():
         raise UserError(f"{out} is there already; move it away, or name another file with --out")
     condition = condition_of(source)
-    begun = out.with_name(f"{out.name}.repairing")
     try:
-        with begun.open("wb") as file:
+        with replaced(out) as file:
             writer = Writer(file, compression=CompressionType.ZSTD)
             writer.start(profile=PROFILE, library="shearloop")
             copied = _Copied()
             for record in records(source, condition, progress):
                 _copy(writer, record, copied)
             writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves its return type out
-        if not copied.messages:
-            raise UserError(f"{source}: there is no whole message in it, so nothing can be saved")
-        begun.replace(out)
-        sync_directory(out.parent)
+            if not copied.messages:
+                raise UserError(f"{source}: there is no whole message in it, so nothing can be saved")
     except OSError as error:
         raise UserError(f"{out}: the repaired recording cannot be written: {error.strerror}") from error
-    finally:
-        begun.unlink(missing_ok=True)
     return Repaired(out, copied.messages, condition)
 
 

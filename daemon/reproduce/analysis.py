@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from bank.bank_file import Bank
 from bank.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
+from bank.channels import smoothed_along_channels
 from bank.errors import CalibrationError, MatchingError
 from bank.forward import ForwardModel
 from bank.grouping import Labels, group_means, kmeans_groups, place_in_series
@@ -38,8 +39,6 @@ _GROUPS = 10
 # Where the slices are no repeats, the held-out parts are so many stretches of time.
 _STRETCHES = 5
 _BATCH = 8
-# Diameter slices are smoothed along the channels before they are matched: a Gaussian over nine channels.
-_SMOOTHING = np.exp(-0.5 * (np.arange(-4, 5) / (9 / 5)) ** 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,12 +213,6 @@ def correlation(x: FloatArray, y: FloatArray) -> float | None:
     if len(x) < FEWEST_SLICES or np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
     return float(np.corrcoef(x, y)[0, 1])
-
-
-def smoothed_along_channels(differences: FloatArray) -> FloatArray:
-    """Return (n, 896) differences averaged over nine channels by a Gaussian of sd 9/5, less of them at both ends."""
-    weights = np.convolve(np.ones(differences.shape[1]), _SMOOTHING, "same")
-    return np.array([np.convolve(row, _SMOOTHING, "same") / weights for row in differences])
 
 
 def _levels(torque: FloatArray) -> tuple[Labels, str]:

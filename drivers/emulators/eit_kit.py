@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.eit_format import FRAME_PERIOD_S
 from drivers.emulators.board import PlayedBoard
 from drivers.emulators.outage import Outage
 
-# The mean over two recordings of 832 frames each.
-FRAME_PERIOD_S = 0.5408
 N_VALUES = 1024
 FLOOD_BYTES = 100_000
 # Lateness of this process that it makes up for, so that a fast pace is kept on the average.

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from drivers.eit_format import FRAME_PERIOD_S
 from drivers.emulators import eit_kit, hx711
-from drivers.emulators.eit_kit import FRAME_PERIOD_S, EitKitBoard
+from drivers.emulators.eit_kit import EitKitBoard
 from drivers.emulators.hx711 import Hx711Board, Sketch
 from drivers.emulators.robotiq.gripper import Gripper
 from drivers.emulators.robotiq.modbus_face import ModbusServer

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from bank import channels
 
@@ -21,3 +22,14 @@ def test_a_line_and_its_channels_are_one_another() -> None:
     assert (line[channels.ZERO_SLOTS] == 0).all()
     np.testing.assert_array_equal(channels.channels_of_line(line), frame)
     assert line[:3].tolist() == [0.0, 1.0, 2.0], "injection 0: the pair 0-1 touches the driven electrode 0"
+
+
+def test_smoothing_keeps_what_is_constant_and_spreads_a_peak_over_nine_channels() -> None:
+    peak = np.zeros((2, 896))
+    peak[0] = 3.0
+    peak[1, 100] = 1.0
+    smooth = channels.smoothed_along_channels(peak)
+    np.testing.assert_allclose(smooth[0], 3.0)
+    assert np.flatnonzero(smooth[1]).tolist() == list(range(96, 105))
+    assert smooth[1].sum() == pytest.approx(1.0)
+    assert smooth[1, 101] / smooth[1, 100] == pytest.approx(np.exp(-0.5 / 1.8**2))

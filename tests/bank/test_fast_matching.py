@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Iterator
-from multiprocessing import resource_tracker
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +11,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
-from bank import batch_matching, bounds, fast_matching
-from bank.bank_file import BankDefinition, write_bank
-from bank.batch_matching import BatchMatcher
+from bank import bounds, fast_matching
 from bank.channels import N_CHANNELS, channels_of_line
-from bank.errors import BankFileError, MatchingError
+from bank.errors import MatchingError
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
 from bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher
 
@@ -177,34 +174,17 @@ def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
     assert sum(read) < BANK[1].sum() / 4
 
 
-@pytest.fixture(scope="module")
-def tracker() -> None:
-    """Start what the first spawned process starts and leaves running, with its pipe."""
-    resource_tracker.ensure_running()
-
-
 @both
-@pytest.mark.usefixtures("tracker")
-def test_a_batch_is_its_frames_in_their_order(slow, fast, monkeypatch, tmp_path) -> None:
+def test_a_batch_is_its_frames_in_their_order(slow, fast) -> None:
     random = np.random.default_rng(5)
     frames = random.normal(size=(19, N_CHANNELS)) + 3 * BANK[0][BANK[1]][random.integers(0, BANK[1].sum(), 19)]
     alone = [fast.match(frame, runner_up=False) for frame in frames]
     assert [match.cell for match in alone] == [slow.match(frame).cell for frame in frames]
     assert fast.matches(frames) == alone
     assert fast.matches(frames[:0]) == []
-    monkeypatch.setattr(batch_matching, "_FRAMES_PER_TASK", 5)
-    path = tmp_path / "smooth.bank"
-    definition = BankDefinition("ab" * 32, "gaussian_derivative", fast.k_grid, fast.sigma_grid)
-    write_bank(path, definition, np.ones(N_CHANNELS), np.ones(SHAPE), BANK[1], BANK[0])
-    with BatchMatcher(type(fast), path, 2) as batch:
-        assert batch.matches(frames) == alone
-        assert batch.matches(frames[:0]) == []
-        frames[-1] = 0.0
-        for wrong in (fast, batch):
-            with pytest.raises(MatchingError, match="zero in all channels"):
-                wrong.matches(frames)
-    with pytest.raises(BankFileError, match="none"):
-        BatchMatcher(type(fast), tmp_path / "none.bank", 2)
+    frames[-1] = 0.0
+    with pytest.raises(MatchingError, match="zero in all channels"):
+        fast.matches(frames)
 
 
 @both

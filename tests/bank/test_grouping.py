@@ -1,6 +1,8 @@
+from itertools import combinations
+
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from bank.errors import CalibrationError
@@ -23,6 +25,41 @@ def test_series_are_found_though_some_lack_a_level(repeats: int, lacking: dict[i
     series = place_in_series(np.array([LEVELS[level] for _, level in places]) + drift)
     assert series is not None
     assert list(zip(series.repeat.tolist(), series.level.tolist(), strict=True)) == places
+
+
+@given(drift=st.lists(st.floats(-0.02, 0.02), min_size=14, max_size=14), lacking=st.sampled_from([1, 2, 3, 4, 5, 6]))
+def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift: list[float], lacking: int) -> None:
+    """By all ways there are: values that noise made change places stay in their order, and each has its own level."""
+    lacks_two = [level for level in range(1, 8) if level != lacking]
+    values = LEVELS[[*range(8), *lacks_two]] + drift
+    series = place_in_series(values)
+    # So much noise may be in it that nothing rises, or that a level looks like the beginning of another series.
+    assume(series is not None and series.repeat.tolist() == 8 * [0] + 6 * [1])
+    assert series.level[:8].tolist() == list(range(8))
+    found = series.level[8:]
+    cost = {
+        levels: float(((values[8:] - values[list(levels)]) ** 2).sum()) for levels in combinations(range(8), len(found))
+    }
+    assert tuple(found) in cost
+    assert cost[tuple(found)] == pytest.approx(min(cost.values()), abs=1e-15)
+
+
+def test_a_value_nearer_to_a_level_that_its_series_lacks_goes_there() -> None:
+    """Nothing tells them apart: 0.06 that reads 0.0549 is 0.05, where no other value is."""
+    whole, lacking = LEVELS.tolist(), np.delete(LEVELS, 2).tolist()
+    for reading, level in ((0.0551, 3), (0.0549, 2)):
+        lacking[2] = reading
+        series = place_in_series(np.array([*whole, *lacking, *whole]))
+        assert series is not None
+        assert series.level[8:15].tolist() == [0, 1, level, 4, 5, 6, 7]
+
+
+def test_in_a_whole_series_noise_moves_no_value_to_another_level() -> None:
+    swapped = LEVELS.copy()
+    swapped[[3, 4]] = 0.071, 0.059
+    series = place_in_series(np.concatenate([LEVELS, swapped, LEVELS]))
+    assert series is not None
+    assert series.level.tolist() == 3 * list(range(8))
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import pytest
 
 from bank.bank_file import Bank, BankDefinition, write_bank
 from bench import peers
+from daemon.workers import InTurn
 from tests.bank.conftest import small_fingertip
 
 
@@ -20,7 +21,7 @@ def bank(tmp_path_factory) -> Bank:
 
 def test_ratios_are_taken_turn_by_turn() -> None:
     seconds = {"own": [1.0, 2.0, 4.0], "peer": [3.0, 6.0, 12.0], "other": [1.0, 1.0, 1.0]}
-    found = peers.ratios(seconds, "own", iter(("peer", "absent")))
+    found = peers.ratios(seconds, "own", ("peer", "absent"))
     assert found == {"peer / own": {"median": 3.0, "low": 3.0, "high": 3.0, "n": 3}}
 
 
@@ -44,6 +45,24 @@ def test_the_fast_ways_give_what_the_slow_ones_give(bank, monkeypatch) -> None:
     assert same == peers.N_CHECKED
     quick, plain = (matches[name][0]() for name in ("zero lag, fast", "zero lag, numpy float32"))
     assert [bank.signals.shape[1] * each.cell[0] + each.cell[1] for each in quick] == plain
+
+
+def test_two_processes_match_a_batch_as_one_does(bank, monkeypatch) -> None:
+    frames = peers.frames_of(bank, None)[:5]
+    parts: list[int] = []
+
+    class Counted(InTurn):
+        def map(self, function, shared, items):
+            parts.append(len(items))
+            for number, found in super().map(function, shared, items):
+                assert found == peers.MATCHERS[shared[0]].from_bank(bank).matches(items[number])
+                yield number, found
+
+    monkeypatch.setattr(peers, "BATCH", 7)
+    monkeypatch.setattr(peers, "Processes", lambda _: Counted())
+    found = peers.batches_a_minute(bank.path, frames, 2)
+    assert list(found) == [f"{lags}, {n}" for lags in peers.MATCHERS for n in ("one process", "two processes")]
+    assert parts == [2] * 6, "once to warm up, and twice in turn"
 
 
 def test_fewer_than_five_turns_are_refused(monkeypatch, capsys) -> None:

@@ -208,7 +208,7 @@ def test_plot_draws_signals_and_models(pictures):
         (["--sigma", "1:2:3:4"], "--sigma must be LO:HI:N"),
         (
             ["--k", "1:2:1"],
-            "--k 1:2:1: `count` should be greater than or equal to 2 (found 1, allowed: from 2 to 2000)",
+            "--k 1:2:1: a count of 1 needs low and high to be the same, not 1 and 2",
         ),
         (["--k", "2:2:5"], "--k 2:2:5: low must be below high"),
         (["--k", "nan:2:5"], "--k nan:2:5: `low` should be a finite number"),

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from daemon.clock import Clock
+from daemon.config import Fingertip
 from daemon.estimation import Estimation
 from daemon.estimator import Reading
 from daemon.fingertip import FingertipTask
 from daemon.messages import Message
 from daemon.publisher import Publisher
+from drivers.eit_format import FRAME_PERIOD_S
 from drivers.eit_kit import EitKit, Frame
 
 
@@ -112,3 +114,7 @@ async def test_what_an_estimator_dies_of_ends_its_own_task_and_not_the_one_that_
         await told.enough.wait()
         assert not reading.done()
     assert [number for topic, number in told.messages if topic == "eit.frame"] == [0, 1, 2, 3]
+
+
+def test_a_board_is_expected_at_its_own_pace_before_that_is_measured() -> None:
+    assert Fingertip.model_fields["frame_period_s"].default == FRAME_PERIOD_S

@@ -25,9 +25,9 @@ def run(args: argparse.Namespace) -> int:
     from bank.errors import ConductivityError
     from bank.forward import ForwardModel
     from bank.models import conductivity
+    from bank.stored import replaced
     from daemon.bank_config import load_geometry
     from daemon.errors import UserError
-    from daemon.replaced import replaced
 
     mesh = load_geometry(args.mesh)
     try:

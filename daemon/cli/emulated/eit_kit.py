@@ -68,7 +68,8 @@ def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
     from daemon.cli.emulated.console import play
     from daemon.errors import UserError
-    from drivers.emulators.eit_kit import FRAME_PERIOD_S, EitKitBoard, read_fault
+    from drivers.eit_format import FRAME_PERIOD_S
+    from drivers.emulators.eit_kit import EitKitBoard, read_fault
 
     if not (math.isfinite(args.speed) and args.speed > 0):
         raise UserError(f"--speed {args.speed:g} is not above 0")

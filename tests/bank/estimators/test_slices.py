@@ -1,5 +1,7 @@
 """Slices: frames by themselves, with a torque or a diameter each."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -49,12 +51,22 @@ def test_what_is_not_familiar_is_not_valid(sliced):
         assert all(why in one.why[0] and one.torque_nm is None for one in estimates)
 
 
-def test_dead_channels_are_filled_in(sliced):
-    whole, later = sliced(), sliced(seed=4)
-    calibration = fit("fused", [whole], "all")
-    usable = np.random.default_rng(1).random((1, 896)) > 0.1
-    estimates = follow(calibration, later, usable)
-    assert np.sqrt((errors(estimates, later) ** 2).mean()) < 0.012
+@pytest.mark.parametrize("name", ["fused", "regression"])
+def test_with_a_fifth_of_the_channels_dead_the_rest_say_nearly_as_much(sliced, name):
+    """A dead channel that was given the calibration's mean would pull the torque towards its mean."""
+    later = sliced(seed=4)
+    calibration = fit(name, [sliced()], "all")
+    usable = np.random.default_rng(1).random((1, 896)) > 0.2
+    dead = replace(later, channels=np.where(usable, later.channels, 1.0))
+    whole, left = (errors(follow(calibration, *one), later) for one in ((later,), (dead, usable)))
+    assert np.sqrt((left**2).mean()) < 1.25 * np.sqrt((whole**2).mean())
+
+
+def test_slices_of_two_fingertips_are_not_judged_by_one_of_them(sliced):
+    one = sliced()
+    both = replace(one, sides=("right", "left"), channels=np.repeat(one.channels, 2, axis=1))
+    with pytest.raises(CalibrationError, match=r"slices of 2 fingertips \(right, left\) do not go into one"):
+        fit("fused", [both], "both")
 
 
 def test_cylinders_give_a_diameter_and_no_torque(sliced):

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 from bank.bank_file import BankDefinition
 from bank.build import RowSolver
+from bank.channels import smoothed_along_channels
 from bank.grouping import group_means
 from bank.matching import ReferenceMatcher, best_match
 from bank.mesh import Mesh, load_mesh
@@ -17,7 +18,6 @@ from daemon.reproduce.analysis import (
     correlation,
     match_slices,
     score_models,
-    smoothed_along_channels,
 )
 from daemon.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
 
@@ -101,17 +101,6 @@ def test_two_diameters_make_no_correlation(signals: NDArray, bank) -> None:
     found = analyse_diameter(slices, bank, lambda _: None)
     assert (found.r_single, found.r_accumulated, found.fit) == (None, None, None)
     assert any("2 diameters" in note for note in found.notes)
-
-
-def test_smoothing_keeps_what_is_constant_and_spreads_a_peak_over_nine_channels() -> None:
-    peak = np.zeros((2, 896))
-    peak[0] = 3.0
-    peak[1, 100] = 1.0
-    smooth = smoothed_along_channels(peak)
-    np.testing.assert_allclose(smooth[0], 3.0)
-    assert np.flatnonzero(smooth[1]).tolist() == list(range(96, 105))
-    assert smooth[1].sum() == pytest.approx(1.0)
-    assert smooth[1, 101] / smooth[1, 100] == pytest.approx(np.exp(-0.5 / 1.8**2))
 
 
 def test_a_correlation_needs_three_points_that_differ() -> None:

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from scipy.io import savemat
 
 from bank.channels import channels_of_line
+from bank.stored import replaced
 from daemon.errors import UserError
 from daemon.messages import Scalar
-from daemon.replaced import replaced
 
 FloatArray = NDArray[np.float64]
 

@@ -146,7 +146,7 @@ def unwritable(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
         def full(_descriptor: int) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        monkeypatch.setattr("daemon.replaced.os.fsync", full)
+        monkeypatch.setattr("bank.stored.os.fsync", full)
     return tmp_path
 
 

@@ -90,7 +90,13 @@ class LineParser:
         self._last_mid_ns: int | None = None
         self._last_line: bytes | None = None
         self._last_channels = np.full(len(self._slots), np.nan)
-        self._equal_frames = np.zeros(len(self._slots), np.int64)
+        # Of the frames that were no repetition: how many there were, in which one each channel changed last, and before
+        # which one no channel can be dead, so that it is not looked for in every frame.
+        self._fresh = 0
+        self._changed_in = np.zeros(len(self._slots), np.int64)
+        self._none_dead_before = dead_after
+        self._no_channels = np.zeros(len(self._slots), np.bool_)
+        self._no_channels.setflags(write=False)
 
     def take(self, told: RawInput) -> list[Frame]:
         """Do what an input says, live or recorded; return the frames that it completes. A tare is not the parser's."""
@@ -170,7 +176,8 @@ class LineParser:
         channels = values[self._slots]
         repeated = line == self._last_line
         if not repeated:
-            self._equal_frames = np.where(channels == self._last_channels, self._equal_frames + 1, 1)
+            self._fresh += 1
+            self._changed_in[channels != self._last_channels] = self._fresh
         self._last_line, self._last_channels = line, channels
         t_mid_ns = sent_ns - self._transfer_ns - self.clock.period_ns // 2
         # Where another period has just been learned, time still goes forward.
@@ -183,13 +190,21 @@ class LineParser:
             t_arrival_ns=t_arrival_ns,
             seq=self.frames,
             saturated=channels > self._full_scale_v,
-            dead=self._equal_frames >= self._dead_after,
+            dead=self._dead(),
             repeated=repeated,
         )
         for array in (frame.channels, frame.raw, frame.saturated, frame.dead):
             array.setflags(write=False)
         self.frames += 1
         return frame
+
+    def _dead(self) -> NDArray[np.bool_]:
+        if self._fresh < self._none_dead_before:
+            return self._no_channels
+        dead = self._changed_in <= self._fresh + 1 - self._dead_after
+        if not dead.any():
+            self._none_dead_before = int(self._changed_in.min()) - 1 + self._dead_after
+        return dead
 
     def _refuse(self, refusal: Refusal) -> None:
         self.refused[refusal.kind] += 1

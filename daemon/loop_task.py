@@ -55,7 +55,8 @@ class LoopTask:
         self._clock = clock
         self._died = died
         self._acceleration_rad_per_s2 = acceleration_rad_per_s2
-        self._states = 0
+        # The state that was published last, by its number.
+        self._published = 0
         self._unanswered: set[asyncio.Task[None]] = set()
         self._actions = DeviceActions(robot, gripper, take_zero, lambda: bool(self._sent_rad_per_s or self._unanswered))
         self._action: asyncio.Task[None] | None = None
@@ -75,14 +76,13 @@ class LoopTask:
         try:
             while True:
                 began_ns = self._clock.now_ns()
-                state = await self._next_state()
+                ahead = self._states_until_needed()
+                state = await self._robot.state_within(ahead * LONGEST_TICK_S, ahead=ahead)
                 now_ns = self._clock.now_ns()
-                self._brain.senses.late_s = max(0.0, (now_ns - began_ns) / 1e9 - LONGEST_TICK_S)
+                self._brain.senses.late_s = max(0.0, (now_ns - began_ns) / 1e9 - ahead * LONGEST_TICK_S)
                 self._brain.senses.died = self._deaths()
                 if state is not None:
                     self._sense(state)
-                    if self._nothing_to_decide():
-                        continue
                 self._carry_out(self._brain.tick(now_ns))
                 await self._tell(now_ns)
         except Exception as error:
@@ -102,10 +102,12 @@ class LoopTask:
             return reply.refused
         # The state that says so comes one cycle later.
         for _ in range(25):
-            state = await self._next_state()
+            state = await self._robot.state_within(LONGEST_TICK_S)
             if state is not None and not state.blocked:
                 self._sense(state)
                 break
+        # From now on the brain is asked at each state.
+        self._robot.hurry()
         return self._brain.start(file, self._clock.now_ns())
 
     async def ended(self) -> Experiment:
@@ -129,16 +131,12 @@ class LoopTask:
         """Return what health tells of the robot."""
         return {
             "connected": self._robot.state is not None,
-            "states": self._states,
+            "states": self._robot.states,
             "errors": dict(self._robot.losses),
             "trouble": "" if self._robot.link.status == "up" else self._robot.link.sentence,
         }
 
-    async def _next_state(self) -> RobotState | None:
-        return await self._robot.next_state_within(LONGEST_TICK_S)
-
     def _sense(self, state: RobotState) -> None:
-        self._states += 1
         self._brain.senses.arm = Arm(
             wrist_rad=state.wrist_rad,
             wrist_torque_nm=state.wrist_torque_nm,
@@ -149,19 +147,22 @@ class LoopTask:
             blocked=state.blocked,
             moving_linearly=state.moving_linearly,
         )
-        if self._states % PUBLISH_EVERY == 0:
+        if self._robot.states - self._published >= PUBLISH_EVERY:
+            self._published = self._robot.states // PUBLISH_EVERY * PUBLISH_EVERY
             # The wrench is what the tool does to the wrist; the torque on the tool is its opposite.
             self._brain.hear(
                 Torque(WRENCH, -state.wrist_torque_nm, "", state.t_mono_ns - state.age_ns, self._clock.now_ns())
             )
             self._publisher.publish(_message(state))
 
-    def _nothing_to_decide(self) -> bool:
-        """Return whether the brain may be asked later: nothing moves or is about to, and the arm was told to stop.
+    def _states_until_needed(self) -> int:
+        """Return which of the next states the brain is to be asked at: the first one, unless nothing can move.
 
-        Then it is asked as often as states are published.
+        While no experiment runs and the arm was told to stop, it is the next one that is published.
         """
-        return self._stopped and not self._running() and self._states % PUBLISH_EVERY != 0
+        if not self._stopped or self._running():
+            return 1
+        return PUBLISH_EVERY - self._robot.states % PUBLISH_EVERY
 
     def _running(self) -> bool:
         experiment = self._brain.experiment

@@ -79,8 +79,10 @@ class UrRobot:
         self._stdin: asyncio.StreamWriter | None = None
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
         self._number = 0
-        # Who waits for the next state; None is for those who wait no longer.
-        self._awaiting: set[asyncio.Future[RobotState | None]] = set()
+        # How many states have come since the beginning.
+        self.states = 0
+        # Who waits for a state, and for which one; None is for those who wait no longer.
+        self._awaiting: dict[asyncio.Future[RobotState | None], int] = {}
 
     @property
     def state(self) -> RobotState | None:
@@ -90,24 +92,29 @@ class UrRobot:
     async def next_state(self) -> RobotState:
         """Return the next state that arrives; waits through losses of the connection."""
         while True:
-            state = await self._next(None)
+            state = await self._awaited(1, None)
             if state is not None:
                 return state
 
-    async def next_state_within(self, seconds: float) -> RobotState | None:
-        """Return the next state that arrives, or None where none does within so many seconds."""
-        return await self._next(seconds)
+    async def state_within(self, seconds: float, *, ahead: int = 1) -> RobotState | None:
+        """Return the next state that arrives, or one further `ahead`; None where it does not within so many seconds."""
+        return await self._awaited(ahead, seconds)
 
-    async def _next(self, seconds: float | None) -> RobotState | None:
+    def hurry(self) -> None:
+        """Give those who await a state further ahead the next one."""
+        for arrived in self._awaiting:
+            self._awaiting[arrived] = self.states + 1
+
+    async def _awaited(self, ahead: int, seconds: float | None) -> RobotState | None:
         # 125 times a second: a future and a timer are a third of the price of a condition and `asyncio.timeout`.
         loop = asyncio.get_running_loop()
         arrived: asyncio.Future[RobotState | None] = loop.create_future()
-        self._awaiting.add(arrived)
+        self._awaiting[arrived] = self.states + ahead
         timer = loop.call_later(seconds, _give_up, arrived) if seconds is not None else None
         try:
             return await arrived
         finally:
-            self._awaiting.discard(arrived)
+            self._awaiting.pop(arrived, None)
             if timer is not None:
                 timer.cancel()
 
@@ -200,9 +207,9 @@ class UrRobot:
                 self._state = message
                 if first:
                     self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
-                awaiting, self._awaiting = self._awaiting, set()
-                for arrived in awaiting:
-                    if not arrived.done():
+                self.states += 1
+                for arrived, awaited in self._awaiting.items():
+                    if awaited <= self.states and not arrived.done():
                         arrived.set_result(message)
             case Reply():
                 future = self._waiting.get(number)

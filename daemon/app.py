@@ -16,12 +16,14 @@ import zmq.asyncio
 from bank.channels import ZERO_SLOTS
 from daemon import sd_notify
 from daemon.addresses import open_stop_address
+from daemon.begun_mark import BegunMark
 from daemon.both import BOTH, BothTask
 from daemon.clock import Clock
 from daemon.command_server import CommandServer
 from daemon.commands import Commands, needed
 from daemon.config import DaemonConfig, Fingertip
 from daemon.estimation import Estimation
+from daemon.experiment.machine import Phase
 from daemon.fingertip import FingertipTask
 from daemon.health import HealthReporter, TaskFacts
 from daemon.keys import Gatekeeper, load_server_keys
@@ -58,6 +60,9 @@ class Daemon:
         self._stop = asyncio.Event()
         # The configured experiment, until it has begun.
         self._awaited: Path | None = None
+        # Whether it has begun, and whether it was carried out to its end.
+        self._begun = self._done = False
+        self._mark = BegunMark()
         self._rig: Rig | None = None
         checked_experiment(config)
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
@@ -181,6 +186,7 @@ class Daemon:
                 sd_notify.notify("STOPPING=1")
                 for task in running:
                     task.cancel()
+            self._mark.clear()
         finally:
             try:
                 if self._recorder is not None:
@@ -195,6 +201,11 @@ class Daemon:
     def stop(self) -> None:
         """End `run` as soon as the tasks have ended."""
         self._stop.set()
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing was left undone: the experiment that ends the daemon is done, or there is none."""
+        return self._done or self._config.experiment is None or not self._config.stop_when_done
 
     async def start_experiment(self, path: Path) -> str | None:
         """Begin an experiment, or return why it cannot be begun; raises UserError for a file that is none."""
@@ -238,8 +249,15 @@ class Daemon:
         if rig is None or path is None:
             return
         log, told = structlog.get_logger().bind(experiment=str(path)), ""
-        self._awaited = path
-        while (why := await self._begin(path)) is not None:
+        if self._mark.left_behind:
+            log.warning(
+                "the daemon before this one died after it had begun an experiment: this one waits for "
+                "`shearloop command start`"
+            )
+            return
+        # Begun once, whatever becomes of this task.
+        self._awaited = path if not self._begun else None
+        while not self._begun and (why := await self._begin(path)) is not None:
             if self._awaited is None:
                 log.info("the operator said stop: it is not started")
                 return
@@ -247,8 +265,9 @@ class Daemon:
                 log.info("waiting to start", why=why)
                 told = why
             await asyncio.sleep(START_RETRY_S)
-        self._awaited = None
+        self._awaited, self._begun = None, True
         experiment = await rig.loop.ended()
+        self._done = experiment.phase is Phase.DONE
         log.info("the experiment has ended", phase=experiment.phase.value, why=experiment.why)
         if self._config.stop_when_done:
             self.stop()
@@ -258,6 +277,8 @@ class Daemon:
         rig, recorder = needed(self._rig), self._recorder
         attached = Attached.if_there(path) if recorder is not None else ()
         why = await rig.start(path)
+        if why is None:
+            self._mark.set()
         if why is None and recorder is not None and rig.brain.experiment is not None:
             recorder.experiment(rig.brain.experiment.file.name, attached)
         return why
@@ -358,22 +379,30 @@ async def run_daemon(
     config: DaemonConfig,
     listeners: tuple[Listener, ...] = (),
     facts: Mapping[str, Callable[[], TaskFacts]] = MappingProxyType({}),
-) -> None:
-    """Run a daemon until SIGINT, SIGTERM or the command `stop`.
+) -> bool:
+    """Run a daemon until SIGINT, SIGTERM or the command `stop`; return whether nothing was left undone.
 
-    `listeners` hear every message; `facts` are what health tells of them, by name.
+    SIGTERM is how a service manager ends a service: what that leaves undone was to be left. `listeners` hear every
+    message; `facts` are what health tells of them, by name.
     """
-    loop = asyncio.get_running_loop()
+    loop, terminated = asyncio.get_running_loop(), False
+
+    def terminate() -> None:
+        nonlocal terminated
+        terminated = True
+        daemon.stop()
+
     with zmq.asyncio.Context() as context:
         daemon = Daemon(config, context)
         for listener in listeners:
             daemon.publisher.listen(listener)
         for name, told in facts.items():
             daemon.health.add(name, told)
-        for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, daemon.stop)
+        loop.add_signal_handler(signal.SIGINT, daemon.stop)
+        loop.add_signal_handler(signal.SIGTERM, terminate)
         try:
             await daemon.run()
         finally:
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.remove_signal_handler(number)
+    return daemon.finished or terminated

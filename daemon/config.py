@@ -244,7 +244,9 @@ class DaemonConfig(ConfigModel):
     gripper: GripperConfig | None = None
     loop: LoopConfig = Field(default_factory=lambda: LoopConfig.model_validate({}))
     experiment: Path | None = Field(None, description="started as soon as all devices are there")
-    stop_when_done: bool = Field(False, description="whether the daemon ends with that experiment")
+    stop_when_done: bool = Field(
+        False, description="whether the daemon ends with that experiment: status 0 when done, else 3"
+    )
     recording: RecordingConfig | None = Field(None, description="without one, nothing is recorded")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
     emulators: tuple[Emulator, ...] = ()

@@ -48,6 +48,8 @@ COMMANDS = {
 }
 
 EXIT_OK, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
+# Of `run`: the experiment with which it was to end (`stop_when_done`) is not done.
+EXIT_UNFINISHED = 3
 # As a shell has it for what SIGINT ended.
 EXIT_INTERRUPTED = 130
 

@@ -43,8 +43,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until SIGINT, SIGTERM or `shearloop command stop`."""
+    """Run until SIGINT, SIGTERM or `shearloop command stop`, or until the experiment has ended (`stop_when_done`)."""
     from daemon.app import run_daemon
+    from daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from daemon.cli.demonstration import Deaths, Happenings, Truth, print_summary
     from daemon.config import RecordingConfig, load_daemon_config
     from daemon.errors import UserError
@@ -86,14 +87,14 @@ def run(args: argparse.Namespace) -> int:
             summary = RunSummary(print_summary, truth.torques, lambda: happenings.happened)
             listeners = (Deaths(config.emulators, processes), happenings, *listeners)
             facts = {"slices": slices.facts} if slices is not None else {}
-            asyncio.run(run_daemon(config, (*listeners, *((Show(), summary) if args.show else ())), facts))
+            finished = asyncio.run(run_daemon(config, (*listeners, *((Show(), summary) if args.show else ())), facts))
     finally:
         truth.close()
         if slices is not None:
             slices.close()
     if slices is not None:
         print(f"{args.slices}: {slices.summary}")
-    return 0
+    return EXIT_OK if finished else EXIT_UNFINISHED
 
 
 def checked_emulators(emulators: "tuple[Emulator, ...]", config: Path) -> None:

@@ -68,6 +68,15 @@ def experiment(folder: Path, *steps: Mapping[str, Any]) -> str:
     return str(path)
 
 
+def ending_with(rig_config: Path, *steps: Mapping[str, Any]) -> Path:
+    """Return a configuration whose experiment, of these steps, begins by itself and ends the daemon."""
+    path, folder = rig_config.with_name("ending.yaml"), rig_config.parent
+    (folder / "own.yaml").write_text(yaml.safe_dump({"name": "own", "drive": "wrench", "steps": [*map(dict, steps)]}))
+    content = yaml.safe_load(rig_config.read_text())
+    path.write_text(yaml.safe_dump({**content, "experiment": "own.yaml", "stop_when_done": True}))
+    return path
+
+
 class Watcher:
     """Collects what the daemon publishes, and waits for what a test is after."""
 
@@ -215,6 +224,19 @@ async def test_a_protective_stop_ends_the_experiment_and_is_unlocked_on_the_oper
         assert (await command("pause"))["ok"]
         assert (await command("stop")) == {"ok": True, "stopped": "test"}
         assert not daemon.supervisor.records["loop"].restarts
+
+
+@pytest.mark.parametrize(("fault", "finished"), [("", True), ("protective-stop", False)])
+async def test_a_daemon_that_ends_with_its_experiment_knows_whether_it_is_done(
+    fault: str, finished: bool, rig_config: Path, tiny_bank: Path
+) -> None:
+    path = ending_with(rig_config, {"do": "wait", "wait_s": 60.0 if fault else 0.2})
+    async with running_rig(path, tiny_bank) as (daemon, watcher, cause, _command):
+        await watcher.until("loop.state", lambda state: state["phase"] == "running")
+        if fault:
+            cause(fault)
+        await daemon.stopped()
+        assert daemon.finished is finished
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,82 @@
+"""How a daemon ends that was to end with its experiment, and what one does that is started again after a crash."""
+
+import asyncio
+import signal
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+import zmq.asyncio
+
+from daemon.app import Daemon
+from daemon.begun_mark import BegunMark
+from daemon.config import load_daemon_config
+from tests.daemon.conftest import DEADLINE_S, shearloop
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture
+def waiting_config(config: Write, tmp_path: Path) -> Path:
+    """Write a configuration whose experiment waits for a robot that there is none of."""
+    robot = yaml.safe_load(Path("config/ur.yaml").read_text())
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": "127.0.0.47"}))
+    steps = {"name": "test", "drive": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}
+    (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
+    return config(robot="ur.yaml", experiment="experiment.yaml", stop_when_done=True)
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 3), (signal.SIGTERM, 0)])
+async def test_an_experiment_that_is_not_done_is_seen_in_the_exit_status(
+    number: signal.Signals, status: int, waiting_config: Path
+) -> None:
+    async with shearloop("run", str(waiting_config)) as daemon:
+        assert daemon.stderr is not None
+        async with asyncio.timeout(DEADLINE_S):
+            while b"waiting to start" not in await daemon.stderr.readline():
+                pass
+            daemon.send_signal(number)
+            assert await daemon.wait() == status
+
+
+async def ended(path: Path, *, once: Callable[[Daemon], bool]) -> Daemon:
+    """Run a daemon until something is so, and end it in good order."""
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(path), context)
+        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+            group.create_task(daemon.run())
+            while not once(daemon):  # noqa: ASYNC110 - it is asked, as health asks
+                await asyncio.sleep(0.01)
+            daemon.stop()
+    return daemon
+
+
+def gave_up(daemon: Daemon) -> bool:
+    record = daemon.supervisor.records.get("experiment")
+    return record is not None and record.done
+
+
+async def test_after_a_crash_no_experiment_begins_by_itself(
+    waiting_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    crashed = BegunMark()
+    assert not crashed.left_behind
+    crashed.set()
+    assert not (await ended(waiting_config, once=gave_up)).finished
+    assert "died after it had begun an experiment" in capsys.readouterr().out
+    assert not BegunMark().left_behind, "this one ended in good order"
+
+
+def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    mark = BegunMark()
+    mark.set()
+    mark.clear()
+    assert not BegunMark().left_behind
+
+
+def test_a_mark_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    BegunMark({"RUNTIME_DIRECTORY": str(tmp_path / "nowhere")}).set()
+    assert "there is no mark of this one" in capsys.readouterr().out

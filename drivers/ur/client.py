@@ -19,6 +19,7 @@ from typing import Final, Literal
 
 from drivers.errors import DeviceLostError, DriverError, ProtocolError
 from drivers.ur import sentences
+from drivers.ur.ear import Ear
 from drivers.ur.messages import (
     RECOVERY_HANG_S,
     Command,
@@ -46,6 +47,8 @@ STEADY_S = 30.0
 FAREWELL_S = 3.0
 # Beyond its own alarms a process gets so long: they end it at a known place, and first.
 GRACE_S = 1.0
+# The last of several states that are taken together may come so much later than their rate says.
+LAST_OF_SEVERAL_S = 0.001
 # What a stuck process leaves unread; some hundred commands.
 MOST_UNSENT = 1 << 15
 # Of what a process prints the end is kept: enough for the last lines of a traceback, and for one sentence.
@@ -77,6 +80,7 @@ class UrRobot:
         self._on_link = on_link or (lambda _event: None)
         self._state: RobotState | None = None
         self._stdin: asyncio.StreamWriter | None = None
+        self._ear: Ear | None = None
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
         self._number = 0
         # How many states have come since the beginning.
@@ -97,19 +101,27 @@ class UrRobot:
                 return state
 
     async def state_within(self, seconds: float, *, ahead: int = 1) -> RobotState | None:
-        """Return the next state that arrives, or one further `ahead`; None where it does not within so many seconds."""
+        """Return the next state that arrives, or one further `ahead`; None where it does not within so many seconds.
+
+        The states before that one are taken together with it, unless somebody else waits for one of them.
+        """
+        if ahead > 1 and self._ear is not None and not self._awaiting:
+            self._ear.pause(ahead / self.settings.rate_hz + LAST_OF_SEVERAL_S)
         return await self._awaited(ahead, seconds)
 
     def hurry(self) -> None:
         """Give those who await a state further ahead the next one."""
         for arrived in self._awaiting:
             self._awaiting[arrived] = self.states + 1
+        self._listen()
 
     async def _awaited(self, ahead: int, seconds: float | None) -> RobotState | None:
         # 125 times a second: a future and a timer are a third of the price of a condition and `asyncio.timeout`.
         loop = asyncio.get_running_loop()
         arrived: asyncio.Future[RobotState | None] = loop.create_future()
         self._awaiting[arrived] = self.states + ahead
+        if ahead == 1:
+            self._listen()
         timer = loop.call_later(seconds, _give_up, arrived) if seconds is not None else None
         try:
             return await arrived
@@ -117,6 +129,10 @@ class UrRobot:
             self._awaiting.pop(arrived, None)
             if timer is not None:
                 timer.cancel()
+
+    def _listen(self) -> None:
+        if self._ear is not None:
+            self._ear.listen()
 
     async def send(self, command: Command) -> Reply:
         """Return the one reply to a command: what is sent after clipping, or why nothing is.
@@ -130,6 +146,7 @@ class UrRobot:
         future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
         self._waiting[number] = future
         self._stdin.write(encode(command, number))
+        self._listen()
         try:
             return await future
         finally:
@@ -187,12 +204,12 @@ class UrRobot:
         if loss is not None:
             raise loss
 
-    def connected(self, stdin: asyncio.StreamWriter) -> None:
-        """Send commands there from now on."""
-        self._stdin = stdin
+    def connected(self, stdin: asyncio.StreamWriter, ear: Ear) -> None:
+        """Send commands there from now on, and hear of them there."""
+        self._stdin, self._ear = stdin, ear
 
     def _disconnected(self) -> None:
-        self._stdin = None
+        self._stdin = self._ear = None
         self._state = None
         for future in self._waiting.values():
             if not future.done():
@@ -241,6 +258,7 @@ class _Conversation:
         self._settings = robot.settings
         self._process = process
         self._stdin, self._stdout, self._stderr = process.stdin, stdout, process.stderr
+        self._ear = Ear(stdout, self._hear)
         self._decoder = Decoder()
         self._heard_s = time.monotonic()
         # Done when the process has no more to say, or has said what ends the conversation.
@@ -252,8 +270,7 @@ class _Conversation:
 
     async def listen(self) -> None:
         """Take messages until the process has no more; a silent process is ended."""
-        loop = asyncio.get_running_loop()
-        loop.add_reader(self._stdout, self._hear)
+        self._ear.listen()
         try:
             while not self._over.done():
                 patience_s = self._patience_s()
@@ -263,7 +280,7 @@ class _Conversation:
                     raise _LostError("hung", self._hung(patience_s))
                 await asyncio.wait([self._over], timeout=min(patience_s - silent_s, self._settings.hang_timeout_s))
         finally:
-            loop.remove_reader(self._stdout)
+            self._ear.close()
         # What was wrong with a message is raised here.
         self._over.result()
         raise await self._died()
@@ -289,13 +306,13 @@ class _Conversation:
     def _take(self, number: int, message: Message) -> None:
         if isinstance(message, RobotState):
             self._doing = "controlling"
-            self._robot.connected(self._stdin)
+            self._robot.connected(self._stdin, self._ear)
         elif isinstance(message, Phase):
             self._doing = message.doing
         self._robot.take(number, message)
 
     def _end_with(self, error: Exception | None) -> None:
-        asyncio.get_running_loop().remove_reader(self._stdout)
+        self._ear.close()
         if self._over.done():
             return
         if error is None:

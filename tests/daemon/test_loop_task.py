@@ -19,7 +19,7 @@ from daemon.loop.tune import TuneSettings, tuned
 from daemon.loop.watch import WatchSettings
 from daemon.loop.wrist import Wrist, WristSettings
 from daemon.loop_actions import along_tool
-from daemon.loop_task import WRENCH, WRENCH_SOURCE, LoopTask
+from daemon.loop_task import PUBLISH_EVERY, WRENCH, WRENCH_SOURCE, LoopTask
 from daemon.safety import Event
 from drivers.ur.client import UrRobot
 from drivers.ur.messages import Command, MoveLinear, Reply, RobotState, Stop, WristSpeed
@@ -322,3 +322,22 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
         file = ExperimentFile.model_validate({"name": "other", "drive": WRENCH, "steps": [MOVE]})
         assert "is still running" in (await cell.loop.start(file) or "")
         assert all(isinstance(command, WristSpeed) for command in cell.robot.commands[before:])
+
+
+async def test_the_brain_is_asked_at_every_fifth_state_until_an_experiment_runs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with driven() as cell:
+        asked: list[int] = []
+        tick = cell.brain.tick
+        monkeypatch.setattr(cell.brain, "tick", lambda now_ns: asked.append(cell.robot.states) or tick(now_ns))
+        await cell.cycles(50)
+        assert len(asked) == 10
+        assert all(number % PUBLISH_EVERY == 0 for number in asked)
+        cell.published.messages.clear()
+        await cell.start({"do": "wait", "wait_s": 60})
+        asked.clear()
+        await cell.cycles(50)
+        assert len(asked) == 50
+        published = [one for one in cell.published.messages if one.topic == "robot.state"]
+        assert len(published) == pytest.approx(10, abs=2)

@@ -83,6 +83,22 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
         assert sorted(states, key=lambda state: state.timestamp_s) == states
 
 
+async def test_states_that_nobody_needs_singly_are_taken_together(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        await until(robot, lambda state: not state.recovering)
+        before = robot.states
+        state = await robot.state_within(30.0, ahead=25)
+        assert state is not None
+        # Those that came before and with it were all counted.
+        assert robot.states >= before + 25
+        waiting = asyncio.create_task(robot.state_within(3600.0, ahead=100_000))
+        await asyncio.sleep(0)
+        async with asyncio.timeout(10):
+            assert (await robot.send(Enable())).accepted, "a command ends the wait for the states beside it"
+            robot.hurry()
+            assert await waiting is not None
+
+
 async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess) -> None:
     link = Link()
     async with running(settings_for(controller.host), link) as robot:

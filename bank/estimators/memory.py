@@ -119,6 +119,8 @@ class Memory:
         self._idle: list[deque[FloatArray]] = [deque(maxlen=_BASELINE_FRAMES) for _ in guards]
         # The calibration's, until the session has its own.
         self._baselines: FloatArray = np.array([guard.idle for guard in guards])
+        # (m, 1) of each fingertip's idle frame of this session against the calibration's.
+        self._gains: FloatArray = np.ones((len(guards), 1))
         self._begun = False
         self._before: FloatArray | None = None
         self._refused: FloatArray | None = None
@@ -148,13 +150,7 @@ class Memory:
     @property
     def recent(self) -> FloatArray | None:
         """The (n_lags + 1, m, 896) last frames at the calibration's gain, the newest last; None while incomplete."""
-        return np.array(self._recent) / self._gains() if len(self._recent) == self._recent.maxlen else None
-
-    def _gains(self) -> FloatArray:
-        """Return the (m, 1) gain of each fingertip's idle frame of this session against the calibration's."""
-        if not self.own_baseline:
-            return np.ones((len(self._guards), 1))
-        return np.array([[guard.gain(one)] for guard, one in zip(self._guards, self._baselines, strict=True)])
+        return np.array(self._recent) / self._gains if len(self._recent) == self._recent.maxlen else None
 
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
@@ -167,15 +163,14 @@ class Memory:
             frame.usable & ~np.array(list(map(at_rail, frame.channels, frame.usable))),
         )
         channels = self._filled(told)
+        seen = [guard.seen(*one) for guard, *one in zip(self._guards, channels, told.usable, strict=True)]
         why = [
             reason
             for layer, guard in enumerate(self._guards)
-            if (reason := _too_few(guard, told.usable[layer]) or guard.foreign(channels[layer], told.usable[layer]))
+            if (reason := _too_few(guard, told.usable[layer]) or seen[layer][0])
         ]
         # Channels that are lost for longer are left out; while they are being lost they count as jumping.
-        lost = np.array(
-            [guard.lost(*one) for guard, one in zip(self._guards, zip(channels, told.usable, strict=True), strict=True)]
-        )
+        lost = np.array([one for _, one in seen])
         disturbed = self._disturbed(channels, told.usable & ~(lost & self._lost))
         self._lost = lost
         frame = TactileFrame(frame.t_s, frame.channels, told.usable & ~lost)
@@ -207,6 +202,7 @@ class Memory:
             self._baselines, self._begun = np.mean(self._idle_taken, axis=0), True
             for layer, idle in enumerate(self._idle):
                 idle.extend(one[layer] for one in self._idle_taken)
+            self._take_gains()
             self._idle_wanted, self._idle_taken = 0, []
         return Moment(
             channels, np.zeros_like(channels), (f"taking the homogeneous frame, {taken} of {wanted}",), usable
@@ -224,7 +220,7 @@ class Memory:
     def _judged(self, channels: FloatArray, usable: BoolArray) -> Moment:
         held = [self._holds(layer, channels[layer]) for layer in range(len(self._guards))]
         loose = [guard.side for layer, guard in enumerate(self._guards) if self._let_go[layer] or not held[layer]]
-        difference = self._difference(channels, usable) / self._gains()
+        difference = self._difference(channels, usable) / self._gains
         if loose:
             self._recent.clear()
             self._bridged.clear()
@@ -249,9 +245,8 @@ class Memory:
         self._passed.append(channels)
         if len(self._passed) <= STEP_FRAMES:
             return
-        gains = self._gains()
         for layer, guard in enumerate(self._guards):
-            now, then, idle = (one[layer] / gains[layer] for one in (channels, self._passed[0], self._baselines))
+            now, then, idle = (one[layer] / self._gains[layer] for one in (channels, self._passed[0], self._baselines))
             released = guard.released(now, then, idle)
             if released is not None:
                 self._let_go[layer] = released
@@ -307,6 +302,12 @@ class Memory:
             if (begun or following) and not self._recent:
                 idle.append(channels[layer])
                 self._baselines[layer] = np.mean(idle, axis=0)
+                self._take_gains()
+
+    def _take_gains(self) -> None:
+        if self.own_baseline:
+            gains = [guard.gain(idle) for guard, idle in zip(self._guards, self._baselines, strict=True)]
+            self._gains = np.array(gains)[:, None]
 
     def _forget(self) -> None:
         self._recent.clear()

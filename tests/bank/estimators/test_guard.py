@@ -1,9 +1,11 @@
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from bank.errors import CalibrationError
 from bank.estimators.gripped import gripped_part
-from bank.estimators.guard import LEAST_NOISE_V, SideGuard, channel_noise
+from bank.estimators.guard import LEAST_NOISE_V, SideGuard, _median, channel_noise
 
 ALL = np.ones(896, dtype=bool)
 
@@ -34,8 +36,8 @@ def test_noise_is_what_is_fast(twisting):
 @pytest.mark.parametrize("gain", [0.85, 1.0, 1.2])
 def test_a_fingertip_is_known_under_any_gain(recorded, gain):
     guard = guard_of(recorded)
-    assert all(guard.foreign(gain * frame, ALL) is None for frame in recorded.channels[::20, 0])
-    assert all(guard.foreign(gain * frame, ALL) for frame in recorded.channels[::20, 1])
+    assert all(guard.seen(gain * frame, ALL)[0] is None for frame in recorded.channels[::20, 0])
+    assert all(guard.seen(gain * frame, ALL)[0] for frame in recorded.channels[::20, 1])
 
 
 def test_grip_is_about_one_gripped_and_zero_idle(recorded):
@@ -69,3 +71,8 @@ def test_too_little_is_said_to_be(recorded):
     )  # fmt: skip
     with pytest.raises(CalibrationError, match="no torque to calibrate on"):
         gripped_part(silent)
+
+
+@given(st.lists(st.floats(-1e3, 1e3), max_size=40))
+def test_the_quick_median_is_the_median_to_the_bit(values: list[float]) -> None:
+    assert _median(np.array(values)) == (np.median(values) if values else 0.0)

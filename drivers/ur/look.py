@@ -10,13 +10,12 @@ from dataclasses import dataclass
 
 from drivers.errors import DriverError
 from drivers.ur import sentences
-from drivers.ur.probe import RTDE_PORT, ProbeError, probe, receive
+from drivers.ur.probe import RTDE_PORT, ProbeError, agree_on_protocol, probe, request
 
 DASHBOARD_PORT = 29999
 # What ur-rtde's control script takes its commands from.
 REGISTERS = ("input_int_register_0", "input_double_register_0")
-_PROTOCOL, _INPUTS = ord("V"), ord("I")
-_HEADER = struct.Struct(">HB")
+_INPUTS = ord("I")
 _LONGEST_LINE = 1024
 
 
@@ -71,8 +70,5 @@ def _ask(host: str, timeout_s: float, questions: tuple[str, ...]) -> list[str]:
 
 def _registers_free(host: str, timeout_s: float) -> bool:
     with socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection:
-        connection.sendall(_HEADER.pack(5, _PROTOCOL) + b"\x00\x02")
-        receive(connection, _PROTOCOL)
-        names = ",".join(REGISTERS).encode()
-        connection.sendall(_HEADER.pack(_HEADER.size + len(names), _INPUTS) + names)
-        return b"IN_USE" not in receive(connection, _INPUTS)
+        agree_on_protocol(connection)
+        return b"IN_USE" not in request(connection, _INPUTS, ",".join(REGISTERS).encode())

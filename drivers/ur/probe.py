@@ -33,11 +33,9 @@ def probe(host: str, timeout_s: float) -> str:
     """
     try:
         with socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection:
-            connection.sendall(_HEADER.pack(3, _CONTROLLER_VERSION))
-            answer = receive(connection, _CONTROLLER_VERSION)
+            answer = request(connection, _CONTROLLER_VERSION)
             version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
-            connection.sendall(_HEADER.pack(5, _PROTOCOL) + b"\x00\x02")
-            accepted = receive(connection, _PROTOCOL)[:1] == b"\x01"
+            accepted = agree_on_protocol(connection)
     except TimeoutError as error:
         raise ProbeError("silent", sentences.silent(host, timeout_s, "greeting it")) from error
     except (OSError, struct.error) as error:
@@ -47,13 +45,19 @@ def probe(host: str, timeout_s: float) -> str:
     return version
 
 
-def receive(connection: socket.socket, kind: int) -> bytes:
-    """Return the next RTDE package of a kind; raises OSError where none comes among the first twenty."""
+def agree_on_protocol(connection: socket.socket) -> bool:
+    """Ask for version 2 of the protocol, and return whether the controller accepts it."""
+    return request(connection, _PROTOCOL, b"\x00\x02")[:1] == b"\x01"
+
+
+def request(connection: socket.socket, kind: int, payload: bytes = b"") -> bytes:
+    """Send an RTDE package, and return the next one of its kind; OSError where none comes among the first twenty."""
+    connection.sendall(_HEADER.pack(_HEADER.size + len(payload), kind) + payload)
     for _ in range(_OTHER_PACKAGES):
         size, got = _HEADER.unpack(_exactly(connection, _HEADER.size))
-        payload = _exactly(connection, size - _HEADER.size)
+        answer = _exactly(connection, size - _HEADER.size)
         if got == kind:
-            return payload
+            return answer
     raise OSError("something else than RTDE listens on its port")
 
 

@@ -32,9 +32,11 @@ COMMANDS = {
     "chart": Command("bench.charts.command", "chart speed against accuracy, stability, and how much model is needed"),
     "check": Command("daemon.cli.check", "say whether a configuration and the files it names are in order"),
     "listen": Command("daemon.cli.listen", "print what a running daemon publishes"),
-    "command": Command("daemon.cli.command", "ask a running daemon to tare, to tell its status, or to stop"),
+    "command": Command(
+        "daemon.cli.command", "ask a running daemon to do something: tare, start, pause, stop, unlock …"
+    ),
     "view": Command("daemon.cli.view", "show a running daemon as a page in the browser, with a stop button"),
-    "calibrate": Command("daemon.cli.calibrate", "calibrate the load cell or the gripper, step by step"),
+    "calibrate": Command("daemon.cli.calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
     "emulate": Command("daemon.cli.emulate", "play a device, byte for byte, on a port of its own"),
     "bank": Command("daemon.cli.bank", "solve, build, inspect and draw banks of simulated signals"),
     "doctor": Command("daemon.cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),

@@ -18,9 +18,28 @@ THINGS = {
 }
 
 
+EPILOG = """
+in this order, the first time (docs/first-calibration.md):
+  shearloop calibrate load --serial-number NUMBER --mass-g 100 --mass-g 200 --out load.yaml
+  shearloop calibrate gripper --host ADDRESS --diameter-mm 10 --diameter-mm 20 --out gripper.yaml
+  shearloop calibrate recording REC.mcap --out right.cal
+  shearloop calibrate creep HELD.mcap --calibration right.cal
+
+Name each file as the `calibration` of its device or fingertip in the configuration;
+`creep` prints the line to put there. Without a THING, recordings are meant:
+`shearloop calibrate REC.mcap --out right.cal`. The shear skin has a command of its
+own, `shearloop skin calibrate`.
+"""
+
+
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add a sub-parser per thing."""
-    things = parser.add_subparsers(dest="thing", metavar="THING", required=True)
+    parser.description = "Measure something known, and write down what follows from it."
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
+    things = parser.add_subparsers(
+        dest="thing", metavar="THING", required=True, help="`shearloop calibrate THING --help` explains one"
+    )
     for name, (module, summary) in THINGS.items():
         part = things.add_parser(name, help=summary, description=f"Calibrate {summary}.")
         importlib.import_module(module).configure(part)

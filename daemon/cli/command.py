@@ -6,35 +6,59 @@ from pathlib import Path
 from daemon.addresses import COMMAND_ADDRESS, needs_keys, stop_address
 from daemon.cli.connection import add_connection, client_keys
 
+# The robot may have to be powered, its brakes released and its program started, and the gripper activated.
+UNLOCK_TIMEOUT_S = 60.0
+TIMEOUT_S = 2.0
+
 COMMANDS = {
-    "tare": "take the zero of every torque sensor anew, nothing gripped and no experiment running",
+    "tare": "take the zero of the torque sensors anew: nothing gripped, no experiment running",
     "status": "how each task is",
     "start": "begin an experiment",
     "pause": "stand still until `resume`",
     "resume": "go on",
     "stop": "end the experiment and stand still; where none is running, end the daemon",
-    "unlock": "let robot and gripper move again after a stop, once it is safe",
+    "unlock": "let robot and gripper move again after a stop, once nobody is in reach of them",
     "set": "change what may change while it runs: --heatmap",
 }
 
 
+EPILOG = """
+examples:
+  shearloop command tare --source right
+  shearloop command start --experiment config/experiments/loosen.yaml
+  shearloop command stop
+
+Exit status: 0 done, 1 refused (and why), 2 nobody answered. On the daemon's own
+machine `stop` and `status` need no key. `shearloop listen` prints what it publishes.
+"""
+
+
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `command`."""
-    parser.add_argument(
-        "name",
-        choices=COMMANDS,
-        help="; ".join(f"{name}: {what}" for name, what in COMMANDS.items()),
+    parser.description = "Ask a running daemon to do something, and print what it answers."
+    width = max(map(len, COMMANDS))
+    parser.epilog = (
+        "what it can be asked:\n" + "".join(f"  {name:<{width}}  {what}\n" for name, what in COMMANDS.items()) + EPILOG
     )
-    parser.add_argument("--source", help="the fingertip to tare or to set, or `skin`; all by default")
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.add_argument("name", choices=COMMANDS, metavar="WHAT", help="one of those below")
     parser.add_argument(
-        "--heatmap", choices=("always", "on_request"), help="what to set: whether heatmaps wait for a subscriber"
+        "--source", metavar="NAME", help="for tare and set: which sensor, as the configuration names it (default: all)"
     )
     parser.add_argument(
-        "--experiment", type=Path, metavar="FILE", help="what to start; else what the daemon's configuration names"
+        "--heatmap",
+        choices=("always", "on_request"),
+        help="for set: whether heatmaps are computed always, or while somebody subscribes to them",
+    )
+    parser.add_argument(
+        "--experiment", type=Path, metavar="FILE", help="for start (default: the one that the configuration names)"
     )
     add_connection(parser, COMMAND_ADDRESS)
     parser.add_argument(
-        "--timeout", type=float, default=2.0, metavar="S", help="how long to wait (default: %(default)s s)"
+        "--timeout",
+        type=float,
+        metavar="S",
+        help=f"how long to wait for the answer (default: {TIMEOUT_S:g} s, for unlock {UNLOCK_TIMEOUT_S:g} s)",
     )
     parser.add_argument("--json", action="store_true", help="print the reply as JSON")
 
@@ -59,7 +83,12 @@ def run(args: argparse.Namespace) -> int:
         address = stop_address(address)
     else:
         keys = client_keys(args)
-    reply = request(address, {"command": args.name, **arguments}, checked_timeout_s(args.timeout), keys)
+    timeout_s = TIMEOUT_S if args.timeout is None else checked_timeout_s(args.timeout)
+    if args.name == "unlock" and args.timeout is None:
+        # That nobody is there is said at once all the same.
+        request(address, {"command": "status"}, TIMEOUT_S, keys)
+        timeout_s = UNLOCK_TIMEOUT_S
+    reply = request(address, {"command": args.name, **arguments}, timeout_s, keys)
     accepted = bool(reply.pop("ok", False))
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))

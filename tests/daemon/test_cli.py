@@ -210,3 +210,20 @@ def test_a_path_that_names_nothing_and_one_address_for_two_are_named(
     assert "`robot` must be the path of a file" in mistake(capsys, "check", str(config(robot="a\0b")))
     both = "ipc:///tmp/one-for-both"
     assert f"are both {both}" in mistake(capsys, "check", str(config(publish=both, commands=both)))
+
+
+def test_unlocking_is_waited_for_and_an_absent_daemon_is_told_at_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[tuple[str, float]] = []
+
+    def answers(_address: str, content: dict[str, Any], timeout_s: float, _keys: object) -> dict[str, Any]:
+        asked.append((content["command"], timeout_s))
+        return {"ok": True}
+
+    monkeypatch.setattr("daemon.request.request", answers)
+    assert main(["command", "unlock"]) == 0
+    assert main(["command", "unlock", "--timeout", "5"]) == 0
+    assert main(["command", "stop"]) == 0
+    assert asked == [("status", 2.0), ("unlock", 60.0), ("unlock", 5.0), ("stop", 2.0)]
+    assert "unlock: done" in capsys.readouterr().out

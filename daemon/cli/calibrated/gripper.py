@@ -15,13 +15,25 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `calibrate gripper`."""
+    parser.epilog = (
+        "The fingers open and close: keep clear of them. It asks for one object after the other, to be held between "
+        "the fingertips, and closes on each once you press Enter. No daemon may be using the gripper meanwhile. Name "
+        "the file as `gripper.calibration` in the configuration."
+    )
     way = parser.add_mutually_exclusive_group(required=True)
     way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
     way.add_argument("--serial-number", metavar="NUMBER", help="the USB adapter's serial number, for Modbus RTU")
     way.add_argument("--port", metavar="PATH", help="the USB adapter's port, for Modbus RTU")
-    parser.add_argument("--socket-port", type=int, default=63352, help="default: %(default)s")
     parser.add_argument(
-        "--diameter-mm", type=float, action="append", required=True, metavar="MM", help="an object's; at least two"
+        "--socket-port", type=int, default=63352, metavar="PORT", help="the URCap's (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--diameter-mm",
+        type=float,
+        action="append",
+        required=True,
+        metavar="MM",
+        help="an object's diameter; give it once per object, of at least two",
     )
     parser.add_argument("--force-n", type=float, default=10.0, metavar="N", help="to grip with (default: %(default)s)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="the calibration file to write")

@@ -17,14 +17,28 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `calibrate load`."""
+    parser.epilog = (
+        "It asks for an empty cell, then for each mass in turn, and measures each for some seconds once you press "
+        "Enter. A signal that is saturated, flat or noisy is refused, and asked for again. No daemon may be using the "
+        "port meanwhile. Name the file as `load_cell.calibration` in the configuration."
+    )
     port = parser.add_mutually_exclusive_group(required=True)
     port.add_argument("--serial-number", metavar="NUMBER", help="the board's USB serial number")
     port.add_argument("--port", metavar="PATH", help="the board's serial port")
     parser.add_argument(
-        "--mass-g", type=float, action="append", required=True, metavar="G", help="a known mass; several make it better"
+        "--mass-g",
+        type=float,
+        action="append",
+        required=True,
+        metavar="G",
+        help="a known mass to put on the cell; give it once per mass: several show whether they agree",
     )
     parser.add_argument(
-        "--lever-arm-mm", type=float, default=35.0, metavar="MM", help="from shaft to cell (default: %(default)s)"
+        "--lever-arm-mm",
+        type=float,
+        default=35.0,
+        metavar="MM",
+        help="from the shaft to the cell (default: %(default)s)",
     )
     parser.add_argument(
         "--reverse", action="store_true", help="the turn that presses on the cell counts as negative torque"

@@ -1,6 +1,7 @@
 """The driver against the played gripper, by both ways in: real socket and real pseudo-terminal, real pymodbus.
 
-Model time runs as fast as the loop turns; the driver is given the same clock.
+Model time runs as fast as the loop turns, but stands still while a busy machine keeps the driver waiting for an answer;
+the driver is given the same clock.
 """
 
 import asyncio
@@ -24,6 +25,8 @@ from drivers.robotiq.width import WidthCalibration
 from drivers.serial_port import LinkEvent, ReconnectPolicy
 
 STEP_S = 0.01
+# Between two looks of the driver at its clock.
+MOST_STEPS = 20
 MECHANICS = GripperMechanics(open_counts=4.0, closed_counts=224.0)
 CALIBRATION = WidthCalibration(open_counts=4.0, open_mm=140.0, closed_counts=224.0, std_mm=0.4)
 WAYS = pytest.mark.parametrize("way", ["socket", "modbus"])
@@ -34,11 +37,16 @@ class Rig:
     model: Gripper
     server: UrcapServer | ModbusServer
     t_s: float = 0.0
+    steps_left: int = MOST_STEPS
     object_mm: float | None = None
     stopped: bool = False
     driver: RobotiqGripper = field(init=False)
     events: list[LinkEvent] = field(default_factory=list)
     lost: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def clock_ns(self) -> int:
+        self.steps_left = MOST_STEPS
+        return round(self.t_s * 1e9)
 
     def on_event(self, event: LinkEvent) -> None:
         self.events.append(event)
@@ -70,13 +78,14 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
         poll_s=0.0,
         policy=ReconnectPolicy(0.001, 0.002),
         on_event=rig.on_event,
-        clock_ns=lambda: round(rig.t_s * 1e9),
+        clock_ns=rig.clock_ns,
     )
     model.between = lambda _: rig.object_mm
 
     async def pass_time() -> None:
         while True:
-            if not rig.stopped:
+            if not rig.stopped and rig.steps_left > 0:
+                rig.steps_left -= 1
                 model.step(STEP_S)
                 rig.t_s += STEP_S
             await asyncio.sleep(0)
@@ -154,6 +163,8 @@ async def test_a_halted_gripper_claims_no_object(way: str, tmp_path: Path) -> No
         await rig.driver.connect()
         await rig.driver.activate()
         sent = await rig.driver.move(GripperCommand(0.0, speed_mm_s=30.0))
+        while (await rig.driver.read()).width_mm >= 140:
+            pass
         rig.stopped = True
         await rig.driver.halt()
         rig.stopped = False

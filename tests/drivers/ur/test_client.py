@@ -181,8 +181,8 @@ async def test_lost_rtde_ends_the_process_and_the_next_one_moves_nothing(control
         dropped_ns = await controller.fault("drop-rtde")
         stopped = await controller.event("motion-stopped", dropped_ns)
         assert stopped_after_s(stopped, dropped_ns) <= STOPPED_WITHIN_S
-        # Which of the two comes first is up to the client: our look at its connection, or its crash in reconnecting.
-        assert (await link.down()).kind in ("lost", "crashed")
+        # What comes first is up to the client: our look at its connection, or its crash or hang in reconnecting.
+        assert (await link.down()).kind in ("lost", "crashed", "hung")
         await until(robot, lambda state: state.program_running and not state.recovering)
         assert "not been enabled" in (await robot.send(WristSpeed(0.5, 4.0))).refused
         await enable(robot)

@@ -21,6 +21,21 @@ CHROMIUM_ARGUMENTS = (
 )
 
 
+# Where things are once the page is scrolled to its end.
+LAYOUT = """() => {
+  const box = (element) => element.getBoundingClientRect().toJSON();
+  const seen = (selector) => [...document.querySelectorAll(selector)].filter((element) => element.offsetParent);
+  window.scrollTo(0, document.body.scrollHeight);
+  return {
+    wide: document.documentElement.scrollWidth - document.documentElement.clientWidth,
+    stop: box(document.querySelector('#stop')),
+    panels: seen('.panel').map(box),
+    buttons: seen('button').map(box),
+    spilt: seen('.panel').filter((panel) => panel.scrollWidth > panel.clientWidth + 1).map((panel) => panel.className),
+  };
+}"""
+
+
 class FakeDaemon:
     """The sockets of a daemon, in a process that can be killed."""
 
@@ -123,6 +138,11 @@ class Browsed:
         self.until("#link-state", "● live")
         return self.page
 
+    def layout(self) -> dict[str, Any]:
+        """Return where things are once the page is scrolled to its end."""
+        found: dict[str, Any] = self.page.evaluate(LAYOUT)
+        return found
+
     def text(self, selector: str) -> str:
         """Return the text of one element."""
         return self.page.inner_text(selector)
@@ -147,6 +167,20 @@ class Browsed:
     def until_old(self, count: int) -> None:
         """Wait until so many panels are marked as old."""
         self.page.wait_for_function("n => document.querySelectorAll('.panel.old').length === n", arg=count)
+
+
+@pytest.fixture
+def fresh(browsed: Browsed) -> Iterator[None]:
+    """Every test begins with all messages, and ends without a complaint of the browser or a call to elsewhere."""
+    browsed.daemon.say()
+    browsed.daemon.forget()
+    browsed.daemon.start()
+    browsed.complaints.clear()
+    yield
+    unexpected = [line for line in browsed.complaints if not line.startswith("Failed to load resource")]
+    unexpected = [line for line in unexpected if "WebSocket connection to" not in line]
+    assert unexpected == []
+    assert browsed.hosts <= {browsed.viewer.url.split("/")[2]}
 
 
 @pytest.fixture(scope="module")

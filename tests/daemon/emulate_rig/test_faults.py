@@ -1,0 +1,128 @@
+"""The emulated rig's faults, as the real clients meet them."""
+
+import asyncio
+import contextlib
+from contextlib import AsyncExitStack
+
+import pytest
+
+from drivers.errors import DeviceLostError, DriverError
+from drivers.load_cell import LoadCell
+from drivers.robotiq.gripper import RobotiqGripper
+from drivers.robotiq.messages import ObjectStatus
+from drivers.serial_port import LinkEvent
+from drivers.ur.client import LinkEvent as RobotLink
+from drivers.ur.messages import Unlock
+from tests.daemon.emulate_rig.rig import (
+    COUNTS,
+    DEADLINE_S,
+    Reader,
+    RigProcess,
+    arm_at,
+    grip,
+    kit_at,
+    open_gripper_at,
+    torque_of,
+    until,
+)
+
+pytestmark = pytest.mark.real_time
+
+
+async def test_disturbances_reach_the_tool_and_robot_faults_the_robot(rig: RigProcess) -> None:
+    async with AsyncExitStack() as stack:
+        gripper = await stack.enter_async_context(open_gripper_at(rig))
+        load = await stack.enter_async_context(Reader(LoadCell(COUNTS, path=rig.run_dir / "load-cell").samples()))
+        await grip(gripper)
+        await rig.fault("kick 0.05")
+        truth = await rig.truth(lambda truth: bool(truth["torque_nm"]))
+        assert truth["torque_nm"] == pytest.approx(0.05, rel=0.05)
+        assert await torque_of(load) == pytest.approx(0.05, rel=0.08)
+        links: asyncio.Queue[RobotLink] = asyncio.Queue()
+        async with arm_at(rig, links.put_nowait) as arm:
+            await until(arm, lambda state: state.wrist_torque_nm < -0.04)
+            await rig.fault("slip 0.01")
+            await until(arm, lambda state: -0.02 < state.wrist_torque_nm < 0.0)
+            assert (await rig.truth())["slipped_rad"] > 0.02
+            await rig.fault("protective-stop")
+            await until(arm, lambda state: state.protective_stop)
+            await rig.event("protective-stop", 0)
+            await rig.fault("robot emergency-stop")
+            await until(arm, lambda state: state.emergency_stop)
+            await rig.fault("release")
+            async with asyncio.timeout(DEADLINE_S):
+                while not (await arm.send(Unlock())).accepted:
+                    await arm.next_state()
+            await rig.fault("drop-rtde")
+            async with asyncio.timeout(DEADLINE_S):
+                while (await links.get()).status != "down":
+                    continue
+        await rig.fault("joint seized")
+        assert (await rig.truth())["joint"] == "seized"
+        await rig.fault("joint lever")
+
+
+async def test_gripper_faults_reach_the_gripper(rig: RigProcess) -> None:
+    async with asyncio.timeout(DEADLINE_S), open_gripper_at(rig) as gripper:
+        await grip(gripper)
+        await rig.fault("gripper drop")
+        while (await gripper.read()).object is not ObjectStatus.AT_TARGET:
+            continue
+        assert not (await rig.truth())["gripped"]
+        await rig.fault("object 30")
+        await rig.fault("gripper fault 12")
+        state = await gripper.read()
+        assert (state.fault.code, state.fault.needs_activation) == (12, True)
+        await gripper.activate(operator_confirmed=True)
+        assert (await grip(gripper)).diameter_mm == pytest.approx(30.0, abs=1.0)
+        await rig.fault("unplug gripper")
+        with pytest.raises(DeviceLostError):
+            await _read_on(gripper)
+        await rig.fault("replug gripper")
+        while not gripper.connected:
+            with contextlib.suppress(DriverError):
+                await gripper.connect()
+        await rig.fault("silence gripper")
+        with pytest.raises(DeviceLostError, match="gave no whole answer"):
+            await gripper.read()
+        await rig.fault("object 20")
+
+
+async def _read_on(gripper: RobotiqGripper) -> None:
+    while True:
+        await gripper.read()
+
+
+async def test_boards_fall_silent_vanish_and_come_back(rig: RigProcess) -> None:
+    async with AsyncExitStack() as stack:
+        told: asyncio.Queue[LinkEvent] = asyncio.Queue()
+        losses: asyncio.Queue[LinkEvent] = asyncio.Queue()
+        kit, other = kit_at(rig, "right", told.put_nowait), kit_at(rig, "left")
+        cell = LoadCell(COUNTS, path=rig.run_dir / "load-cell", on_event=losses.put_nowait)
+        right = await stack.enter_async_context(Reader(kit.frames()))
+        left = await stack.enter_async_context(Reader(other.frames()))
+        load = await stack.enter_async_context(Reader(cell.samples()))
+        for each in (right, left, load):
+            await each.take(1)
+        assert told.get_nowait().up
+        assert losses.get_nowait().up
+        for line in ("unplug right", "silence left", "silence load"):
+            await rig.fault(line)
+        async with asyncio.timeout(DEADLINE_S):
+            assert not (await told.get()).up
+            assert "has sent nothing" in (await losses.get()).sentence
+            # A silent board is started again by its driver, without being lost.
+            while not other.facts()["silences"]:
+                await left.take(1)
+            await rig.fault("replug right")
+            await rig.fault("normal")
+            while not (await told.get()).up:
+                continue
+            while not (await losses.get()).up:
+                continue
+            for each in (right, left, load):
+                await each.take(2)
+            await rig.fault("right cut-line")
+            while "wrong_count" not in kit.facts()["errors"]:
+                await right.take(1)
+            assert other.facts()["errors"] == {}

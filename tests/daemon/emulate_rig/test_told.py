@@ -1,0 +1,56 @@
+"""What `shearloop emulate rig` says of arguments and commands that are none."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bank.channels import channels_of_line
+from daemon.cli import main
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (["--bank", "absent.bank"], "absent.bank"),
+        (["--speed", "0"], "--speed 0 is not above 0"),
+        (["--arm-speed", "nan"], "--arm-speed nan is not above 0"),
+        (["--gel-stiffness", "-1"], "--gel-stiffness -1 is not above 0"),
+        (["--rate-hz", "5"], "--rate-hz 5 is outside 50 to 1000"),
+        (["--diameter-mm", "150"], "--diameter-mm 150 does not fit"),
+        (["--run-dir", "/dev/null/run"], "--run-dir /dev/null/run cannot be made"),
+        (["--truth", "/nowhere/truth"], "--truth /nowhere/truth cannot be written"),
+        (["--sigma", "1.2", "1.8"], "give the larger one first"),
+        (["--sigma", "3.0", "1.8"], "the bank has no signal at sigma = 3"),
+        (["--calibration", "absent.yaml"], "absent.yaml"),
+        # An address for documentation (RFC 5737), which no machine has.
+        (["--host", "192.0.2.1"], "the rig cannot be played on 192.0.2.1"),
+    ],
+)
+def test_mistakes_are_told(
+    arguments: list[str], sentence: str, bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["emulate", "rig", "--bank", str(bank), "--run-dir", str(tmp_path), *arguments]) == 2
+    complaint = capsys.readouterr().err
+    assert sentence in complaint
+    assert complaint.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("explode", "'explode' is no command; there are kick NM"),
+        ("kick hard", "'hard' is no torque in N·m"),
+        ("kick 0.1", "kick needs a tool in the grip"),
+        ("joint loose", "there is no joint 'loose'; there are lever"),
+        ("unplug toaster", "there is no device 'toaster'; there are load, gripper, robot, right, left"),
+        ("right explode", "there is no fault 'explode'"),
+        ("gripper fault 99", "'99' is not a fault code"),
+    ],
+)
+def test_what_is_no_command_is_said_to_be_none(line: str, sentence: str, tmp_path: Path) -> None:
+    from drivers.emulators.rig import Rig, RigSettings
+
+    rig = Rig(RigSettings(run_dir=tmp_path), lambda _grip, _shear, _diameter: channels_of_line(np.zeros(1024)))
+    with pytest.raises(ValueError, match=sentence):
+        rig.command(line)

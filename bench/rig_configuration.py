@@ -13,7 +13,7 @@ _LOOP = {"disagreement_nm": 1.0, "jump_nm": 1.0}
 def write_configuration(
     folder: Path,
     bank: Path,
-    calibration: Path,
+    calibration: Path | None,
     host: str,
     *,
     robot: Mapping[str, Any] | None = None,
@@ -34,7 +34,7 @@ def write_configuration(
             "right": {
                 "device": {"path": "eit-right"},
                 "bank": str(bank.resolve()),
-                "calibration": str(calibration.resolve()),
+                "calibration": None if calibration is None else str(calibration.resolve()),
                 "matching": "zero_lag",
                 **(fingertip or {}),
             }

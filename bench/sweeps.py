@@ -1,6 +1,6 @@
 """The paper's two sweeps on the emulated rig, many times faster than real time, and the data set that they yield.
 
-    python -m bench.sweeps --bank run/demo.bank --calibration config/calibrations/rig.yaml --out DIR [--speed 30]
+    python -m bench.sweeps --bank run/demo.bank --out DIR [--speed 30]
 
 The experiments are the shipped ones with their times divided by the speed; rig, drivers and daemon are the real ones.
 Gel, fingers and boards are played that many times as fast, controller and loop stay in real time, so that what the
@@ -69,7 +69,8 @@ def configuration(args: argparse.Namespace, folder: Path) -> Path:
     return write_configuration(
         folder,
         args.bank,
-        args.calibration,
+        # What is calibrated on a sweep cannot need its calibration: the load cell drives, and limits.
+        None,
         args.host,
         robot={"rate_hz": args.rate_hz, "limits": limits},
         fingertip={"frame_period_s": FRAME_PERIOD_S / args.speed},
@@ -191,7 +192,6 @@ def main() -> None:
     """Run the sweeps and print how fast they were."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bank", type=Path, required=True)
-    parser.add_argument("--calibration", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--speed", type=float, default=30.0)
     parser.add_argument("--rate-hz", type=float, default=125.0, help="of the robot's loop")

@@ -1,5 +1,6 @@
 """The task of the gripper: read it, publish it, move it."""
 
+import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
 
@@ -14,6 +15,8 @@ from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
 
 RELEASE_WIDTH_MM = 140.0
+# Longer than a lost connection takes to be there again.
+RELEASE_WITHIN_S, RELEASE_AGAIN_S = 5.0, 0.1
 
 
 class GripperTask:
@@ -50,8 +53,16 @@ class GripperTask:
         return ""
 
     async def release(self) -> str:
-        """Open wide; return why it went wrong, or an empty text."""
-        return await self.grip(GripTo(RELEASE_WIDTH_MM, 100.0, 10.0, expect_object=False))
+        """Open wide; return why it went wrong, or an empty text.
+
+        It is tried again for a while: a grip that is broken off for it may have cost the connection.
+        """
+        tries_until_s = asyncio.get_running_loop().time() + RELEASE_WITHIN_S
+        while why := await self.grip(GripTo(RELEASE_WIDTH_MM, 100.0, 10.0, expect_object=False)):
+            if asyncio.get_running_loop().time() > tries_until_s:
+                return why
+            await asyncio.sleep(RELEASE_AGAIN_S)
+        return ""
 
     async def unlock(self) -> str:
         """Activate anew after a fault, on the operator's word that the fingers are clear."""

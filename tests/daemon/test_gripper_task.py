@@ -1,0 +1,53 @@
+"""The gripper's task over the real driver and the played gripper, by both ways in."""
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from daemon import gripper_task
+from daemon.experiment.wishes import GripTo
+from daemon.gripper_task import GripperTask
+from tests.daemon.conftest import DEADLINE_S
+from tests.drivers.robotiq.test_gripper import WAYS, Rig, a_rig
+
+GRIP = GripTo(0.0, 60.0, 40.0, expect_object=True)
+
+
+class Silent:
+    """A publisher to which nobody listens."""
+
+    def publish(self, _message: Any) -> None:
+        """Send nothing."""
+
+
+def task_of(rig: Rig) -> GripperTask:
+    return GripperTask(rig.driver, Silent(), lambda _: None)  # type: ignore[arg-type]
+
+
+@WAYS
+async def test_a_grip_that_is_broken_off_in_the_middle_of_an_exchange_is_opened_all_the_same(
+    way: str, tmp_path: Path
+) -> None:
+    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
+        rig.object_mm = 40.0
+        task = task_of(rig)
+        read = tasks.create_task(task.read())
+        while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
+            await asyncio.sleep(0)
+        for turns in range(1, 30, 3):
+            grip = asyncio.create_task(task.grip(GRIP))
+            # A question is under way now and then: broken off, it takes the connection with it.
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            grip.cancel()
+            assert await task.release() == ""
+            assert rig.model.width_mm > 130.0
+        read.cancel()
+
+
+async def test_a_gripper_that_stays_away_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gripper_task, "RELEASE_WITHIN_S", 0.2)
+    async with a_rig("socket", tmp_path) as rig:
+        assert "There is no connection to the gripper" in await task_of(rig).release()

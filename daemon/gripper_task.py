@@ -66,11 +66,11 @@ class GripperTask:
 
     async def unlock(self) -> str:
         """Activate anew after a fault, on the operator's word that the fingers are clear."""
-        state = self._gripper.latest
-        if state is not None and not state.fault.needs_activation:
-            return ""
         try:
-            await self._gripper.activate(operator_confirmed=True)
+            # Where the connection was lost just now nothing is known of a fault, and activating opens the fingers.
+            state = self._gripper.latest or await self._gripper.read()
+            if state.fault.needs_activation:
+                await self._gripper.activate(operator_confirmed=True)
         except DriverError as error:
             return str(error)
         return ""

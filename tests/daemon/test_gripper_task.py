@@ -47,6 +47,25 @@ async def test_a_grip_that_is_broken_off_in_the_middle_of_an_exchange_is_opened_
         read.cancel()
 
 
+@WAYS
+async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
+        rig.object_mm = 40.0
+        task = task_of(rig)
+        await rig.driver.connect()
+        assert await task.grip(GRIP) == ""
+        held_mm = rig.model.width_mm
+        rig.driver.latest = None
+        assert await task.unlock() == ""
+        for _ in range(200):
+            await asyncio.sleep(0)
+        assert rig.model.width_mm == held_mm
+        rig.model.fail(12)
+        await rig.driver.read()
+        assert await task.unlock() == ""
+        assert not (await rig.driver.read()).fault.needs_activation
+
+
 async def test_a_gripper_that_stays_away_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gripper_task, "RELEASE_WITHIN_S", 0.2)
     async with a_rig("socket", tmp_path) as rig:

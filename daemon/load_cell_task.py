@@ -1,6 +1,5 @@
 """The task of the load cell: read it, publish it, take its zero."""
 
-import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
 
@@ -8,6 +7,7 @@ from daemon.clock import Clock
 from daemon.loop.senses import Source, Torque
 from daemon.messages import LoadTorque, Scalar
 from daemon.publisher import Publisher
+from daemon.waiting import Waiting
 from drivers.hx711 import LoadSample
 from drivers.load_cell import LoadCell
 
@@ -30,7 +30,7 @@ class LoadCellTask:
         self._clock = clock
         self._hear = hear
         self._zeroing: list[float] | None = None
-        self._zeroed: list[asyncio.Future[str]] = []
+        self._waiting = Waiting()
         self._why = ""
 
     async def read(self) -> None:
@@ -56,18 +56,14 @@ class LoadCellTask:
     async def zero(self) -> str:
         """Take the mean of the next samples for zero; return why it could not be done, or an empty text."""
         self.tare()
-        zeroed: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        # Who waits for a zero that was asked for before waits for this one, which is later still.
-        self._zeroed.append(zeroed)
         try:
-            async with asyncio.timeout(ZERO_DEADLINE_S):
-                return await zeroed
+            # Who waits for a zero that was asked for before waits for this one, which is later still.
+            return await self._waiting.wait(ZERO_DEADLINE_S)
         except TimeoutError:
             why = self._why or "nothing came"
             return f"the load cell's zero could not be taken within {ZERO_DEADLINE_S:g} s: {why}"
         finally:
-            self._zeroed = [other for other in self._zeroed if other is not zeroed]
-            if not self._zeroed:
+            if not self._waiting:
                 # A zero that nobody waits for any longer would be taken at whatever load comes.
                 self._zeroing = None
 
@@ -85,10 +81,7 @@ class LoadCellTask:
             mean = sum(self._zeroing) / ZERO_SAMPLES
             self._board.tare(mean)
             self._zeroing = None
-            for waiting in self._zeroed:
-                # Who gave up waiting has cancelled it.
-                if not waiting.done():
-                    waiting.set_result("")
+            self._waiting.tell("")
 
 
 def load_message(sample: LoadSample) -> LoadTorque:

@@ -1,6 +1,5 @@
 """The tasks of the shear skin: keep its source going, read its voltages, publish the shear force, take its zero."""
 
-import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
 
@@ -9,6 +8,7 @@ from daemon.loop.senses import Torque
 from daemon.messages import Scalar, SkinShear
 from daemon.publisher import Publisher
 from daemon.skin_estimator import SkinEstimator, SkinReading
+from daemon.waiting import Waiting
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.shear_skin.judge import SkinSample
 from drivers.shear_skin.skin import ShearSkin
@@ -41,7 +41,7 @@ class SkinTask:
         self._clock = clock
         self._hear = hear
         self._radius_m = None if tool_radius_mm is None else tool_radius_mm * 1e-3
-        self._zeroed: list[asyncio.Future[str]] = []
+        self._waiting = Waiting()
         self._why = ""
         self._valid = 0
 
@@ -65,16 +65,11 @@ class SkinTask:
     async def zero(self) -> str:
         """Take a new zero and wait until it is there; return why it could not be taken, or an empty text."""
         self.tare()
-        zeroed: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        # Who waits for a zero that was asked for before waits for this one, which is later still.
-        self._zeroed.append(zeroed)
         try:
-            async with asyncio.timeout(ZERO_DEADLINE_S):
-                return await zeroed
+            # Who waits for a zero that was asked for before waits for this one, which is later still.
+            return await self._waiting.wait(ZERO_DEADLINE_S)
         except TimeoutError:
             return f"the skin's zero could not be taken within {ZERO_DEADLINE_S:g} s: {self._why or 'nothing came'}"
-        finally:
-            self._zeroed = [other for other in self._zeroed if other is not zeroed]
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the voltages, the zero and the force."""
@@ -94,15 +89,9 @@ class SkinTask:
 
     def _tell_zero(self) -> None:
         if self._estimator.refused:
-            told = f"the skin's zero was refused: {self._estimator.refused}"
+            self._waiting.tell(f"the skin's zero was refused: {self._estimator.refused}")
         elif self._estimator.zero is not None:
-            told = ""
-        else:
-            return
-        for waiting in self._zeroed:
-            # Who gave up waiting has cancelled it.
-            if not waiting.done():
-                waiting.set_result(told)
+            self._waiting.tell("")
 
     def _publish(self, sample: SkinSample, reading: SkinReading) -> None:
         now_ns = self._clock.now_ns()

@@ -1,7 +1,5 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from bank.channels import line_of_channels
@@ -50,32 +48,6 @@ def test_what_was_not_closed_is_kept_under_another_name(tmp_path):
         interrupted()
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap.partial"]
     assert read_recording(tmp_path / "a.mcap.partial").torque_nm.tolist() == [1.0]
-
-
-@pytest.fixture(scope="module")
-def content(tmp_path_factory):
-    path = tmp_path_factory.mktemp("whole") / "a.mcap"
-    written(path)
-    return path.read_bytes()
-
-
-@settings(max_examples=50, deadline=None)
-@given(where=st.floats(0, 0.9999), length=st.integers(1, 30), cut=st.booleans())
-def test_damage_is_refused_by_name(content, tmp_path_factory, where, length, cut):
-    at = int(where * len(content))
-    spoilt = bytes(255 - byte for byte in content[at : at + length])
-    path = tmp_path_factory.mktemp("damaged") / "x.mcap"
-    path.write_bytes(content[:at] if cut else content[:at] + spoilt + content[at + length :])
-    try:
-        found = read_recording(path)
-    except UserError as error:
-        told = str(error)
-    else:
-        # A byte that nothing reads, such as the library's name.
-        assert not cut
-        assert len(found.torque_nm) == 4
-        return
-    assert str(path) in told
 
 
 def test_foreign_and_stale_files_are_refused(tmp_path, monkeypatch):

@@ -19,13 +19,16 @@ class Sentence:
 
 
 def raised(path: Path) -> Iterator[Sentence]:
-    """Yield what the errors that a module raises say, in the order of the source."""
+    """Yield what the errors say that a module raises, or makes for others to raise, in the order of the source."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in sorted((n for n in ast.walk(tree) if isinstance(n, ast.Raise)), key=lambda n: n.lineno):
-        if isinstance(node.exc, ast.Call) and _name(node.exc.func) not in _NOT_FOR_OPERATORS:
-            for argument in node.exc.args:
+    calls = {node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call)}
+    calls |= {node for node in ast.walk(tree) if isinstance(node, ast.Call) and _name(node.func).endswith("Error")}
+    for call in sorted(calls, key=lambda node: (node.lineno, node.col_offset)):
+        if _name(call.func) not in _NOT_FOR_OPERATORS:
+            for argument in call.args:
                 text = _text(argument)
-                if len(text.split()) >= _FEWEST_WORDS:
+                words = text.split()
+                if len(words) >= _FEWEST_WORDS and not all(word.startswith("‹") for word in words):
                     yield split(text)
 
 

@@ -73,6 +73,17 @@ def test_sentences_are_found_in_the_source(tmp_path: Path) -> None:
     assert cure_of(split("it is so"), section) == section.otherwise
 
 
+def test_errors_that_others_raise_are_found_too(tmp_path: Path) -> None:
+    module = tmp_path / "module.py"
+    module.write_text(
+        "def fail(name, made):\n"
+        '    made.set_exception(DeviceLostError(f"{name} has gone: plug it in again"))\n'
+        '    raise unusable("there is nothing in it")\n'
+        '    return RuntimeError(f"{name}: {made}; {name}")\n'
+    )
+    assert [sentence.said for sentence in raised(module)] == ["‹name› has gone", "there is nothing in it"]
+
+
 def test_no_cure_is_for_a_sentence_that_there_is_none_of() -> None:
     page = troubleshooting_page(ROOT)
     assert [words for words, cure in CURES if cure not in page] == []

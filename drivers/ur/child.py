@@ -178,10 +178,7 @@ def _fly(pipe: Pipe, settings: UrSettings, arm: "Arm") -> NoReturn:
             pipe.send(decided[1], decided[0])
         pipe.send_latest(pilot.state(reading))
         if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
-            _alarm(settings.hang_timeout_s)
-            # This cycle may have started a program; none is left running.
-            if arm.read().program_running:
-                arm.end_program()
+            _end_program(settings, pilot, arm)
             _leave(EXIT_DONE)
         # A late cycle is not caught up with: two commands at once are no use to anyone.
         due_s = max(due_s + period_s, time.monotonic())
@@ -191,6 +188,17 @@ def _fly(pipe: Pipe, settings: UrSettings, arm: "Arm") -> NoReturn:
                 leaving_s = time.monotonic() + FAREWELL_S
         if (left_s := due_s - time.monotonic()) > 0:
             time.sleep(left_s)
+
+
+def _end_program(settings: UrSettings, pilot: Pilot, arm: "Arm") -> None:
+    """Leave no program behind: none that this very cycle has started, and none that waits to be resumed."""
+    _alarm(settings.hang_timeout_s)
+    reading = arm.read()
+    if reading.program_running:
+        arm.end_program()
+    elif pilot.left_paused(reading):
+        _alarm(FAREWELL_S + settings.hang_timeout_s)
+        arm.stop_program()
 
 
 def _obey(pipe: Pipe, pilot: Pilot, reading: Reading) -> bool:

@@ -11,6 +11,8 @@ import math
 from drivers.ur import sentences
 from drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation, violation
 from drivers.ur.messages import (
+    RUNTIME_PLAYING,
+    RUNTIME_STOPPED,
     SAFETY_EMERGENCY_STOPS,
     SAFETY_PROTECTIVE_STOP,
     Command,
@@ -34,7 +36,7 @@ from drivers.ur.settings import Six, UrSettings
 # A linear move may be too short to be seen under way: who rests at its end (in m and rad) after so long has arrived.
 ARRIVED, ARRIVED_AFTER_S = 2e-3, 0.2
 # An arm that nothing was asked of may tremble, but not move as fast as this for so long.
-ASTRAY_RAD_PER_S, ASTRAY_S = 0.05, 0.2
+ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
 
 
 class Pilot:
@@ -48,7 +50,7 @@ class Pilot:
         self._held = sentences.NOT_ENABLED
         # Why the program on the robot is not ours to send anything to, as long as it is not.
         self._not_ours = sentences.NOT_OURS
-        self._leaving = False
+        self._started = self._leaving = False
         self._motion: MotionKind = "idle"
         self._motion_id = 0
         self._ended = ""
@@ -74,6 +76,10 @@ class Pilot:
     def recovering(self) -> bool:
         """Whether calls may take seconds: the dashboard's, and the first one to a new program."""
         return self._recovery is not None
+
+    def left_paused(self, reading: Reading) -> bool:
+        """Whether the program that was started here is paused, and could be resumed by anybody."""
+        return self._started and reading.runtime_state not in (RUNTIME_STOPPED, RUNTIME_PLAYING)
 
     def heard(self, now_ns: int) -> None:
         """Note a sign of life of the daemon."""
@@ -114,6 +120,7 @@ class Pilot:
                 self._let_go(trouble)
             if not reading.program_running:
                 self._not_ours = sentences.NOT_OURS
+                self._started = self._started and reading.runtime_state != RUNTIME_STOPPED
             return None
         beyond = self._violation(reading)
         if beyond:
@@ -242,7 +249,8 @@ class Pilot:
         return None
 
     def _zero_wrench(self, reading: Reading) -> Reply:
-        why = self._unfit(reading)
+        # What is beyond a limit stays so: a new zero would only hide it.
+        why = self._unfit(reading) or self._violation(reading)
         if not why and not (self._motion == "idle" and reading.rests):
             why = "The wrench is zeroed only at rest: stop the arm first."
         if not why and not self._arm.zero_wrench():
@@ -369,7 +377,7 @@ class Pilot:
             return None
         self._recovery = None
         if outcome is Outcome.DONE:
-            self._not_ours = ""
+            self._not_ours, self._started = "", True
         number, self._unlock_number = self._unlock_number, None
         if number is None:
             self._held = recovery.why or self._held

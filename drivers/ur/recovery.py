@@ -2,7 +2,7 @@
 
 It waits by being asked again every cycle, never by blocking: states keep flowing while the arm powers up. A protective
 stop is unlocked on the operator's word only (UR's own rule); without it just the program is started, where nothing
-stands against that.
+stands against that, such as a program that somebody else runs.
 """
 
 import enum
@@ -33,6 +33,8 @@ class Outcome(enum.Enum):
 
 # How often a step is asked for again while the robot does not follow: the controller needs a moment after each.
 _AGAIN_S = 1.0
+# A program that nobody kicks has ended by its watchdog after so long.
+_ENDS_ITSELF_S = 2.0
 
 
 class Recovery:
@@ -75,6 +77,8 @@ class Recovery:
             # The control connection may see the program start a sample later than the one that reads; then once more.
             return Outcome.DONE if self._arm.arm_watchdog() else Outcome.UNDER_WAY
         if reading.runtime_state != RUNTIME_STOPPED:
+            if not self._operator_asked:
+                return self._leave_it_alone(now_ns)
             self._every_second("stop", now_ns, self._arm.stop_program)
         elif not self._cleared:
             # The registers outlive the program: a new one would carry out in its first cycle whatever was commanded
@@ -86,6 +90,11 @@ class Recovery:
             self._every_second("upload", now_ns, self._arm.upload)
             self._uploaded = True
         return Outcome.UNDER_WAY
+
+    def _leave_it_alone(self, now_ns: int) -> Outcome:
+        """Wait for the end of a program that is not ours to stop, as the one of a process that died has by itself."""
+        since_ns = self._asked_ns.setdefault("end", now_ns)
+        return self._refuse("") if now_ns > since_ns + int(_ENDS_ITSELF_S * 1e9) else Outcome.UNDER_WAY
 
     def _make_safe(self, reading: Reading, now_ns: int) -> Outcome:
         if not self._operator_asked:

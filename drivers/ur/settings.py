@@ -22,6 +22,10 @@ _CLIENT_BOUNDS = {
     "linear_acceleration_m_per_s2": 150.0,
 }
 
+# How long a robot may go on by itself: no setting allows more, whatever is mistyped. (The watchdog: a second.)
+_LONGEST_S = {"command_timeout_s": 1.0, "silence_timeout_s": 1.0, "state_timeout_s": 1.0, "reaction_s": 0.5}
+_LEAST_WATCHDOG_HZ = 1.0
+
 _CHECKED: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
 
 
@@ -125,6 +129,17 @@ class UrSettings:
             value = getattr(self, name)
             if isinstance(value, float | int) and not 0 < value < math.inf:
                 raise ValueError(f"{name} must be above 0, not {value:g}")
+        for name, longest_s in _LONGEST_S.items():
+            value = getattr(self, name)
+            if value > longest_s:
+                raise ValueError(
+                    f"{name} must be at most {longest_s:g} s, not {value:g}: so long the robot goes on alone"
+                )
+        if self.watchdog_hz < _LEAST_WATCHDOG_HZ:
+            raise ValueError(
+                f"watchdog_hz must be at least {_LEAST_WATCHDOG_HZ:g}, not {self.watchdog_hz:g}: a robot without its "
+                "daemon goes on for 1/watchdog_hz"
+            )
         if self.rate_hz < 3 * self.watchdog_hz:
             raise ValueError(
                 f"rate_hz ({self.rate_hz:g}) must be at least three times watchdog_hz ({self.watchdog_hz:g}), "

@@ -124,6 +124,31 @@ def test_program_that_this_very_cycle_started_is_ended(daemon: Daemon, monkeypat
     assert not arm.reading.program_running
 
 
+def test_program_that_is_paused_is_stopped_before_the_process_leaves(daemon: Daemon) -> None:
+    """Resumed by somebody later, it would turn on where it was."""
+
+    class Stopped(CyclingArm):
+        """In a protective stop as soon as its program is ready."""
+
+        def arm_watchdog(self) -> bool:
+            super().arm_watchdog()
+            self.protective_stop()
+            daemon.say(Disconnect())
+            return True
+
+    arm = Stopped()
+    fly(daemon, arm)
+    assert arm.calls[:4] == ["clear_command", "upload", "arm_watchdog", "stop_program"]
+
+
+def test_program_of_somebody_else_is_not_stopped_by_a_process_that_leaves(daemon: Daemon) -> None:
+    arm = CyclingArm()
+    arm.be(runtime_state=4)
+    daemon.say(Disconnect())
+    fly(daemon, arm)
+    assert arm.calls == []
+
+
 CRASHING = """
 import threading
 from drivers.ur import child

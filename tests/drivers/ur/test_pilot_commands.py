@@ -54,6 +54,13 @@ def test_wrench_is_zeroed_at_rest_only() -> None:
     assert flight.arm.calls[-1] == "zero_wrench"
 
 
+def test_no_zero_hides_a_force_beyond_its_limit() -> None:
+    flight = flying()
+    flight.arm.be(wrench=(0.0, 0.0, 70.0, 0.0, 0.0, 0.0))
+    assert "Force is 70.00 N" in flight.ask(ZeroForceTorque()).refused
+    assert "zero_wrench" not in flight.arm.calls
+
+
 def test_reading_is_part_of_the_state() -> None:
     flight = flying()
     for field in dataclasses.fields(Reading):

@@ -71,6 +71,26 @@ def test_program_that_someone_resumes_is_not_kept_going() -> None:
     assert flight.ask(Unlock()).accepted
 
 
+def test_program_that_somebody_else_runs_is_not_stopped_before_the_operator_says_so() -> None:
+    flight = Flight()
+    flight.arm.be(runtime_state=2)
+    flight.fly(500)
+    assert flight.arm.calls == []
+    assert "someone else" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert flight.ask(Unlock()).accepted
+    assert "stop_program" in flight.arm.calls
+
+
+def test_program_of_a_process_that_died_is_outlived() -> None:
+    flight = Flight()
+    flight.arm.be(runtime_state=2)
+    flight.fly(60)
+    flight.arm.end_program()
+    flight.fly(5)
+    assert flight.arm.calls[:3] == ["clear_command", "upload", "arm_watchdog"]
+    assert flight.ask(Enable()).accepted
+
+
 def test_program_that_was_not_started_here_is_sent_nothing() -> None:
     flight = Flight()
     flight.arm.be(safety_mode=3)

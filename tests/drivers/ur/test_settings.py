@@ -47,6 +47,9 @@ def test_all_mistakes_are_told_together(tmp_path: Path) -> None:
     [
         ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: 60", "three times"),
         ("host: 192.168.1.10", "host: 192.168.1.10\nhang_timeout_s: 0", "above 0"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nwatchdog_hz: 0.5", "at least 1, not 0.5"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\ncommand_timeout_s: 3", "at most 1 s, not 3"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nsilence_timeout_s: 30", "at most 1 s, not 30"),
         ("margin_rad: 0.1", "margin_rad: 3.2", "no room"),
         ("{inner: 4.0, hard: 8.0}", "{inner: 4.0, hard: 50.0}", "more than ur-rtde takes, which is 40"),
         ("margin_m: 0.02", "margin_m: 0", "above 0"),

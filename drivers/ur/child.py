@@ -109,21 +109,21 @@ def main() -> NoReturn:
     os.dup2(2, 1)
     pipe = Pipe(0, stdout)
     try:
-        settings = _configuration(pipe)
-        if settings is None:
+        configured = _configuration(pipe)
+        if configured is None:
             _leave(EXIT_DONE)
-        _fly(pipe, settings, _connect(pipe, settings))
+        _fly(pipe, configured, _connect(pipe, configured.settings))
     except Exception:  # noqa: BLE001 - told, and the end of the process all the same
         traceback.print_exc()
         _leave(EXIT_FAILED)
 
 
-def _configuration(pipe: Pipe) -> UrSettings | None:
+def _configuration(pipe: Pipe) -> Configure | None:
     while pipe.open:
         pipe.wait(60.0)
         for _, message in pipe.receive():
             if isinstance(message, Configure):
-                return message.settings
+                return message
     return None
 
 
@@ -154,8 +154,9 @@ def _explain(host: str, text: str) -> tuple[FailureKind, str]:
     return "unreachable", sentences.refused_by_client(host, text)
 
 
-def _fly(pipe: Pipe, settings: UrSettings, arm: "Arm") -> NoReturn:
-    pilot = Pilot(settings, arm, time.monotonic_ns())
+def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
+    settings = configured.settings
+    pilot = Pilot(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
     period_s = 1.0 / settings.rate_hz
     leaving_s = 0.0
     due_s = time.monotonic()

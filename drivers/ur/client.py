@@ -8,6 +8,7 @@ and nothing moves until someone says `Enable` (or `Unlock`) anew.
 import asyncio
 import contextlib
 import importlib.util
+import math
 import os
 import signal
 import sys
@@ -49,6 +50,8 @@ FAREWELL_S = 3.0
 GRACE_S = 1.0
 # The last of several states that are taken together may come so much later than their rate says.
 LAST_OF_SEVERAL_S = 0.001
+# So long after the loss of a process what runs on the robot is taken for the program that it left behind.
+TAKES_OVER_S = 10.0
 # What a stuck process leaves unread; some hundred commands.
 MOST_UNSENT = 1 << 15
 # Of what a process prints the end is kept: enough for the last lines of a traceback, and for one sentence.
@@ -83,10 +86,16 @@ class UrRobot:
         self._ear: Ear | None = None
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
         self._number = 0
+        self._lost_s = -math.inf
         # How many states have come since the beginning.
         self.states = 0
         # Who waits for a state, and for which one; None is for those who wait no longer.
         self._awaiting: dict[asyncio.Future[RobotState | None], int] = {}
+
+    @property
+    def takes_over(self) -> bool:
+        """Whether the connection was lost just now, so that a program may have been left on the robot."""
+        return time.monotonic() - self._lost_s < TAKES_OVER_S
 
     @property
     def state(self) -> RobotState | None:
@@ -210,6 +219,8 @@ class UrRobot:
 
     def _disconnected(self) -> None:
         self._stdin = self._ear = None
+        if self._state is not None:
+            self._lost_s = time.monotonic()
         self._state = None
         for future in self._waiting.values():
             if not future.done():
@@ -266,7 +277,7 @@ class _Conversation:
         self._said = b""
         self._said_all = asyncio.Event()
         self._doing = "starting"
-        self._stdin.write(encode(Configure(robot.settings)))
+        self._stdin.write(encode(Configure(robot.settings, robot.takes_over)))
 
     async def listen(self) -> None:
         """Take messages until the process has no more; a silent process is ended."""

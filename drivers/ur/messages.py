@@ -172,6 +172,8 @@ class Configure:
     __pydantic_config__: ClassVar = _STRICT
 
     settings: UrSettings
+    # Whether a program that runs on the robot is one that a process before this one has just left behind.
+    takes_over: bool = False
 
 
 @dataclass(frozen=True, slots=True)

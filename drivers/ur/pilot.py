@@ -42,8 +42,11 @@ ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
 class Pilot:
     """Applies the latest command, within the limits, while everything is well."""
 
-    def __init__(self, settings: UrSettings, arm: PilotArm, now_ns: int) -> None:
-        """Begin with motion not enabled, and with starting the control program where the robot lets us."""
+    def __init__(self, settings: UrSettings, arm: PilotArm, now_ns: int, *, takes_over: bool = False) -> None:
+        """Begin with motion not enabled, and with starting the control program where the robot lets us.
+
+        `takes_over`: a program that runs there is one that we may stop for that.
+        """
         self._settings = settings
         self._limits = settings.limits
         self._arm = arm
@@ -62,7 +65,9 @@ class Pilot:
         self._move_end: Six = (0.0,) * 6
         self._sent: WristSpeed | MoveLinear | Stop | None = None
         self._clipped: tuple[str, ...] = ()
-        self._recovery: Recovery | None = Recovery(arm, now_ns, settings.recover_timeout_s, operator_asked=False)
+        self._recovery: Recovery | None = Recovery(
+            arm, now_ns, settings.recover_timeout_s, operator_asked=False, may_stop_program=takes_over
+        )
         self._unlock_number: int | None = None
         self._judged: Reading | None = None
         self._beyond = ""
@@ -245,7 +250,9 @@ class Pilot:
         self._speed_thread = False
         self._not_ours = self._not_ours or sentences.NOT_OURS
         self._unlock_number = number
-        self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
+        self._recovery = Recovery(
+            self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True, may_stop_program=True
+        )
         return None
 
     def _zero_wrench(self, reading: Reading) -> Reply:
@@ -283,7 +290,8 @@ class Pilot:
         why = line_violation(reading, self._limits)
         if now_ns > self._deadline_ns:
             why = "the linear move did not end within its time"
-        if not reading.moving_linearly and (self._move_seen or self._is_there(reading, now_ns)):
+        # The end of the move and the joints' speeds come over two connections, of which one may lag.
+        if not reading.moving_linearly and reading.rests and (self._move_seen or self._is_there(reading, now_ns)):
             self._end("arrived")
         elif why:
             self._stop(reading, now_ns, why)
@@ -292,7 +300,7 @@ class Pilot:
 
     def _is_there(self, reading: Reading, now_ns: int) -> bool:
         waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
-        return waited and reading.rests and math.dist(reading.tcp_pose, self._move_end) < ARRIVED
+        return waited and math.dist(reading.tcp_pose, self._move_end) < ARRIVED
 
     def _keep_resting(self, now_ns: int) -> None:
         if now_ns - self._rested_ns > ASTRAY_S * 1e9:

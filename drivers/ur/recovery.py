@@ -40,12 +40,15 @@ _ENDS_ITSELF_S = 2.0
 class Recovery:
     """One attempt to get the robot ready."""
 
-    def __init__(self, arm: CureArm, now_ns: int, timeout_s: float, *, operator_asked: bool) -> None:
+    def __init__(
+        self, arm: CureArm, now_ns: int, timeout_s: float, *, operator_asked: bool, may_stop_program: bool
+    ) -> None:
         """Begin; `operator_asked` allows unlocking and powering."""
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
         self._timeout_s = timeout_s
         self._operator_asked = operator_asked
+        self._may_stop_program = may_stop_program
         self._asked_ns: dict[str, int] = {}
         self._cleared = self._uploaded = False
         self.why = ""
@@ -77,7 +80,7 @@ class Recovery:
             # The control connection may see the program start a sample later than the one that reads; then once more.
             return Outcome.DONE if self._arm.arm_watchdog() else Outcome.UNDER_WAY
         if reading.runtime_state != RUNTIME_STOPPED:
-            if not self._operator_asked:
+            if not self._may_stop_program:
                 return self._leave_it_alone(now_ns)
             self._every_second("stop", now_ns, self._arm.stop_program)
         elif not self._cleared:
@@ -92,7 +95,7 @@ class Recovery:
         return Outcome.UNDER_WAY
 
     def _leave_it_alone(self, now_ns: int) -> Outcome:
-        """Wait for the end of a program that is not ours to stop, as the one of a process that died has by itself."""
+        """Wait for the end of a program that is not ours to stop; one whose daemon has died ends by its watchdog."""
         since_ns = self._asked_ns.setdefault("end", now_ns)
         return self._refuse("") if now_ns > since_ns + int(_ENDS_ITSELF_S * 1e9) else Outcome.UNDER_WAY
 

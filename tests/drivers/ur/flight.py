@@ -148,12 +148,12 @@ class FakeArm:
 class Flight:
     """A pilot, its arm and the time."""
 
-    def __init__(self, settings: UrSettings = SETTINGS) -> None:
+    def __init__(self, settings: UrSettings = SETTINGS, *, takes_over: bool = False) -> None:
         self.arm = FakeArm()
         self.now_ns = 10**12
         self.number = 0
         self.decided: dict[int, Reply] = {}
-        self.pilot = Pilot(settings, self.arm, self.now_ns)
+        self.pilot = Pilot(settings, self.arm, self.now_ns, takes_over=takes_over)
 
     def ask(self, command: Command) -> Reply:
         """Send a command and return its reply, letting cycles pass until it comes."""

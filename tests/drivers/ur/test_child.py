@@ -12,6 +12,7 @@ import pytest
 from drivers.ur import child
 from drivers.ur.messages import (
     Command,
+    Configure,
     Decoder,
     Disconnect,
     Enable,
@@ -80,7 +81,7 @@ def daemon(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
 
 def fly(daemon: Daemon, arm: CyclingArm) -> None:
     with pytest.raises(LeftError):
-        child._fly(daemon.pipe, SETTINGS, arm)  # type: ignore[arg-type]  # an arm in all that counts
+        child._fly(daemon.pipe, Configure(SETTINGS), arm)  # type: ignore[arg-type]  # an arm in all that counts
 
 
 def test_disconnecting_while_the_robot_is_made_ready_starts_nothing(daemon: Daemon) -> None:
@@ -152,6 +153,7 @@ def test_program_of_somebody_else_is_not_stopped_by_a_process_that_leaves(daemon
 CRASHING = """
 import threading
 from drivers.ur import child
+from drivers.ur.messages import Configure
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 class Arm(FakeArm):
@@ -160,7 +162,7 @@ class Arm(FakeArm):
 
 # As the client's threads may, this one keeps the interpreter from ending.
 threading.Thread(target=threading.Event().wait).start()
-child._configuration = lambda pipe: SETTINGS
+child._configuration = lambda pipe: Configure(SETTINGS)
 child._connect = lambda pipe, settings: Arm()
 child.main()
 """

@@ -40,8 +40,10 @@ def test_linear_move_is_kicked_along_and_its_arrival_told() -> None:
     flight.fly(20)
     assert flight.arm.calls == ["move"] + ["kick"] * 20
     assert "linear move is under way" in flight.ask(WristSpeed(0.1, 1.0)).refused
-    flight.arm.be(moving_linearly=False)
-    flight.fly(1)
+    flight.arm.be(moving_linearly=False, qd_rad_per_s=(0.1, 0.0, 0.0, 0.0, 0.0, 0.0))
+    flight.pilot.tick(flight.arm.reading, flight.now_ns)
+    assert flight.state.motion == "linear", "its joints are still said to move"
+    flight.fly(2)
     assert (flight.state.motion, flight.state.ended) == ("idle", "arrived")
 
 

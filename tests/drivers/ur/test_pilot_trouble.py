@@ -81,7 +81,15 @@ def test_program_that_somebody_else_runs_is_not_stopped_before_the_operator_says
     assert "stop_program" in flight.arm.calls
 
 
-def test_program_of_a_process_that_died_is_outlived() -> None:
+def test_program_that_a_process_before_left_behind_is_stopped() -> None:
+    flight = Flight(takes_over=True)
+    flight.arm.be(runtime_state=2)
+    flight.fly(20)
+    assert flight.arm.calls[:4] == ["stop_program", "clear_command", "upload", "arm_watchdog"]
+    assert flight.ask(Enable()).accepted
+
+
+def test_program_of_a_daemon_that_died_is_outlived() -> None:
     flight = Flight()
     flight.arm.be(runtime_state=2)
     flight.fly(60)

@@ -38,10 +38,12 @@ _LEAST_CELLS = 4
 _USUAL_T = 0.5
 # Frames fall where the bank's cells stand close: groups of many cells are split a little sooner.
 _CROWDING = 0.1
-# What float32 may take from a bound, and from the squares that ρ and t are the roots of. Sums of 98 products and a
-# Fourier transform of 1792 values, of norm 1, lose 5e-6 by the usual estimates; what is seen is 3e-7.
+# What float32 may take from a bound, and from the square that t is the root of. Sums of 98 products and a Fourier
+# transform of 1792 values, of norm 1, lose 5e-6 by the usual estimates; what is seen is 3e-7.
 ROUNDING = 2e-5
 _SQUARE_ROUNDING = 4e-6
+# The same for ρ, whose square is summed in float64.
+_SQUARE_ROUNDING_64 = 1e-12
 
 
 class Level(NamedTuple):
@@ -135,7 +137,7 @@ def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Sing
 def _rows_of_cells(numbers: FloatArray) -> Single:
     rows = np.zeros((len(numbers), numbers.shape[1] + 2), dtype=np.float32)
     rows[:, :-2] = numbers
-    rows[:, -1] = np.sqrt(np.maximum(1 - np.einsum("ij,ij->i", numbers, numbers), 0.0) + _SQUARE_ROUNDING)
+    rows[:, -1] = np.sqrt(np.maximum(1 - np.einsum("ij,ij->i", numbers, numbers), 0.0) + _SQUARE_ROUNDING_64)
     return rows
 
 

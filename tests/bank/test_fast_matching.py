@@ -13,9 +13,10 @@ from scipy.io import loadmat
 
 from bank import bounds, fast_matching
 from bank.channels import N_CHANNELS, channels_of_line
+from bank.compression import ROUNDING
 from bank.errors import MatchingError
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
-from bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher
+from bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher, unit_magnitude
 
 SHAPE = (22, 20)
 
@@ -156,6 +157,22 @@ def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, module,
     monkeypatch.setattr(module, limit, value)
     for frame in np.random.default_rng(5).random((4, N_CHANNELS)):
         assert_same(fast.match(frame), slow.match(frame))
+
+
+@settings(max_examples=100)
+@given(cells, st.sampled_from([0.0, 1e-6, 1e-4, 1e-2, 0.1, 1.0]), st.integers(0, 2**32 - 1))
+def test_no_bound_is_below_its_score(cell, noise, seed) -> None:
+    """Also of frames that are a cell's own signal, where next to nothing is left out of the bank's basis."""
+    _, fast = PAIRS[1]
+    frame = unit_magnitude(BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS))
+    signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
+    scores = (signals @ frame) / np.linalg.norm(signals, axis=1)
+    found = bounds.ZeroLagBounds(fast._bank, frame)
+    everything = found.left(-1.0)
+    np.testing.assert_array_equal(everything.cells, np.arange(len(scores)))
+    assert (everything.bounds - scores).min() >= -ROUNDING / 2
+    for score in np.quantile(scores, [0.5, 0.9, 1.0]):
+        assert set(np.flatnonzero(scores >= score)) <= set(found.left(score).cells)
 
 
 @both

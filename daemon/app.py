@@ -16,37 +16,33 @@ import zmq.asyncio
 from bank.channels import ZERO_SLOTS
 from daemon import sd_notify
 from daemon.addresses import open_stop_address
-from daemon.begun_mark import BegunMark
 from daemon.both import BOTH, BothTask
 from daemon.clock import Clock
 from daemon.command_server import CommandServer
 from daemon.commands import Commands, needed
 from daemon.config import DaemonConfig, Fingertip
+from daemon.configured_experiment import ConfiguredExperiment
 from daemon.estimation import Estimation
-from daemon.experiment.machine import Phase
 from daemon.fingertip import FingertipTask
 from daemon.health import HealthReporter, TaskFacts
 from daemon.keys import Gatekeeper, load_server_keys
 from daemon.links import log_link
 from daemon.load_cell_task import LOAD_CELL
-from daemon.loop.senses import Source
 from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Listener, Publisher
 from daemon.recording.identity import Attached, identity_of
 from daemon.recording.recorder import Recorder
 from daemon.rig import Rig, make_load_cell
 from daemon.rig_check import checked_experiment
-from daemon.skin_setup import make_skin, skin_source
+from daemon.skin_setup import make_skin
 from daemon.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from daemon.supervisor import Supervisor
 from daemon.tool_diameter import FingertipDiameters
+from daemon.torque_sources import torque_sources
 from daemon.tracking import TrackedEstimator
 from drivers.eit_kit import EitKit
 from drivers.raw_input import Tap, no_tap
 from drivers.serial_port import LinkEvent
-
-# How often a start that was refused is tried again, and an end looked for.
-START_RETRY_S = 0.5
 
 
 class Daemon:
@@ -58,12 +54,8 @@ class Daemon:
         self._clock = Clock()
         self.supervisor = Supervisor()
         self._stop = asyncio.Event()
-        # The configured experiment, until it has begun.
-        self._awaited: Path | None = None
-        # Whether it has begun, and whether it was carried out to its end.
-        self._begun = self._done = False
-        self._mark = BegunMark()
         self._rig: Rig | None = None
+        self._experiment: ConfiguredExperiment | None = None
         checked_experiment(config)
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
         both = open_both(config.both, config.fingertips) if config.both is not None else None
@@ -98,11 +90,13 @@ class Daemon:
                 config,
                 self.publisher,
                 self._clock,
-                _sources(config, estimators, both),
+                torque_sources(config, estimators, both),
                 self._tare_to_the_end,
                 self.supervisor.deaths,
                 self._tap,
             )
+            if config.experiment is not None:
+                self._experiment = ConfiguredExperiment(config.experiment, self._begin, self._rig.loop.ended)
         hear = self._rig.brain.hear if self._rig is not None else lambda _: None
         self._load_cell = self._rig.load_cell if self._rig is not None else None
         if self._rig is None and config.load_cell is not None:
@@ -186,7 +180,8 @@ class Daemon:
                 sd_notify.notify("STOPPING=1")
                 for task in running:
                     task.cancel()
-            self._mark.clear()
+            if self._experiment is not None:
+                self._experiment.end()
         finally:
             try:
                 if self._recorder is not None:
@@ -205,7 +200,7 @@ class Daemon:
     @property
     def finished(self) -> bool:
         """Whether nothing was left undone: the experiment that ends the daemon is done, or there is none."""
-        return self._done or self._config.experiment is None or not self._config.stop_when_done
+        return self._experiment is None or self._experiment.done or not self._config.stop_when_done
 
     async def start_experiment(self, path: Path) -> str | None:
         """Begin an experiment, or return why it cannot be begun; raises UserError for a file that is none."""
@@ -232,8 +227,8 @@ class Daemon:
         if self._rig is not None:
             for name, run in self._rig.tasks():
                 yield supervised(name, run)
-            if self._config.experiment is not None:
-                yield supervised("experiment", self._run_experiment)
+            if self._experiment is not None:
+                yield supervised("experiment", partial(self._run_experiment, self._experiment))
         if self._recorder is not None:
             yield supervised("recording", self._recorder.run)
         yield supervised("commands", self._commands.run)
@@ -243,33 +238,9 @@ class Daemon:
             yield supervised("open_stop", self._open_stop.run)
         yield supervised("health", self.health.run)
 
-    async def _run_experiment(self) -> None:
-        """Start the configured experiment as soon as it can be started, and see it to its end."""
-        rig, path = self._rig, self._config.experiment
-        if rig is None or path is None:
-            return
-        log, told = structlog.get_logger().bind(experiment=str(path)), ""
-        if self._mark.left_behind:
-            log.warning(
-                "the daemon before this one died after it had begun an experiment: this one waits for "
-                "`shearloop command start`"
-            )
-            return
-        # Begun once, whatever becomes of this task.
-        self._awaited = path if not self._begun else None
-        while not self._begun and (why := await self._begin(path)) is not None:
-            if self._awaited is None:
-                log.info("the operator said stop: it is not started")
-                return
-            if why != told:
-                log.info("waiting to start", why=why)
-                told = why
-            await asyncio.sleep(START_RETRY_S)
-        self._awaited, self._begun = None, True
-        experiment = await rig.loop.ended()
-        self._done = experiment.phase is Phase.DONE
-        log.info("the experiment has ended", phase=experiment.phase.value, why=experiment.why)
-        if self._config.stop_when_done:
+    async def _run_experiment(self, experiment: ConfiguredExperiment) -> None:
+        await experiment.run()
+        if experiment.begun and self._config.stop_when_done:
             self.stop()
 
     async def _begin(self, path: Path) -> str | None:
@@ -277,16 +248,15 @@ class Daemon:
         rig, recorder = needed(self._rig), self._recorder
         attached = Attached.if_there(path) if recorder is not None else ()
         why = await rig.start(path)
-        if why is None:
-            self._mark.set()
+        if why is None and self._experiment is not None:
+            self._experiment.has_begun(path)
         if why is None and recorder is not None and rig.brain.experiment is not None:
             recorder.experiment(rig.brain.experiment.file.name, attached)
         return why
 
     def _give_up_waiting(self) -> Path | None:
         """Begin the configured experiment no more, and return it; None where it was not waited for."""
-        awaited, self._awaited = self._awaited, None
-        return awaited
+        return self._experiment.give_up() if self._experiment is not None else None
 
     def _tap(self, source: str) -> Tap:
         return no_tap if self._recorder is None else self._recorder.tap(source)
@@ -324,26 +294,6 @@ class Daemon:
         if self._skin is not None:
             tares.append(self._skin.zero())
         return " ".join(filter(None, await asyncio.gather(*tares)))
-
-
-def _sources(
-    config: DaemonConfig, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None
-) -> dict[str, Source]:
-    """Return how often each sensor's torque comes; the mean of several frames speaks of a longer time."""
-    sources = {
-        name: Source(
-            name=name,
-            period_s=own.frame_period_s,
-            window_s=own.frame_period_s * own.average_frames,
-            measures_torque=estimators[name].measures_torque,
-        )
-        for name, own in config.fingertips.items()
-    }
-    if both is not None:
-        period_s = max(own.frame_period_s for own in config.fingertips.values())
-        sources[BOTH] = Source(name=BOTH, period_s=period_s, window_s=period_s, measures_torque=both.measures_torque)
-    skin = skin_source(config.skin) if config.skin is not None else None
-    return sources if skin is None else {**sources, skin.name: skin}
 
 
 def _recorder(

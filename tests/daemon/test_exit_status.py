@@ -4,6 +4,7 @@ import asyncio
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -12,6 +13,7 @@ import zmq.asyncio
 from daemon.app import Daemon
 from daemon.begun_mark import BegunMark
 from daemon.config import load_daemon_config
+from daemon.experiment.machine import Phase
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 Write = Callable[..., Path]
@@ -67,6 +69,42 @@ async def test_after_a_crash_no_experiment_begins_by_itself(
     assert not (await ended(waiting_config, once=gave_up)).finished
     assert "died after it had begun an experiment" in capsys.readouterr().out
     assert not BegunMark().left_behind, "this one ended in good order"
+
+
+@pytest.mark.parametrize(("own", "finished"), [(True, True), (False, False)])
+async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment_that_waited(
+    own: bool, finished: bool, waiting_config: Path, tmp_path: Path
+) -> None:
+    """Neither by the same one again, nor by the configured one after another."""
+    ready, begun = asyncio.Event(), []
+
+    async def start(path: Path) -> str | None:
+        if not ready.is_set():
+            return "the gripper is not ready"
+        begun.append(path)
+        return None
+
+    async def done() -> SimpleNamespace:
+        return SimpleNamespace(phase=Phase.DONE, why="")
+
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(waiting_config), context)
+        assert daemon._rig is not None
+        daemon._rig.start = start  # type: ignore[method-assign]
+        assert daemon._experiment is not None
+        daemon._experiment._ended = done  # type: ignore[assignment]
+        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+            group.create_task(daemon.run())
+            while not daemon._experiment.awaited:  # noqa: ASYNC110 - it is asked, as `stop` asks
+                await asyncio.sleep(0.01)
+            ready.set()
+            path = tmp_path / ("experiment.yaml" if own else "another.yaml")
+            assert await daemon.start_experiment(path) is None
+            while not gave_up(daemon):  # noqa: ASYNC110 - it is asked, as health asks
+                await asyncio.sleep(0.01)
+            daemon.stop()
+    assert begun == [path]
+    assert daemon.finished is finished
 
 
 def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+import zmq
 
 from bank.bank_file import Bank
 from bench.daemon_parts import (
@@ -33,11 +34,26 @@ from bench.daemon_parts import (
     subscription,
     tree,
 )
+from daemon.request import request
 
 REPEATS = 5
 # Between frames whose latency is measured: long enough for the daemon to be idle again.
 PAUSE_S = 0.03
 FLOOD_HZ = 500.0
+# Before processor time is measured: until everything is connected, and until an experiment has gripped its tool.
+SETTLING_S, GRIPPING_S = 10.0, 15.0
+TWISTS = {
+    "name": "twists",
+    "drive": "load_cell",
+    "limits": {"torque_nm": 0.3, "angle_rad": 0.5},
+    "steps": [
+        {"do": "release", "timeout_s": 15},
+        {"do": "tare", "timeout_s": 30},
+        {"do": "approach", "along_tool_m": 0.03, "timeout_s": 15},
+        {"do": "grip", "width_mm": 5, "force_n": 60, "timeout_s": 15},
+        {"do": "twist", "angles_rad": [0.15, 0.0], "speed_rad_per_s": 0.2, "hold_s": 2, "repeats": 1000},
+    ],
+}
 
 
 def latency(bank: Path, matching: str, n_frames: int) -> dict[str, Any]:
@@ -95,10 +111,13 @@ def flood(bank: Path, n_frames: int) -> dict[str, Any]:
     }
 
 
-def rated(bank: Path, rig_bank: Path, seconds: float, *, recording: bool = True) -> dict[str, Any]:
+def rated(
+    bank: Path, rig_bank: Path, seconds: float, *, recording: bool = True, twisting: bool = False
+) -> dict[str, Any]:
     """Return processor time, of every thread too, and memory with the whole emulated rig at its rated speeds.
 
-    Memory is told at the beginning and at the end, so that one that grows is seen to.
+    No experiment runs, or one that is `twisting` a tool to and fro. Memory is told at the beginning and at the end, so
+    that one that grows is seen to.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -129,17 +148,16 @@ def rated(bank: Path, rig_bank: Path, seconds: float, *, recording: bool = True)
                 rig.stdout.readline()
             try:
                 with daemon(config, folder) as (pid, ready_s), subscription(folder, "health") as health:
-                    until = time.monotonic() + 10
-                    while time.monotonic() < until:
-                        tasks = received(health)[1]["tasks"]
+                    tasks = _listened(health, SETTLING_S)
+                    if twisting:
+                        (folder / "twists.yaml").write_text(yaml.safe_dump(TWISTS))
+                        _started(f"ipc://{folder}/commands", folder / "twists.yaml")
+                        _listened(health, GRIPPING_S)
                     at_first = memory_mb(pid)
                     before = {each: cpu_s(each) for each in tree(pid)}
                     threads_before = {each: cpu_of_threads_s(each) for each in before}
                     begun = time.monotonic()
-                    until = begun + seconds
-                    while time.monotonic() < until:
-                        # Read as they come: the last one tells the rates at the end.
-                        tasks = received(health)[1]["tasks"]
+                    tasks = _listened(health, seconds)
                     took_s = time.monotonic() - begun
                     shares = {each: (cpu_s(each) - cpu) / took_s for each, cpu in before.items()}
                     threads = {
@@ -156,6 +174,7 @@ def rated(bank: Path, rig_bank: Path, seconds: float, *, recording: bool = True)
     return {
         "ready_s": ready_s,
         "recording": recording,
+        "twisting": twisting,
         "seconds": took_s,
         "cpu_share_of_one_core": shares[pid],
         "cpu_share_of_the_robots_process": sum(shares[each] for each in children),
@@ -165,6 +184,24 @@ def rated(bank: Path, rig_bank: Path, seconds: float, *, recording: bool = True)
         "memory_mb_of_the_robots_process": sum(memory[each]["resident"] for each in children),
         "rates_hz": {task: facts.get("rate_hz") for task, facts in tasks.items() if facts.get("rate_hz")},
     }
+
+
+def _listened(health: "zmq.Socket[bytes]", seconds: float) -> dict[str, Any]:
+    """Read health as it comes for so long, and return what it last said of the tasks."""
+    until = time.monotonic() + seconds
+    tasks: dict[str, Any] = {}
+    while not tasks or time.monotonic() < until:
+        tasks = received(health)[1]["tasks"]
+    return tasks
+
+
+def _started(commands: str, experiment: Path) -> None:
+    """Begin an experiment, with the operator's word for what waits for it."""
+    until = time.monotonic() + SETTLING_S
+    while not (reply := request(commands, {"command": "start", "experiment": str(experiment)}, SETTLING_S))["ok"]:
+        if time.monotonic() > until:
+            raise RuntimeError(reply["why"])
+        request(commands, {"command": "unlock"}, SETTLING_S)
 
 
 def shared_bank(bank: Path) -> dict[str, Any]:
@@ -235,6 +272,7 @@ def main() -> None:
         rig_bank = args.rig_bank or args.bank
         found["rated"] = rated(args.bank, rig_bank, args.rated_s)
         found["rated_without_recording"] = rated(args.bank, rig_bank, args.rated_s, recording=False)
+        found["rated_twisting"] = rated(args.bank, rig_bank, args.rated_s, twisting=True)
     if "shared" in wanted:
         found["shared"] = shared_bank(args.bank)
     args.out.parent.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.ur.client import LAST_WORDS_BYTES, UrRobot
-from tests.drivers.ur.robots import Link, running, settings_for
+from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
 
 async def test_absent_controller_is_explained() -> None:
@@ -59,3 +59,29 @@ async def test_long_line_of_a_process_is_heard_and_told_in_short(play: Callable[
     assert "ended with status 3" in loss.sentence
     assert loss.sentence.endswith("xxx / no memory.")
     assert len(loss.sentence) < LAST_WORDS_BYTES + 400
+
+
+BRIEFLY = """
+import os, sys
+from drivers.ur.messages import Configure, Decoder, encode
+from drivers.ur.pilot import Pilot
+from tests.drivers.ur.flight import SETTINGS, FakeArm
+
+decoder = Decoder()
+while not (heard := decoder.feed(os.read(0, 1 << 16))):
+    pass
+with open(sys.argv[1], "a") as told:
+    print(heard[0][1].takes_over, file=told)
+os.write(1, encode(Pilot(SETTINGS, FakeArm(), 0).state(FakeArm().reading)))
+"""
+
+
+async def test_process_after_one_that_was_connected_may_stop_what_that_left_running(
+    play: Callable[[str], None], tmp_path: Path
+) -> None:
+    told = tmp_path / "told"
+    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{BRIEFLY}' '{told}'")
+    link = Link()
+    async with running(settings_for("127.0.0.254"), link):
+        await link.down(2)
+    assert told.read_text().split()[:2] == ["False", "True"]

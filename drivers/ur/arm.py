@@ -107,7 +107,9 @@ class Arm:
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
         """Begin to end a linear move."""
-        return bool(self._control.stopJ(deceleration_rad_per_s2, asynchronous=True))
+        # The client does not say whether the stop was taken; whether the program takes what comes after it, it does.
+        self._control.stopJ(deceleration_rad_per_s2, asynchronous=True)
+        return self.kick()
 
     def kick(self) -> bool:
         """Tell the robot's watchdog that we live."""

@@ -226,6 +226,31 @@ async def test_a_protective_stop_ends_the_experiment_and_is_unlocked_on_the_oper
         assert not daemon.supervisor.records["loop"].restarts
 
 
+async def test_a_straight_move_brakes_while_it_is_paused_and_ends_where_it_was_to(
+    rig_config: Path, tiny_bank: Path, tmp_path: Path
+) -> None:
+    def pose(state: Mapping[str, Any]) -> np.ndarray:
+        return np.frombuffer(state["tcp_pose"], "<f4")[:3]
+
+    move = {"do": "approach", "along_tool_m": -0.05, "speed_m_per_s": 0.05}
+    path = tmp_path / "move.yaml"
+    path.write_text(yaml.safe_dump({"name": "move", "drive": "wrench", "steps": [move]}))
+    async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
+        first = pose(watcher.seen["robot.state"][-1])
+        await started(command, str(path))
+        await watcher.until("robot.state", lambda state: np.linalg.norm(pose(state) - first) > 0.01)
+        assert (await command("pause"))["ok"]
+        told = watcher.seen["robot.state"][-1]["seq"]
+        still = await watcher.until("robot.state", lambda state: state["seq"] > told + 12)
+        later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 12)
+        assert np.linalg.norm(pose(later) - pose(still)) < 1e-4, "it stands"
+        assert np.linalg.norm(pose(later) - first) < 0.045, "and is not there yet"
+        assert (await command("resume"))["ok"]
+        ended = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
+        assert ended["phase"] == "done", ended["doing"]
+        assert np.linalg.norm(pose(watcher.seen["robot.state"][-1]) - first) == pytest.approx(0.05, abs=2e-3)
+
+
 @pytest.mark.parametrize(("fault", "finished"), [("", True), ("protective-stop", False)])
 async def test_a_daemon_that_ends_with_its_experiment_knows_whether_it_is_done(
     fault: str, finished: bool, rig_config: Path, tiny_bank: Path

@@ -72,6 +72,22 @@ async def test_states_arrive_and_commands_are_answered_with_what_is_sent(control
         assert state.tcp_pose[2] == pytest.approx(z - 0.02, abs=1e-5)
 
 
+async def test_a_linear_move_is_stopped_and_another_goes_on_from_there(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        x, y, z, *turned = (await robot.next_state()).tcp_pose
+        move = MoveLinear((x, y, z + 0.04, turned[0], turned[1], turned[2]), 0.05, 0.5)
+        assert (await robot.send(move)).accepted
+        await until(robot, lambda state: state.tcp_pose[2] > z + 0.01)
+        assert (await robot.send(Stop(4.0))).sent == Stop(4.0)
+        state = await until(robot, lambda state: state.motion == "idle")
+        assert (state.ended, state.blocked) == ("stopped on command", "")
+        assert state.tcp_pose[2] < z + 0.03
+        assert (await robot.send(move)).accepted
+        await until(robot, lambda state: state.motion == "idle" and state.ended == "arrived")
+        assert (await robot.next_state()).tcp_pose[2] == pytest.approx(z + 0.04, abs=1e-4)
+
+
 async def test_state_comes_125_times_a_second_with_the_controllers_own_time(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
         first = await until(robot, lambda state: not state.recovering)

@@ -5,10 +5,7 @@ from pathlib import Path
 
 from daemon.addresses import COMMAND_ADDRESS, needs_keys, stop_address
 from daemon.cli.connection import add_connection, client_keys
-
-# The robot may have to be powered, its brakes released and its program started, and the gripper activated.
-UNLOCK_TIMEOUT_S = 60.0
-TIMEOUT_S = 2.0
+from daemon.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
 
 COMMANDS = {
     "tare": "take the zero of the torque sensors anew: nothing gripped, no experiment running",
@@ -58,7 +55,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--timeout",
         type=float,
         metavar="S",
-        help=f"how long to wait for the answer (default: {TIMEOUT_S:g} s, for unlock {UNLOCK_TIMEOUT_S:g} s)",
+        help=f"how long to wait for the answer (default: {COMMAND_TIMEOUT_S:g} s, for unlock {UNLOCK_TIMEOUT_S:g} s)",
     )
     parser.add_argument("--json", action="store_true", help="print the reply as JSON")
 
@@ -83,10 +80,10 @@ def run(args: argparse.Namespace) -> int:
         address = stop_address(address)
     else:
         keys = client_keys(args)
-    timeout_s = TIMEOUT_S if args.timeout is None else checked_timeout_s(args.timeout)
+    timeout_s = COMMAND_TIMEOUT_S if args.timeout is None else checked_timeout_s(args.timeout)
     if args.name == "unlock" and args.timeout is None:
         # That nobody is there is said at once all the same.
-        request(address, {"command": "status"}, TIMEOUT_S, keys)
+        request(address, {"command": "status"}, COMMAND_TIMEOUT_S, keys)
         timeout_s = UNLOCK_TIMEOUT_S
     reply = request(address, {"command": args.name, **arguments}, timeout_s, keys)
     accepted = bool(reply.pop("ok", False))

@@ -14,6 +14,7 @@ import zmq.asyncio
 from daemon.errors import UserError
 from daemon.keys import ClientKeys
 from daemon.messages import EitFrame, EitHeatmap, decode
+from daemon.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
 from daemon.request import request
 from daemon.subscriber import connect
 from daemon.topics import TOPICS
@@ -22,9 +23,6 @@ from daemon.view.latest import Latest
 # The largest message is a heatmap of 200 × 200 float32.
 LARGEST_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 1000
-# A person waits for the answer; a daemon that lives gives it in some milliseconds, but for `unlock`.
-COMMAND_TIMEOUT_S = 2.0
-UNLOCK_TIMEOUT_S = 15.0
 COMMANDS_AT_ONCE = 4
 
 

@@ -4,7 +4,7 @@ import { byId, put } from "./text.js";
 
 const KEY = "shearloop-token";
 // A daemon that lives answers in some milliseconds; `unlock` takes its time.
-const LATE_MS = 20000;
+const LATE_MS = 65000;
 const STOP_LATE_MS = 4000;
 
 export class Controls {

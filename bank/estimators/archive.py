@@ -9,7 +9,7 @@ import io
 import types
 import zipfile
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -144,6 +144,8 @@ def _restored(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]])
             **{
                 item.name: _restored(hints[item.name], plain[item.name], f"{path}/{item.name}", arrays)
                 for item in fields(kind)
+                # What a file lacks that was not there when it was written has its default.
+                if item.name in plain or item.default is MISSING
             }
         )
     if kind is float:

@@ -15,6 +15,7 @@ from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
 from bank.estimators.guard import LARGEST_UNUSABLE_SHARE
 from bank.estimators.heads import left_out_blocks
+from bank.estimators.twins import Twins
 from bank.estimators.values import BoolArray, FloatArray
 
 # Beyond the largest misfit and reach of blocks left out: on the recorded slices the later ones stay within 1.37 and 1.5
@@ -37,7 +38,7 @@ class DifferenceGuard:
     """The mean (896,) in volts, each channel's spread (896,) in volts, and directions (r, 896) in units of spread.
 
     variances (r,) are those along the directions. typical_misfit is the median of what was left out; of an estimate
-    from more, the interval is as much wider.
+    from more, the interval is as much wider. Calibrations that were made before there were twins have none.
     """
 
     mean: FloatArray
@@ -49,6 +50,7 @@ class DifferenceGuard:
     largest_misfit: float
     largest_outlying: float
     largest_reach: float
+    twins: Twins | None = None
 
     @classmethod
     def fit(cls, differences: FloatArray) -> Self:
@@ -68,7 +70,7 @@ class DifferenceGuard:
         return cls(
             whole.mean, whole.spread, whole.directions, whole.variances, least,
             float(np.median(misfits, axis=0)[0]), _MISFIT_MARGIN * float(misfit),
-            max(_MISFIT_MARGIN * float(outlying), _LEAST_OUTLYING), _REACH_MARGIN * reach,
+            max(_MISFIT_MARGIN * float(outlying), _LEAST_OUTLYING), _REACH_MARGIN * reach, Twins.fit(differences),
         )  # fmt: skip
 
     @classmethod
@@ -124,6 +126,11 @@ class DifferenceGuard:
             return (
                 f"outside of the calibration: the misfit is {misfit:.1f} (at most {self.largest_misfit:.1f}), with "
                 f"{100 * outlying:.0f} % of the channels far off (at most {100 * self.largest_outlying:.0f} %)",
+            )
+        if self.twins is not None and (twins := self.twins.misfit(difference, usable)) > self.twins.largest_misfit:
+            return (
+                f"outside of the calibration: what opposite injections say twice is off by {twins:.2f} (at most "
+                f"{self.twins.largest_misfit:.2f}); part of the frame may be another fingertip's",
             )
         reach = self.reach(difference, usable)
         if reach > self.largest_reach:

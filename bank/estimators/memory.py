@@ -26,7 +26,8 @@ from bank.estimators.values import BoolArray, FloatArray, TactileFrame
 
 # Frames that an idle baseline is averaged over at the most recent end.
 _BASELINE_FRAMES = 10
-# Frames further apart than this many periods of 0.54 s have lost the thread.
+# Frames further apart than this have lost the thread: two of a period of 0.54 s are missing. With single ones missing,
+# now and then, later twists are read with errors half as large again, within the same intervals.
 _LARGEST_GAP_S = 1.4
 # A session's baseline is made of at least so many frames before a grip is looked for that is not half as strong as the
 # calibration's.
@@ -154,7 +155,8 @@ class Memory:
 
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
-        if frame.t_s - self._t_s > _LARGEST_GAP_S:
+        if not 0 < frame.t_s - self._t_s <= _LARGEST_GAP_S:
+            # A frame from before the last one says nothing of how the gel has moved since that.
             self._forget()
         self._t_s = frame.t_s
         told = TactileFrame(

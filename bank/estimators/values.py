@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
+from bank.gaussian import TWO_SIDED_95
 
 FloatArray: TypeAlias = NDArray[np.float64]
 BoolArray: TypeAlias = NDArray[np.bool_]
@@ -133,8 +134,8 @@ class Measured:
 def fused(*measured: Measured | None) -> Measured | None:
     """Return the mean of independent measurements of one thing, weighted by their variances; None without any.
 
-    Used for the diameter, which the fingertips and the gripper's width both give. The half widths are taken as the
-    same multiple of the standard deviations.
+    Used for the diameter, which the fingertips and the gripper's width both give. The half widths are those of 95 %
+    intervals. Measurements further apart than they should be make the mean as much less certain (Birge 1932).
     """
     present = [one for one in measured if one is not None]
     if not present:
@@ -142,5 +143,7 @@ def fused(*measured: Measured | None) -> Measured | None:
     if any(one.half_width <= 0 for one in present):
         raise ValueError("a measurement with no uncertainty cannot be weighed against others")
     weights = np.array([one.half_width**-2 for one in present])
-    value = float(weights @ [one.value for one in present] / weights.sum())
-    return Measured(value, float(weights.sum() ** -0.5))
+    values = np.array([one.value for one in present])
+    value = float(weights @ values / weights.sum())
+    apart = TWO_SIDED_95**2 * float(weights @ (values - value) ** 2) / max(len(present) - 1, 1)
+    return Measured(value, float(np.sqrt(max(apart, 1.0) / weights.sum())))

@@ -16,6 +16,7 @@ from bank.channels import N_CHANNELS
 from bank.estimators import FrameSeries
 from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.physics import Registration
+from bank.estimators.twins import Twins
 from bench.charts.picture import SHADES, figure, look
 
 Floats = NDArray[np.float64]
@@ -27,17 +28,16 @@ _TURNED_ELECTRODES = 5
 
 @dataclass(frozen=True, slots=True)
 class Detected:
-    """One origin, kind of foreign frame and share of it: misfits of the later slices in units of the typical one.
+    """One origin, kind of foreign frame and share of it: misfits of the later slices in units of their limit.
 
-    passing is the share that the guard lets through, passing_best that of the best limit; auc is how often a spoilt
-    slice has a larger misfit than a good one.
+    The misfit is that of what is measured twice. passing is the share that the guard lets through, passing_best that of
+    the best limit; auc is how often a spoilt slice has a larger misfit than a good one.
     """
 
     origin: float
     kind: str
     share: float
     misfits: tuple[float, ...]
-    limit: float
     passing: float
     passing_best: float
     auc: float
@@ -57,15 +57,15 @@ def detected(series: FrameSeries, origins: Sequence[float] = ORIGINS, seed: int 
             "another fingertip": mean[np.random.default_rng(seed).permutation(N_CHANNELS)],
             f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned],
         }
-        good = _misfits(guard, later)
+        twins = Twins.fit(frames[:n])
+        good = _misfits(twins, later)
         for kind, one in foreign.items():
             for share in SHARES:
                 spoilt = (1 - share) * later + share * one
-                misfits = _misfits(guard, spoilt)
+                misfits = _misfits(twins, spoilt)
                 found.append(
                     Detected(
-                        origin, kind, share, tuple(misfits / guard.typical_misfit),
-                        guard.largest_misfit / guard.typical_misfit,
+                        origin, kind, share, tuple(misfits),
                         float(np.mean([not guard.refuse(frame, usable) for frame in spoilt])),
                         float((misfits <= good.max()).mean()),
                         float((misfits[:, None] > good).mean() + 0.5 * (misfits[:, None] == good).mean()),
@@ -74,9 +74,9 @@ def detected(series: FrameSeries, origins: Sequence[float] = ORIGINS, seed: int 
     return found
 
 
-def _misfits(guard: DifferenceGuard, frames: Floats) -> Floats:
+def _misfits(twins: Twins, frames: Floats) -> Floats:
     usable = np.ones(N_CHANNELS, dtype=np.bool_)
-    return np.array([guard.misfit(one, usable)[0] for one in frames])
+    return np.array([twins.misfit(one, usable) for one in frames]) / twins.largest_misfit
 
 
 def detectability_figure(title: str, found: Sequence[Detected]) -> Figure:
@@ -90,14 +90,13 @@ def detectability_figure(title: str, found: Sequence[Detected]) -> Figure:
         if one.origin == shown and one.kind == kinds[0]:
             x = np.full(len(one.misfits), one.share) + np.linspace(-0.008, 0.008, len(one.misfits))
             clouds.plot(x, one.misfits, "o", color=SHADES[1], markersize=4, alpha=0.7)
-            limit = one.limit
     good = next(one for one in found if one.origin == shown and one.share == 0)
-    clouds.axhline(limit, color="black", linewidth=1.4, label="the guard's limit, from the earlier slices alone")
+    clouds.axhline(1.0, color="black", linewidth=1.4, label="the guard's limit, from the earlier slices alone")
     clouds.axhline(
         max(good.misfits), color="black", linestyle=":", linewidth=1.4, label="best limit: the worst good slice"
     )
     clouds.set(
-        xlabel=f"share of a foreign frame ({kinds[0]})", ylabel="misfit of each later slice (typical left-out one = 1)",
+        xlabel=f"share of a foreign frame ({kinds[0]})", ylabel="misfit of each later slice, by what it measures twice",
         title=f"calibrated on the first {shown:.0%}", yscale="log",
     )  # fmt: skip
     clouds.legend(fontsize=8.5, loc="upper left")
@@ -114,7 +113,7 @@ def detectability_figure(title: str, found: Sequence[Detected]) -> Figure:
         xlabel="share of the foreign frame", ylabel="share of the slices that passes",
         title=f"mean of {len(origins)} origins (bars: lowest and highest)", ylim=(-0.04, 1.04),
     )  # fmt: skip
-    passing.legend(fontsize=8.5, loc="lower left")
+    passing.legend(fontsize=8.5, loc="upper right")
     for panel in (clouds, passing):
         panel.grid(alpha=0.25)
     made.suptitle(f"How much of a foreign frame can be seen: {title}")

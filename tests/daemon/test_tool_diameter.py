@@ -8,12 +8,18 @@ def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> N
     diameters = FingertipDiameters("both")
     assert diameters.at(0) is None
     diameters.hear("right", Interval(20.0, 18.0, 22.0), 0)
-    diameters.hear("left", Interval(26.0, 22.0, 30.0), 0)
+    diameters.hear("left", Interval(22.0, 18.0, 26.0), 0)
     said = diameters.at(0)
     assert said is not None
     # Weights 1 / 2² and 1 / 4².
-    assert said.value == pytest.approx((20.0 / 4 + 26.0 / 16) / (1 / 4 + 1 / 16))
+    assert said.value == pytest.approx((20.0 / 4 + 22.0 / 16) / (1 / 4 + 1 / 16))
     assert said.half_width == pytest.approx((1 / 4 + 1 / 16) ** -0.5)
+    # Six apart is 2.6 standard deviations of the difference: so much less sure is the mean.
+    diameters.hear("left", Interval(26.0, 22.0, 30.0), 0)
+    apart = diameters.at(0)
+    assert apart is not None
+    deviations = 6.0 / ((2.0**2 + 4.0**2) ** 0.5 / 1.96)
+    assert apart.half_width == pytest.approx(deviations * said.half_width)
     diameters.hear("both", Interval(21.0, 20.0, 22.0), 0)
     both = diameters.at(0)
     assert both is not None

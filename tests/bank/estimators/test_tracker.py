@@ -159,6 +159,18 @@ def test_after_a_gap_the_memory_is_filled_anew(fused_calibration, twisting):
     assert estimates[166].valid
 
 
+def test_frames_that_come_again_later_are_no_motion(fused_calibration, twisting):
+    """Somebody sends two old frames again: what the gel has done since is not told by them."""
+    other = twisting(seed=13)
+    order = [*range(150), 148, 149, *range(150, 220)]
+    again = [TactileFrame.of(float(other.t_s[i]), other.channels[i]) for i in order]
+    tracker = Tracker(fused_calibration)
+    estimates = [tracker.estimate(one) for one in again]
+    assert estimates[149].valid
+    assert not any(one.valid for one in estimates[150:162])
+    assert estimates[175].valid
+
+
 def test_one_fingertip_does_too_and_two_do_better(twisting):
     other = twisting(seed=14, noise_v=0.003)
     errors = {}

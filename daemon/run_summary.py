@@ -72,7 +72,7 @@ class RunSummary:
 
     def __init__(
         self,
-        tell: Callable[[Sequence[str]], None],
+        tell: Callable[[Sequence[str]], object],
         truth: Callable[[], Known | None] = lambda: None,
         happened: Callable[[], Sequence[tuple[int, str]]] = tuple,
     ) -> None:

@@ -1,7 +1,6 @@
 """What a demonstration adds to a run: what befalls the emulated rig, the truth about it, and the summary's end."""
 
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -103,13 +102,3 @@ class Deaths:
                 device=entry[0],
                 status=entry[1].returncode,
             )
-
-
-def print_summary(lines: Sequence[str]) -> None:
-    """Print what happened; where nobody reads any more, the daemon goes on without."""
-    from daemon.logs import silence
-
-    try:
-        print("", *lines, "", sep="\n", flush=True)
-    except OSError:
-        silence(sys.stdout)

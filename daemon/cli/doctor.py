@@ -25,26 +25,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Examine and tell; status 1 when something is wrong."""
     import json
+    import logging
     import math
     from dataclasses import asdict
 
     from daemon.doctor.examination import examine
     from daemon.errors import UserError
-    from daemon.logs import set_up_logging
+    from daemon.logs import logging_to_stderr
 
     if not (math.isfinite(args.seconds) and 0 < args.seconds <= 600):
         raise UserError(f"--seconds {args.seconds:g} is not a time to listen; give seconds above 0, up to 600")
-    set_up_logging(level=40)
     findings = []
-    for finding in examine(args.config, args.seconds, args.geometry):
-        findings.append(finding)
-        if args.json:
-            continue
-        print(f"{MARKS[finding.state]} {finding.subject}: {finding.found}", flush=True)
-        if finding.means:
-            print(f"        it means: {finding.means}")
-        if finding.next_step:
-            print(f"        next: {finding.next_step}", flush=True)
+    with logging_to_stderr(level=logging.ERROR):
+        for finding in examine(args.config, args.seconds, args.geometry):
+            findings.append(finding)
+            if args.json:
+                continue
+            print(f"{MARKS[finding.state]} {finding.subject}: {finding.found}", flush=True)
+            if finding.means:
+                print(f"        it means: {finding.means}")
+            if finding.next_step:
+                print(f"        next: {finding.next_step}", flush=True)
     wrong = sum(finding.state == "trouble" for finding in findings)
     if args.json:
         print(json.dumps([asdict(finding) for finding in findings], ensure_ascii=False))

@@ -87,7 +87,7 @@ async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, ar
         opened.callback(publisher.close)
         replay = Replay(run, Chain(config, run.tares(), publisher), publisher, clock)
         if args.show:
-            publisher.listen(Show())
+            publisher.listen(Show(sys.stdout))
         while args.wait and not publisher.subscribed:  # noqa: ASYNC110 - it is told when it is asked
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, run.messages, "message"))

@@ -10,11 +10,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from daemon.cli.demonstration import Truth
     from daemon.config import Emulator
+    from daemon.outlet import Outlet
     from daemon.publisher import Listener
 
 # Long enough for an emulator to remove its port's link, short enough for a clean stop within a second.
@@ -44,19 +45,25 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until SIGINT, SIGTERM or `shearloop command stop`, or until the experiment has ended (`stop_when_done`)."""
+    from daemon.logs import logging_to_stderr
+    from daemon.outlet import Outlet
+
+    # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    with logging_to_stderr(json_lines=args.json_log) as log, Outlet(sys.stdout) as out:
+        return _run(args, log, out)
+
+
+def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
     from daemon.app import run_daemon
     from daemon.cli import EXIT_OK, EXIT_UNFINISHED
-    from daemon.cli.demonstration import Deaths, Happenings, Truth, print_summary
+    from daemon.cli.demonstration import Deaths, Happenings, Truth
     from daemon.config import RecordingConfig, load_daemon_config
     from daemon.errors import UserError
-    from daemon.logs import set_up_logging
     from daemon.run_summary import RunSummary
     from daemon.service.priority import first_in_line
     from daemon.slices import SliceRecorder
 
-    # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    set_up_logging(json_lines=args.json_log)
     config = load_daemon_config(args.config)
     if args.recording is not None and not any(emulator.device == "eit-kit" for emulator in config.emulators):
         raise UserError(f"{args.config} has no eit-kit among its `emulators` to play --recording {args.recording}")
@@ -84,16 +91,19 @@ def run(args: argparse.Namespace) -> int:
             _emulators(config.emulators, args.config.parent, args.recording, truth) as processes,
         ):
             happenings = Happenings(config.emulators, processes)
-            summary = RunSummary(print_summary, truth.torques, lambda: happenings.happened)
+            summary = RunSummary(
+                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: happenings.happened
+            )
             listeners = (Deaths(config.emulators, processes), happenings, *listeners)
-            facts = {"slices": slices.facts} if slices is not None else {}
-            finished = asyncio.run(run_daemon(config, (*listeners, *((Show(), summary) if args.show else ())), facts))
+            facts = {"log": log.facts, "shown": out.facts, **({"slices": slices.facts} if slices is not None else {})}
+            shown = (Show(out), summary) if args.show else ()
+            finished = asyncio.run(run_daemon(config, (*listeners, *shown), facts))
     finally:
         truth.close()
         if slices is not None:
             slices.close()
     if slices is not None:
-        print(f"{args.slices}: {slices.summary}")
+        out.write(f"{args.slices}: {slices.summary}\n")
     return EXIT_OK if finished else EXIT_UNFINISHED
 
 
@@ -122,25 +132,18 @@ def _side(arguments: tuple[str, ...]) -> str | None:
 
 
 class Show:
-    """A listener that prints the estimates, as long as somebody reads them."""
+    """A listener that prints the estimates."""
 
-    def __init__(self) -> None:
-        self._read = True
+    def __init__(self, out: "TextIO | Outlet") -> None:
+        self._out = out
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Print one message; where the reader (`| head`) has gone, the daemon goes on without."""
-        if topic in ("eit.estimate", "skin.shear") and self._read:
-            import structlog
-
-            from daemon.logs import silence
+        """Print one message."""
+        if topic in ("eit.estimate", "skin.shear"):
             from daemon.readable import as_line
 
-            try:
-                print(as_line(topic, content), flush=True)
-            except OSError as error:
-                self._read = False
-                silence(sys.stdout)
-                structlog.get_logger().warning("estimates are no longer shown", why=error.strerror)
+            self._out.write(as_line(topic, content) + "\n")
+            self._out.flush()
 
 
 def _same_code() -> dict[str, str]:

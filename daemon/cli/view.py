@@ -40,12 +40,11 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("the live view needs aiohttp; install it with `pip install 'shearloop[view]'`")
     if not 0 <= args.port <= 65535:
         raise UserError(f"--port {args.port} is not a port; give one from 1 to 65535, or 0 for any that is free")
-    from daemon.logs import set_up_logging
+    from daemon.logs import logging_to_stderr
     from daemon.view.bridge import Place
     from daemon.view.serve import serve
     from daemon.view.token_file import default_path, kept_token
 
-    set_up_logging()
     keys = client_keys(args)
     # Of a daemon on this machine a stop is heard whatever becomes of our keys.
     stop = None if needs_keys(args.commands) else lambda: stop_address(args.commands)
@@ -64,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
             print(f"{page}#token={token}", flush=True)
             print(f"Without what follows the slash the page shows all and stops, but moves nothing. Token: {path}")
 
-    asyncio.run(serve(place, args.port, token, fingertip, ready))
+    with logging_to_stderr():
+        asyncio.run(serve(place, args.port, token, fingertip, ready))
     return 0
 
 

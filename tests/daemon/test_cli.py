@@ -191,16 +191,6 @@ def test_an_emulator_or_a_recording_that_cannot_play_is_refused_before_anything_
     assert "the recording cannot be read" in mistake(capsys, "run", known, "--recording", str(tmp_path / "none.mat"))
 
 
-def test_estimates_that_nobody_reads_any_longer_do_not_kill_the_estimator() -> None:
-    program = (
-        "import os, sys; from daemon.cli.run import Show; read, write = os.pipe(); os.close(read); os.dup2(write, 1)\n"
-        "show, estimate = Show(), {'timestamp': 0.0, 'source': 'right', 'valid': False, 'why': 'x'}\n"
-        "show('eit.estimate', estimate); show('eit.estimate', estimate)"
-    )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert ended.returncode == 0, ended.stderr
-
-
 def test_a_path_that_names_nothing_and_one_address_for_two_are_named(
     config: Write, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,6 +1,7 @@
 import asyncio
 import contextlib
 import os
+import pty
 import signal
 import sys
 import time
@@ -252,6 +253,34 @@ async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, t
         if process.returncode is None:
             process.kill()
             await process.wait()
+
+
+async def test_a_terminal_that_was_stopped_keeps_no_estimate_waiting(
+    config: Write, tmp_path: Path, subscriber: Connect
+) -> None:
+    terminal, its_end = pty.openpty()
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "daemon", "run", str(config()), "--show", stdout=its_end, stderr=its_end
+    )
+    try:
+        frames = subscriber(f"ipc://{tmp_path}/publish", "eit.estimate")
+        health = subscriber(f"ipc://{tmp_path}/publish", "health")
+        assert await asyncio.to_thread(next_message, health), "the subscription has arrived"
+        play = ("--recording", str(recording(tmp_path, 300)), "--once", "--speed", "100")
+        async with shearloop(
+            *("emulate", "eit-kit", *play, "--link", str(tmp_path / "eit-right")), stdin=asyncio.subprocess.PIPE
+        ):
+            # A line for each would be 30 kB, of which the terminal takes 4 unread.
+            received = await asyncio.to_thread(lambda: [next_message(frames) for _ in range(300)])
+        assert [message["frame"] for message in received] == list(range(300))
+        assert (await asyncio.to_thread(next_message, health))["tasks"]["shown"]["trouble"] == ""
+        await stop_and_time(process, signal.SIGTERM)
+    finally:
+        if process.returncode is None:
+            process.kill()
+            await process.wait()
+        os.close(terminal)
+        os.close(its_end)
 
 
 async def test_a_load_cell_is_read_without_a_robot_too(config: Write, tmp_path: Path) -> None:

@@ -1,0 +1,105 @@
+"""Text for a terminal, a pipe or a journal, written in a thread of its own.
+
+A terminal that was stopped with Ctrl-S takes nothing until Ctrl-Q, and whoever writes to it waits: that must not be the
+loop that drives a robot.
+"""
+
+import contextlib
+import os
+import queue
+import threading
+import time
+from collections.abc import Mapping
+from types import TracebackType
+from typing import Self, TextIO
+
+import structlog
+
+from daemon.messages import Scalar
+
+# Of texts that nobody takes so many are kept; later ones are counted.
+MOST_WAITING = 10_000
+# How long the end waits for what nobody has taken yet.
+CLOSE_S = 1.0
+
+
+def silence(stream: TextIO) -> None:
+    """Let a stream whose reader has gone lead nowhere, so that what Python still holds of it does not fail again."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, stream.fileno())
+    os.close(nowhere)
+
+
+class Outlet:
+    """Takes text without ever waiting, and writes it in order; as a context, what is left at the end.
+
+    `lost` counts texts that were not kept because nobody read; a line says so in their place. Where the reader has gone
+    (`| head`) it goes quiet: what the text tells of goes on.
+    """
+
+    def __init__(self, stream: TextIO, most_waiting: int = MOST_WAITING) -> None:
+        self.lost = 0
+        self._stream = stream
+        self._waiting: queue.Queue[str | None] = queue.Queue(most_waiting)
+        self._told = 0
+        # Several threads log.
+        self._lock = threading.Lock()
+        # A write that never ends must not keep the process from ending.
+        self._thread = threading.Thread(target=self._run, name="outlet", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        """Return the outlet itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Write what is left."""
+        self.close()
+
+    def write(self, text: str) -> int:
+        """Have a text written soon; return its length, as a stream does."""
+        with self._lock, contextlib.suppress(queue.Full):
+            self._tell_of_lost()
+            self._waiting.put_nowait(text)
+            return len(text)
+        self.lost += 1
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing: what was written is on its way."""
+
+    def close(self, timeout_s: float = CLOSE_S) -> None:
+        """Write what is left, as far as it is taken in time."""
+        until_s = time.monotonic() + timeout_s
+        with contextlib.suppress(queue.Full):
+            with self._lock:
+                self._tell_of_lost()
+            self._waiting.put(None, timeout=timeout_s)
+        self._thread.join(max(0.0, until_s - time.monotonic()))
+
+    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return what health tells of it."""
+        if not self.lost:
+            return {"errors": {}, "trouble": ""}
+        return {
+            "errors": {"unread": self.lost},
+            "trouble": f"{self.lost} texts are lost that nobody read; a terminal that was stopped with Ctrl-S goes on "
+            "with Ctrl-Q",
+        }
+
+    def _tell_of_lost(self) -> None:
+        if self.lost > self._told:
+            self._waiting.put_nowait(f"… {self.lost - self._told} texts are missing here: nobody read for a while\n")
+            self._told = self.lost
+
+    def _run(self) -> None:
+        while (text := self._waiting.get()) is not None:
+            try:
+                self._stream.write(text)
+                if self._waiting.empty():
+                    self._stream.flush()
+            except OSError as error:
+                silence(self._stream)
+                structlog.get_logger().warning("nobody reads any more what is shown", why=error.strerror)

@@ -1,0 +1,72 @@
+"""Text that nobody waits for: in order, counted where it is lost, quiet where its reader has gone."""
+
+import io
+import subprocess
+import sys
+import threading
+
+from daemon.outlet import Outlet
+
+PROGRAM = """
+import os, sys
+from daemon.logs import logging_to_stderr
+from daemon.outlet import Outlet
+import structlog
+read, write = os.pipe()
+os.close(read)
+os.dup2(write, 1)
+with logging_to_stderr(), Outlet(sys.stdout) as out:
+    for number in range(3):
+        out.write(f"{number}\\n")
+"""
+
+
+def test_what_is_written_comes_out_in_order_and_all_of_it_at_the_end() -> None:
+    stream = io.StringIO()
+    with Outlet(stream) as outlet:
+        for number in range(1000):
+            assert outlet.write(f"{number}\n") == len(f"{number}\n")
+    assert stream.getvalue().splitlines() == [str(number) for number in range(1000)]
+    assert outlet.facts() == {"errors": {}, "trouble": ""}
+
+
+class Terminal(io.StringIO):
+    """A terminal that takes nothing while it is stopped."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.goes_on, self.waited_for = threading.Event(), threading.Event()
+
+    def write(self, text: str) -> int:
+        self.waited_for.set()
+        assert self.goes_on.wait(10)
+        return super().write(text)
+
+
+def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_told_in_its_place() -> None:
+    terminal = Terminal()
+    outlet = Outlet(terminal, most_waiting=5)
+    outlet.write("0\n")
+    assert terminal.waited_for.wait(10)
+    for number in range(1, 9):
+        outlet.write(f"{number}\n")
+    assert outlet.lost == 3
+    assert outlet.facts()["errors"] == {"unread": 3}
+    assert "Ctrl-Q" in str(outlet.facts()["trouble"])
+    outlet.close(timeout_s=0.0)
+    assert outlet._thread.is_alive(), "the end waits no longer than it is told"
+    terminal.goes_on.set()
+    while not outlet._waiting.empty():
+        outlet.close(timeout_s=0.01)
+    outlet.close(10)
+    assert not outlet._thread.is_alive()
+    assert terminal.getvalue().splitlines() == [
+        *"012345", "… 3 texts are missing here: nobody read for a while",
+    ]  # fmt: skip
+
+
+def test_what_nobody_reads_any_longer_kills_nobody() -> None:
+    ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stderr.count("nobody reads any more what is shown") == 1
+    assert "Broken pipe" in ended.stderr

@@ -7,8 +7,12 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from daemon.errors import UserError
 
@@ -53,6 +57,68 @@ def draw_frontier(axes: Axes, costs: Sequence[float], errors: Sequence[float]) -
         solid_capstyle="round", label="frontier: nothing is faster and as accurate",
     )  # fmt: skip
     return best
+
+
+# Where a name may stand beside its point, in points, the first ones liked best.
+_BESIDE = [
+    (dx, dy) for far in (5, 14, 24) for dx, dy in ((far, 4), (far, -4), (-far, 4), (-far, -4), (0, far), (0, -far))
+]
+_MARK_PX = 6.0
+
+
+def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize: float = 7) -> None:
+    """Write a name beside each point (x, y, name), where it covers neither other names nor marks nor the legend.
+
+    To be done when limits, marks and legend are final.
+    """
+    made = axes.figure
+    if not isinstance(made, Figure):
+        raise TypeError("axes with names are those of a figure")
+    made.draw_without_rendering()
+    centres = [axes.transData.transform((x, y)) for x, y, _ in points]
+    taken = [Bbox([centre - _MARK_PX, centre + _MARK_PX]) for centre in centres]
+    legend = axes.get_legend()
+    if legend is not None:
+        taken.append(legend.get_window_extent())
+    inside = axes.get_window_extent()
+    for x, y, name in sorted(points):
+        tried: list[tuple[float, int, Annotation, Bbox]] = []
+        for dx, dy in _BESIDE:
+            note = axes.annotate(
+                name, (x, y), xytext=(dx, dy), textcoords="offset points", fontsize=fontsize,
+                ha="center" if dx == 0 else "left" if dx > 0 else "right",
+                va="center" if dx else "bottom" if dy > 0 else "top",
+            )  # fmt: skip
+            note.set_in_layout(False)
+            box = note.get_window_extent()
+            within = Bbox.intersection(box, inside)
+            outside = _area(box) - (_area(within) if within is not None else 0.0)
+            covered = sum(_area(both) for other in taken if (both := Bbox.intersection(box, other)) is not None)
+            tried.append((covered + 10 * outside, len(tried), note, box))
+            if tried[-1][0] == 0:
+                break
+        _, _, chosen, box = min(tried, key=lambda one: one[:2])
+        taken.append(box)
+        for _, _, note, _ in tried:
+            if note is not chosen:
+                note.remove()
+
+
+def _area(box: Bbox) -> float:
+    return float(box.width * box.height)
+
+
+def plain_log(axes: Axes) -> None:
+    """Make both axes logarithmic, with 1, 2 and 5 of each decade written out."""
+    axes.set(xscale="log", yscale="log")
+    for axis in (axes.xaxis, axes.yaxis):
+        _plain_ticks(axis)
+
+
+def _plain_ticks(axis: Axis) -> None:
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def save(made: Figure, content: Mapping[str, Any], directory: Path, name: str) -> list[Path]:

@@ -13,7 +13,7 @@ from bank.estimators import Name, Physics
 from bank.mesh import Mesh
 from bench.charts.forwards import CELLS, Solved, forwards
 from bench.charts.methods import Measured, estimators, fewer_channels, matchers, measure
-from bench.charts.picture import LINES, MARKS, SHADES, draw_frontier, figure, save
+from bench.charts.picture import LINES, MARKS, SHADES, draw_frontier, figure, plain_log, save, write_names
 from bench.charts.sources import Split
 from bench.charts.windows import GAIN, LOOPS, Followed, followed
 
@@ -80,6 +80,11 @@ def write(
     for panel in axes[panels:]:
         panel.set_axis_off()
     made.suptitle("Speed against accuracy: below and to the left is better", fontsize=14)
+    for one, panel in zip(compared, axes, strict=False):
+        most = max(method.valid_fraction for method in one.methods)
+        write_names(panel, [(method.latency_ms, method.rmse_nm, _short(method, most)) for method in one.methods])
+    named = [(one.cell_ms, one.error, f"{one.name}\n{one.triangles} triangles") for one in solved if one.error]
+    write_names(axes[len(compared)], named)
     return save(made, content, out, "speed-accuracy")
 
 
@@ -91,7 +96,7 @@ def _rows(methods: Sequence[Measured]) -> list[dict[str, Any]]:
 
 def _draw_methods(axes: Axes, compared: Compared) -> None:
     methods = compared.methods
-    axes.set(xscale="log", yscale="log")
+    plain_log(axes)
     best = draw_frontier(axes, [one.latency_ms for one in methods], [one.rmse_nm for one in methods])
     families = list(dict.fromkeys(one.family for one in methods))
     for number, family in enumerate(families):
@@ -110,8 +115,6 @@ def _draw_methods(axes: Axes, compared: Compared) -> None:
                 markerfacecolor=shade if i in best else "white", linestyle="none", zorder=2 + (i in best),
                 label=family if i == members[0] else None,
             )  # fmt: skip
-    most = max(one.valid_fraction for one in methods)
-    _label(axes, [(one.latency_ms, one.rmse_nm, _short(one, most)) for one in methods])
     frames = len(compared.split.future.t_s)
     axes.set(
         title=f"{compared.split.title}; judged on the {frames} frames that follow",
@@ -132,18 +135,8 @@ def _short(one: Measured, most_valid: float) -> str:
     return short if one.valid_fraction > _MOST_VALID * most_valid else f"{short} ({one.valid_fraction:.0%} valid)"
 
 
-def _label(axes: Axes, points: list[tuple[float, float, str]]) -> None:
-    """Write each point's name beside it, above or below by turns where points crowd."""
-    for i, (x, y, text) in enumerate(sorted(points)):
-        above = i % 2 == 0
-        axes.annotate(
-            text, (x, y), xytext=(3, 6 if above else -7), textcoords="offset points", fontsize=7,
-            ha="left", va="bottom" if above else "top",
-        )  # fmt: skip
-
-
 def _draw_forward(axes: Axes, solved: Sequence[Solved]) -> None:
-    axes.set(xscale="log", yscale="log")
+    plain_log(axes)
     known = [(one.cell_ms, one.error) for one in solved if one.error is not None]
     draw_frontier(axes, [cost for cost, _ in known], [error for _, error in known])
     families = list(dict.fromkeys(one.family for one in solved))
@@ -161,16 +154,6 @@ def _draw_forward(axes: Axes, solved: Sequence[Solved]) -> None:
         for one in members:
             if one.error is None:
                 axes.axvline(one.cell_ms, color=shade, linestyle=LINES[number % len(LINES)], label=one.name)
-            else:
-                text = f"{one.name}\n{one.triangles} triangles"
-                axes.annotate(
-                    text,
-                    (one.cell_ms, one.error),
-                    # What is cited lies on the direct solve's error: above it, where that is written below.
-                    xytext=(6, 8 if one.cited else 4 if number % 2 else -18),
-                    textcoords="offset points",
-                    fontsize=7,
-                )
     axes.set(
         title=f"Forward methods, {len(CELLS)} cells of the Gaussian derivative",
         xlabel="time per cell, ms (one thread; cited ones from elsewhere)",

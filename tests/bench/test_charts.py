@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from bench.charts.forwards import converged, direct, error_of, forwards
-from bench.charts.picture import frontier
+from bench.charts.picture import figure, frontier, plain_log, write_names
 from bench.charts.sources import bank_of, own_fingertip, splits, synthetic_stream
 from bench.charts.speed_accuracy import measured, write
 from bench.charts.windows import followed
@@ -89,3 +89,20 @@ def test_a_mistake_is_one_sentence(
     said = capsys.readouterr().err
     assert complaint in said
     assert said.count("\n") == 1
+
+
+def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark() -> None:
+    made = figure(6, 4)
+    axes = made.subplots()
+    plain_log(axes)
+    points = [(1.0, 1.0, "one"), (1.05, 1.0, "another"), (1.0, 1.04, "a third"), (1.1, 1.0, "a fourth")]
+    axes.plot(*zip(*[point[:2] for point in points], strict=True), "o")
+    axes.set(xlim=(0.5, 2), ylim=(0.5, 2))
+    write_names(axes, points)
+    boxes = [note.get_window_extent() for note in axes.texts]
+    assert sorted(note.get_text() for note in axes.texts) == sorted(name for *_, name in points)
+    for i, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:i])
+        assert not any(box.contains(*axes.transData.transform(point[:2])) for point in points)
+        assert axes.get_window_extent().containsx(box.x0)
+        assert axes.get_window_extent().containsx(box.x1)

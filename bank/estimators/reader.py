@@ -10,6 +10,7 @@ from bank.errors import CalibrationError
 from bank.estimators.heads import Censored, Curve, Ridge, Rows, best_strength, later_splits, left_out_blocks
 from bank.estimators.intervals import Intervals
 from bank.estimators.values import BoolArray, FloatArray
+from bank.gaussian import TWO_SIDED_95
 
 Head: TypeAlias = Ridge | Censored | Curve
 HeadOf: TypeAlias = Callable[[FloatArray, FloatArray, float], Head]
@@ -65,13 +66,19 @@ class Reader:
         """Return the value of (d,) features and how far its 95 % interval reaches below and above it.
 
         With a share of the channels unusable the rest have to carry the noise of all: the interval grows by the root.
+        Where the lever of the calibration did not touch, the tool may have been twisted the other way as far as the
+        frames say: nothing that was read then denies it.
         """
         raw = float(self.head.predict(features[None])[0])
-        half = widening * self.intervals.half_width(raw) / float(np.sqrt(max(usable_share, 0.1)))
+        widening /= float(np.sqrt(max(usable_share, 0.1)))
+        half = widening * self.intervals.half_width(raw)
         value, beyond = _shown(self.head, raw), _UNSEEN * (self.high - self.low)
         below, above = half, half
         if self.misses_loads:
             below, above = half + max(value - self.low, 0.0), half + max(self.high - value, 0.0)
+        if isinstance(self.head, Censored) and raw < 0:
+            other_way = widening * TWO_SIDED_95 * self.head.sigma - raw
+            below, above = (max(below, other_way), above) if self.head.sign > 0 else (below, max(above, other_way))
         if value <= self.low_end:
             below = max(below, value - (self.low - beyond))
         if value >= self.high_end:

@@ -13,6 +13,7 @@ from bank.estimators.heads import (
     later_splits,
     left_out_blocks,
 )
+from bank.estimators.reader import fit_reader
 
 
 def test_a_ridge_without_strength_is_least_squares():
@@ -149,3 +150,23 @@ def test_what_is_judged_comes_later_or_is_left_out(n):
 
 def test_of_equal_strengths_the_strongest():
     assert best_strength((0.1, 1.0, 10.0), lambda s, *_: 5.0 if s == 10.0 else 1.0, list(later_splits(20))) == 1.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_twist_the_other_way_than_the_lever_pushed_is_no_sure_zero(sign: float) -> None:
+    """The load cell read 0 whenever the tool was twisted the other way: a 0 that may be anything on that side."""
+    rng = np.random.default_rng(9)
+    twist = np.sin(np.arange(400) / 9.0)
+    frames = twist[:, None] * rng.normal(size=(1, 12)) + rng.normal(0.0, 0.05, (400, 12))
+    reader = fit_reader(frames, sign * np.maximum(twist, 0.0) * 0.1, Censored.fit, strengths=(1e-5,))
+    other_way = np.flatnonzero(twist < -0.1)
+    read = [reader.read(frames[i]) for i in other_way.tolist()]
+    truth = (sign * 0.1 * twist[other_way]).tolist()
+    inside = [value - below <= true <= value + above for (value, below, above), true in zip(read, truth, strict=True)]
+    assert np.mean(inside) > 0.95
+    for _, below, above in read:
+        # Towards the side that the lever pushes to, it is as sure as it was.
+        assert (above if sign > 0 else below) < 0.02
+    far, below, above = reader.read(frames[np.argmin(twist)])
+    assert far == 0.0
+    assert (below if sign > 0 else above) > 0.1

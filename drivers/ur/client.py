@@ -112,10 +112,12 @@ class UrRobot:
     async def state_within(self, seconds: float, *, ahead: int = 1) -> RobotState | None:
         """Return the next state that arrives, or one further `ahead`; None where it does not within so many seconds.
 
-        The states before that one are taken together with it, unless somebody else waits for one of them.
+        The states before that one are taken together with it, unless somebody else waits for one of them, or they come
+        so slowly that this would take longer: a pause that each next call begins anew would be one without an end.
         """
-        if ahead > 1 and self._ear is not None and not self._awaiting:
-            self._ear.pause(ahead / self.settings.rate_hz + LAST_OF_SEVERAL_S)
+        together_s = ahead / self.settings.rate_hz + LAST_OF_SEVERAL_S
+        if ahead > 1 and together_s < seconds and self._ear is not None and not self._awaiting:
+            self._ear.pause(together_s)
         return await self._awaited(ahead, seconds)
 
     def hurry(self) -> None:

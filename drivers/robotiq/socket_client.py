@@ -161,6 +161,9 @@ class _Connection(asyncio.Protocol):
 
     def _watch(self) -> None:
         """Give up where the latest question has waited for too long, and else look again when it would have."""
+        if not self._questions:
+            # Answered just now, and late: who asked has not been woken yet.
+            return
         due_s = self._asked_s + self._deadline_s
         if self._loop.time() < due_s:
             self._timer = self._loop.call_at(due_s, self._watch)

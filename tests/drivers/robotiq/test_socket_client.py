@@ -169,3 +169,18 @@ async def test_every_answer_has_the_whole_time_and_the_one_that_is_late_is_named
     with pytest.raises(DeviceLostError, match=r"'SET GTO 0' within 0\.5 s"):
         await asking
     assert transport.aborted
+
+
+async def test_an_answer_that_comes_late_with_the_deadline_is_an_answer() -> None:
+    """Where the computer stood still: what came meanwhile is read first, and then the timer is due."""
+    loop, transport = Loop(), Transport()
+    connection = _Connection("gripper", 0.5)
+    connection._loop = cast(asyncio.AbstractEventLoop, loop)
+    connection.connection_made(transport)
+    asking = asyncio.create_task(connection.ask([(b"GET ACT\n", "ACT")]))
+    await asyncio.sleep(0)
+    loop.now_s = 103.0
+    connection.data_received(b"ACT 1\n")
+    loop.pass_to(103.0)
+    assert await asking == ["1"]
+    assert not transport.aborted

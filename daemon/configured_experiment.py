@@ -25,7 +25,10 @@ class ConfiguredExperiment:
         self._begin = begin
         self._ended = ended
         self.begun = False
-        self._awaited = False
+        # Whether it is the operator's to begin it, if anybody's.
+        self.left_to_operator = False
+        self._awaited = self._called_off = False
+        self._begun_now = asyncio.Event()
         self._mark = BegunMark()
 
     @property
@@ -34,26 +37,27 @@ class ConfiguredExperiment:
         return self._awaited
 
     async def run(self) -> None:
-        """Begin it as soon as it can be begun, and return when it has ended or does not begin."""
+        """Begin it as soon as it can be begun, unless that is left to the operator, and return when it has ended."""
         log, told = structlog.get_logger().bind(experiment=str(self.path)), ""
-        if self._mark.left_behind:
+        if self._mark.left_behind and not self._called_off:
             log.warning(
                 "the daemon before this one died after it had begun an experiment: this one waits for "
                 "`shearloop command start`"
             )
-            return
-        self._awaited = not self.begun
-        # Begun once: by us or by hand, and whatever becomes of this task.
-        while not self.begun:
-            if not self._awaited:
-                log.info("the operator said stop, or started another: it is not started")
-                return
+            self._called_off = True
+        # Begun once: by us or by hand, and whatever becomes of this task. What was called off stays so.
+        self._awaited = not (self.begun or self._called_off)
+        while self._awaited:
             why = await self._begin(self.path)
             if why is not None:
                 if why != told:
                     log.info("waiting to start", why=why)
                     told = why
                 await asyncio.sleep(START_RETRY_S)
+        if not self.begun:
+            log.info("it begins by `shearloop command start` alone")
+            self.left_to_operator = True
+            await self._begun_now.wait()
         experiment = await self._ended()
         self.done = experiment.phase is Phase.DONE
         log.info("the experiment has ended", phase=experiment.phase.value, why=experiment.why)
@@ -61,12 +65,15 @@ class ConfiguredExperiment:
     def has_begun(self, path: Path) -> None:
         """Take note that an experiment has begun: this one does no more by itself, whichever it was."""
         self._mark.set()
-        self._awaited = False
-        self.begun |= path.resolve() == self.path.resolve()
+        self._awaited, self._called_off = False, True
+        if path.resolve() == self.path.resolve():
+            self.begun = True
+            self._begun_now.set()
 
     def give_up(self) -> Path | None:
         """Begin it no more, and return it; None where it was not waited for."""
         awaited, self._awaited = self._awaited, False
+        self._called_off |= awaited
         return self.path if awaited else None
 
     def end(self) -> None:

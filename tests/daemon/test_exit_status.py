@@ -13,6 +13,8 @@ import zmq.asyncio
 from daemon.app import Daemon
 from daemon.begun_mark import BegunMark
 from daemon.config import load_daemon_config
+from daemon.configured_experiment import ConfiguredExperiment
+from daemon.errors import UserError
 from daemon.experiment.machine import Phase
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
@@ -54,9 +56,17 @@ async def ended(path: Path, *, once: Callable[[Daemon], bool]) -> Daemon:
     return daemon
 
 
+async def done_experiment() -> SimpleNamespace:
+    return SimpleNamespace(phase=Phase.DONE, why="")
+
+
 def gave_up(daemon: Daemon) -> bool:
-    record = daemon.supervisor.records.get("experiment")
-    return record is not None and record.done
+    return daemon._experiment is not None and daemon._experiment.left_to_operator
+
+
+async def left_to_operator(experiment: ConfiguredExperiment) -> None:
+    while not experiment.left_to_operator:  # noqa: ASYNC110 - it is asked, as health asks
+        await asyncio.sleep(0.01)
 
 
 async def test_after_a_crash_no_experiment_begins_by_itself(
@@ -84,15 +94,12 @@ async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment
         begun.append(path)
         return None
 
-    async def done() -> SimpleNamespace:
-        return SimpleNamespace(phase=Phase.DONE, why="")
-
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(waiting_config), context)
         assert daemon._rig is not None
         daemon._rig.start = start  # type: ignore[method-assign]
         assert daemon._experiment is not None
-        daemon._experiment._ended = done  # type: ignore[assignment]
+        daemon._experiment._ended = done_experiment  # type: ignore[assignment]
         async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
             group.create_task(daemon.run())
             while not daemon._experiment.awaited:  # noqa: ASYNC110 - it is asked, as `stop` asks
@@ -100,11 +107,63 @@ async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment
             ready.set()
             path = tmp_path / ("experiment.yaml" if own else "another.yaml")
             assert await daemon.start_experiment(path) is None
-            while not gave_up(daemon):  # noqa: ASYNC110 - it is asked, as health asks
-                await asyncio.sleep(0.01)
-            daemon.stop()
+            if not own:
+                await left_to_operator(daemon._experiment)
+                daemon.stop()
     assert begun == [path]
     assert daemon.finished is finished
+
+
+@pytest.mark.parametrize("crashed", [False, True], ids=["called off", "after a crash"])
+async def test_an_experiment_that_is_begun_by_hand_after_all_is_seen_to_its_end(
+    crashed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    if crashed:
+        BegunMark().set()
+    path = tmp_path / "experiment.yaml"
+
+    async def not_yet(_path: Path) -> str | None:
+        experiment.give_up()
+        return "the gripper is not ready"
+
+    experiment = ConfiguredExperiment(path, not_yet, done_experiment)  # type: ignore[arg-type]
+    async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+        running = group.create_task(experiment.run())
+        await left_to_operator(experiment)
+        experiment.has_begun(tmp_path / "another.yaml")
+        await asyncio.sleep(0)
+        assert not running.done()
+        experiment.has_begun(path)
+    assert experiment.done
+
+
+@pytest.mark.parametrize("by", ["stop", "another"])
+async def test_what_was_called_off_stays_so_when_its_task_dies(by: str, tmp_path: Path) -> None:
+    """An experiment file may be spoilt when it is to begin, and mended after somebody has said stop."""
+    begun = []
+
+    async def begin(path: Path) -> str | None:
+        if begun:
+            experiment.has_begun(path)
+            return None
+        begun.append(path)
+        raise UserError("the file is none")
+
+    experiment = ConfiguredExperiment(tmp_path / "experiment.yaml", begin, done_experiment)  # type: ignore[arg-type]
+    with pytest.raises(UserError):
+        await experiment.run()
+    if by == "stop":
+        assert experiment.give_up() == experiment.path
+    else:
+        experiment.has_begun(tmp_path / "another.yaml")
+    again = asyncio.create_task(experiment.run())
+    async with asyncio.timeout(DEADLINE_S):
+        await left_to_operator(experiment)
+    assert not experiment.begun
+    again.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await again
 
 
 def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:

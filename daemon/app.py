@@ -240,7 +240,9 @@ class Daemon:
 
     async def _run_experiment(self, experiment: ConfiguredExperiment) -> None:
         await experiment.run()
-        if experiment.begun and self._config.stop_when_done:
+        if self._config.stop_when_done:
+            if experiment.left_to_operator:
+                await experiment.begun_and_ended()
             self.stop()
 
     async def _begin(self, path: Path) -> str | None:

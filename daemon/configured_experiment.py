@@ -37,7 +37,7 @@ class ConfiguredExperiment:
         return self._awaited
 
     async def run(self) -> None:
-        """Begin it as soon as it can be begun, unless that is left to the operator, and return when it has ended."""
+        """Begin it as soon as it can be begun, and return when it has ended or does not begin by itself."""
         log, told = structlog.get_logger().bind(experiment=str(self.path)), ""
         if self._mark.left_behind and not self._called_off:
             log.warning(
@@ -54,13 +54,20 @@ class ConfiguredExperiment:
                     log.info("waiting to start", why=why)
                     told = why
                 await asyncio.sleep(START_RETRY_S)
-        if not self.begun:
+        self.left_to_operator = not self.begun
+        if self.left_to_operator:
             log.info("it begins by `shearloop command start` alone")
-            self.left_to_operator = True
-            await self._begun_now.wait()
+            return
+        await self.begun_and_ended()
+
+    async def begun_and_ended(self) -> None:
+        """Wait until it is begun, by hand where it does not begin by itself, and return when it has ended."""
+        await self._begun_now.wait()
         experiment = await self._ended()
         self.done = experiment.phase is Phase.DONE
-        log.info("the experiment has ended", phase=experiment.phase.value, why=experiment.why)
+        structlog.get_logger().info(
+            "the experiment has ended", experiment=str(self.path), phase=experiment.phase.value, why=experiment.why
+        )
 
     def has_begun(self, path: Path) -> None:
         """Take note that an experiment has begun: this one does no more by itself, whichever it was."""

@@ -5,6 +5,7 @@ loop that drives a robot.
 """
 
 import contextlib
+import io
 import os
 import queue
 import threading
@@ -39,6 +40,9 @@ class Outlet:
 
     def __init__(self, stream: TextIO, most_waiting: int = MOST_WAITING) -> None:
         self.lost = 0
+        if isinstance(stream, io.TextIOWrapper):
+            # A terminal of another encoding has no "…": as standard error does it, and not an end of everything shown.
+            stream.reconfigure(errors="backslashreplace")
         self._stream = stream
         self._waiting: queue.Queue[str | None] = queue.Queue(most_waiting)
         self._told = 0

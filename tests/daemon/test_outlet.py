@@ -70,3 +70,11 @@ def test_what_nobody_reads_any_longer_kills_nobody() -> None:
     assert ended.returncode == 0, ended.stderr
     assert ended.stderr.count("nobody reads any more what is shown") == 1
     assert "Broken pipe" in ended.stderr
+
+
+def test_what_a_terminal_has_no_letters_for_is_spelt_and_what_follows_comes_out() -> None:
+    taken = io.BytesIO()
+    with Outlet(io.TextIOWrapper(taken, encoding="ascii", write_through=True)) as outlet:
+        outlet.write("0.10 N·m …\n")
+        outlet.write("and on\n")
+    assert taken.getvalue().splitlines() == [rb"0.10 N\xb7m \u2026", b"and on"]

@@ -62,11 +62,15 @@ class DeviceActions:
         self._free.set()
 
     async def _rest(self) -> str:
-        """Wait until the arm has come to rest after the step before; return why it did not, or an empty text."""
+        """Wait until no motion is under way; return why one still is, or an empty text.
+
+        That the joints rest is not enough: a stop, or a last speed of zero, keeps the robot's process busy a little
+        longer, and it would refuse the zero or the straight move that is to follow.
+        """
         try:
             async with asyncio.timeout(COMES_TO_REST_S):
                 state = await self._robot.next_state()
-                while self._turns() or not state.rests:
+                while self._turns() or state.motion != "idle" or not state.rests:
                     state = await self._robot.next_state()
         except TimeoutError:
             return f"the arm did not come to rest within {COMES_TO_REST_S:g} s; see what moves it"

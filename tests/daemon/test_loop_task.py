@@ -53,6 +53,8 @@ class Robot(UrRobot):
         self.commands: list[Command] = []
         self.dies_of: Exception | None = None
         self._goal: MoveLinear | None = None
+        # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
+        self.brakes_for = 0
         self.flight.fly(5)
 
     async def send(self, command: Command) -> Reply:
@@ -67,7 +69,12 @@ class Robot(UrRobot):
     def cycle(self) -> None:
         """Let 8 ms pass, and tell who waits for the next state."""
         arm = self.flight.arm
-        if arm.reading.moving_linearly and self._goal is not None:
+        # A real arm's move is under way until its end is told, though its joints rest.
+        arm.stops_moves = not self.brakes_for
+        if self.flight.state.motion == "stopping" and self.brakes_for:
+            self.brakes_for -= 1
+            arm.be(moving_linearly=bool(self.brakes_for))
+        elif arm.reading.moving_linearly and self._goal is not None:
             step_m = SPEED_M_PER_S * CYCLE_NS / 1e9
             z = arm.reading.tcp_pose[2]
             missing_m = self._goal.pose[2] - z
@@ -341,3 +348,26 @@ async def test_the_brain_is_asked_at_every_fifth_state_until_an_experiment_runs(
         assert len(asked) == 50
         published = [one for one in cell.published.messages if one.topic == "robot.state"]
         assert len(published) == pytest.approx(10, abs=2)
+
+
+async def test_a_zero_is_taken_after_a_turn() -> None:
+    """A wrist that turned is the robot's to move until its last speed, zero, has run out."""
+    async with driven() as cell:
+        await cell.start({"do": "turn_to", "angle_rad": 0.2}, {"do": "tare"})
+        await cell.until_ended()
+        assert cell.phase is Phase.DONE, cell.why
+
+
+@pytest.mark.parametrize("cycles", [1, 2, 3])
+async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_braking(cycles: int) -> None:
+    async with driven() as cell:
+        await cell.start(MOVE)
+        await cell.cycles(40)
+        end_m = cell.robot.end_m
+        cell.robot.brakes_for = 20
+        assert cell.brain.pause() is None
+        await cell.cycles(cycles)
+        assert cell.brain.resume() is None
+        await cell.until_ended()
+        assert cell.phase is Phase.DONE, cell.why
+        assert cell.robot.z_m == pytest.approx(end_m)

@@ -11,15 +11,21 @@ from typing import Any
 Event = dict[str, Any]
 
 
-class EmulatorProcess:
-    """`shearloop emulate DEVICE`, which prints JSON lines and takes commands; `ready` is in the line that it is up.
+def own_address(module: int) -> str:
+    """Return an address of this machine that this process and a module of it (0 to 7) have for themselves.
 
-    The ports of a robot are fixed by its client: two test runs at once need two addresses, and so do two modules of
-    one run, by their `network` (64, 128, 192).
+    The ports of a robot are fixed by its client: two test runs at once need two addresses, and so do two modules.
     """
+    first, second = module & 3, module >> 2
+    pid = os.getpid()
+    return f"127.{first << 6 | pid >> 14 & 63}.{second << 7 | pid >> 7 & 127}.{1 + pid % 128}"
 
-    def __init__(self, device: str, *options: str, network: int, ready: str) -> None:
-        self.host = f"127.{os.getpid() >> 14 & 63 | network}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
+
+class EmulatorProcess:
+    """`shearloop emulate DEVICE`, which prints JSON lines and takes commands; `ready` is in the line that it is up."""
+
+    def __init__(self, device: str, *options: str, module: int, ready: str) -> None:
+        self.host = own_address(module)
         self.events: list[Event] = []
         self._unread = b""
         self.process = subprocess.Popen(

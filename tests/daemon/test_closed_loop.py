@@ -22,10 +22,11 @@ from daemon.view.bridge import Bridge, Place
 from daemon.view.latest import Latest
 from daemon.view.server import make_app
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.emulator_process import own_address
 
 pytestmark = pytest.mark.real_time
 
-HOST = "127.0.0.41"
+HOST = own_address(4)
 SPEED = 5
 Write = Callable[..., Path]
 

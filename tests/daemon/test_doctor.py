@@ -21,11 +21,12 @@ from daemon.keys import make_key_pair
 from daemon.ports import PortThere
 from daemon.subscriber import messages
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.emulator_process import own_address
 
 pytestmark = pytest.mark.real_time
 
 Write = Callable[..., Path]
-HOST = "127.0.0.43"
+HOST = own_address(5)
 SPEED = 8
 
 

@@ -17,6 +17,7 @@ from daemon.configured_experiment import ConfiguredExperiment
 from daemon.errors import UserError
 from daemon.experiment.machine import Phase
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.emulator_process import own_address
 
 Write = Callable[..., Path]
 
@@ -25,7 +26,7 @@ Write = Callable[..., Path]
 def waiting_config(config: Write, tmp_path: Path) -> Path:
     """Write a configuration whose experiment waits for a robot that there is none of."""
     robot = yaml.safe_load(Path("config/ur.yaml").read_text())
-    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": "127.0.0.47"}))
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": own_address(6)}))
     steps = {"name": "test", "drive": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     return config(robot="ur.yaml", experiment="experiment.yaml", stop_when_done=True)

@@ -9,7 +9,6 @@ time at any pace.
 
 import asyncio
 import json
-import os
 import re
 import shlex
 import shutil
@@ -25,6 +24,7 @@ import pytest
 import yaml
 
 from tests.daemon.conftest import DEADLINE_S
+from tests.emulator_process import own_address
 
 REPOSITORY = Path(__file__).parents[2]
 PROGRAM = ".venv/bin/shearloop"
@@ -32,7 +32,7 @@ SPEED = 6
 # Of the held torque, in seconds; the README's demo holds for half a minute.
 HOLD_S = 3
 # As in tests/emulator_process.py: two runs of the tests at once need two addresses.
-HOST = f"127.{os.getpid() >> 14 & 63}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
+HOST = own_address(0)
 
 
 def readme_commands() -> list[str]:

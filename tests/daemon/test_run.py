@@ -23,6 +23,7 @@ from daemon.messages import decode
 from daemon.request import request
 from drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.emulator_process import own_address
 
 Connect = Callable[[str, str], "zmq.Socket[bytes]"]
 Write = Callable[..., Path]
@@ -167,8 +168,12 @@ async def test_a_heatmap_is_computed_only_while_somebody_subscribes(
 def robotless(config: Write, tmp_path: Path) -> Path:
     """Write a configuration with an experiment, and with a robot that is not there."""
     robot = yaml.safe_load(Path("config/ur.yaml").read_text())
-    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": "127.0.0.62"}))
-    rig = {"robot": "ur.yaml", "gripper": {"socket": {"host": "127.0.0.62"}}, "load_cell": {"device": {"path": "load"}}}
+    (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": own_address(7)}))
+    rig = {
+        "robot": "ur.yaml",
+        "gripper": {"socket": {"host": own_address(7)}},
+        "load_cell": {"device": {"path": "load"}},
+    }
     return config(**rig, experiment=str(Path("config/experiments/loosen.yaml").resolve()))
 
 

@@ -23,7 +23,7 @@ def bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def rig_process(bank: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RigProcess]:
     run_dir = tmp_path_factory.mktemp("run")
-    process = RigProcess("rig", "--bank", str(bank), "--run-dir", str(run_dir), *PACE, network=128, ready="rig ready")
+    process = RigProcess("rig", "--bank", str(bank), "--run-dir", str(run_dir), *PACE, module=2, ready="rig ready")
     process.run_dir = run_dir
     yield process
     assert process.close() == 0, "it ends when its input does"

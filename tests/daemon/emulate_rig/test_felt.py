@@ -91,7 +91,7 @@ async def test_the_modbus_gripper_the_papers_sketch_a_calibration_and_the_truth_
     arguments = ("--bank", str(bank), "--run-dir", str(run_dir), *PACE, "--gripper", "modbus", "--paper-sketch")
     files = ("--truth", str(truth), "--calibration", str(calibration))
     rig = RigProcess(
-        "rig", *arguments, *files, "--diameter-mm", "40", "--gel-stiffness", "0.4", network=192, ready="rig ready"
+        "rig", *arguments, *files, "--diameter-mm", "40", "--gel-stiffness", "0.4", module=3, ready="rig ready"
     )
     rig.run_dir = run_dir
     try:

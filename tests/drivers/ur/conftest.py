@@ -12,7 +12,7 @@ from tests.emulator_process import EmulatorProcess as ControllerProcess
 def controller_process() -> Iterator[ControllerProcess]:
     """A controller that unlocks after a second, not five."""
     options = ("--rate-hz", "250", "--unlock-wait-s", "1.0", "--power-on-s", "0.1")
-    process = ControllerProcess("ur", *options, network=64, ready="listening")
+    process = ControllerProcess("ur", *options, module=1, ready="listening")
     yield process
     process.close()
 

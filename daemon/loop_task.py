@@ -12,6 +12,7 @@ from daemon.experiment.steps import ExperimentFile
 from daemon.gripper_task import GripperTask
 from daemon.loop.brain import Brain, Orders
 from daemon.loop.senses import Arm, Source, Torque
+from daemon.loop.watch import ARM_STALE_S
 from daemon.loop_actions import DeviceActions
 from daemon.messages import LoopState, RobotStateMessage, Scalar
 from daemon.publisher import Publisher
@@ -23,6 +24,8 @@ WRENCH = "wrench"
 WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04, of_the_arm=True)
 # The brain is asked at each state of the robot while an experiment runs, and no less often than this without a state.
 LONGEST_TICK_S = 0.02
+# While nothing can move it is asked no less often than this: half of the time after which the arm's state is stale.
+LONGEST_REST_S = 0.5 * ARM_STALE_S
 # Every fifth state is published, and speaks as the torque of the wrench: 25 of 125 a second.
 PUBLISH_EVERY = 5
 # Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
@@ -158,11 +161,13 @@ class LoopTask:
     def _states_until_needed(self) -> int:
         """Return which of the next states the brain is to be asked at: the first one, unless nothing can move.
 
-        While no experiment runs and the arm was told to stop, it is the next one that is published.
+        While no experiment runs and the arm was told to stop, it is the next one that is published, where the robot
+        sends so many in time.
         """
         if not self._stopped or self._running():
             return 1
-        return PUBLISH_EVERY - self._robot.states % PUBLISH_EVERY
+        in_time = max(1, int(LONGEST_REST_S * self._robot.settings.rate_hz))
+        return min(in_time, PUBLISH_EVERY - self._robot.states % PUBLISH_EVERY)
 
     def _running(self) -> bool:
         experiment = self._brain.experiment

@@ -4,9 +4,11 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 from daemon.clock import Clock
@@ -371,3 +373,15 @@ async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_bra
         await cell.until_ended()
         assert cell.phase is Phase.DONE, cell.why
         assert cell.robot.z_m == pytest.approx(end_m)
+
+
+async def test_a_robot_that_sends_few_states_is_not_found_silent_between_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 40 a second, five take longer than the age at which the arm's state is stale."""
+    async with driven() as cell:
+        cell.robot.settings = replace(SETTINGS, rate_hz=40.0)
+        await cell.cycles(5)
+        asked: list[int] = []
+        tick = cell.brain.tick
+        monkeypatch.setattr(cell.brain, "tick", lambda now_ns: asked.append(cell.robot.states) or tick(now_ns))
+        await cell.cycles(20)
+        assert set(np.diff(asked)) <= {1, 2}

@@ -104,7 +104,16 @@ class _Connection(asyncio.Protocol):
             self._send_next()
             self._watch()
             answers: list[str] = await answered
-        except BaseException:
+        except BaseException as error:
+            if self._failure is None:
+                self._failure = (
+                    error
+                    if isinstance(error, DriverError)
+                    else DeviceLostError(
+                        f"A question to the gripper at {self._name} was given up, and the connection with it; it is "
+                        "opened again by itself."
+                    )
+                )
             self.abort()
             raise
         finally:

@@ -108,7 +108,7 @@ async def test_a_question_that_was_given_up_leaves_no_answer_behind() -> None:
         asking.cancel()
         with pytest.raises(asyncio.CancelledError):
             await asking
-        with pytest.raises(DeviceLostError):
+        with pytest.raises(DeviceLostError, match="given up"):
             await client.read()
 
 

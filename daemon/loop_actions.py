@@ -9,7 +9,7 @@ import structlog
 from daemon.experiment.wishes import Action, GripTo, MoveTo, TakeZero
 from daemon.gripper_task import GripperTask
 from drivers.ur.client import UrRobot
-from drivers.ur.messages import MoveLinear, ZeroForceTorque
+from drivers.ur.messages import ARRIVED, STOPPED_ON_COMMAND, MoveLinear, ZeroForceTorque
 
 LINEAR_ACCELERATION_M_PER_S2 = 0.3
 # A wrist that was told to stand rests within this time, or something else moves the arm.
@@ -115,7 +115,10 @@ class DeviceActions:
         while True:
             state = await self._robot.next_state()
             if state.motion_id != before and state.ended:
-                return "" if state.ended == "arrived" else f"the move ended early: {state.ended}"
+                if state.ended not in (ARRIVED, STOPPED_ON_COMMAND):
+                    # It ended by itself, just before it was to be held back: what it met is not met again.
+                    self._interrupted = False
+                return "" if state.ended == ARRIVED else f"the move ended early: {state.ended}"
 
 
 def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:

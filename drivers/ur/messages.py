@@ -204,6 +204,10 @@ class Failed:
 
 Message = Command | Reply | RobotState | Configure | Heartbeat | Phase | Failed
 
+# Why a motion ended that did as it was asked, or was told to stop; any other reason is a sentence of its own.
+ARRIVED: Final = "arrived"
+STOPPED_ON_COMMAND: Final = "stopped on command"
+
 # Slower than this, a joint rests: below it lies the noise of a real arm's speed signal.
 REST_RAD_PER_S: Final = 2e-3
 

@@ -8,13 +8,21 @@ import math
 
 from drivers.ur import sentences
 from drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation
-from drivers.ur.messages import MotionKind, MoveLinear, Reading, Stop, WristSpeed
+from drivers.ur.messages import (
+    ARRIVED,
+    STOPPED_ON_COMMAND,
+    MotionKind,
+    MoveLinear,
+    Reading,
+    Stop,
+    WristSpeed,
+)
 from drivers.ur.motion import longest_move_s, longest_stop_s
 from drivers.ur.ports import PilotArm
 from drivers.ur.settings import Six, UrSettings
 
 # A linear move may be too short to be seen under way: who rests at its end (in m and rad) after so long has arrived.
-ARRIVED, ARRIVED_AFTER_S = 2e-3, 0.2
+CLOSE, ARRIVED_AFTER_S = 2e-3, 0.2
 # An arm that nothing was asked of may tremble, but not move as fast as this for so long.
 ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
 
@@ -72,7 +80,7 @@ class Mover:
             sent = _harder(sent, self._braking)
         self.number = number
         self.sent, self.clipped = sent, ()
-        self.stop_now(reading, now_ns, "stopped on command", sent)
+        self.stop_now(reading, now_ns, STOPPED_ON_COMMAND, sent)
 
     def stop_now(self, reading: Reading, now_ns: int, why: str, stop: Stop | None = None) -> None:
         """Begin to stop, and send it: the next cycle may be a whole one away."""
@@ -140,7 +148,7 @@ class Mover:
             why = "the linear move did not end within its time"
         # The end of the move and the joints' speeds come over two connections, of which one may lag.
         if not reading.moving_linearly and reading.rests and (self._move_seen or self._is_there(reading, now_ns)):
-            self.kind, self.ended = "idle", "arrived"
+            self.kind, self.ended = "idle", ARRIVED
         elif why:
             self.stop(reading, now_ns, why)
             return
@@ -148,7 +156,7 @@ class Mover:
 
     def _is_there(self, reading: Reading, now_ns: int) -> bool:
         waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
-        return waited and math.dist(reading.tcp_pose, self._move_end) < ARRIVED
+        return waited and math.dist(reading.tcp_pose, self._move_end) < CLOSE
 
     def _keep_stopping(self, reading: Reading, now_ns: int) -> None:
         if now_ns > self._deadline_ns:

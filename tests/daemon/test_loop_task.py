@@ -385,3 +385,21 @@ async def test_a_robot_that_sends_few_states_is_not_found_silent_between_them(mo
         monkeypatch.setattr(cell.brain, "tick", lambda now_ns: asked.append(cell.robot.states) or tick(now_ns))
         await cell.cycles(20)
         assert set(np.diff(asked)) <= {1, 2}
+
+
+async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pause_in_the_same_moment() -> None:
+    async with driven() as cell:
+        await cell.start(MOVE)
+        await cell.cycles(40)
+        arm, flight = cell.robot.flight.arm, cell.robot.flight
+        # The pause is said while the state that tells of the force is on its way.
+        arm.be(wrench=(0.0, 0.0, SETTINGS.limits.force_n.inner + 5.0, 0.0, 0.0, 0.0))
+        flight.fly(1)
+        assert "force" in flight.state.ended
+        cell.loop._actions.hold_back()
+        arm.be(wrench=(0.0,) * 6)
+        await cell.cycles(1)
+        cell.loop._actions.let_go()
+        await cell.until_ended()
+        assert "the move ended early: force" in cell.why
+        assert sum(isinstance(command, MoveLinear) for command in cell.robot.commands) == 1

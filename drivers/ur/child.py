@@ -102,8 +102,9 @@ class Pipe:
 def main() -> NoReturn:
     """Run until told to go, until the daemon is gone, or until the controller is."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    # Ctrl-C at the terminal reaches the daemon, which then says when to stop.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C at the terminal reaches the daemon too, as does a service manager's end; it then says when to stop.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     # What the client prints must not get between the messages.
     stdout = os.dup(1)
     os.dup2(2, 1)

@@ -271,11 +271,18 @@ async def test_connection_that_is_refused_is_explained(
         assert said in (await robot.send(Enable())).refused
 
 
-async def test_leaving_stops_the_arm_and_ends_the_program(controller: ControllerProcess) -> None:
+@pytest.mark.parametrize("told", [None, signal.SIGINT, signal.SIGTERM])
+async def test_leaving_stops_the_arm_and_ends_the_program(
+    told: signal.Signals | None, controller: ControllerProcess
+) -> None:
+    """Also where a terminal, or a service manager, tells every process of the daemon to end."""
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         await turn(robot, controller)
         left_ns = time.monotonic_ns()
+        if told is not None:
+            assert robot.pid is not None
+            os.kill(robot.pid, told)
     stopped = await controller.event("motion-stopped", left_ns)
     ended = await controller.event("program-ended", left_ns)
     assert ended["t_mono_ns"] >= stopped["t_mono_ns"]

@@ -21,7 +21,6 @@ from drivers.ur.client import UrRobot
 from drivers.ur.messages import Enable, Reply, RobotState, Stop, Unlock, WristSpeed
 
 WRENCH = "wrench"
-WRENCH_SOURCE = Source(name=WRENCH, period_s=0.04, of_the_arm=True)
 # The brain is asked at each state of the robot while an experiment runs, and no less often than this without a state.
 LONGEST_TICK_S = 0.02
 # While nothing can move it is asked no less often than this: half of the time after which the arm's state is stale.
@@ -34,6 +33,11 @@ MOST_UNANSWERED = 1
 LOOP_STATE_PERIOD_S = 1.0
 # A loop that died tells the arm to stop, and waits no longer than this for the answer.
 BRAKE_S = 0.5
+
+
+def wrench_source(rate_hz: float) -> Source:
+    """Return how often the wrench's torque comes, of a robot that tells its state so often: with those published."""
+    return Source(name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, of_the_arm=True)
 
 
 class LoopTask:

@@ -79,8 +79,8 @@ class Outlet:
         until_s = time.monotonic() + timeout_s
         with contextlib.suppress(queue.Full):
             with self._lock:
-                self._tell_of_lost()
-            self._waiting.put(None, timeout=timeout_s)
+                self._tell_of_lost(timeout_s)
+            self._waiting.put(None, timeout=max(0.0, until_s - time.monotonic()))
         self._thread.join(max(0.0, until_s - time.monotonic()))
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
@@ -93,9 +93,12 @@ class Outlet:
             "with Ctrl-Q",
         }
 
-    def _tell_of_lost(self) -> None:
-        if self.lost > self._told:
-            self._waiting.put_nowait(f"… {self.lost - self._told} texts are missing here: nobody read for a while\n")
+    def _tell_of_lost(self, timeout_s: float = 0.0) -> None:
+        """Write how much is missing here; raises queue.Full where there is no room for it in time."""
+        missing = self.lost - self._told
+        if missing:
+            note = f"… {missing} texts are missing here: nobody read for a while\n"
+            self._waiting.put(note, block=timeout_s > 0, timeout=timeout_s)
             self._told = self.lost
 
     def _run(self) -> None:

@@ -19,7 +19,7 @@ from daemon.loop.senses import Hand, Source, Torque
 from daemon.loop.tune import TuneSettings, tuned
 from daemon.loop.watch import WatchSettings
 from daemon.loop.wrist import Wrist, WristSettings
-from daemon.loop_task import WRENCH, WRENCH_SOURCE, LoopTask
+from daemon.loop_task import WRENCH, LoopTask, wrench_source
 from daemon.publisher import Publisher
 from daemon.rig_check import read_experiment
 from drivers.calibration_file import load_calibration
@@ -140,7 +140,8 @@ class Rig:
                 config.load_cell, publisher, clock, self._hear, self.link_of(LOAD_CELL), tap(LOAD_CELL)
             )
             sources[self.load_cell.source.name] = self.load_cell.source
-        sources[WRENCH] = WRENCH_SOURCE
+        robot = read_settings(config.robot)
+        sources[WRENCH] = wrench_source(robot.rate_hz)
         required = ("robot", "gripper") if config.gripper is not None else ("robot",)
         creep = {name: tip.creep for name, tip in (*config.fingertips.items(), (BOTH, config.both)) if tip is not None}
         gels = {name: Creep(own.share, own.time_s) for name, own in creep.items() if own is not None}
@@ -148,10 +149,7 @@ class Rig:
         self.gripper = None
         if config.gripper is not None:
             self.gripper = make_gripper(config.gripper, publisher, self._feel, self.link_of("gripper"))
-        self.robot = UrRobot(
-            read_settings(config.robot),
-            on_link=self._robot_link,
-        )
+        self.robot = UrRobot(robot, on_link=self._robot_link)
         self.loop = LoopTask(
             self.brain,
             self.robot,

@@ -1,8 +1,9 @@
-"""How long a motion may take, and the torque about the tool's own axis; pure functions of a reading."""
+"""How long a motion may take, whether it is there, and the torque about the tool's own axis; pure functions."""
 
 import math
 
 from drivers.ur.messages import MoveLinear, Reading, Stop
+from drivers.ur.settings import Six
 
 # How long a linear move may take beyond its nominal time before it is stopped.
 MOVE_SLACK, MOVE_SLACK_S = 1.5, 2.0
@@ -40,3 +41,19 @@ def tool_axis_torque(reading: Reading) -> float:
     sine, versine = math.sin(angle), 1 - math.cos(angle)
     _, _, _, tx, ty, tz = reading.wrench
     return (x * z * versine + y * sine) * tx + (y * z * versine - x * sine) * ty + (1 - (x * x + y * y) * versine) * tz
+
+
+def is_close(pose: Six, other: Six, within: float) -> bool:
+    """Return whether two poses are less than so many metres and radians apart.
+
+    A turn has more than one rotation vector: at half a turn, as of a tool that points down, both signs are the same.
+    """
+    same = abs(sum(a * b for a, b in zip(_quaternion(pose), _quaternion(other), strict=True)))
+    return math.dist(pose[:3], other[:3]) < within and 2.0 * math.acos(min(same, 1.0)) < within
+
+
+def _quaternion(pose: Six) -> tuple[float, float, float, float]:
+    x, y, z = pose[3:]
+    angle = math.sqrt(x * x + y * y + z * z)
+    share = math.sin(angle / 2) / angle if angle > 0.0 else 0.5
+    return math.cos(angle / 2), x * share, y * share, z * share

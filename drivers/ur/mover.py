@@ -4,8 +4,6 @@ No clock and no ur-rtde: the arm is a port and the time an argument. A motion th
 robot's watchdog: nothing is sent to the program any more, and only another one may move the arm again.
 """
 
-import math
-
 from drivers.ur import sentences
 from drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation
 from drivers.ur.messages import (
@@ -17,7 +15,7 @@ from drivers.ur.messages import (
     Stop,
     WristSpeed,
 )
-from drivers.ur.motion import longest_move_s, longest_stop_s
+from drivers.ur.motion import is_close, longest_move_s, longest_stop_s
 from drivers.ur.ports import PilotArm
 from drivers.ur.settings import Six, UrSettings
 
@@ -156,7 +154,7 @@ class Mover:
 
     def _is_there(self, reading: Reading, now_ns: int) -> bool:
         waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
-        return waited and math.dist(reading.tcp_pose, self._move_end) < CLOSE
+        return waited and is_close(reading.tcp_pose, self._move_end, CLOSE)
 
     def _keep_stopping(self, reading: Reading, now_ns: int) -> None:
         if now_ns > self._deadline_ns:

@@ -21,7 +21,7 @@ from daemon.loop.tune import TuneSettings, tuned
 from daemon.loop.watch import WatchSettings
 from daemon.loop.wrist import Wrist, WristSettings
 from daemon.loop_actions import along_tool
-from daemon.loop_task import PUBLISH_EVERY, WRENCH, WRENCH_SOURCE, LoopTask
+from daemon.loop_task import PUBLISH_EVERY, WRENCH, LoopTask, wrench_source
 from daemon.safety import Event
 from drivers.ur.client import UrRobot
 from drivers.ur.messages import Command, MoveLinear, Reply, RobotState, Stop, WristSpeed
@@ -144,8 +144,9 @@ class Cell:
 
     def __init__(self) -> None:
         self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
-        wrist = Wrist(WRENCH_SOURCE, WristSettings(), partial(tuned, TuneSettings()))
-        self.brain = Brain({WRENCH: wrist}, WatchSettings(), {WRENCH: WRENCH_SOURCE}, ("robot",))
+        source = wrench_source(SETTINGS.rate_hz)
+        wrist = Wrist(source, WristSettings(), partial(tuned, TuneSettings()))
+        self.brain = Brain({WRENCH: wrist}, WatchSettings(), {WRENCH: source}, ("robot",))
         self.died: Mapping[str, str] = {}
 
         async def no_zero() -> str:

@@ -17,9 +17,9 @@ def request(
     """Return the daemon's reply; raises UserError when none comes in time."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
         socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.SNDTIMEO, int(timeout_s * 1000))
         connect(socket, address, keys)
-        socket.send(encode(content))
-        if not socket.poll(int(timeout_s * 1000)):
+        if not (_sent(socket, encode(content)) and socket.poll(int(timeout_s * 1000))):
             raise UserError(
                 f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
                 f"or give the address of its `commands` key with --connect{keys_hint(keys)}"
@@ -31,3 +31,11 @@ def request(
                 f"what answers at {address} is not a daemon of shearloop ({error}); give the address of its `commands` "
                 "key with --connect"
             ) from error
+
+
+def _sent(socket: "zmq.Socket[bytes]", data: bytes) -> bool:
+    try:
+        socket.send(data)
+    except zmq.Again:
+        return False
+    return True

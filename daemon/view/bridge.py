@@ -3,7 +3,6 @@
 import asyncio
 import time
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -15,9 +14,9 @@ from daemon.errors import UserError
 from daemon.keys import ClientKeys
 from daemon.messages import EitFrame, EitHeatmap, decode
 from daemon.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
-from daemon.request import request
 from daemon.subscriber import connect
 from daemon.topics import TOPICS
+from daemon.view.asked import Requests
 from daemon.view.latest import Latest
 
 # The largest message is a heatmap of 200 × 200 float32.
@@ -51,9 +50,8 @@ class Bridge:
         self._watchers = 0
         self._on_their_way = 0
         self._stopping: asyncio.Future[dict[str, Any]] | None = None
-        # A stop has a thread of its own: other commands cannot be before it in a queue.
-        self._threads = ThreadPoolExecutor(COMMANDS_AT_ONCE, "command")
-        self._stop_thread = ThreadPoolExecutor(1, "stop")
+        # Each has a thread of its own: no command can be before a stop in a queue.
+        self._requests = Requests()
         self._socket = context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
@@ -102,7 +100,7 @@ class Bridge:
         self._on_their_way += 1
         try:
             timeout_s = UNLOCK_TIMEOUT_S if name == "unlock" else COMMAND_TIMEOUT_S
-            return await self._ask(self._threads, self._place.commands, {"command": name}, timeout_s)
+            return await self._ask(self._place.commands, {"command": name}, timeout_s)
         finally:
             self._on_their_way -= 1
 
@@ -114,23 +112,19 @@ class Bridge:
         if self._stopping is None or self._stopping.done():
             place, content = self._place, {"command": "stop", "spare_daemon": True}
             address = place.commands if place.stop_address is None else place.stop_address()
-            self._stopping = asyncio.ensure_future(self._ask(self._stop_thread, address, content, COMMAND_TIMEOUT_S))
+            self._stopping = asyncio.ensure_future(self._ask(address, content, COMMAND_TIMEOUT_S))
         # Shielded: a page that goes away has still said stop.
         return await asyncio.shield(self._stopping)
 
-    async def _ask(
-        self, threads: ThreadPoolExecutor, address: str, content: Mapping[str, Any], timeout_s: float
-    ) -> dict[str, Any]:
-        loop = asyncio.get_running_loop()
+    async def _ask(self, address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
         # A socket of this machine's own is spoken to in the clear.
         keys = self._place.keys if address == self._place.commands else None
-        return await loop.run_in_executor(threads, request, address, content, timeout_s, keys)
+        return await self._requests.ask(address, content, timeout_s, keys)
 
     def close(self) -> None:
         """Close the socket; commands on their way are waited for."""
         self._socket.close()
-        self._threads.shutdown()
-        self._stop_thread.shutdown()
+        self._requests.close()
 
 
 def _check_address(context: zmq.asyncio.Context, place: Place) -> None:

@@ -4,7 +4,7 @@ import logging
 import os
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import TextIO, cast
 
 import structlog
@@ -34,7 +34,7 @@ def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.IN
     ]
     if json_lines:
         processors.append(structlog.processors.format_exc_info)
-    with Outlet(sys.stderr) as outlet:
+    with closing(Outlet(sys.stderr)) as outlet:
         structlog.configure(
             processors=[*processors, renderer],
             wrapper_class=structlog.make_filtering_bound_logger(level),

@@ -11,8 +11,7 @@ import queue
 import threading
 import time
 from collections.abc import Mapping
-from types import TracebackType
-from typing import Self, TextIO
+from typing import TextIO
 
 import structlog
 
@@ -32,7 +31,7 @@ def silence(stream: TextIO) -> None:
 
 
 class Outlet:
-    """Takes text without ever waiting, and writes it in order; as a context, what is left at the end.
+    """Takes text without ever waiting, and writes it in order; `close` writes what is left.
 
     `lost` counts texts that were not kept because nobody read; a line says so in their place. Where the reader has gone
     (`| head`) it goes quiet: what the text tells of goes on.
@@ -52,23 +51,14 @@ class Outlet:
         self._thread = threading.Thread(target=self._run, name="outlet", daemon=True)
         self._thread.start()
 
-    def __enter__(self) -> Self:
-        """Return the outlet itself."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Write what is left."""
-        self.close()
-
     def write(self, text: str) -> int:
         """Have a text written soon; return its length, as a stream does."""
-        with self._lock, contextlib.suppress(queue.Full):
-            self._tell_of_lost()
-            self._waiting.put_nowait(text)
-            return len(text)
-        self.lost += 1
+        with self._lock:
+            try:
+                self._tell_of_lost()
+                self._waiting.put_nowait(text)
+            except queue.Full:
+                self.lost += 1
         return len(text)
 
     def flush(self) -> None:

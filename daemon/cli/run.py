@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    with logging_to_stderr(json_lines=args.json_log) as log, Outlet(sys.stdout) as out:
+    with logging_to_stderr(json_lines=args.json_log) as log, closing(Outlet(sys.stdout)) as out:
         return _run(args, log, out)
 
 

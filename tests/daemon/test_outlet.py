@@ -4,18 +4,20 @@ import io
 import subprocess
 import sys
 import threading
+from contextlib import closing
 
 from daemon.outlet import Outlet
 
 PROGRAM = """
 import os, sys
+from contextlib import closing
 from daemon.logs import logging_to_stderr
 from daemon.outlet import Outlet
 import structlog
 read, write = os.pipe()
 os.close(read)
 os.dup2(write, 1)
-with logging_to_stderr(), Outlet(sys.stdout) as out:
+with logging_to_stderr(), closing(Outlet(sys.stdout)) as out:
     for number in range(3):
         out.write(f"{number}\\n")
 """
@@ -23,7 +25,7 @@ with logging_to_stderr(), Outlet(sys.stdout) as out:
 
 def test_what_is_written_comes_out_in_order_and_all_of_it_at_the_end() -> None:
     stream = io.StringIO()
-    with Outlet(stream) as outlet:
+    with closing(Outlet(stream)) as outlet:
         for number in range(1000):
             assert outlet.write(f"{number}\n") == len(f"{number}\n")
     assert stream.getvalue().splitlines() == [str(number) for number in range(1000)]
@@ -74,7 +76,7 @@ def test_what_nobody_reads_any_longer_kills_nobody() -> None:
 
 def test_what_a_terminal_has_no_letters_for_is_spelt_and_what_follows_comes_out() -> None:
     taken = io.BytesIO()
-    with Outlet(io.TextIOWrapper(taken, encoding="ascii", write_through=True)) as outlet:
+    with closing(Outlet(io.TextIOWrapper(taken, encoding="ascii", write_through=True))) as outlet:
         outlet.write("0.10 N·m …\n")
         outlet.write("and on\n")
     assert taken.getvalue().splitlines() == [rb"0.10 N\xb7m \u2026", b"and on"]

@@ -31,11 +31,6 @@ class ConfiguredExperiment:
         self._begun_now = asyncio.Event()
         self._mark = BegunMark()
 
-    @property
-    def awaited(self) -> bool:
-        """Whether it is still to begin by itself."""
-        return self._awaited
-
     async def run(self) -> None:
         """Begin it as soon as it can be begun, and return when it has ended or does not begin by itself."""
         log, told = structlog.get_logger().bind(experiment=str(self.path)), ""

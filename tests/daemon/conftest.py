@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import structlog
 import yaml
 import zmq
 
@@ -66,6 +67,46 @@ def config(tmp_path: Path, tiny_bank: Path, tiny_calibration: Path) -> Callable[
         return path
 
     return write
+
+
+@asynccontextmanager
+async def deadline(otherwise: str) -> AsyncIterator[None]:
+    """Fail with a sentence of what has not happened where it takes longer than any test waits."""
+    try:
+        async with asyncio.timeout(DEADLINE_S):
+            yield
+    except TimeoutError:
+        pytest.fail(f"{otherwise} within {DEADLINE_S} s")
+
+
+class Log:
+    """What the log says, as it says it, and a wait for a sentence of it."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        self._more = asyncio.Event()
+
+    def __call__(self, _logger: Any, _level: str, event: structlog.typing.EventDict) -> structlog.typing.EventDict:
+        """Take in one event, and pass it on, as a processor of structlog."""
+        self.said.append(str(event["event"]))
+        self._more.set()
+        return event
+
+    async def says(self, sentence: str) -> None:
+        """Wait until it has said so."""
+        async with deadline(f"the log did not say {sentence!r}"):
+            while not any(sentence in one for one in self.said):
+                self._more.clear()
+                await self._more.wait()
+
+
+@pytest.fixture
+def log() -> Log:
+    """Give what is logged in this process, in the event loop's thread."""
+    heard = Log()
+    # Every test begins with the defaults (tests/conftest.py).
+    structlog.configure(processors=[heard, *structlog.get_config()["processors"]])
+    return heard
 
 
 @asynccontextmanager

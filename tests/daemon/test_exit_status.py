@@ -16,10 +16,11 @@ from daemon.config import load_daemon_config
 from daemon.configured_experiment import ConfiguredExperiment
 from daemon.errors import UserError
 from daemon.experiment.machine import Phase
-from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.conftest import Log, deadline, shearloop
 from tests.emulator_process import own_address
 
 Write = Callable[..., Path]
+LEFT_TO_OPERATOR = "it begins by `shearloop command start` alone"
 
 
 @pytest.fixture
@@ -38,21 +39,20 @@ async def test_an_experiment_that_is_not_done_is_seen_in_the_exit_status(
 ) -> None:
     async with shearloop("run", str(waiting_config)) as daemon:
         assert daemon.stderr is not None
-        async with asyncio.timeout(DEADLINE_S):
-            while b"waiting to start" not in await daemon.stderr.readline():
-                pass
+        async with deadline("the daemon did not wait to start, or did not end"):
+            while b"waiting to start" not in (line := await daemon.stderr.readline()):
+                assert line, "the daemon ended before its experiment waited to start"
             daemon.send_signal(number)
             assert await daemon.wait() == status
 
 
-async def ended(path: Path, *, once: Callable[[Daemon], bool]) -> Daemon:
-    """Run a daemon until something is so, and end it in good order."""
+async def ended(path: Path, log: Log, *, once: str) -> Daemon:
+    """Run a daemon until its log says something, and end it in good order."""
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(path), context)
-        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+        async with asyncio.TaskGroup() as group:
             group.create_task(daemon.run())
-            while not once(daemon):  # noqa: ASYNC110 - it is asked, as health asks
-                await asyncio.sleep(0.01)
+            await log.says(once)
             daemon.stop()
     return daemon
 
@@ -61,30 +61,21 @@ async def done_experiment() -> SimpleNamespace:
     return SimpleNamespace(phase=Phase.DONE, why="")
 
 
-def gave_up(daemon: Daemon) -> bool:
-    return daemon._experiment is not None and daemon._experiment.left_to_operator
-
-
-async def left_to_operator(experiment: ConfiguredExperiment) -> None:
-    while not experiment.left_to_operator:  # noqa: ASYNC110 - it is asked, as health asks
-        await asyncio.sleep(0.01)
-
-
 async def test_after_a_crash_no_experiment_begins_by_itself(
-    waiting_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    waiting_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Log
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     crashed = BegunMark()
     assert not crashed.left_behind
     crashed.set()
-    assert not (await ended(waiting_config, once=gave_up)).finished
-    assert "died after it had begun an experiment" in capsys.readouterr().out
+    assert not (await ended(waiting_config, log, once=LEFT_TO_OPERATOR)).finished
+    assert any("died after it had begun an experiment" in one for one in log.said)
     assert not BegunMark().left_behind, "this one ended in good order"
 
 
 @pytest.mark.parametrize(("own", "finished"), [(True, True), (False, False)])
 async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment_that_waited(
-    own: bool, finished: bool, waiting_config: Path, tmp_path: Path
+    own: bool, finished: bool, waiting_config: Path, tmp_path: Path, log: Log
 ) -> None:
     """Neither by the same one again, nor by the configured one after another."""
     ready, begun = asyncio.Event(), []
@@ -101,16 +92,17 @@ async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment
         daemon._rig.start = start  # type: ignore[method-assign]
         assert daemon._experiment is not None
         daemon._experiment._ended = done_experiment  # type: ignore[assignment]
-        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
-            group.create_task(daemon.run())
-            while not daemon._experiment.awaited:  # noqa: ASYNC110 - it is asked, as `stop` asks
-                await asyncio.sleep(0.01)
+        async with asyncio.TaskGroup() as group:
+            running = group.create_task(daemon.run())
+            await log.says("waiting to start")
             ready.set()
             path = tmp_path / ("experiment.yaml" if own else "another.yaml")
             assert await daemon.start_experiment(path) is None
             if not own:
-                await left_to_operator(daemon._experiment)
+                await log.says(LEFT_TO_OPERATOR)
                 daemon.stop()
+            async with deadline("the daemon did not end"):
+                await running
     assert begun == [path]
     assert daemon.finished is finished
 
@@ -129,7 +121,7 @@ async def test_an_experiment_that_is_begun_by_hand_after_all_is_seen_to_its_end(
         return "the gripper is not ready"
 
     experiment = ConfiguredExperiment(path, not_yet, done_experiment)  # type: ignore[arg-type]
-    async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+    async with deadline("the experiment was not seen to its end"), asyncio.TaskGroup() as group:
         await experiment.run()
         assert experiment.left_to_operator
         running = group.create_task(experiment.begun_and_ended())

@@ -27,6 +27,7 @@ from daemon.recording.recorder import Recorder
 from daemon.recording.salvage import repair
 from daemon.recording.summary import summarise
 from drivers.raw_input import InputKind, RawInput
+from tests.daemon.conftest import deadline
 
 IDENTITY = Identity(basic_identity("a test"), (Attached("configuration.json", "application/json", b"{}"),))
 
@@ -261,21 +262,25 @@ async def test_on_a_real_full_disk_the_failure_is_told_and_what_was_written_is_s
     small_disk: Path, tmp_path: Path
 ) -> None:
     clock = Clock()
-    failed = asyncio.Event()
-    why = []
+    why: list[str] = []
+    flushed = asyncio.Event()
 
     def on_failure(failure: str) -> None:
         if failure:
             why.append(failure)
-            failed.set()
+        flushed.set()
 
     recorder = Recorder(small_disk, IDENTITY, clock, on_failure=on_failure)
     task = asyncio.create_task(recorder.run())
-    numbers = iter(range(10_000))
-    async with asyncio.timeout(60):
-        while not failed.is_set():
-            recorder.record("eit.frame", frame(clock, next(numbers)))
-            await asyncio.sleep(0.05)
+    number = 0
+    async with deadline("the recorder did not tell of the full disk"):
+        while not why:
+            assert number < 1000, "a disk of 64 kB took a thousand frames, and is not full"
+            for _ in range(5):
+                recorder.record("eit.frame", frame(clock, number))
+                number += 1
+            flushed.clear()
+            await flushed.wait()
     task.cancel()
     await asyncio.gather(task, return_exceptions=True)
     await asyncio.to_thread(recorder.close)

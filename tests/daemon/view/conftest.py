@@ -1,10 +1,10 @@
 """A browser, a viewer as a process of its own, and a daemon's sockets before it, for the tests of the page."""
 
 import json
+import select
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -88,24 +88,24 @@ class Viewer:
         self.url = self.url_with_token = ""
 
     def start(self) -> None:
-        printed = self._folder / "printed"
-        with printed.open("wb") as out:
-            self._process = subprocess.Popen(
-                [
-                    *(sys.executable, "-m", "daemon", "view", "--json", "--port", str(self._port)),
-                    *("--connect", self._daemon.publish, "--commands", self._daemon.commands),
-                    *("--token-file", str(self._folder / "token")),
-                ],
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=subprocess.DEVNULL,
-            )
-        deadline_s = time.monotonic() + DEADLINE_S
-        while not printed.read_text().endswith("\n"):
-            assert self._process.poll() is None, "the viewer has ended"
-            assert time.monotonic() < deadline_s
-            time.sleep(0.01)
-        told = json.loads(printed.read_text())
+        self._process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "daemon", "view", "--json", "--port", str(self._port)),
+                *("--connect", self._daemon.publish, "--commands", self._daemon.commands),
+                *("--token-file", str(self._folder / "token")),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )
+        assert self._process.stdout is not None
+        # It says its address, in one line, and nothing else.
+        with self._process.stdout as said:
+            ready, _, _ = select.select([said], [], [], DEADLINE_S)
+            assert ready, f"the viewer has not said its address within {DEADLINE_S} s"
+            line = said.readline()
+        assert line, "the viewer has ended before it said its address"
+        told = json.loads(line)
         self.url, self.url_with_token = told["url"], told["url_with_token"]
         self._port = int(self.url.rstrip("/").rpartition(":")[2])
 

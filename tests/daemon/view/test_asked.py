@@ -43,6 +43,7 @@ async def test_a_request_that_hangs_is_given_up_and_the_next_one_is_carried(monk
     monkeypatch.setattr(asked, "GRACE_S", 0.0)
     requests.close()
     assert not goes_on.is_set(), "the end waits for nothing that hangs"
+    assert [one.daemon for one in threading.enumerate() if one.name == "request"] == [True], "nor does the process's"
     goes_on.set()
     monkeypatch.setattr(asked, "GRACE_S", 20.0)
     requests.close()

@@ -1,0 +1,194 @@
+"""The loop's task with an arm and a gripper of this process, whose time passes in the robot's cycles."""
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Any
+
+from daemon.clock import Clock
+from daemon.experiment.machine import Phase
+from daemon.experiment.steps import ExperimentFile
+from daemon.experiment.wishes import GripTo
+from daemon.loop.brain import Brain
+from daemon.loop.senses import Hand
+from daemon.loop.tune import TuneSettings, tuned
+from daemon.loop.watch import WatchSettings
+from daemon.loop.wrist import Wrist, WristSettings
+from daemon.loop_task import WRENCH, LoopTask, wrench_source
+from drivers.ur.client import UrRobot
+from drivers.ur.messages import Command, MoveLinear, Reply, RobotState
+from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
+
+SPEED_M_PER_S = 0.1
+
+
+class Robot(UrRobot):
+    """The client with the pilot in the same process, and an arm that moves in straight lines too."""
+
+    def __init__(self) -> None:
+        super().__init__(SETTINGS)
+        self.flight = Flight()
+        self.commands: list[Command] = []
+        self.dies_of: Exception | None = None
+        self._goal: MoveLinear | None = None
+        # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
+        self.brakes_for = 0
+        self.flight.fly(5)
+
+    async def send(self, command: Command) -> Reply:
+        self.commands.append(command)
+        if self.dies_of is not None:
+            raise self.dies_of
+        await asyncio.sleep(0)
+        if isinstance(command, MoveLinear):
+            self._goal = command
+        return self.flight.ask(command)
+
+    def cycle(self) -> None:
+        """Let 8 ms pass, and tell who waits for the next state."""
+        arm = self.flight.arm
+        # A real arm's move is under way until its end is told, though its joints rest.
+        arm.stops_moves = not self.brakes_for
+        if self.flight.state.motion == "stopping" and self.brakes_for:
+            self.brakes_for -= 1
+            arm.be(moving_linearly=bool(self.brakes_for))
+        elif arm.reading.moving_linearly and self._goal is not None:
+            step_m = SPEED_M_PER_S * CYCLE_NS / 1e9
+            z = arm.reading.tcp_pose[2]
+            missing_m = self._goal.pose[2] - z
+            z += math.copysign(min(step_m, abs(missing_m)), missing_m)
+            arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
+        arm.be(t_mono_ns=self.flight.now_ns)
+        self.flight.fly(1)
+        self.take(0, self.flight.state)
+
+    @property
+    def end_m(self) -> float:
+        assert self._goal is not None
+        return self._goal.pose[2]
+
+    @property
+    def z_m(self) -> float:
+        return self.flight.arm.reading.tcp_pose[2]
+
+
+class StepClock(Clock):
+    """The robot's time, which stands between its cycles."""
+
+    def __init__(self, flight: Flight) -> None:
+        super().__init__()
+        self._flight = flight
+
+    def now_ns(self) -> int:
+        return self._flight.now_ns
+
+
+class Gripper:
+    """A gripper's task as the loop knows it; `answers` is what it says, or raises."""
+
+    def __init__(self) -> None:
+        self.answers: str | Exception = ""
+
+    async def grip(self, _wish: GripTo) -> str:
+        if isinstance(self.answers, Exception):
+            raise self.answers
+        return self.answers
+
+    async def release(self) -> str:
+        return await self.grip(GripTo(140.0, 100.0, 10.0, expect_object=False))
+
+    async def unlock(self) -> str:
+        return ""
+
+
+class Published:
+    """What is published, as a list."""
+
+    def __init__(self) -> None:
+        self.messages: list[Any] = []
+
+    def publish(self, message: Any) -> None:
+        self.messages.append(message)
+
+    @property
+    def reasons(self) -> str:
+        return next(one.reasons for one in reversed(self.messages) if one.topic == "loop.state")
+
+
+class Cell:
+    """Robot, gripper and loop, whose time passes in `cycles`."""
+
+    def __init__(self) -> None:
+        self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
+        source = wrench_source(SETTINGS.rate_hz)
+        wrist = Wrist(source, WristSettings(), partial(tuned, TuneSettings()))
+        self.brain = Brain({WRENCH: wrist}, WatchSettings(), {WRENCH: source}, ("robot",))
+        self.died: Mapping[str, str] = {}
+
+        async def no_zero() -> str:
+            return ""
+
+        self.loop = LoopTask(
+            self.brain,
+            self.robot,
+            self.gripper,  # type: ignore[arg-type]
+            no_zero,
+            self.published,  # type: ignore[arg-type]
+            StepClock(self.robot.flight),
+            lambda: self.died,
+        )
+        self.task: asyncio.Task[None] | None = None
+
+    def drive(self) -> None:
+        self.task = asyncio.create_task(self.loop.drive())
+
+    async def cycles(self, count: int) -> None:
+        for _ in range(count):
+            self.brain.senses.hand = Hand(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
+            self.robot.cycle()
+            # A state is sensed, decided upon and answered within a few turns of the event loop.
+            for _ in range(8):
+                await asyncio.sleep(0)
+
+    async def start(self, *steps: Mapping[str, Any]) -> None:
+        file = ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": list(steps)})
+        starting = asyncio.create_task(self.loop.start(file))
+        while not starting.done():
+            await self.cycles(1)
+        assert starting.result() is None
+
+    async def until_ended(self, most: int = 500) -> None:
+        for _ in range(most):
+            await self.cycles(1)
+            if self.phase not in (Phase.RUNNING, Phase.PAUSED):
+                return
+        raise AssertionError("the experiment goes on and on")
+
+    @property
+    def phase(self) -> Phase:
+        assert self.brain.experiment is not None
+        return self.brain.experiment.phase
+
+    @property
+    def why(self) -> str:
+        assert self.brain.experiment is not None
+        return self.brain.experiment.why
+
+    @property
+    def state(self) -> RobotState:
+        return self.robot.flight.state
+
+
+@asynccontextmanager
+async def driven() -> AsyncIterator[Cell]:
+    cell = Cell()
+    cell.drive()
+    await cell.cycles(10)
+    try:
+        yield cell
+    finally:
+        assert cell.task is not None
+        cell.task.cancel()
+        await asyncio.gather(cell.task, return_exceptions=True)

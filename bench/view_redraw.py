@@ -67,7 +67,10 @@ def rig_messages(t_ns: int, turn: int) -> Iterator[Message]:
         age_s=0.0,
     )
     if turn % 2 == 0:
-        yield LoadTorque(source="load_cell", t_mono_ns=t_ns, torque_nm=torque_nm, raw=0.0, saturated=False, spike=False)
+        yield LoadTorque(
+            source="load_cell", t_mono_ns=t_ns, torque_nm=torque_nm, raw=0.0,
+            saturated=False, spike=False, valid=True, why="",
+        )  # fmt: skip
     if turn % 13 == 0:
         yield from _estimate(t_ns, turn, torque_nm)
     if turn % 25 == 0:

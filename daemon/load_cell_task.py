@@ -38,15 +38,8 @@ class LoadCellTask:
         async with contextlib.aclosing(self._board.samples()) as samples:
             async for sample in samples:
                 self._publisher.publish(load_message(sample))
-                self._hear(
-                    Torque(
-                        LOAD_CELL,
-                        sample.torque_nm if sample.trusted else None,
-                        "" if sample.trusted else _why(sample),
-                        sample.t_mid_ns,
-                        self._clock.now_ns(),
-                    )
-                )
+                torque_nm = sample.torque_nm if sample.trusted else None
+                self._hear(Torque(LOAD_CELL, torque_nm, _why(sample), sample.t_mid_ns, self._clock.now_ns()))
                 self._take_zero(sample)
 
     def tare(self) -> None:
@@ -72,7 +65,7 @@ class LoadCellTask:
         return self._board.facts()
 
     def _take_zero(self, sample: LoadSample) -> None:
-        self._why = "" if sample.trusted else _why(sample)
+        self._why = _why(sample)
         if self._zeroing is None:
             return
         if sample.trusted:
@@ -93,10 +86,15 @@ def load_message(sample: LoadSample) -> LoadTorque:
         raw=sample.raw,
         saturated=sample.saturated,
         spike=sample.spike,
+        valid=sample.trusted,
+        why=_why(sample),
     )
 
 
 def _why(sample: LoadSample) -> str:
+    """Return what speaks against a reading, or an empty text."""
+    if sample.trusted:
+        return ""
     flags = {
         "at the end of its range": sample.saturated,
         "further from the last one than the rig can move": sample.spike,

@@ -95,7 +95,7 @@ class EitHeatmap(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadTorque(Message):
-    """One reading of the load cell on the lever."""
+    """One reading of the load cell on the lever; what is not `valid` is no torque, whatever the number."""
 
     topic: ClassVar[str] = "load.torque"
     rate_hz: ClassVar[float | None] = 10.9
@@ -104,6 +104,8 @@ class LoadTorque(Message):
     raw: float = column("", "the number that the board sent")
     saturated: bool = column("", "whether the converter was at its full scale")
     spike: bool = column("", "whether the reading cannot be true, going by those before it")
+    valid: bool = column("", "whether nothing speaks against the reading")
+    why: str = column("", "what speaks against it, in a sentence; empty when it is valid")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

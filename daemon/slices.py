@@ -104,7 +104,7 @@ class SliceRecorder:
         match topic:
             case "eit.frame":
                 self._frame(content)
-            case "load.torque" if not (content["spike"] or content["saturated"]):
+            case "load.torque" if content["valid"]:
                 self._torques.append((content["t_mono_ns"], content["torque_nm"]))
             case "gripper.state":
                 self._diameter_mm = content["diameter_mm"]

@@ -1,6 +1,7 @@
 """Reads a recording back, and refuses by name what is truncated, foreign, damaged or of another channel table."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -73,7 +74,7 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
         try:
             if channel.topic == LOAD_TOPIC:
                 # What the driver took for no load at all, or had no number for, is no truth to calibrate on.
-                if "torque_nm" in content and not (content.get("saturated") or content.get("spike")):
+                if "torque_nm" in content and _is_believed(content):
                     torques.append((message.log_time, float(content["torque_nm"])))
             elif channel.topic.startswith(f"{FRAME_TOPIC}."):
                 line = content["line"]
@@ -101,6 +102,11 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
         np.array([t for t, _ in torques], dtype=np.int64),
         np.array([torque for _, torque in torques], dtype=np.float64),
     )
+
+
+def _is_believed(load: Mapping[str, Any]) -> bool:
+    """Return whether a reading of the load cell is one; those recorded before they said so have two flags alone."""
+    return bool(load.get("valid", not (load.get("saturated") or load.get("spike"))))
 
 
 def _content(path: Path, channel: Channel, message: Message) -> dict[str, Any]:

@@ -123,6 +123,8 @@ class RecordedRun:
                 "raw": content.get("torque_nm"),
                 "saturated": False,
                 "spike": False,
+                "valid": True,
+                "why": "",
                 **content,
                 "timestamp": log_ns / 1e9,
                 "t_mono_ns": log_ns,

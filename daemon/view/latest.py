@@ -26,7 +26,7 @@ HISTORY_S = 65.0
 MOST_SAMPLES = 2000
 CHARTED: Mapping[str, tuple[str, ...]] = {
     "eit.estimate": ("torque_nm", "torque_low_nm", "torque_high_nm", "valid"),
-    "load.torque": ("torque_nm", "spike"),
+    "load.torque": ("torque_nm", "valid"),
     "skin.shear": ("shear_n", "shear_low_n", "shear_high_n", "torque_nm", "valid"),
     "loop.state": ("ramp_nm", "phase"),
 }

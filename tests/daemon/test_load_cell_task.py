@@ -1,12 +1,12 @@
 import asyncio
 from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import asynccontextmanager
-from typing import Any
 
 import pytest
 
 from daemon.clock import Clock
 from daemon.load_cell_task import ZERO_SAMPLES, LoadCellTask
+from daemon.messages import LoadTorque
 from drivers.hx711 import LoadSample
 
 
@@ -36,17 +36,20 @@ class Board:
         await self.sent.join()
 
 
-class Silent:
-    """A publisher to which nobody listens."""
+class Published:
+    """What is published, as a list."""
 
-    def publish(self, _message: Any) -> None:
-        """Send nothing."""
+    def __init__(self) -> None:
+        self.messages: list[LoadTorque] = []
+
+    def publish(self, message: LoadTorque) -> None:
+        self.messages.append(message)
 
 
 @asynccontextmanager
-async def reading() -> AsyncIterator[tuple[LoadCellTask, Board]]:
+async def reading(published: Published | None = None) -> AsyncIterator[tuple[LoadCellTask, Board]]:
     board = Board()
-    task = LoadCellTask(board, Silent(), Clock(), lambda _: None, 10.9)  # type: ignore[arg-type]
+    task = LoadCellTask(board, published or Published(), Clock(), lambda _: None, 10.9)  # type: ignore[arg-type]
     read = asyncio.create_task(task.read())
     try:
         yield task, board
@@ -88,3 +91,18 @@ async def test_the_operators_tare_is_taken_from_the_next_samples() -> None:
         task.tare()
         await board.send(3.0)
         assert board.tares == [3.0]
+
+
+@pytest.mark.parametrize(
+    ("flag", "why"),
+    [("saturated", "end of its range"), ("spike", "can move"), ("stuck", "two seconds"), ("partial", "longer line")],
+)
+async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(flag: str, why: str) -> None:
+    published = Published()
+    async with reading(published) as (_, board):
+        board.sent.put_nowait(LoadSample(5.0, 0.1, 1, 1, 1, **{flag: True}))
+        await board.send(5.0, 1)
+    spoilt, good = published.messages
+    assert not spoilt.valid
+    assert why in spoilt.why
+    assert (good.valid, good.why) == (True, "")

@@ -42,7 +42,7 @@ class Sweep:
     def _loop(self, **changes: Any) -> None:
         self.recorder("loop.state", loop_state(self.t_s, slices=self.slices, **changes))
 
-    def frames(self, torque_nm: float, for_s: float) -> None:
+    def frames(self, torque_nm: float, for_s: float, *, valid: bool = True) -> None:
         end_s = self.t_s + for_s
         while self.t_s < end_s:
             self.t_s += PERIOD_S
@@ -54,12 +54,12 @@ class Sweep:
                 "line": line.tobytes(),
             }
             self.recorder("eit.frame", frame)
-            torque = {"t_mono_ns": round(self.t_s * S), "torque_nm": torque_nm, "spike": False, "saturated": False}
+            torque = {"t_mono_ns": round(self.t_s * S), "torque_nm": torque_nm, "valid": valid}
             self.recorder("load.torque", torque)
 
-    def hold(self, number: int, torque_nm: float, for_s: float = 5.0) -> None:
+    def hold(self, number: int, torque_nm: float, for_s: float = 5.0, *, valid: bool = True) -> None:
         self._loop(hold=number)
-        self.frames(torque_nm, for_s)
+        self.frames(torque_nm, for_s, valid=valid)
         self._loop()
         self.frames(0.0, 1.0)
 
@@ -120,6 +120,14 @@ def test_a_hold_that_yields_no_slice_is_counted_with_its_reason(
     sweep.done()
     assert not sweep.recorder.written
     assert why in sweep.recorder.summary
+
+
+def test_a_load_cell_that_is_not_to_be_believed_is_the_torque_of_no_slice(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path)
+    sweep.hold(1, 0.1, valid=False)
+    sweep.done()
+    assert not sweep.recorder.written
+    assert "or no torque" in sweep.recorder.summary
 
 
 def test_an_experiment_that_asks_for_no_slices_leaves_none(tmp_path: Path) -> None:

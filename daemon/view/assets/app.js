@@ -33,7 +33,7 @@ const takers = {
       [`${said.source} high`]: unlessInvalid(said, said.torque_high_nm),
     }, gap("eit.estimate"));
   },
-  "load.torque": (said) => torques.add(said.timestamp, { load: said.spike ? null : said.torque_nm }, gap("load.torque")),
+  "load.torque": (said) => torques.add(said.timestamp, { load: unlessInvalid(said, said.torque_nm) }, gap("load.torque")),
   "loop.state": (said) => torques.add(said.timestamp, { wanted: wantedNow(said) }, gap("loop.state")),
   "skin.shear": (said) => {
     forces.add(said.timestamp, {

@@ -62,9 +62,9 @@ function loadFigure(link) {
   show(byId("load"), load !== undefined);
   if (!load) return;
   const old = link.isOld(load);
-  put(byId("load-torque"), old ? "–" : number(load.content.torque_nm, 4, "N·m", { signed: true }));
-  const trouble = load.content.saturated ? "at full scale" : load.content.spike ? "spike, cannot be true" : "";
-  put(byId("load-note"), old ? `OLD, ${age(link.ageOf(load))}` : trouble);
+  const { torque_nm, valid, why } = load.content;
+  put(byId("load-torque"), old || !valid ? "–" : number(torque_nm, 4, "N·m", { signed: true }));
+  put(byId("load-note"), old ? `OLD, ${age(link.ageOf(load))}` : why);
 }
 
 function diameterFigure(link, estimate) {

@@ -51,7 +51,14 @@ def frame(clock: Clock, number: int) -> dict:
 
 def torque(clock: Clock, number: int, torque_nm: float = 0.1) -> dict:
     message = LoadTorque(
-        source="load_cell", t_mono_ns=clock.now_ns(), torque_nm=torque_nm, raw=1.0, saturated=False, spike=False
+        source="load_cell",
+        t_mono_ns=clock.now_ns(),
+        torque_nm=torque_nm,
+        raw=1.0,
+        saturated=False,
+        spike=False,
+        valid=True,
+        why="",
     )
     return wire_map(message, clock.unix_s(message.t_mono_ns), number)
 
@@ -102,13 +109,16 @@ def test_a_live_recording_is_read_as_an_imported_one(tmp_path: Path) -> None:
     for n, one in enumerate(frames):
         recorder.record("eit.frame", one)
         recorder.record("load.torque", torque(clock, n))
-    recorder.record("load.torque", {**torque(clock, 3, 9.0), "spike": True})
+    recorder.record("load.torque", {**torque(clock, 3, 9.0), "valid": False})
+    recorded_before = torque(clock, 4, 9.0) | {"spike": True}
+    del recorded_before["valid"], recorded_before["why"]
+    recorder.record("load.torque", recorded_before)
     recorder.close()
     found = read_recording(recorder.finished[0])
     wanted = np.round(np.array([np.frombuffer(one["line"], "<f4") for one in frames], dtype=np.float64), 4)
     np.testing.assert_array_equal(found.sides["right"].lines, wanted)
     np.testing.assert_allclose(found.sides["right"].arrival_ns - found.sides["right"].t_mid_ns, 300_000_000)
-    assert found.torque_nm.tolist() == [0.1] * 3, "a spike is no truth"
+    assert found.torque_nm.tolist() == [0.1] * 3, "what is not valid is no truth"
 
 
 def test_each_experiment_has_a_file_which_bears_its_name(tmp_path: Path) -> None:

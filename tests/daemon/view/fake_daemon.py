@@ -88,6 +88,8 @@ MESSAGES: Mapping[str, Mapping[str, Any]] = {
         "raw": 8123.0,
         "saturated": False,
         "spike": False,
+        "valid": True,
+        "why": "",
     },
     "shear": {
         "kind": SkinShear,

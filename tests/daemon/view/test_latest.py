@@ -42,12 +42,12 @@ def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age() -> None:
 def test_a_new_page_gets_the_minute_that_was_before_it() -> None:
     latest = Latest(3.6)
     for second in range(100):
-        latest.take("load.torque", message("load_cell", torque_nm=0.01 * second, raw=1.0, spike=False), float(second))
+        latest.take("load.torque", message("load_cell", torque_nm=0.01 * second, raw=1.0, valid=True), float(second))
     told = latest.history(99.0)
     assert [each["content"]["torque_nm"] for each in told] == pytest.approx(np.arange(34, 100) * 0.01)
     assert told[0] == {
         "topic": "load.torque",
-        "content": {"source": "load_cell", "timestamp": 1.5, "torque_nm": 0.34, "spike": False},
+        "content": {"source": "load_cell", "timestamp": 1.5, "torque_nm": 0.34, "valid": True},
     }
     assert latest.history(1e6) == []
 

@@ -171,7 +171,16 @@ async def test_messages_reach_an_open_page_and_heatmaps_are_asked_for_while_one_
             assert (first["messages"], first["quiet_s"]) == ([], None)
             await until(lambda: page.publisher.wanted(EitHeatmap.topic))
             page.publisher.publish(
-                LoadTorque(source="load_cell", t_mono_ns=1, torque_nm=0.1, raw=5.0, saturated=False, spike=False)
+                LoadTorque(
+                    source="load_cell",
+                    t_mono_ns=1,
+                    torque_nm=0.1,
+                    raw=5.0,
+                    saturated=False,
+                    spike=False,
+                    valid=True,
+                    why="",
+                )
             )
             while not (batch := await stream.receive_json())["messages"]:
                 continue

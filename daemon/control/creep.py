@@ -62,9 +62,15 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class FittedCreep:
-    """The creep of a gel, and how far readings are from the torque without it and with it (std, N·m)."""
+    """The creep of a gel, and how far readings are from the torque without it and with it (std, N·m).
+
+    Both are of readings times `scale` plus `offset_nm`, which were fitted beside it: they are the estimator's and the
+    zero's, and stay as wrong as they are.
+    """
 
     creep: Creep
+    scale: float
+    offset_nm: float
     before_nm: float
     after_nm: float
 
@@ -88,13 +94,14 @@ def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> Fitt
         crept = np.concatenate([_crept(grip, float(time_s)) for grip in grips])
         # A factor and a constant between the two are the estimator's scale and the zero's, and no creep.
         if scale_is_right:
-            (fallen, _), after_nm = _left(np.column_stack([-crept, np.ones_like(shear)]), torque - shear)
+            (fallen, offset_nm), after_nm = _left(np.column_stack([-crept, np.ones_like(shear)]), torque - shear)
             scale = 1.0
         else:
-            (scale, fallen, _), after_nm = _left(np.column_stack([shear, -crept, np.ones_like(shear)]), torque)
+            (scale, fallen, offset_nm), after_nm = _left(np.column_stack([shear, -crept, np.ones_like(shear)]), torque)
         # What no gel does is noise that happens to fit.
         if 0.0 <= fallen < scale and (best is None or after_nm < best.after_nm):
-            best = FittedCreep(Creep(float(fallen / scale), float(time_s)), before_nm, after_nm)
+            creep = Creep(float(fallen / scale), float(time_s))
+            best = FittedCreep(creep, float(scale), float(offset_nm), before_nm, after_nm)
     if best is None:
         raise UserError("creep: the torque does not fall behind the readings; is the load cell's zero right?")
     if best.creep.time_s == _TIMES_S[-1]:

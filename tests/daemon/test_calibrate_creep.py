@@ -59,7 +59,9 @@ def test_it_prints_the_line_of_the_configuration(
     assert (told["grips"], told["frames"]) == (1, 1109)
     assert told["error_after_nm"] < told["error_before_nm"]
     assert main(arguments) == 0
-    line = capsys.readouterr().out.splitlines()[0]
+    line, followed, beside = capsys.readouterr().out.splitlines()
+    assert f"estimates, times {told['scale']:.3f} and {1e3 * told['offset_nm']:+.1f} mN·m, follow" in followed
+    assert "no creep" in beside
     assert line == f"creep: {{share: {told['share']:g}, time_s: {told['time_s']:g}}}"
     CreepConfig(share=told["share"], time_s=told["time_s"])
 

@@ -41,11 +41,16 @@ def run(args: argparse.Namespace) -> int:
         "frames": sum(grip.t_s.size for grip in grips),
         "error_before_nm": found.before_nm,
         "error_after_nm": found.after_nm,
+        "scale": found.scale,
+        "offset_nm": found.offset_nm,
     }
     sentences = [
         f"creep: {{share: {share:g}, time_s: {time_s:g}}}",
-        f"From {told['frames']} frames of {len(grips)} grips: estimates follow the load cell within "
-        f"{1e3 * found.after_nm:.1f} mN·m instead of {1e3 * found.before_nm:.1f} (standard deviation).",
+        f"From {told['frames']} frames of {len(grips)} grips: estimates, times {found.scale:.3f} and "
+        f"{1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} mN·m instead of "
+        f"{1e3 * found.before_nm:.1f} (standard deviation).",
+        "Scale and zero are no creep, and the line above does not mend them: where they are far from 1 and 0, "
+        "calibrate the estimator anew, and take the zero untouched.",
     ]
     tell(told, sentences, as_json=args.json)
     return 0

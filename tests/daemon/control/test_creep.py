@@ -39,6 +39,7 @@ def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep() -> None:
     found = fit_creep([Stretch(times, 1.1 * shears, torques)])
     assert found.creep.share == pytest.approx(0.08, abs=0.005)
     assert found.creep.time_s == pytest.approx(20.0, rel=0.1)
+    assert (found.scale, found.offset_nm) == (pytest.approx(1 / 1.1, rel=0.01), pytest.approx(0.0, abs=1e-4))
     fooled = fit_creep([Stretch(times, 1.1 * shears, torques)], scale_is_right=True)
     assert fooled.creep.time_s < 5.0
 
@@ -46,6 +47,7 @@ def test_a_wrong_scale_of_the_estimator_is_not_taken_for_creep() -> None:
 def test_several_grips_tell_as_much_as_one_long_one_and_a_wrong_zero_tells_nothing() -> None:
     times, shears, torques = twisted(300.0)
     found = fit_creep([Stretch(times, shears, torques + 0.02), Stretch(times + 1e4, shears, torques + 0.02)])
+    assert found.offset_nm == pytest.approx(0.02, abs=1e-4)
     assert found.creep.share == pytest.approx(0.08, abs=0.005)
     assert found.creep.time_s == pytest.approx(20.0, rel=0.1)
 

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from daemon.load_cell_task import LOAD_CELL
+
 FloatArray = NDArray[np.float64]
 
 # The share of the set point within which a torque counts as held.
@@ -197,11 +199,13 @@ def _held(
                 f"    {name:<10} {held.mean():+.4f} N·m on average, ± {held.std():.4f}, "
                 f"within ± {BAND:.0%} for {share:.0%} of the time"
             )
-    judge = truth if truth is not None else next((k for name, k in sources.items() if name != run.driving), None)
-    if judge is None:
+    # The truth, or the load cell, or whatever else did not drive: who judges itself is always right.
+    names = sorted(set(sources) - {run.driving}, key=lambda name: (name != "the truth", name != LOAD_CELL, name))
+    if not names:
         return
+    judge = sources[names[0]]
     if (reached_s := _back_s(judge.between(step.from_ns, step.to_ns), step.from_ns, set_nm)) is not None:
-        yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point was given"
+        yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point was given, by {names[0]}"
     for t_ns, words in happened:
         after = judge.between(t_ns, step.to_ns)
         if after.torque_nm.size:
@@ -211,9 +215,10 @@ def _held(
 
 
 def _back_s(known: Known, since_ns: float, set_nm: float) -> float | None:
-    """Return how long after a moment the torque came into the band to stay there; None where it did not."""
+    """Return how long after a moment the torque came into the band to stay there; None where that was not seen."""
     inside = np.abs(known.torque_nm - set_nm) <= BAND * abs(set_nm)
-    for at in np.flatnonzero(inside):
+    seen = known.t_ns <= known.t_ns[-1:] - STAYS_S * 1e9
+    for at in np.flatnonzero(inside & seen):
         stays = inside[(known.t_ns >= known.t_ns[at]) & (known.t_ns <= known.t_ns[at] + STAYS_S * 1e9)]
         if stays.all():
             return float(known.t_ns[at] - since_ns) / 1e9

@@ -112,11 +112,16 @@ def _paths(out: Path, names: list[str]) -> list[Path]:
 def _is_built(path: Path, plan: "BankPlan") -> bool:
     """Return whether an earlier build of a folder has finished this bank of it."""
     from bank.bank_file import Bank, BankDefinition
+    from bank.errors import BankFileError
 
     if not path.exists():
         return False
     definition = BankDefinition(plan.mesh.digest, plan.model, plan.k_grid, plan.sigma_grid, plan.variation)
-    return Bank.open(path).identity == definition.identity
+    try:
+        return Bank.open(path).identity == definition.identity
+    except BankFileError:
+        print(f"{path}: it cannot be used, and is built anew", file=sys.stderr)
+        return False
 
 
 def _result(path: Path) -> dict[str, Any]:

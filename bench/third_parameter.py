@@ -1,4 +1,4 @@
-"""What a parameter beside k and σ buys: `python -m bench.third_parameter RECORDING BANKS [--plain NAME]`.
+"""What a parameter beside k and σ buys: `python -m bench.third_parameter RECORDING BANKS`.
 
 BANKS is a folder of `shearloop bank build` over more parameters. For each of its banks: how well the recording's frames
 correlate with their best cell, without lags and over all of them; and what the best bank for each frame would add.

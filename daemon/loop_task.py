@@ -23,10 +23,12 @@ from drivers.ur.messages import Enable, Reply, RobotState, Stop, Unlock, WristSp
 WRENCH = "wrench"
 # The brain is asked at each state of the robot while an experiment runs, and no less often than this without a state.
 LONGEST_TICK_S = 0.02
-# While nothing can move it is asked no less often than this: half of the time after which the arm's state is stale.
-LONGEST_REST_S = 0.5 * ARM_STALE_S
-# Every fifth state is published, and speaks as the torque of the wrench: 25 of 125 a second.
+# Of every fifth of the robot's cycles the state is published, and speaks as the torque of the wrench: 25 a second.
 PUBLISH_EVERY = 5
+# While nothing can move no other state is needed; without one the brain is asked no less often than this.
+LONGEST_REST_S = PUBLISH_EVERY * LONGEST_TICK_S
+# Then too states come twice within the time after which the arm's is stale.
+LONGEST_EASE_S = 0.5 * ARM_STALE_S
 # Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
 # take the first one's place.
 MOST_UNANSWERED = 1
@@ -62,8 +64,8 @@ class LoopTask:
         self._clock = clock
         self._died = died
         self._acceleration_rad_per_s2 = acceleration_rad_per_s2
-        # The state that was published last, by its number.
-        self._published = 0
+        # Which of the robot's cycles, in fives, was published last.
+        self._published = -1
         self._unanswered: set[asyncio.Task[None]] = set()
         self._actions = DeviceActions(robot, gripper, take_zero, lambda: bool(self._sent_rad_per_s or self._unanswered))
         self._action: asyncio.Task[None] | None = None
@@ -83,10 +85,10 @@ class LoopTask:
         try:
             while True:
                 began_ns = self._clock.now_ns()
-                ahead = self._states_until_needed()
-                state = await self._robot.state_within(ahead * LONGEST_TICK_S, ahead=ahead)
+                longest_s = self._pace()
+                state = await self._robot.state_within(longest_s)
                 now_ns = self._clock.now_ns()
-                self._brain.senses.late_s = max(0.0, (now_ns - began_ns) / 1e9 - ahead * LONGEST_TICK_S)
+                self._brain.senses.late_s = max(0.0, (now_ns - began_ns) / 1e9 - longest_s)
                 self._brain.senses.died = self._deaths()
                 if state is not None:
                     self._sense(state)
@@ -113,7 +115,7 @@ class LoopTask:
             if state is not None and not state.blocked:
                 self._sense(state)
                 break
-        # From now on the brain is asked at each state.
+        # From now on the brain is asked in each of the robot's cycles.
         self._robot.hurry()
         return self._brain.start(file, self._clock.now_ns())
 
@@ -154,24 +156,27 @@ class LoopTask:
             blocked=state.blocked,
             moving_linearly=state.moving_linearly,
         )
-        if self._robot.states - self._published >= PUBLISH_EVERY:
-            self._published = self._robot.states // PUBLISH_EVERY * PUBLISH_EVERY
+        if (number := state.cycle // PUBLISH_EVERY) != self._published:
+            self._published = number
             # The wrench is what the tool does to the wrist; the torque on the tool is its opposite.
             self._brain.hear(
                 Torque(WRENCH, -state.wrist_torque_nm, "", state.t_mono_ns - state.age_ns, self._clock.now_ns())
             )
             self._publisher.publish(_message(state))
 
-    def _states_until_needed(self) -> int:
-        """Return which of the next states the brain is to be asked at: the first one, unless nothing can move.
+    def _pace(self) -> float:
+        """Have the robot tell its state in each of its cycles, unless nothing can move; return how long to wait for it.
 
-        While no experiment runs and the arm was told to stop, it is the next one that is published, where the robot
-        sends so many in time.
+        While no experiment runs and the arm was told to stop, and does rest, the states that are published will do.
         """
         if not self._stopped or self._running():
-            return 1
-        in_time = max(1, int(LONGEST_REST_S * self._robot.settings.rate_hz))
-        return min(in_time, PUBLISH_EVERY - self._robot.states % PUBLISH_EVERY)
+            self._robot.hurry()
+            return LONGEST_TICK_S
+        state = self._robot.state
+        if state is not None and state.motion == "idle":
+            in_time = int(LONGEST_EASE_S * self._robot.settings.rate_hz)
+            self._robot.ease(min(in_time, PUBLISH_EVERY))
+        return LONGEST_REST_S
 
     def _running(self) -> bool:
         experiment = self._brain.experiment

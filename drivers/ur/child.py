@@ -1,5 +1,5 @@
 """The robot's own process, `python -m drivers.ur.child`: commands on stdin, states and replies on stdout, 125 times a
-second.
+second, or fewer while the daemon is at ease and nothing moves.
 
 It may hang or crash in ur-rtde at any time and holds nothing worth saving. Before every stretch that may hang it sets
 an alarm that the kernel answers by ending it, whatever holds the interpreter lock; the robot's watchdog then ends the
@@ -21,8 +21,8 @@ from drivers.ur.messages import (
     RECOVERY_HANG_S,
     Command,
     Configure,
-    Decoder,
     Disconnect,
+    Ease,
     Failed,
     FailureKind,
     Heartbeat,
@@ -33,11 +33,12 @@ from drivers.ur.messages import (
     Reply,
     Stop,
     WristSpeed,
-    encode,
 )
+from drivers.ur.pace import Pace
 from drivers.ur.pilot import Pilot
 from drivers.ur.probe import ProbeError, probe
 from drivers.ur.settings import UrSettings
+from drivers.ur.wire import Decoder, encode
 
 if TYPE_CHECKING:
     from drivers.ur.arm import Arm
@@ -158,37 +159,40 @@ def _explain(host: str, text: str) -> tuple[FailureKind, str]:
 def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
     settings = configured.settings
     pilot = Pilot(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
-    period_s = 1.0 / settings.rate_hz
+    pace = Pace(settings, time.monotonic())
     leaving_s = 0.0
-    due_s = time.monotonic()
     while True:
+        pace.begin()
         _alarm(settings.hang_timeout_s)
         reading = arm.read()
         if not reading.connected or reading.age_ns > 3 * settings.state_timeout_s * 1e9:
             _fail(pipe, "lost", sentences.unfit(reading, settings.host, settings.state_timeout_s))
-        if _obey(pipe, pilot, reading):
+        if _obey(pipe, pilot, pace, reading):
             leaving_s = time.monotonic() + FAREWELL_S
         if not pipe.open and not leaving_s:
             pilot.request(0, Disconnect(), reading, time.monotonic_ns())
             leaving_s = time.monotonic() + FAREWELL_S
         if pilot.recovering:
             # The daemon learns beforehand that this cycle may take long.
-            pipe.send_latest(pilot.state(reading))
+            pipe.send_latest(pilot.state(reading, pace.cycle))
             _alarm(RECOVERY_HANG_S)
         decided = pilot.tick(reading, time.monotonic_ns())
         if decided is not None:
             pipe.send(decided[1], decided[0])
-        pipe.send_latest(pilot.state(reading))
+        pipe.send_latest(pilot.state(reading, pace.cycle))
         if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
             _end_program(settings, pilot, arm)
             _leave(EXIT_DONE)
-        # A late cycle is not caught up with: two commands at once are no use to anyone.
-        due_s = max(due_s + period_s, time.monotonic())
-        while pipe.open and not leaving_s and (left_s := due_s - time.monotonic()) > 0:
+        pace.plan(time.monotonic(), rests=pilot.rests(reading) and not leaving_s)
+        while pipe.open and not leaving_s and (left_s := pace.left_s(time.monotonic())) > 0:
             # A command is carried out when it comes: waiting for the next cycle would be a delay in the loop.
-            if pipe.wait(left_s) and _obey(pipe, pilot, arm.read()):
+            if not pipe.wait(left_s):
+                continue
+            if _obey(pipe, pilot, pace, arm.read()):
                 leaving_s = time.monotonic() + FAREWELL_S
-        if (left_s := due_s - time.monotonic()) > 0:
+            if not (pace.at_ease and pipe.open):
+                pace.hurry(time.monotonic())
+        if (left_s := pace.left_s(time.monotonic())) > 0:
             time.sleep(left_s)
 
 
@@ -203,10 +207,10 @@ def _end_program(settings: UrSettings, pilot: Pilot, arm: "Arm") -> None:
         arm.stop_program()
 
 
-def _obey(pipe: Pipe, pilot: Pilot, reading: Reading) -> bool:
+def _obey(pipe: Pipe, pilot: Pilot, pace: Pace, reading: Reading) -> bool:
     """Carry out what the daemon has sent; return whether it says to go."""
     goes = False
-    for number, command in _newest(pipe, pilot):
+    for number, command in _newest(pipe, pilot, pace):
         reply = pilot.request(number, command, reading, time.monotonic_ns())
         if reply is not None:
             pipe.send(reply, number)
@@ -214,14 +218,15 @@ def _obey(pipe: Pipe, pilot: Pilot, reading: Reading) -> bool:
     return goes
 
 
-def _newest(pipe: Pipe, pilot: Pilot) -> list[tuple[int, Command]]:
+def _newest(pipe: Pipe, pilot: Pilot, pace: Pace) -> list[tuple[int, Command]]:
     """Return the commands to carry out in this cycle: of motions only the latest, the others answered as overtaken."""
     commands: list[tuple[int, Command]] = []
     for number, message in pipe.receive():
         pilot.heard(time.monotonic_ns())
+        pace.hear(message)
         if isinstance(message, COMMANDS):
             commands.append((number, message))
-        elif not isinstance(message, Heartbeat):
+        elif not isinstance(message, Heartbeat | Ease):
             raise TypeError(f"the daemon sent a {type(message).__name__}, which is no command")
     motions = [n for n, (_, command) in enumerate(commands) if isinstance(command, WristSpeed | MoveLinear | Stop)]
     # A stop is never overtaken: what comes after it finds the arm stopping.

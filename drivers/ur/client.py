@@ -20,13 +20,12 @@ from typing import Final, Literal
 
 from drivers.errors import DeviceLostError, DriverError, ProtocolError
 from drivers.ur import sentences
-from drivers.ur.ear import Ear
 from drivers.ur.messages import (
     RECOVERY_HANG_S,
     Command,
     Configure,
-    Decoder,
     Disconnect,
+    Ease,
     Failed,
     FailureKind,
     Heartbeat,
@@ -34,9 +33,9 @@ from drivers.ur.messages import (
     Phase,
     Reply,
     RobotState,
-    encode,
 )
 from drivers.ur.settings import UrSettings
+from drivers.ur.wire import Decoder, encode
 
 LinkStatus = Literal["starting", "up", "down"]
 LossKind = FailureKind | Literal["crashed", "hung", "garbled"]
@@ -48,8 +47,6 @@ STEADY_S = 30.0
 FAREWELL_S = 3.0
 # Beyond its own alarms a process gets so long: they end it at a known place, and first.
 GRACE_S = 1.0
-# The last of several states that are taken together may come so much later than their rate says.
-LAST_OF_SEVERAL_S = 0.001
 # So long after the loss of a process what runs on the robot is taken for the program that it left behind.
 TAKES_OVER_S = 10.0
 # What a stuck process leaves unread; some hundred commands.
@@ -58,6 +55,7 @@ MOST_UNSENT = 1 << 15
 LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
 # What a process printed before its end arrives after that at times, but no later than this.
 LAST_WORDS_S = 0.5
+HEARTBEAT: Final = encode(Heartbeat())
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,14 +81,16 @@ class UrRobot:
         self._on_link = on_link or (lambda _event: None)
         self._state: RobotState | None = None
         self._stdin: asyncio.StreamWriter | None = None
-        self._ear: Ear | None = None
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
         self._number = 0
         self._lost_s = -math.inf
         # How many states have come since the beginning.
         self.states = 0
-        # Who waits for a state, and for which one; None is for those who wait no longer.
-        self._awaiting: dict[asyncio.Future[RobotState | None], int] = {}
+        # Who waits for the next state; None is for those who wait no longer.
+        self._awaiting: set[asyncio.Future[RobotState | None]] = set()
+        # Clear while the process was told that states are needed less often.
+        self._hurried = asyncio.Event()
+        self._hurried.set()
 
     @property
     def takes_over(self) -> bool:
@@ -105,45 +105,52 @@ class UrRobot:
     async def next_state(self) -> RobotState:
         """Return the next state that arrives; waits through losses of the connection."""
         while True:
-            state = await self._awaited(1, None)
+            state = await self._awaited(None)
             if state is not None:
                 return state
 
-    async def state_within(self, seconds: float, *, ahead: int = 1) -> RobotState | None:
-        """Return the next state that arrives, or one further `ahead`; None where it does not within so many seconds.
+    async def state_within(self, seconds: float) -> RobotState | None:
+        """Return the next state that arrives, or None where none does within so many seconds."""
+        return await self._awaited(seconds)
 
-        The states before that one are taken together with it, unless somebody else waits for one of them, or they come
-        so slowly that this would take longer: a pause that each next call begins anew would be one without an end.
-        """
-        together_s = ahead / self.settings.rate_hz + LAST_OF_SEVERAL_S
-        if ahead > 1 and together_s < seconds and self._ear is not None and not self._awaiting:
-            self._ear.pause(together_s)
-        return await self._awaited(ahead, seconds)
+    @property
+    def at_ease(self) -> bool:
+        """Whether the process was told that states are needed less often."""
+        return not self._hurried.is_set()
+
+    def ease(self, cycles: int) -> None:
+        """Have a state only every so many cycles, as long as nothing moves, until `hurry` or the next command."""
+        if cycles > 1 and self._stdin is not None and not self.at_ease:
+            self._hurried.clear()
+            self._stdin.write(encode(Ease(cycles)))
 
     def hurry(self) -> None:
-        """Give those who await a state further ahead the next one."""
-        for arrived in self._awaiting:
-            self._awaiting[arrived] = self.states + 1
-        self._listen()
+        """Have a state in every cycle again, the next one in the present one."""
+        if self._end_ease() and self._stdin is not None:
+            self._stdin.write(HEARTBEAT)
 
-    async def _awaited(self, ahead: int, seconds: float | None) -> RobotState | None:
+    async def hurried(self) -> None:
+        """Wait until a state is needed in every cycle, and signs of life with them."""
+        await self._hurried.wait()
+
+    def _end_ease(self) -> bool:
+        """Return whether the process was at ease, and will not be: whatever it hears next ends that."""
+        at_ease = self.at_ease
+        self._hurried.set()
+        return at_ease
+
+    async def _awaited(self, seconds: float | None) -> RobotState | None:
         # 125 times a second: a future and a timer are a third of the price of a condition and `asyncio.timeout`.
         loop = asyncio.get_running_loop()
         arrived: asyncio.Future[RobotState | None] = loop.create_future()
-        self._awaiting[arrived] = self.states + ahead
-        if ahead == 1:
-            self._listen()
+        self._awaiting.add(arrived)
         timer = loop.call_later(seconds, _give_up, arrived) if seconds is not None else None
         try:
             return await arrived
         finally:
-            self._awaiting.pop(arrived, None)
+            self._awaiting.discard(arrived)
             if timer is not None:
                 timer.cancel()
-
-    def _listen(self) -> None:
-        if self._ear is not None:
-            self._ear.listen()
 
     async def send(self, command: Command) -> Reply:
         """Return the one reply to a command: what is sent after clipping, or why nothing is.
@@ -156,8 +163,8 @@ class UrRobot:
         number = self._number
         future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
         self._waiting[number] = future
+        self._end_ease()
         self._stdin.write(encode(command, number))
-        self._listen()
         try:
             return await future
         finally:
@@ -215,12 +222,14 @@ class UrRobot:
         if loss is not None:
             raise loss
 
-    def connected(self, stdin: asyncio.StreamWriter, ear: Ear) -> None:
-        """Send commands there from now on, and hear of them there."""
-        self._stdin, self._ear = stdin, ear
+    def connected(self, stdin: asyncio.StreamWriter) -> None:
+        """Send commands there from now on."""
+        self._stdin = stdin
 
     def _disconnected(self) -> None:
-        self._stdin = self._ear = None
+        self._stdin = None
+        # The next process begins with every cycle.
+        self._end_ease()
         if self._state is not None:
             self._lost_s = time.monotonic()
         self._state = None
@@ -238,8 +247,8 @@ class UrRobot:
                 if first:
                     self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
                 self.states += 1
-                for arrived, awaited in self._awaiting.items():
-                    if awaited <= self.states and not arrived.done():
+                for arrived in self._awaiting:
+                    if not arrived.done():
                         arrived.set_result(message)
             case Reply():
                 future = self._waiting.get(number)
@@ -271,7 +280,6 @@ class _Conversation:
         self._settings = robot.settings
         self._process = process
         self._stdin, self._stdout, self._stderr = process.stdin, stdout, process.stderr
-        self._ear = Ear(stdout, self._hear)
         self._decoder = Decoder()
         self._heard_s = time.monotonic()
         # Done when the process has no more to say, or has said what ends the conversation.
@@ -283,7 +291,7 @@ class _Conversation:
 
     async def listen(self) -> None:
         """Take messages until the process has no more; a silent process is ended."""
-        self._ear.listen()
+        asyncio.get_running_loop().add_reader(self._stdout, self._hear)
         try:
             while not self._over.done():
                 patience_s = self._patience_s()
@@ -293,7 +301,7 @@ class _Conversation:
                     raise _LostError("hung", self._hung(patience_s))
                 await asyncio.wait([self._over], timeout=min(patience_s - silent_s, self._settings.hang_timeout_s))
         finally:
-            self._ear.close()
+            self._turn_away()
         # What was wrong with a message is raised here.
         self._over.result()
         raise await self._died()
@@ -319,13 +327,16 @@ class _Conversation:
     def _take(self, number: int, message: Message) -> None:
         if isinstance(message, RobotState):
             self._doing = "controlling"
-            self._robot.connected(self._stdin, self._ear)
+            self._robot.connected(self._stdin)
         elif isinstance(message, Phase):
             self._doing = message.doing
         self._robot.take(number, message)
 
+    def _turn_away(self) -> None:
+        asyncio.get_running_loop().remove_reader(self._stdout)
+
     def _end_with(self, error: Exception | None) -> None:
-        self._ear.close()
+        self._turn_away()
         if self._over.done():
             return
         if error is None:
@@ -334,14 +345,15 @@ class _Conversation:
             self._over.set_exception(error)
 
     async def keep_alive(self) -> None:
-        """Give signs of life four times in the time after which motion would be stopped."""
-        beat = encode(Heartbeat())
+        """Give signs of life four times in the time after which motion would be stopped; at ease nothing moves."""
         while True:
+            await self._robot.hurried()
             await asyncio.sleep(self._settings.silence_timeout_s / 4)
             if self._stdin.transport.get_write_buffer_size() > MOST_UNSENT:
                 self._kill()
                 raise _LostError("hung", self._hung(self._settings.silence_timeout_s))
-            self._stdin.write(beat)
+            if not self._robot.at_ease:
+                self._stdin.write(HEARTBEAT)
 
     async def collect_stderr(self) -> None:
         """Keep the end of what the process printed: after a crash it is all there is."""

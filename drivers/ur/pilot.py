@@ -58,6 +58,10 @@ class Pilot:
         """Whether no motion is under way."""
         return self._mover.kind == "idle"
 
+    def rests(self, reading: Reading) -> bool:
+        """Whether nothing moves and nothing is under way: no cycle is needed then but to look."""
+        return self.at_rest and reading.rests and not self.recovering
+
     @property
     def recovering(self) -> bool:
         """Whether calls may take seconds: the dashboard's, and the first one to a new program."""
@@ -116,8 +120,8 @@ class Pilot:
         self._mover.keep(reading, now_ns)
         return None
 
-    def state(self, reading: Reading) -> RobotState:
-        """Return the reading with everything that this pilot adds to it."""
+    def state(self, reading: Reading, cycle: int) -> RobotState:
+        """Return the reading of a cycle with everything that this pilot adds to it."""
         return RobotState(
             reading.t_mono_ns,
             reading.timestamp_s,
@@ -142,6 +146,7 @@ class Pilot:
             ended=self._mover.ended,
             sent=self._mover.sent,
             clipped=self._mover.clipped,
+            cycle=cycle,
         )
 
     # ---- commands -------------------------------------------------------------------------------------------------

@@ -36,8 +36,17 @@ class Robot(UrRobot):
         # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
         self.brakes_for = 0
         self.flight.fly(5)
+        # Of how many cycles the daemon needs one.
+        self.of_cycles = 1
+
+    def ease(self, cycles: int) -> None:
+        self.of_cycles = cycles
+
+    def hurry(self) -> None:
+        self.of_cycles = 1
 
     async def send(self, command: Command) -> Reply:
+        self.hurry()
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
@@ -62,7 +71,8 @@ class Robot(UrRobot):
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
         arm.be(t_mono_ns=self.flight.now_ns)
         self.flight.fly(1)
-        self.take(0, self.flight.state)
+        if self.flight.cycle % self.of_cycles == 0:
+            self.take(0, self.flight.state)
 
     @property
     def end_m(self) -> float:

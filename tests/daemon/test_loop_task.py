@@ -153,16 +153,18 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
         assert all(isinstance(command, WristSpeed) for command in cell.robot.commands[before:])
 
 
-async def test_the_brain_is_asked_at_every_fifth_state_until_an_experiment_runs(
+async def test_the_robot_is_at_ease_until_an_experiment_runs_and_then_asked_in_each_cycle(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async with driven() as cell:
         asked: list[int] = []
         tick = cell.brain.tick
-        monkeypatch.setattr(cell.brain, "tick", lambda now_ns: asked.append(cell.robot.states) or tick(now_ns))
+        monkeypatch.setattr(cell.brain, "tick", lambda now_ns: asked.append(cell.state.cycle) or tick(now_ns))
+        cell.published.messages.clear()
         await cell.cycles(50)
         assert len(asked) == 10
         assert all(number % PUBLISH_EVERY == 0 for number in asked)
+        assert sum(one.topic == "robot.state" for one in cell.published.messages) == 10
         cell.published.messages.clear()
         await cell.start({"do": "wait", "wait_s": 60})
         asked.clear()
@@ -202,9 +204,24 @@ async def test_a_robot_that_sends_few_states_is_not_found_silent_between_them(mo
         await cell.cycles(5)
         asked: list[int] = []
         tick = cell.brain.tick
-        monkeypatch.setattr(cell.brain, "tick", lambda now_ns: asked.append(cell.robot.states) or tick(now_ns))
+        monkeypatch.setattr(cell.brain, "tick", lambda now_ns: asked.append(cell.state.cycle) or tick(now_ns))
         await cell.cycles(20)
-        assert set(np.diff(asked)) <= {1, 2}
+        assert set(np.diff(asked)) == {2}
+
+
+async def test_an_arm_that_was_told_to_stop_is_attended_to_until_it_rests() -> None:
+    async with driven() as cell:
+        await cell.start({"do": "turn_to", "angle_rad": 2.0})
+        while abs(cell.robot.flight.wrist_speed) < 0.1:
+            await cell.cycles(1)
+        cell.brain.stop("the operator said so")
+        await cell.cycles(2)
+        assert cell.state.motion == "stopping"
+        while cell.state.motion == "stopping":
+            assert cell.robot.of_cycles == 1
+            await cell.cycles(1)
+        await cell.cycles(2)
+        assert cell.robot.of_cycles == PUBLISH_EVERY
 
 
 async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pause_in_the_same_moment() -> None:

@@ -165,7 +165,7 @@ class WholeRig:
         return reply if reply is not None else dataclasses.make_dataclass("Later", [("sent", object, None)])()
 
     def _sense(self, torque_nm: float) -> None:
-        state = self.pilot.state(self.arm.reading)
+        state = self.pilot.state(self.arm.reading, self.number)
         self.brain.senses.arm = Arm(
             state.wrist_rad, 0.0, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked
         )

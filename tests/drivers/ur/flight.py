@@ -151,7 +151,7 @@ class Flight:
     def __init__(self, settings: UrSettings = SETTINGS, *, takes_over: bool = False) -> None:
         self.arm = FakeArm()
         self.now_ns = 10**12
-        self.number = 0
+        self.number = self.cycle = 0
         self.decided: dict[int, Reply] = {}
         self.pilot = Pilot(settings, self.arm, self.now_ns, takes_over=takes_over)
 
@@ -175,6 +175,7 @@ class Flight:
                 self.decided[decided[0]] = decided[1]
             self.arm.cycle()
             self.now_ns += CYCLE_NS
+            self.cycle += 1
 
     def fly_until(self, condition: Callable[[RobotState], bool], cycles: int = 1000) -> RobotState:
         for _ in range(cycles):
@@ -185,7 +186,7 @@ class Flight:
 
     @property
     def state(self) -> RobotState:
-        return self.pilot.state(self.arm.reading)
+        return self.pilot.state(self.arm.reading, self.cycle)
 
     @property
     def wrist_speed(self) -> float:

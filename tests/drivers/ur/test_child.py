@@ -11,18 +11,19 @@ import pytest
 
 from drivers.ur import child
 from drivers.ur.messages import (
-    Command,
     Configure,
-    Decoder,
     Disconnect,
+    Ease,
     Enable,
+    Heartbeat,
     Message,
     Reading,
     Reply,
+    RobotState,
     Unlock,
     WristSpeed,
-    encode,
 )
+from drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 ROOT = Path(__file__).parents[3]
@@ -48,9 +49,9 @@ class Daemon:
     def _left(_status: int) -> NoReturn:
         raise LeftError
 
-    def say(self, *commands: Command) -> None:
-        for number, command in enumerate(commands, 1):
-            os.write(self._stdin, encode(command, number))
+    def say(self, *messages: Message) -> None:
+        for number, message in enumerate(messages, 1):
+            os.write(self._stdin, encode(message, number))
 
     def hear(self) -> list[tuple[int, Message]]:
         return Decoder().feed(os.read(self._stdout, 1 << 20))
@@ -148,6 +149,108 @@ def test_program_of_somebody_else_is_not_stopped_by_a_process_that_leaves(daemon
     daemon.say(Disconnect())
     fly(daemon, arm)
     assert arm.calls == []
+
+
+class Time:
+    """A clock that only waiting moves on."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def monotonic_ns(self) -> int:
+        return round(self.now_s * 1e9)
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+class TimedArm(CyclingArm):
+    """An arm that is read in the process's own time."""
+
+    def read(self) -> Reading:
+        super().read()
+        self.be(t_mono_ns=child.time.monotonic_ns())
+        return self.reading
+
+
+class Eased:
+    """A flight in a time of its own: at some times the daemon says something; what was done when is kept."""
+
+    def __init__(
+        self,
+        daemon: Daemon,
+        monkeypatch: pytest.MonkeyPatch,
+        *script: tuple[float, Message],
+        arm: "TimedArm | None" = None,
+    ) -> None:
+        self.time = Time()
+        self.arm = arm or TimedArm()
+        self._daemon = daemon
+        self._script = [(1000.0 + at_s, message) for at_s, message in script]
+        monkeypatch.setattr(child, "time", self.time)
+        monkeypatch.setattr(daemon.pipe, "wait", self._wait)
+        fly(daemon, self.arm)
+        self.states = [message for _, message in daemon.hear() if isinstance(message, RobotState)]
+
+    def _wait(self, timeout_s: float) -> bool:
+        if self._script and self._script[0][0] <= self.time.now_s + timeout_s:
+            at_s, message = self._script.pop(0)
+            self.time.now_s = max(self.time.now_s, at_s)
+            self._daemon.say(message)
+            return True
+        self.time.now_s += timeout_s
+        return False
+
+    def cycles_between(self, from_s: float, to_s: float) -> list[int]:
+        """Return the numbers of the cycles that were gone through in that time."""
+        return sorted({state.cycle for state in self.states if from_s < state.t_mono_ns / 1e9 - 1000.0 < to_s})
+
+
+def test_at_ease_every_fifth_cycle_is_gone_through_until_the_daemon_says_something(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    eased = Eased(daemon, monkeypatch, (0.101, Ease(5)), (0.225, Heartbeat()), (0.301, Ease(5)), (0.405, Disconnect()))
+    assert eased.cycles_between(-0.001, 0.101) == [*range(13)]
+    assert eased.cycles_between(0.101, 0.225) == [13, 15, 20, 25]
+    assert eased.cycles_between(0.225, 0.301) == [*range(29, 38)]
+    assert eased.cycles_between(0.301, 0.405) == [38, 40, 45, 50]
+    assert eased.cycles_between(0.405, 1.0) == [51]
+
+
+def test_a_command_at_ease_is_carried_out_when_it_comes_and_ends_the_ease(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told_s: list[float] = []
+
+    class Told(TimedArm):
+        def wrist(self, command: WristSpeed) -> bool:
+            told_s.append(child.time.monotonic())
+            return super().wrist(command)
+
+    eased = Eased(
+        daemon, monkeypatch,
+        (0.1, Enable()), (0.101, Ease(5)), (0.203, WristSpeed(0.1, 4.0)), (0.204, Ease(5)), (0.3, Disconnect()),
+        arm=Told(),
+    )  # fmt: skip
+    assert told_s[0] == pytest.approx(1000.203, abs=1e-9)
+    # It turns: at ease or not, nothing is left out.
+    assert eased.cycles_between(0.201, 0.3) == [*range(26, 38)]
+    assert all(state.motion == "wrist" for state in eased.states if 26 <= state.cycle < 38)
+
+
+def test_an_arm_that_is_moved_is_watched_in_every_cycle(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever moves it: at ease it takes one of the fewer cycles to be seen, and each one from then on."""
+
+    class Moved(TimedArm):
+        def cycle(self) -> None:
+            super().cycle()
+            self.be(qd_rad_per_s=(0.0,) * 5 + (0.01 * (child.time.monotonic() > 1000.201),))
+
+    eased = Eased(daemon, monkeypatch, (0.101, Ease(5)), (0.301, Disconnect()), arm=Moved())
+    assert eased.cycles_between(0.101, 0.301) == [13, 15, 20, 25, *range(30, 38)]
 
 
 CRASHING = """

@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import time
+from itertools import pairwise
 
 import pytest
 
@@ -99,20 +100,45 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
         assert sorted(states, key=lambda state: state.timestamp_s) == states
 
 
-async def test_states_that_nobody_needs_singly_are_taken_together(controller: ControllerProcess) -> None:
+async def test_states_come_less_often_at_ease_until_someone_is_in_a_hurry(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
+
+        async def steps() -> list[int]:
+            cycles = [(await robot.next_state()).cycle for _ in range(10)]
+            return [later - earlier for earlier, later in pairwise(cycles)][2:]
+
         await until(robot, lambda state: not state.recovering)
-        before = robot.states
-        state = await robot.state_within(30.0, ahead=25)
-        assert state is not None
-        # Those that came before and with it were all counted.
-        assert robot.states >= before + 25
-        waiting = asyncio.create_task(robot.state_within(3600.0, ahead=100_000))
-        await asyncio.sleep(0)
-        async with asyncio.timeout(10):
-            assert (await robot.send(Enable())).accepted, "a command ends the wait for the states beside it"
-            robot.hurry()
-            assert await waiting is not None
+        for end in (robot.hurry, lambda: robot.send(Enable())):
+            robot.ease(5)
+            assert await steps() == [5] * 7
+            # Longer than the time after which motion would be stopped that nobody stands by.
+            waited = end()
+            if waited is not None:
+                assert (await waited).accepted
+            assert await steps() == [1] * 7
+        assert not robot.losses
+
+
+async def test_a_twist_is_begun_at_ease_at_once_and_a_protective_stop_told(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        for _ in range(3):
+            robot.ease(5)
+            await robot.state_within(1.0)
+            await robot.state_within(1.0)
+            assert robot.at_ease
+            since_ns = time.monotonic_ns()
+            assert (await robot.send(WristSpeed(0.1, 4.0))).accepted
+            started = await controller.event("motion-started", since_ns)
+            assert stopped_after_s(started, since_ns) < 0.1
+            await robot.send(Stop(4.0))
+            await until(robot, lambda state: state.motion == "idle")
+        robot.ease(5)
+        since_ns = time.monotonic_ns()
+        await controller.fault("protective-stop")
+        state = await until(robot, lambda state: state.protective_stop)
+        assert robot.at_ease
+        assert (state.t_mono_ns - since_ns) / 1e9 < 0.5
 
 
 async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess) -> None:

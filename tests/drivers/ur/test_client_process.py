@@ -1,18 +1,13 @@
 """The daemon's end of the robot where there is no controller: what is said of a process that ends."""
 
-import asyncio
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from unittest.mock import create_autospec
 
 import pytest
 
 from drivers.errors import DriverError
 from drivers.ur.client import LAST_WORDS_BYTES, UrRobot
-from drivers.ur.ear import Ear
-from tests.drivers.ur.flight import Flight
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
 
@@ -68,8 +63,9 @@ async def test_long_line_of_a_process_is_heard_and_told_in_short(play: Callable[
 
 BRIEFLY = """
 import os, sys
-from drivers.ur.messages import Configure, Decoder, encode
+from drivers.ur.messages import Configure
 from drivers.ur.pilot import Pilot
+from drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 decoder = Decoder()
@@ -77,7 +73,7 @@ while not (heard := decoder.feed(os.read(0, 1 << 16))):
     pass
 with open(sys.argv[1], "a") as told:
     print(heard[0][1].takes_over, file=told)
-os.write(1, encode(Pilot(SETTINGS, FakeArm(), 0).state(FakeArm().reading)))
+os.write(1, encode(Pilot(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
 """
 
 
@@ -90,27 +86,3 @@ async def test_process_after_one_that_was_connected_may_stop_what_that_left_runn
     async with running(settings_for("127.0.0.254"), link):
         await link.down(2)
     assert told.read_text().split()[:2] == ["False", "True"]
-
-
-async def test_states_that_come_slowly_are_not_waited_for_together_and_all_heard() -> None:
-    """At 30 a second, five take longer than the loop waits for them: it asks again before they have come."""
-    robot = UrRobot(settings_for("127.0.0.254", rate_hz=30.0))
-    reading, writing = os.pipe()
-    os.set_blocking(reading, False)
-    state = Flight().state
-
-    def hear() -> None:
-        for _ in os.read(reading, 100):
-            robot.take(0, state)
-
-    ear = Ear(reading, hear)
-    stdin = create_autospec(asyncio.StreamWriter, instance=True)
-    robot.connected(stdin, ear)
-    try:
-        ear.listen()
-        os.write(writing, bytes(5))
-        assert await robot.state_within(0.1, ahead=5) is state
-    finally:
-        ear.close()
-        os.close(reading)
-        os.close(writing)

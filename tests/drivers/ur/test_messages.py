@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from drivers.errors import ProtocolError
 from drivers.ur.messages import (
     Configure,
-    Decoder,
     Disconnect,
+    Ease,
     Enable,
     Failed,
     Heartbeat,
@@ -26,9 +26,9 @@ from drivers.ur.messages import (
     Unlock,
     WristSpeed,
     ZeroForceTorque,
-    encode,
 )
 from drivers.ur.settings import UrSettings
+from drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.test_limits import LIMITS
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -44,14 +44,15 @@ mode, time_ns = st.integers(-(2**31), 2**31 - 1), st.integers(-(2**63), 2**63 - 
 states = st.builds(
     RobotState,
     t_mono_ns=time_ns, age_ns=time_ns, robot_mode=mode, safety_mode=mode, runtime_state=mode,
-    motion_id=st.integers(0, 2**32 - 1),
+    motion_id=st.integers(0, 2**32 - 1), cycle=st.integers(0, 2**64 - 1),
     q_rad=six, qd_rad_per_s=six, tcp_pose=six, wrench=six, sent=sent, clipped=reasons,
     timestamp_s=finite, speed_scaling=finite, wrist_torque_nm=finite,
     motion=st.sampled_from(["idle", "wrist", "linear", "stopping"]),
 )  # fmt: skip
 messages = st.one_of(
     wrist, line, stop, st.just(Enable()), st.just(Unlock()), st.just(ZeroForceTorque()), st.just(Disconnect()),
-    st.just(Heartbeat()), st.builds(Reply, st.text(), sent, reasons), st.builds(Phase, st.text()),
+    st.just(Heartbeat()), st.builds(Ease, st.integers(1, 100)),
+    st.builds(Reply, st.text(), sent, reasons), st.builds(Phase, st.text()),
     st.builds(Failed, st.sampled_from(["lost", "silent"]), st.text()), states,
     st.just(Configure(UrSettings(host="10.0.0.1", limits=LIMITS))),
 )  # fmt: skip
@@ -97,7 +98,7 @@ def test_command_with_anything_missing_wrong_or_more_is_refused(body: bytes) -> 
 def test_a_state_with_anything_missing_wrong_or_more_is_refused(change: str) -> None:
     state = RobotState(
         0, 0.0, 0, True, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, 7, 1, 2, 1.0, False,
-        0.0, False, False, "", False, "stopping", 0, "", None, (),
+        0.0, False, False, "", False, "stopping", 0, "", None, (), 3,
     )  # fmt: skip
     header, body = encode(state)[:9], encode(state)[9:]
     numbers = body.index(b"{")
@@ -115,7 +116,7 @@ def test_a_state_with_anything_missing_wrong_or_more_is_refused(change: str) -> 
 def test_states_carry_what_is_no_number() -> None:
     state = RobotState(
         0, 0.0, 0, True, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0, False,
-        0.0, False, False, "", False, "idle", 0, "", None, (),
+        0.0, False, False, "", False, "idle", 0, "", None, (), 3,
     )  # fmt: skip
     ((_, got),) = Decoder().feed(encode(state))
     assert isinstance(got, RobotState)

@@ -1,0 +1,54 @@
+"""When the robot's process goes through its next cycle: at the rate, or at ease. No clock: the time is an argument.
+
+Each waking costs, whatever is done then. While the daemon needs few states and nothing moves, all that can come between
+two of them is a message, and that is answered when it comes.
+"""
+
+import math
+
+from drivers.ur.messages import Ease, Message
+from drivers.ur.settings import UrSettings
+
+# Of the robot's patience with a silent client (1/watchdog_hz): at ease too a whole cycle may be left out.
+OF_THE_WATCHDOG = 0.4
+
+
+class Pace:
+    """Numbers the cycles, and says when each is due. Those at ease have multiples for numbers."""
+
+    def __init__(self, settings: UrSettings, now_s: float) -> None:
+        """Begin with a cycle that is due now, and with a daemon that needs every one."""
+        self._period_s = 1.0 / settings.rate_hz
+        self._most = max(1, int(OF_THE_WATCHDOG * settings.rate_hz / settings.watchdog_hz))
+        self._wanted = 1
+        self.cycle, self._due_s = 0, now_s
+        self._next, self._next_s = 0, now_s
+
+    @property
+    def at_ease(self) -> bool:
+        """Whether the daemon does not need every cycle."""
+        return self._wanted > 1
+
+    def hear(self, message: Message) -> None:
+        """Note what the daemon needs: every cycle, once it has said anything but `Ease`."""
+        self._wanted = min(max(1, message.cycles), self._most) if isinstance(message, Ease) else 1
+
+    def plan(self, now_s: float, *, rests: bool) -> None:
+        """Choose the next cycle once the work of this one is done; `rests`: nothing moves, and nothing is under way."""
+        self._next = self.cycle + (self._wanted - self.cycle % self._wanted if rests else 1)
+        # A late cycle is not caught up with: two commands at once are no use to anyone.
+        self._next_s = max(self._due_s + (self._next - self.cycle) * self._period_s, now_s)
+
+    def hurry(self, now_s: float) -> None:
+        """Take the next cycle of the rate instead, where more of them were to pass."""
+        soon = self.cycle + max(1, math.ceil((now_s - self._due_s) / self._period_s))
+        if soon < self._next:
+            self._next, self._next_s = soon, self._due_s + (soon - self.cycle) * self._period_s
+
+    def left_s(self, now_s: float) -> float:
+        """Return the time until the next cycle is due; 0 or less where it is."""
+        return self._next_s - now_s
+
+    def begin(self) -> None:
+        """Begin the cycle that was chosen."""
+        self.cycle, self._due_s = self._next, self._next_s

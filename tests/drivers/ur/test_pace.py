@@ -1,0 +1,109 @@
+"""When the next cycle is due: at the rate, at ease, late, and when something comes meanwhile."""
+
+import dataclasses
+
+import pytest
+
+from drivers.ur.messages import Ease, Enable, Heartbeat, Message, Stop
+from drivers.ur.pace import Pace
+from tests.drivers.ur.flight import SETTINGS
+
+PERIOD_S = 1.0 / SETTINGS.rate_hz
+
+
+class Cycles:
+    """A pace and its time."""
+
+    def __init__(self, **changes: float) -> None:
+        self.now_s = 100.0
+        self.pace = Pace(dataclasses.replace(SETTINGS, **changes), self.now_s)
+
+    def work(self, seconds: float = 0.0, *, rests: bool = True) -> float:
+        """Begin a cycle that is due, work for so long, and return what is left until the next one."""
+        self.pace.begin()
+        self.now_s += seconds
+        self.pace.plan(self.now_s, rests=rests)
+        return self.pace.left_s(self.now_s)
+
+    def wait(self) -> None:
+        self.now_s += max(0.0, self.pace.left_s(self.now_s))
+
+    def numbers(self, count: int, *, rests: bool = True) -> list[int]:
+        """Go through so many cycles, and return their numbers and check their times."""
+        numbers = []
+        for _ in range(count):
+            self.work(0.001, rests=rests)
+            numbers.append(self.pace.cycle)
+            self.wait()
+            assert self.now_s == pytest.approx(100.0 + self.pace._next * PERIOD_S)
+        return numbers
+
+
+def test_cycles_come_at_the_rate() -> None:
+    assert Cycles().numbers(4) == [0, 1, 2, 3]
+
+
+def test_cycles_at_ease_are_the_multiples() -> None:
+    cycles = Cycles()
+    assert cycles.numbers(3) == [0, 1, 2]
+    cycles.pace.hear(Ease(5))
+    assert cycles.numbers(4) == [3, 5, 10, 15]
+
+
+@pytest.mark.parametrize("message", [Heartbeat(), Enable(), Stop(4.0), Ease(1), Ease(0)])
+def test_whatever_else_is_heard_ends_the_ease(message: Message) -> None:
+    cycles = Cycles()
+    cycles.pace.hear(Ease(5))
+    cycles.pace.hear(message)
+    assert not cycles.pace.at_ease
+    assert cycles.numbers(3) == [0, 1, 2]
+
+
+def test_while_something_moves_there_is_no_ease() -> None:
+    cycles = Cycles()
+    cycles.pace.hear(Ease(5))
+    assert cycles.numbers(3, rests=False) == [0, 1, 2]
+    assert cycles.numbers(3) == [3, 5, 10]
+
+
+def test_a_late_cycle_begins_at_once_and_is_not_caught_up_with() -> None:
+    cycles = Cycles()
+    assert cycles.work(5.5 * PERIOD_S) <= 0
+    assert cycles.work() == pytest.approx(PERIOD_S)
+    assert cycles.pace.cycle == 1
+
+
+@pytest.mark.parametrize(("after", "cycle"), [(0.1, 1), (0.9, 1), (1.1, 2), (3.9, 4), (4.1, 5)])
+def test_who_hurries_at_ease_gets_the_next_cycle_of_the_rate(after: float, cycle: int) -> None:
+    cycles = Cycles()
+    cycles.pace.hear(Ease(5))
+    assert cycles.work() == pytest.approx(5 * PERIOD_S)
+    cycles.now_s += after * PERIOD_S
+    cycles.pace.hear(Stop(4.0))
+    cycles.pace.hurry(cycles.now_s)
+    assert cycles.pace.left_s(cycles.now_s) == pytest.approx((cycle - after) * PERIOD_S)
+    cycles.wait()
+    cycles.work()
+    assert cycles.pace.cycle == cycle
+
+
+def test_who_hurries_after_a_late_cycle_gets_none_that_is_later() -> None:
+    cycles = Cycles()
+    cycles.work(1.5 * PERIOD_S)
+    cycles.pace.hurry(cycles.now_s)
+    assert cycles.pace.left_s(cycles.now_s) == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "watchdog_hz", "most"), [(125.0, 10.0, 5), (125.0, 20.0, 2), (125.0, 40.0, 1), (500.0, 10.0, 20)]
+)
+def test_at_ease_the_robots_watchdog_allows_a_cycle_to_be_left_out(
+    rate_hz: float, watchdog_hz: float, most: int
+) -> None:
+    cycles = Cycles(rate_hz=rate_hz, watchdog_hz=watchdog_hz)
+    cycles.pace.hear(Ease(1000))
+    cycles.pace.begin()
+    cycles.pace.plan(cycles.now_s, rests=True)
+    left_s = cycles.pace.left_s(cycles.now_s)
+    assert left_s == pytest.approx(most / rate_hz)
+    assert most == 1 or 2 * left_s < 1.0 / watchdog_hz

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import DriverError
-from drivers.ur.client import LAST_WORDS_BYTES, UrRobot
+from drivers.ur.client import UrRobot
+from drivers.ur.conversation import LAST_WORDS_BYTES
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
 

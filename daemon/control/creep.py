@@ -62,10 +62,10 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class FittedCreep:
-    """The creep of a gel, and how far readings are from the torque without it and with it (std, N·m).
+    """The creep of a gel, and how far readings are from what the torque makes of them without and with it (std, N·m).
 
-    Both are of readings times `scale` plus `offset_nm`, which were fitted beside it: they are the estimator's and the
-    zero's, and stay as wrong as they are.
+    Torque is `scale` times a reading plus `offset_nm`, less the creep. Both were fitted beside it: they are the
+    estimator's and the zero's, and stay as wrong as they are.
     """
 
     creep: Creep
@@ -78,8 +78,12 @@ class FittedCreep:
 def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> FittedCreep:
     """Return the creep of a gel from grips, each of them begun with the gel at rest.
 
-    For each time constant of a grid share, scale and offset are a least-squares fit; the one that leaves least wins.
-    With `scale_is_right` the readings differ from the torque by creep and offset alone, and tell more of both.
+    The readings, which are noisy, are fitted to the load cell's torques, which are hardly so. With c as above,
+    d = (1 - share)·c follows the torque with a time constant of time_s / (1 - share), and γ is the torque plus
+    share / (1 - share)·d. (The torque fitted to the readings takes noise for shear: at 12 mN·m the scale came out 5 %
+    too small and a time constant of 20 s as 50, see bench/creep_fit.py.) For each time constant of a grid share, scale
+    and offset are a least-squares fit; the one that leaves least wins. With `scale_is_right` the readings differ from
+    the torque by creep and offset alone, and tell more of both.
     Raises UserError for fewer than twenty readings, where the torque does not fall behind the readings, and where no
     twist was held for long enough to tell.
     """
@@ -87,24 +91,25 @@ def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> Fitt
         count = sum(grip.t_s.size for grip in grips)
         raise UserError(f"creep: {count} readings are too few to learn it from; hold a twist for a minute")
     shear, torque = (np.concatenate([getattr(grip, name) for grip in grips]) for name in ("shear_nm", "torque_nm"))
+    # A factor and a constant between the two are the estimator's scale and the zero's, and no creep.
+    wanted = shear - torque if scale_is_right else shear
+    plain = np.column_stack([np.ones_like(torque), *([] if scale_is_right else [torque])])
+    before_nm = _left(plain, wanted)[1]
     best: FittedCreep | None = None
-    without = np.ones((shear.size, 1)) if scale_is_right else np.column_stack([shear, np.ones_like(shear)])
-    before_nm = _left(without, torque - shear)[1]
+    slowest = False
     for time_s in _TIMES_S:
-        crept = np.concatenate([_crept(grip, float(time_s)) for grip in grips])
-        # A factor and a constant between the two are the estimator's scale and the zero's, and no creep.
-        if scale_is_right:
-            (fallen, offset_nm), after_nm = _left(np.column_stack([-crept, np.ones_like(shear)]), torque - shear)
-            scale = 1.0
-        else:
-            (scale, fallen, offset_nm), after_nm = _left(np.column_stack([shear, -crept, np.ones_like(shear)]), torque)
+        followed = np.concatenate([_followed(grip, float(time_s)) for grip in grips])
+        (lag, offset_nm, *gains), after_nm = _left(np.column_stack([followed, plain]), wanted)
+        gain = float(gains[0]) if gains else 1.0
         # What no gel does is noise that happens to fit.
-        if 0.0 <= fallen < scale and (best is None or after_nm < best.after_nm):
-            creep = Creep(float(fallen / scale), float(time_s))
-            best = FittedCreep(creep, float(scale), float(offset_nm), before_nm, after_nm)
+        if gain > 0.0 <= lag and (best is None or after_nm < best.after_nm):
+            share = float(lag / (gain + lag))
+            creep = Creep(share, float(time_s) * (1.0 - share))
+            best = FittedCreep(creep, 1.0 / gain, -float(offset_nm) / gain, before_nm, after_nm)
+            slowest = time_s == _TIMES_S[-1]
     if best is None:
         raise UserError("creep: the torque does not fall behind the readings; is the load cell's zero right?")
-    if best.creep.time_s == _TIMES_S[-1]:
+    if slowest:
         raise UserError(
             "creep: the torque falls behind the readings for as long as it was recorded, as it does where the "
             "estimates themselves drift; hold some twists for a minute"
@@ -118,9 +123,10 @@ def _left(columns: FloatArray, wanted: FloatArray) -> tuple[FloatArray, float]:
     return coefficients, float((wanted - columns @ coefficients).std())
 
 
-def _crept(grip: Stretch, time_s: float) -> FloatArray:
-    creep, crept = Creep(0.0, time_s), np.empty_like(grip.t_s)
-    for index, (at_s, shear) in enumerate(zip(grip.t_s, grip.shear_nm, strict=True)):
-        creep.torque_nm(float(shear), round(at_s * 1e9))
-        crept[index] = creep._crept_nm
-    return crept
+def _followed(grip: Stretch, time_s: float) -> FloatArray:
+    """Return what follows the torque with a time constant, from rest."""
+    follower, followed = Creep(0.0, time_s), np.empty_like(grip.t_s)
+    for index, (at_s, torque_nm) in enumerate(zip(grip.t_s, grip.torque_nm, strict=True)):
+        follower.torque_nm(float(torque_nm), round(at_s * 1e9))
+        followed[index] = follower._crept_nm
+    return followed

@@ -91,11 +91,14 @@ class Recorder:
         self._on_failure = on_failure
         self._opener = opener
         self._most_waiting_bytes = most_waiting_bytes
-        self._queue: deque[tuple[_Item, int]] = deque()
+        # Each with its size, and how many had been dropped before it.
+        self._queue: deque[tuple[_Item, int, int]] = deque()
         # Each is counted up by one thread alone; what waits is their difference.
         self._taken_bytes = 0
         self._done_bytes = 0
         self._dropped = 0
+        # How many of them before the file being written began.
+        self._dropped_before = 0
         # One thread at a time writes: a flush that was cancelled may still be under way when the end comes.
         self._writing = threading.Lock()
         self._ended = False
@@ -172,7 +175,7 @@ class Recorder:
 
     def _end(self) -> None:
         if self._file.messages or self._experiment:
-            self._finish(self._file)
+            self._finish(self._file, self._experiment, self._dropped - self._dropped_before)
         else:
             # A daemon that did not get as far as its first message has nothing to keep.
             try:
@@ -189,15 +192,15 @@ class Recorder:
             self._dropped += 1
             return
         self._taken_bytes += size
-        self._queue.append((item, size))
+        self._queue.append((item, size, self._dropped))
 
     def _write(self) -> None:
         self.failure = ""
         # What comes meanwhile waits for the next time.
         for _ in range(len(self._queue)):
-            item, size = self._queue.popleft()
+            item, size, dropped = self._queue.popleft()
             if self._begins_another(item):
-                self._begin_another()
+                self._begin_another(dropped)
             try:
                 self._put(item)
             finally:
@@ -217,16 +220,17 @@ class Recorder:
             return bool(self._experiment)
         return (self._clock.now_ns() - self._began_ns) / 1e9 > LONGEST_IDLE_FILE_S and not self._busy()
 
-    def _begin_another(self) -> None:
-        """Go on in another file; where none can be begun, in the same one."""
+    def _begin_another(self, dropped: int) -> None:
+        """Go on in another file; where none can be begun, in the same one. So many were dropped until now."""
         if not self._flush():
             return
-        finished = self._file, self._experiment
+        finished = self._file, self._experiment, dropped - self._dropped_before
         try:
             self._begin()
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
             return
+        self._dropped_before = dropped
         self._finish(*finished)
 
     def _begin(self) -> None:
@@ -248,14 +252,13 @@ class Recorder:
                 name = f"{name.partition('Z')[0]}Z-{number}"
         raise FileExistsError(17, f"there are {_MOST_ALIKE} files of this second")
 
-    def _finish(self, file: McapFile, experiment: str | None = None) -> None:
+    def _finish(self, file: McapFile, experiment: str, dropped: int) -> None:
         """Close a file, under a name that tells its experiment; what cannot be closed stays PARTIAL, to be repaired."""
-        experiment = self._experiment if experiment is None else experiment
         slug = re.sub(r"[^a-z0-9.]+", "-", experiment.lower()).strip("-.")
         if slug:
             file.path = file.path.with_name(f"{file.path.stem}_{slug}.mcap")
         try:
-            file.metadata(END_METADATA, {"dropped": str(self._dropped)})
+            file.metadata(END_METADATA, {"dropped": str(dropped)})
             self.finished.append(file.close())
         except OSError as error:
             self.failure = f"{file.partial}: {error.strerror}"

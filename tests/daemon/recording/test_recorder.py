@@ -255,6 +255,27 @@ def test_what_waits_has_a_bound_and_what_is_dropped_is_counted(tmp_path: Path) -
     assert summarise(path).dropped == dropped
 
 
+def test_what_was_dropped_is_told_by_the_file_that_lacks_it_and_no_later_one(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock, most_waiting_bytes=100_000)
+    for number in range(20):
+        recorder.record("eit.frame", frame(clock, number))
+    dropped = recorder.facts()["errors"]["dropped"]
+    recorder.write()
+    recorder.experiment("one")
+    recorder.record("load.torque", torque(clock, 0))
+    recorder.write()
+    recorder.experiment("two")
+    for number in range(20):
+        recorder.record("eit.frame", frame(clock, number))
+    later = recorder.facts()["errors"]["dropped"] - dropped
+    recorder.write()
+    recorder.experiment("three")
+    recorder.close()
+    assert dropped > 0 < later
+    assert [summarise(path).dropped for path in recorder.finished] == [dropped, later, 0]
+
+
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
     folder = tmp_path / "disk"

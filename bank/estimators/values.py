@@ -18,6 +18,8 @@ Kind = Literal["raw", "difference"]
 
 # A load cell that this tells apart from nothing hangs on a lever that bears some N·m: more is a damaged line.
 LARGEST_TORQUE_NM = 20.0
+# From a torque this far away in time a frame's own may differ by all there is: recorded loads change by 0.76 N·m/s.
+_FURTHEST_TORQUE_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,10 +54,17 @@ class FrameSeries:
                 raise CalibrationError(f"the times of the {name} must not fall; sort them")
 
     def torque_at_frames(self) -> FloatArray:
-        """Return the (n,) torque in N·m at the middle of each frame, NaN outside of what was measured."""
+        """Return the (n,) torque in N·m at the middle of each frame.
+
+        NaN outside of what was measured, and where the load cell said nothing for so long that nobody knows.
+        """
         if len(self.torque_t_s) == 0:
             return np.full(len(self.t_s), np.nan)
-        return np.interp(self.t_s, self.torque_t_s, self.torque_nm, left=np.nan, right=np.nan)
+        after = np.searchsorted(self.torque_t_s, self.t_s).clip(0, len(self.torque_t_s) - 1)
+        around = self.torque_t_s[[np.maximum(after - 1, 0), after]]
+        known = np.abs(around - self.t_s).min(axis=0) <= _FURTHEST_TORQUE_S
+        torque = np.interp(self.t_s, self.torque_t_s, self.torque_nm, left=np.nan, right=np.nan)
+        return np.where(known, torque, np.nan)
 
     def of_sides(self, sides: tuple[str, ...]) -> "FrameSeries":
         """Return the same series with these sides only; raises CalibrationError for a side that it does not have."""

@@ -51,6 +51,16 @@ def empty(n=3, **changed):
     return FrameSeries(**content | changed)
 
 
+def test_where_the_load_cell_was_silent_for_long_no_torque_is_made_up():
+    t_s, nothing = np.arange(0.0, 12.0, 0.5), np.zeros(24)
+    torque_t_s = np.array([*np.arange(0.0, 3.0, 0.1), *np.arange(9.0, 12.0, 0.1)])
+    series = FrameSeries("raw", ("right",), t_s, np.zeros((24, 1, 896)), torque_t_s, np.sin(torque_t_s), nothing)
+    torque = series.torque_at_frames()
+    np.testing.assert_array_equal(np.isfinite(torque), (t_s < 4.0) | (t_s >= 8.0))
+    told = (t_s < 3.0) | (t_s >= 9.0)
+    np.testing.assert_allclose(torque[told], np.sin(t_s[told]), atol=2e-3)
+
+
 def test_torque_at_frames_is_interpolated_and_never_extrapolated():
     np.testing.assert_array_equal(empty().torque_at_frames(), [np.nan, 0.5, np.nan])
 

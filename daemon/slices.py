@@ -102,7 +102,8 @@ class SliceRecorder:
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
         """Take one message in."""
         match topic:
-            case "eit.frame":
+            # The same line once more is an old frame.
+            case "eit.frame" if not content["repeated"]:
                 self._frame(content)
             case "load.torque" if content["valid"]:
                 self._torques.append((content["t_mono_ns"], content["torque_nm"]))

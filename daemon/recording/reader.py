@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -86,8 +87,10 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
             raise _unusable(path, f"a message on {channel.topic} is not what its schema says ({error!r})") from error
     torques.sort(key=lambda pair: pair[0])
     sides = {}
-    for side, rows in frames.items():
-        rows.sort(key=lambda row: row[0])
+    for side, found in frames.items():
+        found.sort(key=lambda row: row[0])
+        # A line that is the one before to the last digit is an old frame sent again; live it is refused.
+        rows = [found[0], *(row for before, row in pairwise(found) if row[2] != before[2])]
         sides[side] = SideFrames(
             np.array([row[0] for row in rows], dtype=np.int64),
             np.array([row[1] for row in rows], dtype=np.int64),

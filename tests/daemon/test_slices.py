@@ -42,7 +42,7 @@ class Sweep:
     def _loop(self, **changes: Any) -> None:
         self.recorder("loop.state", loop_state(self.t_s, slices=self.slices, **changes))
 
-    def frames(self, torque_nm: float, for_s: float, *, valid: bool = True) -> None:
+    def frames(self, torque_nm: float, for_s: float, *, valid: bool = True, repeated: bool = False) -> None:
         end_s = self.t_s + for_s
         while self.t_s < end_s:
             self.t_s += PERIOD_S
@@ -52,6 +52,7 @@ class Sweep:
                 "t_mono_ns": round(self.t_s * S),
                 "channels": channels_of_line(line).astype("<f4").tobytes(),
                 "line": line.tobytes(),
+                "repeated": repeated,
             }
             self.recorder("eit.frame", frame)
             torque = {"t_mono_ns": round(self.t_s * S), "torque_nm": torque_nm, "valid": valid}
@@ -128,6 +129,16 @@ def test_a_load_cell_that_is_not_to_be_believed_is_the_torque_of_no_slice(tmp_pa
     sweep.done()
     assert not sweep.recorder.written
     assert "or no torque" in sweep.recorder.summary
+
+
+def test_a_board_that_sends_its_last_frame_again_and_again_makes_no_slice(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path)
+    sweep._loop(hold=1)
+    sweep.frames(0.1, 5.0, repeated=True)
+    sweep._loop()
+    sweep.done()
+    assert not sweep.recorder.written
+    assert "fewer than 3 frames" in sweep.recorder.summary
 
 
 def test_an_experiment_that_asks_for_no_slices_leaves_none(tmp_path: Path) -> None:

@@ -121,6 +121,17 @@ def test_a_live_recording_is_read_as_an_imported_one(tmp_path: Path) -> None:
     assert found.torque_nm.tolist() == [0.1] * 3, "what is not valid is no truth"
 
 
+def test_a_frame_that_the_board_sent_again_is_read_once(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock)
+    frames = [frame(clock, n) for n in range(2)]
+    for one in (frames[0], frames[1], {**frames[1], "t_mono_ns": frames[1]["t_mono_ns"] + 10, "repeated": True}):
+        recorder.record("eit.frame", one)
+    recorder.close()
+    found = read_recording(recorder.finished[0]).sides["right"]
+    assert found.t_mid_ns.tolist() == [one["t_mono_ns"] + clock.offset_ns for one in frames]
+
+
 def test_each_experiment_has_a_file_which_bears_its_name(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw where that is asked for."""
     from bank.bank_file import Bank
     from bank.estimators import Calibration
-    from daemon.cli.recorded import parsed_part
+    from daemon.cli.recorded import check_kind, parsed_part
     from daemon.errors import UserError
     from daemon.recording.evaluation import followed, judge, reasons
     from daemon.recording.series import part_of, read_series
@@ -41,12 +41,7 @@ def run(args: argparse.Namespace) -> int:
     bank = Bank.open(args.bank) if args.bank else None
     start, stop = parsed_part(args.part)
     series = [one for path in args.recordings for one in read_series(path)]
-    other = next((one.kind for one in series if one.kind != calibration.kind), None)
-    if other is not None:
-        raise UserError(
-            f"{args.calibration} was made from {_KINDS[calibration.kind]}, and cannot judge {_KINDS[other]}; "
-            "calibrate on recordings of the same kind"
-        )
+    check_kind(args.calibration, calibration, series)
     parts = [part_of(one, start, stop) for one in series]
     shared = (calibration, None if bank is None else str(args.bank.resolve()))
     with workers(args.cluster) as pool:
@@ -72,9 +67,6 @@ def run(args: argparse.Namespace) -> int:
     for why, count in reasons(tracks).most_common():
         print(f"{count:>6} frames not valid: {why}")
     return 0
-
-
-_KINDS = {"raw": "raw frames", "difference": "slices"}
 
 
 def _shown(value: float | None) -> str:

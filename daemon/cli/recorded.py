@@ -1,7 +1,14 @@
 """Arguments that the commands on recordings share."""
 
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 from daemon.errors import UserError
 from daemon.recording.schema import SIDES
+
+if TYPE_CHECKING:
+    from bank.estimators import Calibration, FrameSeries
 
 
 def parsed_part(text: str) -> tuple[float, float]:
@@ -23,3 +30,14 @@ def parsed_sides(text: str | None) -> tuple[str, ...] | None:
     if not set(sides) <= set(SIDES) or len(set(sides)) < len(sides):
         raise UserError(f"--sides must be {' or '.join(SIDES)}, or both with a comma between, not {text!r}")
     return sides
+
+
+def check_kind(path: Path, calibration: "Calibration", series: "Sequence[FrameSeries]") -> None:
+    """Raise UserError for a calibration of slices before raw frames, or of raw frames before slices."""
+    kinds = {"raw": "raw frames", "difference": "slices"}
+    other = next((one.kind for one in series if one.kind != calibration.kind), None)
+    if other is not None:
+        raise UserError(
+            f"{path} was made from {kinds[calibration.kind]}, and cannot judge {kinds[other]}; "
+            "calibrate on recordings of the same kind"
+        )

@@ -1,5 +1,6 @@
 """How good a calibration is on recordings: every frame in order through the tracker, against the truth."""
 
+import re
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -69,14 +70,16 @@ def judge(tracks: Sequence[Track]) -> dict[str, float | int | None]:
 
 
 def reasons(tracks: Sequence[Track]) -> Counter[str]:
-    """Return why frames were not valid, each reason up to its first colon or number, with how often."""
-    found: Counter[str] = Counter()
-    for track in tracks:
-        for estimate in track.estimates:
-            for why in estimate.why:
-                head = why.split(":")[0]
-                found["".join("#" if letter.isdigit() else letter for letter in head)] += 1
-    return found
+    """Return why frames were not valid, each reason without its numbers and what follows from it, with how often."""
+    return Counter(_kind(why) for track in tracks for estimate in track.estimates for why in estimate.why)
+
+
+def _kind(why: str) -> str:
+    """Return a reason up to its first colon, or, where that only names a fingertip, to what follows from it."""
+    head, _, rest = why.partition(":")
+    if head.endswith("fingertip") and rest:
+        head = f"{head}:{rest.partition(';')[0]}"
+    return re.sub(r"\d+(?:\.\d+)?", "#", head)
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,6 +43,7 @@ def test_a_grip_is_a_stretch_of_torques_and_single_frames_do_not_end_it() -> Non
 @dataclass
 class Loaded:
     sides: tuple[str, ...] = ("right",)
+    kind: str = "raw"
 
 
 def test_it_prints_the_line_of_the_configuration(

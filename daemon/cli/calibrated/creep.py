@@ -23,6 +23,7 @@ def run(args: argparse.Namespace) -> int:
     """Estimate every frame, fit, and say what to write into the configuration."""
     from bank.bank_file import Bank
     from bank.estimators import Calibration
+    from daemon.cli.recorded import check_kind
     from daemon.control.creep import fit_creep
     from daemon.recording.evaluation import follow
     from daemon.recording.grips import grips_of
@@ -31,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
     series = [one for path in args.recordings for one in read_series(path, calibration.sides)]
+    check_kind(args.calibration, calibration, series)
     grips = [grip for one in series for grip in grips_of(follow(calibration, one, bank))]
     found = fit_creep(grips)
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)

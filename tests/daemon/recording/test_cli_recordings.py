@@ -5,7 +5,7 @@ import pytest
 
 from bank.estimators import Estimate, FrameSeries
 from daemon.cli import main
-from daemon.recording.evaluation import Track, judge
+from daemon.recording.evaluation import Track, judge, reasons
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "valid_fraction", "latency_ms_p50", "latency_ms_p99", "frames"}
 
@@ -40,6 +40,25 @@ def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_
     assert main(["calibrate", str(slices_folder / "torque_slices"), "--out", str(calibration)]) == 0
     assert main(["evaluate", str(calibration), str(recording)]) == 2
     assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
+    assert main(["calibrate", "creep", str(recording), "--calibration", str(calibration)]) == 2
+    assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
+
+
+def test_reasons_say_what_is_the_matter_and_not_with_whom_alone():
+    said = [
+        "right fingertip: 7 % of the channels jumped since the frame before; it was touched",
+        "right fingertip: 17 % of the channels jumped since the frame before; it was touched",
+        "right fingertip: 31.5 % of the channels are dead or saturated; look at the ribbon cable",
+        "outside of the calibration: the misfit is 2.1 (at most 1.5)",
+    ]
+    nothing = np.full(4, np.nan)
+    series = FrameSeries("raw", ("right",), np.arange(4.0), np.zeros((4, 1, 896)), nothing[:0], nothing[:0], nothing)
+    track = Track(series, tuple(Estimate(valid=False, why=(why,)) for why in said), np.zeros(4))
+    assert reasons([track]) == {
+        "right fingertip: # % of the channels jumped since the frame before": 2,
+        "right fingertip: # % of the channels are dead or saturated": 1,
+        "outside of the calibration": 1,
+    }
 
 
 @pytest.mark.parametrize(

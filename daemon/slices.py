@@ -96,7 +96,10 @@ class SliceRecorder:
             return {"slices": self.written.total(), "errors": missed, "trouble": next(reversed(missed), "")}
 
     def close(self) -> None:
-        """Wait until everything that was kept is written."""
+        """Write the hold that still waited for a later frame, and wait until everything is written."""
+        if self._pending is not None:
+            self._write(self._pending)
+            self._pending = None
         self._writer.shutdown()
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:

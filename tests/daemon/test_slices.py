@@ -97,6 +97,15 @@ def test_a_second_sweep_goes_on_where_the_first_ended(tmp_path: Path) -> None:
     np.testing.assert_allclose(slices.diameter_mm, [10, 10, 20, 20])
 
 
+def test_a_daemon_that_ends_with_the_last_hold_loses_no_slice(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path)
+    sweep._loop(hold=1)
+    sweep.frames(0.1, 5.0)
+    sweep._loop()
+    sweep.recorder.close()
+    assert sweep.recorder.written["torque"] == 1
+
+
 def test_a_hold_that_safety_interrupts_is_one_slice(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)

@@ -1,5 +1,6 @@
 """What a demonstration adds to a run: what befalls the emulated rig, the truth about it, and the summary's end."""
 
+import contextlib
 import json
 import tempfile
 import time
@@ -78,10 +79,12 @@ class Happenings:
         ]
         for happening, process in due:
             self._left.remove((happening, process))
-            if process.stdin is not None and process.poll() is None:
-                process.stdin.write(f"{happening.say}\n".encode())
-                process.stdin.flush()
-                self.happened.append((time.monotonic_ns(), happening.say))
+            # One that ends just now is told of as dead; here it must not take along whose message this is.
+            with contextlib.suppress(BrokenPipeError):
+                if process.stdin is not None and process.poll() is None:
+                    process.stdin.write(f"{happening.say}\n".encode())
+                    process.stdin.flush()
+                    self.happened.append((time.monotonic_ns(), happening.say))
 
 
 class Deaths:

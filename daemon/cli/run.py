@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager, nullcontext, suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -183,4 +183,6 @@ def _emulators(
                 process.kill()
                 process.wait()
             if process.stdin is not None:
-                process.stdin.close()
+                # What it was told and did not read any more goes with it.
+                with suppress(BrokenPipeError):
+                    process.stdin.close()

@@ -1,3 +1,4 @@
+import contextlib
 import json
 import subprocess
 import sys
@@ -44,6 +45,23 @@ def test_a_rig_that_has_ended_is_told_nothing() -> None:
     happenings("loop.state", held(1, step=1))
     assert happenings.happened == []
     process.communicate()
+
+
+def test_a_rig_that_ends_in_this_moment_takes_nobody_along() -> None:
+    rig = emulator(happenings=[{"step": 1, "say": "slip"}])
+    process = subprocess.Popen(
+        [sys.executable, "-c", "import os, signal; os.close(0); os.close(1); signal.pause()"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert process.stdout is not None
+    assert process.stdout.read() == b"", "its input is closed, and it lives"
+    happenings = Happenings((rig,), [process])
+    happenings("loop.state", held(1, step=1))
+    assert happenings.happened == []
+    process.kill()
+    with contextlib.suppress(BrokenPipeError):
+        process.communicate()
 
 
 def test_an_emulated_device_that_dies_is_told_once() -> None:

@@ -5,8 +5,10 @@ orthogonal to it, ‖d‖ = ρ. With a frame y, g = Φᵀ y and t = ‖y − Φ 
 
     b·y = c·g + d·(y − Φ g) ≤ c·g + ρ t,
 
-and for all cells whose c lie within a radius e of a centre m, b·y ≤ m·g + e ‖g‖ + ρ t. So a bound is the product of a
-row (c, e, ρ) with a column (g, ‖g‖, t), and many bounds are one matrix product, in float32.
+and for all cells whose c lie within a radius e of a centre m, b·y ≤ m·g + e ‖g‖ + ρ t. The first direction of Φ is the
+mean of the signals, which is negative nowhere, as these and the frames are: so g₁ ≥ 0, and with the largest c₁ of the
+cells in place of m₁, e and ‖g‖ need only be of the other directions, in which a frame is far shorter. So a bound is the
+product of a row (m, e, ρ) with a column (g, ‖g‖, t), and many bounds are one matrix product, in float32.
 """
 
 import heapq
@@ -30,7 +32,7 @@ Indices = NDArray[np.int64]
 COARSE_RANK = 24
 FINE_RANK = 96
 # Cells are bounded in groups first, those in groups of theirs, of at least so many cells on average.
-_N_GROUPS = (256, 1024, 2048)
+_N_GROUPS = (128, 512, 2048)
 # The level whose groups are small enough to look for a high score in.
 SEED_LEVEL = 1
 _LEAST_CELLS = 4
@@ -58,17 +60,17 @@ class CompressedBank:
     """Rows of bounds, from coarse to fine; a bound is a row times a column of `columns`.
 
     basis (R, 896), its first directions the most important; fine (n, R + 2) and coarse (n, r + 2) rows of the n cells;
-    levels of groups from few to many, and widest (2,) the (e, ρ) of all cells around 0. Cell i belongs to group
-    group_of[i] of the last level; members[j] are the cells of group j of SEED_LEVEL, and centres[j] is the one nearest
-    to its centre. estimators (r, n) and left_out (n,) are coarse again, its c and ρ, in the order of memory that suits
-    products with all cells.
+    levels of groups from few to many. overlaps (1792,) bound what of a signal's norm overlaps with a frame at the lags
+    from −896 up. Cell i belongs to group group_of[i] of the last level; members[j] are the cells of group j of
+    SEED_LEVEL, and centres[j] is the one nearest to its centre. estimators (r, n) and left_out (n,) are coarse again,
+    its c and ρ, in the order of memory that suits products with all cells.
     """
 
     basis: Single
     fine: Single
     coarse: Single
     levels: tuple[Level, ...]
-    widest: Single
+    overlaps: FloatArray
     group_of: Indices
     members: tuple[Indices, ...]
     centres: Indices
@@ -78,15 +80,26 @@ class CompressedBank:
 
 def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
     """Compress unit signals, (n, 896) in parts; `parts()` is gone through twice."""
-    gram = np.zeros((N_CHANNELS, N_CHANNELS))
+    gram, total = np.zeros((N_CHANNELS, N_CHANNELS)), np.zeros(N_CHANNELS)
     n = 0
     for part in parts():
         gram += part.T @ part
+        total += part.sum(axis=0)
         n += len(part)
     rank = min(FINE_RANK, n, N_CHANNELS)
+    mean = total / np.linalg.norm(total)
+    at_mean = gram @ mean
+    # The gram of what is across the mean, and on the mean more than all of it: so the mean comes first.
+    gram -= np.outer(mean, at_mean) + np.outer(at_mean, mean) - (mean @ at_mean + 2 * n) * np.outer(mean, mean)
     _, ascending = linalg.eigh(gram, subset_by_index=[N_CHANNELS - rank, N_CHANNELS - 1])
-    basis = ascending[:, ::-1]
-    numbers = np.vstack([part @ basis for part in parts()])
+    basis = np.column_stack([mean, ascending[:, -2::-1]])
+    found = []
+    least, most = np.ones(N_CHANNELS), np.zeros(N_CHANNELS)
+    for part in parts():
+        found.append(part @ basis)
+        up_to = np.cumsum(part**2, axis=1)
+        least, most = np.minimum(least, up_to.min(axis=0)), np.maximum(most, up_to.max(axis=0))
+    numbers = np.vstack(found)
     coarse = _rows_of_cells(numbers[:, :COARSE_RANK])
     group_of = np.zeros(n, dtype=np.int64)
     levels = []
@@ -102,7 +115,7 @@ def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
         fine=_rows_of_cells(numbers),
         coarse=coarse,
         levels=tuple(levels),
-        widest=np.array([np.linalg.norm(coarse[:, :-2], axis=1).max(), coarse[:, -1].max()], dtype=np.float32),
+        overlaps=np.sqrt(np.maximum(np.concatenate([1 - least[::-1], most[::-1]]), 0.0)),
         group_of=group_of,
         members=tuple(members),
         centres=np.array([_central(coarse, cells) for cells in members]),
@@ -113,24 +126,24 @@ def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
 
 def column(parts: Single, rank: int) -> tuple[Single, np.float32]:
     """Return the (r + 2,) column of a frame y of norm 1, and its t at a lower rank; parts (r,) are Φᵀ y."""
-    first, rest = parts[:rank], parts[rank:]
-    inside = float(first @ first)
-    t = np.float32(math.sqrt(max(1.0 - inside, 0.0) + _SQUARE_ROUNDING))
-    inside += float(rest @ rest)
+    along, coarse, rest = float(parts[0]) ** 2, parts[1:rank], parts[rank:]
+    across = float(coarse @ coarse)
+    t = np.float32(math.sqrt(max(1.0 - along - across, 0.0) + _SQUARE_ROUNDING))
+    across += float(rest @ rest)
     found = np.empty(len(parts) + 2, dtype=np.float32)
     found[:-2] = parts
-    found[-2] = math.sqrt(inside)
-    found[-1] = math.sqrt(max(1.0 - inside, 0.0) + _SQUARE_ROUNDING)
+    found[-2] = math.sqrt(across)
+    found[-1] = math.sqrt(max(1.0 - along - across, 0.0) + _SQUARE_ROUNDING)
     return found, t
 
 
 def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Single:
     """Return the (r + 2, n) columns of n frames y: parts (r, n) are Φᵀ y, squared_norms (n,) are ‖y‖²."""
-    inside = np.einsum("ij,ij->j", parts, parts)
+    across = np.einsum("ij,ij->j", parts[1:], parts[1:])
     found = np.empty((len(parts) + 2, parts.shape[1]), dtype=np.float32)
     found[:-2] = parts
-    found[-2] = np.sqrt(inside)
-    found[-1] = np.sqrt(np.maximum(squared_norms - inside, 0.0) + _SQUARE_ROUNDING)
+    found[-2] = np.sqrt(across)
+    found[-1] = np.sqrt(np.maximum(squared_norms - parts[0] ** 2 - across, 0.0) + _SQUARE_ROUNDING)
     return found
 
 
@@ -144,7 +157,8 @@ def _rows_of_cells(numbers: FloatArray) -> Single:
 def _bounding(cells: Single) -> Single:
     """Return the row that bounds all of some cells."""
     centre = cells[:, :-2].mean(axis=0)
-    radius = np.linalg.norm(cells[:, :-2] - centre, axis=1).max()
+    radius = np.linalg.norm(cells[:, 1:-2] - centre[1:], axis=1).max()
+    centre[0] = cells[:, 0].max()
     return np.array([*centre, radius, cells[:, -1].max()], dtype=np.float32)
 
 

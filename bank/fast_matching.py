@@ -6,6 +6,7 @@ compresses decides how long it takes, never what comes out.
 """
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
 
@@ -36,6 +37,8 @@ _ROUNDING_32 = 6e-5
 _FEW_LAGS = 128
 # With fewer cells, sorting them out in float32 costs more than scoring them.
 _FEW_CELLS = 48
+# So many frames of a batch are searched at once: with more, their bounds leave the cache.
+_AT_ONCE = 8
 # With fewer cells at all lags, leaving out what cannot be the maximum costs more than the whole heatmap.
 FEWEST_PRUNED = 300
 # Scoring more than this takes longer than about a millisecond.
@@ -203,29 +206,44 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
         super().__init__(signals, valid, k_grid, sigma_grid)
         self._spectra = spectra_of(self._bank)
 
+    def matches(self, differences: ArrayLike) -> list[Match]:
+        """Return what `match` returns of each of (n, 896) differences, without the runner-ups; errors as `heatmaps`."""
+        if len(self._cells) < self._fewest:
+            return super().matches(differences)
+        frames = unit_magnitudes(differences)
+        return [match for i in range(0, len(frames), _AT_ONCE) for match in self._several(frames[i : i + _AT_ONCE])]
+
+    def _several(self, frames: FloatArray) -> Iterator[Match]:
+        bounds = AllLagsBounds(self._bank, self._spectra, frames, self._score, quick=True)
+        scores = [score for _, score in bounds.reached]
+        try:
+            lefts = bounds.left(scores)
+        except TakesLongError:
+            # A frame unlike the bank's leaves much to be bounded: not for the others too.
+            yield from (self.match(frame, runner_up=False) for frame in frames)
+            return
+        for frame, left, score in zip(frames, lefts, scores, strict=True):
+            try:
+                yield self._match(self._settled(frame, left, score), None)
+            except _Undecided:
+                yield self.match(frame, runner_up=False)
+
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match:
-        bounds = AllLagsBounds(self._bank, self._spectra, frame, quick=quick)
-        near, reached = self._reached(bounds, None)
+        bounds = AllLagsBounds(self._bank, self._spectra, frame[None], self._score, quick=quick)
+        ((near, reached),) = bounds.reached
         if not runner_up:
-            return self._match(self._settled(frame, bounds.left(reached), reached, quick=quick), None)
+            (left,) = bounds.left([reached])
+            return self._match(self._settled(frame, left, reached, quick=quick), None)
         # What is outside at twice the radius is outside of the peak of every cell in this one's peak.
-        far, least = self._reached(bounds, self._around(near, 2 * RUNNER_UP_RADIUS))
-        left = bounds.left(min(reached, least))
+        far, least = bounds.seed(self._around(near, 2 * RUNNER_UP_RADIUS)) or (-1, 0.0)
+        (left,) = bounds.left([min(reached, least)])
         best = self._settled(frame, left, reached, quick=quick)
         peak = self._around(best[0], RUNNER_UP_RADIUS)
         if far >= 0 and not peak.lacks(np.array([far]))[0]:
-            _, least = self._reached(bounds, peak)
-            left = bounds.left(least)
+            _, least = bounds.seed(peak) or (-1, 0.0)
+            (left,) = bounds.left([least])
         left = left.among(peak.lacks(left.cells))
         return self._match(best, self._settled(frame, left, least, quick=quick) if len(left.cells) else None)
 
     def _around(self, cell: int, radius: int) -> Neighbourhood:
         return Neighbourhood(self._row, self._column, cell, radius)
-
-    def _reached(self, bounds: AllLagsBounds, around: Neighbourhood | None) -> tuple[int, float]:
-        """Return a cell outside a neighbourhood and a score that it reaches; −1 and 0 where there is none."""
-        seed = bounds.seed(around)
-        if seed is None:
-            return -1, 0.0
-        cell, frames = seed
-        return cell, self._score(cell, frames)

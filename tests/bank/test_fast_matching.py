@@ -13,10 +13,10 @@ from scipy.io import loadmat
 
 from bank import bounds, fast_matching
 from bank.channels import N_CHANNELS, channels_of_line
-from bank.compression import ROUNDING
+from bank.compression import COARSE_RANK, ROUNDING, columns
 from bank.errors import MatchingError
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
-from bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher, unit_magnitude
+from bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher, unit_magnitude, unit_magnitudes
 
 SHAPE = (22, 20)
 
@@ -175,6 +175,42 @@ def test_no_bound_is_below_its_score(cell, noise, seed) -> None:
         assert set(np.flatnonzero(scores >= score)) <= set(found.left(score).cells)
 
 
+def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
+    """By frames that point from one cell to another, or along the mean: where a centre alone says too little."""
+    bank = PAIRS[0][1]._bank
+    signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
+    signals /= np.linalg.norm(signals, axis=1, keepdims=True)
+    apart = np.maximum(signals[::3, None] - 0.95 * signals[None, ::7], 0.0).reshape(-1, N_CHANNELS)
+    frames = np.vstack([signals, signals.mean(axis=0), apart[apart.any(axis=1)]])
+    frames /= np.linalg.norm(frames, axis=1, keepdims=True)
+    scores = frames @ signals.T
+    at = columns((frames @ bank.basis[:COARSE_RANK].T).T.astype(np.float32), np.ones(len(frames)))
+    group_of = bank.group_of
+    for level in reversed(bank.levels):
+        highest = np.array([scores[:, group_of == group].max(axis=1) for group in range(len(level.rows))])
+        assert (level.rows @ at - highest).min() >= -ROUNDING / 2
+        group_of = level.part_of[group_of]
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.lists(cells, min_size=1, max_size=3), st.sampled_from([0.0, 1e-6, 1e-2, 1.0]), st.integers(0, 2**32 - 1))
+def test_no_bound_at_any_lag_is_below_its_score(chosen, noise, seed) -> None:
+    """Of several frames at once, each with a limit of its own."""
+    slow, fast = PAIRS[0]
+    random = np.random.default_rng(seed)
+    frames = np.array([BANK[0][cell] + noise * random.normal(size=N_CHANNELS) for cell in chosen])
+    found = bounds.AllLagsBounds(fast._bank, fast._spectra, unit_magnitudes(frames), fast._score)
+    scores = slow.heatmaps(frames)[:, BANK[1]]
+    for (cell, reached), each in zip(found.reached, scores, strict=True):
+        assert 0 < reached <= each[cell] + 1e-12
+    for share in (0.9, 1.0, 0.0):
+        limits = np.quantile(scores, share, axis=1).tolist()
+        for left, limit, each in zip(found.left(limits), limits, scores, strict=True):
+            assert set(np.flatnonzero(each >= limit)) <= set(left.cells)
+            reaching = each[left.cells] >= limit
+            assert (left.bounds - each[left.cells])[reaching].min() >= -ROUNDING / 2
+
+
 @both
 def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
     """What makes it fast: of a frame near to the bank's, most cells are never read."""
@@ -197,11 +233,25 @@ def test_a_batch_is_its_frames_in_their_order(slow, fast) -> None:
     frames = random.normal(size=(19, N_CHANNELS)) + 3 * BANK[0][BANK[1]][random.integers(0, BANK[1].sum(), 19)]
     alone = [fast.match(frame, runner_up=False) for frame in frames]
     assert [match.cell for match in alone] == [slow.match(frame).cell for frame in frames]
-    assert fast.matches(frames) == alone
+    for together, one in zip(fast.matches(frames), alone, strict=True):
+        assert_same(together, one)
     assert fast.matches(frames[:0]) == []
     frames[-1] = 0.0
     with pytest.raises(MatchingError, match="zero in all channels"):
         fast.matches(frames)
+
+
+@pytest.mark.parametrize(
+    ("module", "limit", "value"), [(bounds, "_QUICK_BOUNDS", 10), (fast_matching, "_ROUNDING_64", 2)]
+)
+def test_frames_of_a_batch_that_are_hard_are_matched_alone(monkeypatch, module, limit, value) -> None:
+    slow, fast = PAIRS[0]
+    frames = BANK[0][BANK[1]][[3, 70, 200]] + 0.3 * np.random.default_rng(10).random((3, N_CHANNELS))
+    alone = []
+    monkeypatch.setattr(type(fast), "match", lambda self, *a, **k: alone.append(a) or FastMatcher.match(self, *a, **k))
+    monkeypatch.setattr(module, limit, value)
+    assert [match.cell for match in fast.matches(frames)] == [slow.match(frame).cell for frame in frames]
+    assert len(alone) == 3
 
 
 @both

@@ -28,6 +28,7 @@ from daemon.health import HealthReporter, TaskFacts
 from daemon.keys import Gatekeeper, load_server_keys
 from daemon.links import log_link
 from daemon.load_cell_task import LOAD_CELL
+from daemon.loop.senses import Source
 from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Listener, Publisher
 from daemon.recording.identity import Attached, identity_of
@@ -56,9 +57,10 @@ class Daemon:
         self._stop = asyncio.Event()
         self._rig: Rig | None = None
         self._experiment: ConfiguredExperiment | None = None
-        checked_experiment(config)
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
         both = open_both(config.both, config.fingertips) if config.both is not None else None
+        sources = torque_sources(config, estimators, both)
+        checked_experiment(config, sources)
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
             self._gate: Gatekeeper | None = None
@@ -70,7 +72,7 @@ class Daemon:
             self._recorder = _recorder(config, self.publisher, self._clock, self._busy, self._recording_failed)
             if self._recorder is not None:
                 opened.callback(self._recorder.close)
-            self._wire(estimators, both)
+            self._wire(estimators, both, sources)
             self.health = self._make_health()
             commands = self._make_commands()
             self._commands = CommandServer(context, config.commands, commands.handlers(), keys)
@@ -82,7 +84,9 @@ class Daemon:
                 opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
 
-    def _wire(self, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None) -> None:
+    def _wire(
+        self, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None, sources: Mapping[str, Source]
+    ) -> None:
         """Make the task of every device and of every estimator; none is opened yet."""
         config = self._config
         if config.robot is not None:
@@ -90,7 +94,7 @@ class Daemon:
                 config,
                 self.publisher,
                 self._clock,
-                torque_sources(config, estimators, both),
+                sources,
                 self._tare_to_the_end,
                 self.supervisor.deaths,
                 self._tap,

@@ -1,5 +1,6 @@
 """Whether the files of a rig are in order and its experiment can be carried out with what is configured."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from daemon.both import BOTH
@@ -8,6 +9,7 @@ from daemon.config_file import load_yaml_model
 from daemon.errors import UserError
 from daemon.experiment.steps import ExperimentFile, Grip, Release, beyond_limits
 from daemon.load_cell_task import LOAD_CELL
+from daemon.loop.senses import Source
 from daemon.loop_task import WRENCH
 from daemon.skin_task import SKIN
 
@@ -20,13 +22,17 @@ def read_experiment(path: Path) -> ExperimentFile:
     return file
 
 
-def checked_experiment(config: DaemonConfig) -> ExperimentFile | None:
-    """Return the configured experiment, None where there is none; UserError where it can never be carried out."""
+def checked_experiment(config: DaemonConfig, sources: Mapping[str, Source]) -> ExperimentFile | None:
+    """Return the configured experiment, None where there is none; UserError where it can never be carried out.
+
+    `sources` are the torques of fingertips and skin.
+    """
     path = config.experiment
     if path is None:
         return None
     file = read_experiment(path)
-    driving = _may_drive(config)
+    measured = [name for name, source in sources.items() if source.measures_torque]
+    driving = [*measured, *([LOAD_CELL] if config.load_cell is not None else []), WRENCH]
     if file.drive not in driving:
         raise UserError(f"{path}: `drive: {file.drive}` {_why_not(file.drive, config)}; there are {', '.join(driving)}")
     if config.gripper is None:
@@ -39,21 +45,14 @@ def checked_experiment(config: DaemonConfig) -> ExperimentFile | None:
     return file
 
 
-def _may_drive(config: DaemonConfig) -> list[str]:
-    """Return the names of the torques that are measured."""
-    found = [name for name, own in config.fingertips.items() if own.calibration is not None]
-    if config.both is not None:
-        found.append(BOTH)
-    if config.skin is not None and config.skin.tool_radius_mm is not None:
-        found.append(SKIN)
-    if config.load_cell is not None:
-        found.append(LOAD_CELL)
-    return [*found, WRENCH]
-
-
 def _why_not(drive: str, config: DaemonConfig) -> str:
-    if drive in config.fingertips:
+    if drive in config.fingertips and config.fingertips[drive].calibration is None:
         return "is a fingertip without a calibration, which has no torque: add `calibration`, or take another"
+    if drive in config.fingertips or (drive == BOTH and config.both is not None):
+        return (
+            "has a calibration of diameters alone: calibrate on a recording of one tool with the load cell beside, or "
+            "take another"
+        )
     if drive == SKIN and config.skin is not None:
         return "has no torque without a radius: add `skin.tool_radius_mm`, or take another"
     return "is none of the torques that are measured: take another, or configure its device"

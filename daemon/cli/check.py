@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from daemon.config import CurveConfig, DaemonConfig, SkinConfig
+    from daemon.opening import AnyEstimator
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -22,23 +23,26 @@ def run(args: argparse.Namespace) -> int:
     from daemon.config import load_daemon_config
     from daemon.opening import open_both, open_estimator
     from daemon.rig_check import checked_experiment
+    from daemon.torque_sources import torque_sources
 
     config = load_daemon_config(args.config)
     checked_emulators(config.emulators, args.config)
     told = {}
     if config.curve is not None:
         told["keys"] = f"{_clients(config.curve)} may connect"
+    estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
     for name, fingertip in config.fingertips.items():
-        grids = open_estimator(fingertip, name).grids
-        torque = "with torque" if fingertip.calibration else "without torque: no calibration is configured"
+        grids = estimators[name].grids
+        torque = _torque(estimators[name], calibrated=fingertip.calibration is not None)
         bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
         told[name] = f"{bank}, {torque}"
-    if config.both is not None:
-        told["both"] = f"{' and '.join(open_both(config.both, config.fingertips).sides)} together, with torque"
+    both = open_both(config.both, config.fingertips) if config.both is not None else None
+    if both is not None:
+        told["both"] = f"{' and '.join(both.sides)} together, {_torque(both, calibrated=True)}"
     if config.skin is not None:
         told["skin"] = _skin(config.skin)
     told.update(_rig(config))
-    experiment = checked_experiment(config)
+    experiment = checked_experiment(config, torque_sources(config, estimators, both))
     if experiment is not None:
         told["experiment"] = f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.drive}"
     if args.json:
@@ -48,6 +52,13 @@ def run(args: argparse.Namespace) -> int:
         print(f"{name}: {what}")
     print(f"{args.config} is in order")
     return 0
+
+
+def _torque(estimator: "AnyEstimator", *, calibrated: bool) -> str:
+    if estimator.measures_torque:
+        return "with torque"
+    why = "its calibration is of diameters alone" if calibrated else "no calibration is configured"
+    return f"without torque: {why}"
 
 
 def _rig(config: "DaemonConfig") -> dict[str, str]:

@@ -1,13 +1,18 @@
 """Every mistake ends in one sentence that names the file, the key and the cure, and exit status 2."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import yaml
 
+from bank.bank_file import Bank
+from bank.calibration import Calibration
 from daemon.cli import COMMANDS, main
 from daemon.messages import decode, encode
 from daemon.readable import as_json, as_line
@@ -27,6 +32,22 @@ def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 def test_a_configuration_in_order_is_said_to_be(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(config())]) == 0
     assert "is in order" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["run", "check"])
+def test_a_calibration_of_diameters_alone_is_no_torque_to_drive_by(
+    command: str, config: Write, tiny_bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
+    Calibration.fit(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
+    section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
+    assert main(["check", str(config(fingertips=section))]) == 0
+    assert "without torque: its calibration is of diameters alone" in capsys.readouterr().out
+    shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
+    steps = {"name": "one", "drive": "right", "steps": [{"do": "wait", "wait_s": 1}]}
+    (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
+    said = mistake(capsys, command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
+    assert "`drive: right` has a calibration of diameters alone" in said
 
 
 @pytest.mark.parametrize("command", ["run", "check"])

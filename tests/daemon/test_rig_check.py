@@ -8,6 +8,7 @@ import yaml
 
 from daemon.config import DaemonConfig, load_daemon_config
 from daemon.errors import UserError
+from daemon.loop.senses import Source
 from daemon.rig_check import checked_experiment
 
 SERIAL = {"device": {"path": "port"}}
@@ -26,15 +27,21 @@ def config(folder: Path, experiment: dict[str, Any], **more: Any) -> DaemonConfi
     return load_daemon_config(folder / "config.yaml")
 
 
+SOURCES = {
+    name: Source(name=name, period_s=0.5, measures_torque=measures)
+    for name, measures in (("right", True), ("left", False))
+}
+
+
 def refusal(folder: Path, experiment: dict[str, Any], **more: Any) -> str:
     with pytest.raises(UserError) as error:
-        checked_experiment(config(folder, experiment, **more))
+        checked_experiment(config(folder, experiment, **more), SOURCES)
     return str(error.value)
 
 
 def test_a_torque_that_is_measured_may_drive(tmp_path: Path) -> None:
     for drive in ("right", "load_cell", "wrench"):
-        file = checked_experiment(config(tmp_path, {"drive": drive}, load_cell={"device": {"path": "load"}}))
+        file = checked_experiment(config(tmp_path, {"drive": drive}, load_cell={"device": {"path": "load"}}), SOURCES)
         assert file is not None
         assert file.drive == drive
 
@@ -45,6 +52,10 @@ def test_a_torque_that_is_not_measured_may_not_drive(tmp_path: Path) -> None:
         "device; there are right, wrench"
     )
     assert "`drive: left` is a fingertip without a calibration" in refusal(tmp_path, {"drive": "left"})
+    tips = {name: {"device": {"path": name}, "calibration": f"{name}.cal"} for name in SOURCES}
+    told = refusal(tmp_path, {"drive": "left"}, fingertips=tips)
+    assert "`drive: left` has a calibration of diameters alone" in told
+    assert told.endswith("there are right, wrench")
 
 
 @pytest.mark.parametrize("step", [{"do": "grip"}, {"do": "release"}])
@@ -89,4 +100,4 @@ def test_a_file_that_is_none_is_told_with_its_name(tmp_path: Path) -> None:
     daemon = config(tmp_path, {})
     (tmp_path / "experiment.yaml").unlink()
     with pytest.raises(UserError, match=r"experiment\.yaml: the configuration cannot be read: No such file"):
-        checked_experiment(daemon)
+        checked_experiment(daemon, SOURCES)

@@ -116,7 +116,10 @@ class Daemon:
             self._rig.gripper.fingertips_say = diameters.at
 
         def estimation(name: str, estimator: AnyEstimator) -> Estimation:
-            return Estimation(name, estimator, self.publisher, self._clock, hear, diameters.hear, self._tap(name))
+            made = Estimation(name, estimator, self.publisher, self._clock, hear, diameters.hear, self._tap(name))
+            if self._rig is not None and self._rig.gripper is not None:
+                made.held_tool = self._rig.gripper.held_tool
+            return made
 
         self._both: BothTask | None = None
         if both is not None:

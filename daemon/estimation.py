@@ -3,13 +3,14 @@
 import asyncio
 from collections.abc import Callable
 
+from bank.estimators import Measured
 from daemon.clock import Clock
 from daemon.estimator import Reading
 from daemon.loop.senses import Torque
 from daemon.messages import EitEstimate
 from daemon.opening import AnyEstimator
 from daemon.publisher import Publisher
-from daemon.tool_diameter import HearDiameter, unheard
+from daemon.tool_diameter import HearDiameter, as_text, unheard, unknown
 from drivers.eit_kit import Frame
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 
@@ -35,6 +36,9 @@ class Estimation:
         self._clock = clock
         self._hear = hear
         self._hear_diameter = hear_diameter
+        # Who knows the diameter of the tool that is held, and what the estimator was told of it last.
+        self.held_tool: Callable[[int], Measured | None] = unknown
+        self._tool: Measured | None = None
         self._tare_wanted = False
         self._tared: list[asyncio.Future[str]] = []
 
@@ -64,10 +68,19 @@ class Estimation:
             # A replay takes its zero before the same frame.
             self._tap(RawInput(InputKind.TARE, self._clock.now_ns(), str(frames[0].seq).encode()))
             self.estimator.tare()
+        self._take_note_of_the_tool(frames[0].seq)
         reading: Reading | None = self.estimator.quickly(*frames)
         if reading is not None:
             self._finish(frames, reading)
         return reading
+
+    def _take_note_of_the_tool(self, frame: int) -> None:
+        now_ns = self._clock.now_ns()
+        tool = self.held_tool(now_ns)
+        if tool != self._tool:
+            self._tool = tool
+            self._tap(RawInput(InputKind.TOOL, now_ns, as_text(frame, tool)))
+            self.estimator.hold(tool)
 
     async def slowly(self, *frames: Frame) -> Reading:
         """Estimate in a thread, so that commands and devices are not kept waiting."""

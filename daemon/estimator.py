@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bank.calibration import Calibration
+from bank.estimators import Measured
 from bank.estimators.guard import LEAST_NOISE_V
 from bank.matching import Match, signal_above_noise
 from bank.polynomial import Interval
@@ -166,6 +167,9 @@ class Estimator:
         """Take a new homogeneous frame from the frames to come."""
         self._baseline = Baseline(self._baseline_frames)
         self._latest = ()
+
+    def hold(self, tool: Measured | None) -> None:
+        """Take note of the tool that is held: its diameter changes nothing, for the paper's torque knows of none."""
 
     def update(self, frame: Frame) -> Reading:
         """Return what the frame says; a frame that says nothing comes back with the reasons."""

@@ -8,8 +8,10 @@ from bank.estimators import Measured, fused
 from bank.gaussian import TWO_SIDED_95
 from daemon.experiment.wishes import GripTo
 from daemon.loop.senses import Hand
+from daemon.loop.watch import HAND_STALE_S
 from daemon.messages import GripperStateMessage, Scalar
 from daemon.publisher import Publisher
+from daemon.tool_diameter import unknown
 from drivers.errors import DriverError
 from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
@@ -22,11 +24,20 @@ RELEASE_WITHIN_S, RELEASE_AGAIN_S = 5.0, 0.1
 class GripperTask:
     """Ties the gripper to the publisher and to the loop."""
 
-    def __init__(self, gripper: RobotiqGripper, publisher: Publisher, feel: Callable[[Hand], None]) -> None:
+    def __init__(
+        self,
+        gripper: RobotiqGripper,
+        publisher: Publisher,
+        feel: Callable[[Hand], None],
+        *,
+        measures_diameters: bool = True,
+    ) -> None:
+        """Take the gripper; it `measures_diameters` once its widths were calibrated with its fingertips on."""
+        self._measures_diameters = measures_diameters
         self._gripper = gripper
         self._publisher = publisher
         self._feel = feel
-        self.fingertips_say: Callable[[int], Measured | None] = _nothing
+        self.fingertips_say: Callable[[int], Measured | None] = unknown
 
     async def read(self) -> None:
         """Publish every state and pass it on, until cancelled."""
@@ -75,6 +86,15 @@ class GripperTask:
             return str(error)
         return ""
 
+    def held_tool(self, t_ns: int) -> Measured | None:
+        """Return the diameter in mm of what is held at t_ns, None where nothing is or nobody knows."""
+        state = self._gripper.latest
+        if state is None or not self._measures_diameters or t_ns - state.t_ns > HAND_STALE_S * 1e9:
+            return None
+        if state.diameter_mm is None or state.diameter_std_mm is None:
+            return None
+        return Measured(state.diameter_mm, TWO_SIDED_95 * state.diameter_std_mm)
+
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the gripper."""
         return self._gripper.facts()
@@ -96,10 +116,6 @@ class GripperTask:
                 fault_text=state.fault.sentence if state.fault.code else "",
             )
         )
-
-
-def _nothing(_: int) -> Measured | None:
-    """Return no diameter: no fingertip says one."""
 
 
 def tool_diameter(state: GripperState, fingertips: Measured | None) -> Measured | None:

@@ -81,7 +81,8 @@ def make_gripper(
 ) -> GripperTask:
     """Return the gripper's task; raises DriverError when its calibration cannot be used."""
     client = make_gripper_client(config)
-    return GripperTask(RobotiqGripper(client, gripper_calibration(config), on_event=on_event), publisher, feel)
+    gripper = RobotiqGripper(client, gripper_calibration(config), on_event=on_event)
+    return GripperTask(gripper, publisher, feel, measures_diameters=config.calibration is not None)
 
 
 def make_brain(

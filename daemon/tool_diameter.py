@@ -16,6 +16,24 @@ def unheard(_source: str, _diameter: Interval | None, _t_ns: int) -> None:
     """Let a diameter pass that nobody weighs."""
 
 
+def unknown(_t_ns: int) -> Measured | None:
+    """Return no diameter: nobody knows one."""
+
+
+def as_text(frame: int, tool: Measured | None) -> bytes:
+    """Return how a raw input says which tool is held from a frame on."""
+    return (str(frame) if tool is None else f"{frame} {tool.value!r} {tool.half_width!r}").encode()
+
+
+def from_text(text: bytes) -> tuple[int, Measured | None]:
+    """Return the frame and the tool that a raw input says; raises ValueError for what `as_text` does not return."""
+    frame, *tool = text.decode().split()
+    if not tool:
+        return int(frame), None
+    value, half_width = map(float, tool)
+    return int(frame), Measured(value, half_width)
+
+
 class FingertipDiameters:
     """The latest diameter of each fingertip, and of both together."""
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bank.bank_file import Bank
-from bank.estimators import Calibration, Estimate, TactileFrame, Tracker
+from bank.estimators import Calibration, Estimate, Measured, TactileFrame, Tracker
 from bank.matching import Match
 from bank.polynomial import Interval
 from daemon.estimator import FloatArray, Matcher, Reading
@@ -59,6 +59,10 @@ class TrackedEstimator:
     def tare(self) -> None:
         """Take a new homogeneous frame from the frames to come, which are of an untouched fingertip."""
         self._tracker.take_idle(self._baseline_frames)
+
+    def hold(self, tool: Measured | None) -> None:
+        """Take note of the diameter of the tool that is held from now on: on another one the torque is another."""
+        self._tracker.hold(tool)
 
     def quickly(self, *frames: Frame) -> Reading | None:
         """Return what `update` returns, or None where that takes more than some milliseconds: then call `update`."""

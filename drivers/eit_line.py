@@ -99,7 +99,7 @@ class LineParser:
         self._no_channels.setflags(write=False)
 
     def take(self, told: RawInput) -> list[Frame]:
-        """Do what an input says, live or recorded; return the frames that it completes. A tare is not the parser's."""
+        """Do what an input says, live or recorded; return the frames that it completes: a tare or a tool, none."""
         match told.kind:
             case InputKind.OPENED:
                 self.port_opened()
@@ -107,7 +107,7 @@ class LineParser:
                 self.board_started()
             case InputKind.DATA:
                 return self.feed(told.data, told.t_ns)
-            case InputKind.TARE:
+            case InputKind.TARE | InputKind.TOOL:
                 pass
         return []
 

@@ -14,11 +14,12 @@ class InputKind(Enum):
     ASKED = "asked"  # an instrument was sent the question in `data`; what arrives next is its answer
     DATA = "data"  # bytes arrived
     TARE = "tare"  # a new zero was asked for, or found
+    TOOL = "tool"  # another tool is held, or none
 
 
 @dataclass(frozen=True, slots=True)
 class RawInput:
-    """One thing that a parser was told at t_ns (monotonic clock); `data` are the bytes, or what belongs to a tare."""
+    """One thing that a parser was told at t_ns (monotonic clock); `data` are the bytes, or what belongs to its kind."""
 
     kind: InputKind
     t_ns: int

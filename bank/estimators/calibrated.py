@@ -16,7 +16,7 @@ from bank.estimators.guard import SideGuard
 from bank.estimators.memory import Memory, Motion
 from bank.estimators.physics import BestCell, Locator, NearestCell, Place, Registration
 from bank.estimators.reader import Reader
-from bank.estimators.values import BoolArray, Estimate, FloatArray, Kind, TactileFrame
+from bank.estimators.values import BoolArray, Estimate, FloatArray, Kind, Measured, TactileFrame
 
 Name = Literal["paper", "bank", "regression", "reconstruction", "fused"]
 NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
@@ -149,18 +149,26 @@ class Tracker:
     def __init__(self, calibration: Calibration, bank: Bank | None = None, tool_mm: float = np.nan) -> None:
         """Begin a session; raises CalibrationError for a bank that is missing or another one.
 
-        Where the tool's diameter is known it is compared with the calibration's: the same motion of the gel is another
-        torque on another tool, four times as much on one of 10 mm as on one of 20 mm.
+        Where the tool's diameter is known already, it is `tool_mm`.
         """
         self.calibration = calibration
-        self._other_tool: tuple[str, ...] = ()
-        if abs(tool_mm - calibration.tool_mm) > _LARGEST_TOOL_SHARE * calibration.tool_mm:
-            self._other_tool = (
-                f"the tool is of {tool_mm:g} mm and the calibration of one of {calibration.tool_mm:g} mm, and its "
-                "torque does not carry over; calibrate on this tool",
-            )
+        self.hold(None if np.isnan(tool_mm) else Measured(tool_mm, 0.0))
         self._locator = calibration.locator(bank)
         self.tare()
+
+    def hold(self, tool: Measured | None) -> None:
+        """Take note of the diameter in mm of the tool that is held from now on, None where nobody knows it.
+
+        It is compared with the calibration's: the same motion of the gel is another torque on another tool, four times
+        as much on one of 10 mm as on one of 20 mm.
+        """
+        own_mm = self.calibration.tool_mm
+        self._other_tool: tuple[str, ...] = ()
+        if tool is not None and abs(tool.value - own_mm) > _LARGEST_TOOL_SHARE * own_mm + tool.half_width:
+            self._other_tool = (
+                f"the tool is of {tool.value:.3g} mm and the calibration of one of {own_mm:g} mm, and its torque does "
+                "not carry over; calibrate on this tool",
+            )
 
     def tare(self) -> None:
         """Forget the session: the next frame is its first."""

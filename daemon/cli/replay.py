@@ -85,7 +85,7 @@ async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, ar
     with ExitStack() as opened:
         publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), args.publish, clock)
         opened.callback(publisher.close)
-        replay = Replay(run, Chain(config, run.tares(), publisher), publisher, clock)
+        replay = Replay(run, Chain(config, run.asides(), publisher), publisher, clock)
         if args.show:
             publisher.listen(Show(sys.stdout))
         while args.wait and not publisher.subscribed:  # noqa: ASYNC110 - it is told when it is asked

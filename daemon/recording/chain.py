@@ -1,7 +1,6 @@
 """The daemon's own parsers and estimators, told again what a recording says that they were told."""
 
 import asyncio
-from collections.abc import Mapping
 
 from bank.channels import ZERO_SLOTS
 from bank.estimators.pairing import Pairing
@@ -13,6 +12,7 @@ from daemon.load_cell_task import LOAD_CELL, load_message
 from daemon.messages import EitEstimate, EitFrame, LoadTorque, SkinShear
 from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Publisher
+from daemon.recording.recorded_run import Asides
 from daemon.rig import load_cell_calibration
 from daemon.skin_setup import RecordedSkin
 from daemon.skin_task import SKIN
@@ -27,10 +27,10 @@ MADE_ANEW = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topi
 class Chain:
     """Parsers and estimators of one configuration, fed one input at a time, so that nothing depends on the pace."""
 
-    def __init__(self, config: DaemonConfig, tares: Mapping[str, set[int]], publisher: Publisher) -> None:
-        """Open every file that is needed; raises BankError or UserError. `tares` is by source and frame number."""
+    def __init__(self, config: DaemonConfig, asides: Asides, publisher: Publisher) -> None:
+        """Open every file that is needed; raises BankError or UserError. `asides` is what the estimators were told."""
         self._publisher = publisher
-        self._tares = tares
+        self._asides = asides
         self._estimators: dict[str, AnyEstimator] = {
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
@@ -75,8 +75,11 @@ class Chain:
 
     async def _estimate(self, source: str, *frames: Frame) -> None:
         estimator = self._estimators[source]
-        if frames[0].seq in self._tares.get(source, ()):
+        number, tools = frames[0].seq, self._asides.tools.get(source, {})
+        if number in self._asides.tares.get(source, ()):
             estimator.tare()
+        if number in tools:
+            estimator.hold(tools[number])
         reading = await asyncio.to_thread(estimator.update, *frames)  # type: ignore[arg-type]  # one a side
         # The recording's own time: how long it took then is in the recording, and here it took none of it.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)

@@ -4,7 +4,7 @@ import json
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from bank.channels import N_LINE_VALUES
+from bank.estimators import Measured
 from daemon.config import DaemonConfig
 from daemon.config_file import ConfigModel, mistakes
 from daemon.errors import UserError
@@ -27,9 +28,29 @@ from daemon.recording.schema import (
     input_topic,
     schema_of,
 )
+from daemon.tool_diameter import from_text
 from drivers.raw_input import InputKind, RawInput
 
 Model = TypeVar("Model", bound=ConfigModel)
+
+
+@dataclass(frozen=True, slots=True)
+class Asides:
+    """What estimators were told beside their frames, by source and the number of the frame that it was told before.
+
+    Zeros are asked for before the frame has come, and tools are held by the gripper: neither follows from the frames.
+    """
+
+    tares: dict[str, set[int]] = field(default_factory=dict)
+    tools: dict[str, dict[int, Measured | None]] = field(default_factory=dict)
+
+    def note(self, source: str, told: RawInput) -> None:
+        """Take in a raw input, if it is one of these."""
+        if told.kind is InputKind.TARE and told.data.isdigit():
+            self.tares.setdefault(source, set()).add(int(told.data))
+        elif told.kind is InputKind.TOOL:
+            frame, tool = from_text(told.data)
+            self.tools.setdefault(source, {})[frame] = tool
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,13 +118,14 @@ class RecordedRun:
             for number, (channel, message) in enumerate(messages):
                 yield from self._happened(channel.topic, json.loads(message.data), message.log_time, number)
 
-    def tares(self) -> dict[str, set[int]]:
-        """Return, by source, before which frames a zero was taken: it is asked for before the frames have come."""
-        found: dict[str, set[int]] = {}
+    def asides(self) -> Asides:
+        """Return what the estimators were told beside their frames."""
+        found = Asides()
         if self.has_inputs:
             for one in self.happenings():
-                if one.told is not None and one.told.kind is InputKind.TARE and one.told.data.isdigit():
-                    found.setdefault(one.source, set()).add(int(one.told.data))
+                if one.told is not None:
+                    with damaged(self.path):
+                        found.note(one.source, one.told)
         return found
 
     def _happened(self, topic: str, content: dict[str, Any], log_ns: int, number: int) -> Iterator[Happened]:

@@ -80,8 +80,8 @@ def schemas() -> Mapping[str, dict[str, Any]]:
     raw = {
         INPUT: {
             "t_mono_ns": _TIME,
-            "kind": {"type": "string", "description": "opened or started (the board), asked, data, or tare"},
-            "data": {"type": "string", "description": "the bytes as Latin-1 text, or what belongs to a tare"},
+            "kind": {"type": "string", "description": "opened or started (the board), asked, data, tare, or tool"},
+            "data": {"type": "string", "description": "the bytes as Latin-1 text, or what belongs to a tare or a tool"},
         },
         CLOCK_TOPIC: {
             "t_mono_ns": _TIME,

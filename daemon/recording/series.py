@@ -1,5 +1,6 @@
 """From recordings and folders of slices to the series of frames that estimators are made from and judged by."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +82,13 @@ def _diameter_mm(recording: Recording) -> float:
     if not 0 < value < LARGEST_DIAMETER_MM:
         raise UserError(f"{recording.path}: the diameter in its notes is {text!r}, and not one in mm; record it again")
     return value
+
+
+def on_tool(series: FrameSeries, tool_mm: float) -> FrameSeries:
+    """Return a series whose tool has this diameter, unless it says itself which it has; slices tell of their own."""
+    if series.kind != "raw" or np.isfinite(series.diameter_mm).any():
+        return series
+    return replace(series, diameter_mm=np.full(len(series.t_s), tool_mm))
 
 
 def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:

@@ -6,9 +6,11 @@ from typing import Any
 
 import pytest
 
+from bank.gaussian import TWO_SIDED_95
 from daemon import gripper_task
 from daemon.experiment.wishes import GripTo
 from daemon.gripper_task import GripperTask
+from daemon.loop.watch import HAND_STALE_S
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.test_gripper import WAYS, Rig, a_rig
 
@@ -22,8 +24,9 @@ class Silent:
         """Send nothing."""
 
 
-def task_of(rig: Rig) -> GripperTask:
-    return GripperTask(rig.driver, Silent(), lambda _: None)  # type: ignore[arg-type]
+def task_of(rig: Rig, *, measures_diameters: bool = True) -> GripperTask:
+    publisher: Any = Silent()
+    return GripperTask(rig.driver, publisher, lambda _: None, measures_diameters=measures_diameters)
 
 
 @WAYS
@@ -64,6 +67,24 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way: str, tm
         await rig.driver.read()
         assert await task.unlock() == ""
         assert not (await rig.driver.read()).fault.needs_activation
+
+
+async def test_the_held_tool_has_a_diameter_while_it_is_held_and_the_gripper_speaks(tmp_path: Path) -> None:
+    async with a_rig("socket", tmp_path) as rig, asyncio.timeout(DEADLINE_S):
+        rig.object_mm = 40.0
+        task = task_of(rig)
+        assert task.held_tool(0) is None, "nothing was read yet"
+        await rig.driver.connect()
+        assert await task.grip(GRIP) == ""
+        state = await rig.driver.read()
+        tool = task.held_tool(state.t_ns)
+        assert tool is not None
+        assert tool.half_width == pytest.approx(TWO_SIDED_95 * state.width_std_mm)
+        assert abs(tool.value - 40.0) < tool.half_width
+        assert task.held_tool(state.t_ns + round(HAND_STALE_S * 1e9) + 1) is None
+        assert task_of(rig, measures_diameters=False).held_tool(state.t_ns) is None, "the maker's widths are no gauge"
+        assert await task.release() == ""
+        assert task.held_tool((await rig.driver.read()).t_ns) is None
 
 
 async def test_a_gripper_that_stays_away_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,10 @@
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from bank.estimators import Measured
 from bank.polynomial import Interval
-from daemon.tool_diameter import STALE_AFTER_NS, FingertipDiameters
+from daemon.tool_diameter import STALE_AFTER_NS, FingertipDiameters, as_text, from_text
 
 
 def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> None:
@@ -33,3 +36,17 @@ def test_what_is_old_or_taken_back_is_no_diameter() -> None:
     assert diameters.at(STALE_AFTER_NS + 1) is None
     diameters.hear("right", None, 1)
     assert diameters.at(1) is None
+
+
+POSITIVE = st.floats(0.0, allow_nan=False, allow_infinity=False)
+
+
+@given(st.integers(0), st.none() | st.builds(Measured, POSITIVE, POSITIVE))
+def test_a_tool_is_read_from_a_recording_as_it_was_written(frame: int, tool: Measured | None) -> None:
+    assert from_text(as_text(frame, tool)) == (frame, tool)
+
+
+@pytest.mark.parametrize("text", [b"", b"x", b"3 20", b"3 20 x", b"3 20 1 1"])
+def test_what_is_no_tool_is_none(text: bytes) -> None:
+    with pytest.raises(ValueError):  # noqa: PT011 - the recording's reader says where
+        from_text(text)

@@ -30,6 +30,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="seconds that the load cell's stamps are late, which are taken off; 0 takes them for right unchecked",
     )
+    parser.add_argument(
+        "--tool-mm",
+        type=float,
+        metavar="MM",
+        help="diameter of the tool in recordings that do not name it; on another one its torque is refused",
+    )
     add_json(parser)
 
 
@@ -40,13 +46,19 @@ def run(args: argparse.Namespace) -> int:
     from bank.mesh import load_mesh
     from daemon.cli.recorded import parsed_part, parsed_sides
     from daemon.errors import UserError
-    from daemon.recording.series import part_of, read_series
+    from daemon.recording.schema import LARGEST_DIAMETER_MM
+    from daemon.recording.series import on_tool, part_of, read_series
 
     start, stop = parsed_part(args.part)
     series = [one for path in args.recordings for one in read_series(path, parsed_sides(args.sides))]
     late_s = args.load_late
     if late_s is not None and not abs(late_s) <= _LARGEST_LATE_S:
         raise UserError(f"--load-late must be seconds from -{_LARGEST_LATE_S:g} to {_LARGEST_LATE_S:g}, not {late_s:g}")
+    tool_mm = args.tool_mm
+    if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
+        raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
+    if tool_mm is not None:
+        series = [on_tool(one, tool_mm) for one in series]
     parts = [part_of(one, start, stop) for one in series]
     if late_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bank.errors import CalibrationError
-from bank.estimators import Estimate, FrameSeries, TactileFrame, Tracker, fit
+from bank.estimators import Estimate, FrameSeries, Measured, TactileFrame, Tracker, fit
 
 
 def changed(series, **content):
@@ -215,3 +215,36 @@ def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(fused_calibratio
     channels[0, :, ::4] = 0.01
     estimates = follow(fused_calibration, changed(other, channels=channels))
     assert all(one.valid for one in estimates[20:])
+
+
+def test_another_tool_is_refused_for_as_long_as_it_is_held(twisting):
+    twisted = twisting()
+    calibration = fit("fused", [changed(twisted, diameter_mm=np.full(len(twisted.t_s), 20.0))], "a tool of 20 mm")
+    assert calibration.tool_mm == 20.0
+    tracker, plain = Tracker(calibration), Tracker(calibration)
+    held = {
+        60: Measured(22.9, 0.1),
+        70: Measured(23.2, 0.1),
+        80: Measured(23.2, 0.5),
+        90: Measured(14.0, 1.0),
+        100: None,
+    }
+    refused, same = [], []
+    for number, (t_s, channels) in enumerate(zip(twisted.t_s, twisted.channels, strict=True)):
+        if number in held:
+            tracker.hold(held[number])
+        frame = TactileFrame.of(float(t_s), channels)
+        one, other = tracker.estimate(frame), plain.estimate(frame)
+        if any("the tool is of" in why for why in one.why):
+            refused.append(number)
+            assert not one.valid
+        else:
+            same.append(one == other)
+    # 15 % of 20 mm are 3 mm, and the half width of what is measured comes on top; where there is no grip that is said.
+    assert set(refused) <= {*range(70, 80), *range(90, 100)}
+    assert len(refused) > 15
+    assert all(same), "what it was told of tools changes nothing that it remembers"
+    unknown = Tracker(fit("fused", [twisted], "a tool that nobody measured"))
+    unknown.hold(Measured(14.0, 0.1))
+    frames = [TactileFrame.of(float(t_s), x) for t_s, x in zip(twisted.t_s, twisted.channels, strict=True)]
+    assert any(unknown.estimate(frame).valid for frame in frames)

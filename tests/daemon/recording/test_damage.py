@@ -52,7 +52,7 @@ def happened(path: Path) -> list[Any]:
     run = RecordedRun(path)
     with run.configuration() as config:
         assert list(config.fingertips) == ["right"]
-    run.tares()
+    run.asides()
     return list(run.happenings())
 
 

@@ -41,7 +41,7 @@ async def replayed(
         publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), address, clock)
         opened.callback(publisher.close)
         publisher.listen(lambda topic, content: seen.append((topic, content)))
-        replay = Replay(run, Chain(config, run.tares(), publisher), publisher, clock)
+        replay = Replay(run, Chain(config, run.asides(), publisher), publisher, clock)
         await replay.play(speed)
     return seen, replay.comparison
 

@@ -15,7 +15,7 @@ import zmq.asyncio
 from scipy.io import savemat
 
 from bank.channels import channels_of_line, line_of_channels
-from bank.estimators import FrameSeries, fit
+from bank.estimators import FrameSeries, Measured, fit
 from daemon.app import Daemon
 from daemon.both import LARGEST_BACKLOG, BothTask
 from daemon.config import load_daemon_config
@@ -28,6 +28,9 @@ N_FRAMES = 120
 GRIPPED = slice(25, 110)
 PERIOD_S = 0.5408
 PLAYED = 25
+TOOL_MM = 10.0
+# The gripper says that another tool is held while so many frames have been estimated.
+OTHER_TOOL, OTHER_MM = range(70, 80), 14.0
 SIDES = {"right": "Right_Data", "left": "Left_Data"}
 TORQUE_NM = np.zeros(N_FRAMES)
 TORQUE_NM[40:104] = 0.1 * np.abs(np.sin(np.pi * np.arange(64) / 22))
@@ -55,7 +58,7 @@ def twists(tmp_path_factory: pytest.TempPathFactory) -> Twists:
         boards[side] = folder / f"{side}.mat"
         savemat(boards[side], {variable: np.column_stack([739_588 + t_s / 86_400, lines])})
     series = FrameSeries(
-        "raw", tuple(SIDES), t_s, np.array(channels).swapaxes(0, 1), t_s, TORQUE_NM, np.full(N_FRAMES, np.nan)
+        "raw", tuple(SIDES), t_s, np.array(channels).swapaxes(0, 1), t_s, TORQUE_NM, np.full(N_FRAMES, TOOL_MM)
     )
     calibrations = {}
     for name, sides in (("both", tuple(SIDES)), ("right", ("right",))):
@@ -116,6 +119,8 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
         with zmq.asyncio.Context() as context:
             daemon = Daemon(load_daemon_config(config), context)
             daemon.publisher.listen(listen)
+            right = daemon._estimations["right"]
+            right.held_tool = lambda _: Measured(OTHER_MM, 0.5) if right.count in OTHER_TOOL else None
             running = asyncio.create_task(daemon.run())
             try:
                 await enough.wait()
@@ -154,3 +159,6 @@ def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
     torques = [one["torque_nm"] for _, one in replays[math.inf] if one["source"] == "right" and one["valid"]]
     assert len(torques) > 30
     assert np.ptp(torques) > 0.05
+    refused = [one for _, one in replays[math.inf] if "the tool is of 14 mm" in one["why"]]
+    assert {one["source"] for one in refused} == {"right"}
+    assert len(refused) == len(OTHER_TOOL)

@@ -83,12 +83,14 @@ class LoopTask:
         Where something unexpected ends it, the arm is told to stop; begun again, it stops the experiment.
         """
         try:
+            decided_ns = self._clock.now_ns()
             while True:
-                began_ns = self._clock.now_ns()
                 longest_s = self._pace()
                 state = await self._robot.state_within(longest_s)
                 now_ns = self._clock.now_ns()
-                self._brain.senses.late_s = max(0.0, (now_ns - began_ns) / 1e9 - longest_s)
+                # From one decision to the next: what a decision itself takes is late as well.
+                self._brain.senses.late_s = max(0.0, (now_ns - decided_ns) / 1e9 - longest_s)
+                decided_ns = now_ns
                 self._brain.senses.died = self._deaths()
                 if state is not None:
                     self._sense(state)
@@ -120,11 +122,12 @@ class LoopTask:
         return self._brain.start(file, self._clock.now_ns())
 
     async def ended(self) -> Experiment:
-        """Return the experiment that runs, once it has ended."""
+        """Return the experiment that runs, or the next to run, once it has ended; another may be running by then."""
         async with self._news:
-            while self._brain.experiment is None or self._brain.experiment.running:
+            while (experiment := self._brain.experiment) is None:
                 await self._news.wait()
-            return self._brain.experiment
+            await self._news.wait_for(lambda: not experiment.running)
+            return experiment
 
     async def unlock(self) -> str | None:
         """Let robot and gripper move again after a stop, on the operator's word; return why they would not."""

@@ -115,6 +115,40 @@ async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> 
         assert cell.phase is Phase.DONE, cell.why
 
 
+async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with driven() as cell:
+        await cell.start(TWIST)
+        await cell.cycles(50)
+        decide = cell.brain.tick
+
+        def at_length(t_ns: int) -> Any:
+            monkeypatch.undo()
+            orders = decide(t_ns)
+            cell.robot.flight.now_ns += 200_000_000
+            return orders
+
+        monkeypatch.setattr(cell.brain, "tick", at_length)
+        await cell.cycles(2)
+        assert Event.LOOP_LATE in [trouble.event for trouble in cell.brain.standing.verdict.troubles]
+
+
+async def test_who_waits_for_an_experiments_end_is_told_of_that_one() -> None:
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        first = cell.brain.experiment
+        waiting = asyncio.create_task(cell.loop.ended())
+        await cell.cycles(5)
+        cell.brain.stop("the operator said stop")
+        # The next one begins before whoever waits has had his turn.
+        cell.brain.tick(cell.robot.flight.now_ns)
+        again = {"name": "again", "drive": WRENCH, "steps": [{"do": "wait", "wait_s": 60}]}
+        assert cell.brain.start(ExperimentFile.model_validate(again), cell.robot.flight.now_ns) is None
+        async with asyncio.timeout(20):
+            while not waiting.done():
+                await cell.cycles(1)
+        assert await waiting is first
+
+
 async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experiment(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

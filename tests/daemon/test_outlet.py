@@ -67,6 +67,41 @@ def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_t
     ]  # fmt: skip
 
 
+class Slow(io.StringIO):
+    """A terminal that takes a text for each that it is let take."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.may, self.took = threading.Semaphore(0), threading.Semaphore(0)
+
+    def write(self, text: str) -> int:
+        assert self.may.acquire(timeout=10)
+        written = super().write(text)
+        self.took.release()
+        return written
+
+
+def test_what_is_missing_is_told_before_what_came_later() -> None:
+    terminal = Slow()
+    outlet = Outlet(terminal, most_waiting=4)
+    outlet.write("0\n")
+    terminal.may.release()
+    assert terminal.took.acquire(timeout=10)
+    for number in range(1, 20):
+        outlet.write(f"{number}\n")
+    lost = outlet.lost
+    kept = 19 - lost
+    terminal.may.release(kept)
+    for _ in range(kept):
+        assert terminal.took.acquire(timeout=10)
+    outlet.write("20\n")
+    terminal.may.release(2)
+    outlet.close(10)
+    told = terminal.getvalue().splitlines()
+    assert told[-2:] == [f"… {lost} texts are missing here: nobody read for a while", "20"]
+    assert told[:-2] == [str(number) for number in range(kept + 1)]
+
+
 def test_what_nobody_reads_any_longer_kills_nobody() -> None:
     ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr

@@ -53,6 +53,9 @@ def truth_that_falls_at(t_s: float, for_s: float) -> Known:
 def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturbance() -> None:
     text = told(truth_that_falls_at(26.0, 5.5), [(26 * S, "kick -0.03")])
     assert "'hold' was done, after 44 s" in text
+    assert "  step 1 of 3  identify       10.0 s   stiffness" in text
+    assert "  step 2 of 3  hold_torque    34.0 s\n" in text
+    assert "set point +0.100 N·m, held for 30 s; what drove: right" in text
     assert "stiffness 0.750 N·m/rad, delay 0.80 s" in text
     assert "right      +0.0980 N·m on average" in text
     # 5.5 of 30 s were out of the band.

@@ -97,6 +97,45 @@ def test_a_second_sweep_goes_on_where_the_first_ended(tmp_path: Path) -> None:
     np.testing.assert_allclose(slices.diameter_mm, [10, 10, 20, 20])
 
 
+def test_frames_and_torques_are_smoothed_alike_around_the_middle_of_a_hold(tmp_path: Path) -> None:
+    """The gel relaxes while it is held: what is said of its frame has to be said of its torque."""
+    sweep = Sweep(tmp_path)
+    sweep._loop(hold=1)
+    torques = 0.05 + 0.1 * np.exp(-np.arange(14) * PERIOD_S / 2.0)
+    for torque_nm in torques.tolist():
+        sweep.frames(torque_nm, PERIOD_S)
+    sweep._loop()
+    sweep.frames(0.0, 1.0)
+    sweep.done()
+    slices = read_torque_slices(tmp_path / "torque_slices")
+    # The last frame is not whole within the hold; of the others nine around the middle count.
+    weights = np.exp(-0.5 * (np.arange(-4, 5) / 1.8) ** 2)
+    np.testing.assert_allclose(slices.differences[0], weights @ torques[2:11] / weights.sum(), rtol=1e-5)
+    np.testing.assert_allclose(slices.torque_nm[0], slices.differences[0].mean(), rtol=0.02)
+
+
+def test_frames_of_a_hold_that_arrive_after_its_end_are_of_it(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path)
+    sweep._loop(hold=1)
+    sweep.frames(0.1, 1.0)
+    begun_s, sweep.t_s = sweep.t_s, sweep.t_s + 2.5
+    sweep._loop()
+    sweep._loop(step_name="turn_to")
+    sweep.t_s = begun_s
+    sweep.frames(0.1, 3.5)
+    sweep.done()
+    assert sweep.recorder.written["torque"] == 1, sweep.recorder.summary
+
+
+def test_the_raw_frame_beside_the_slices_is_clipped_as_the_papers(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path)
+    sweep.hold(1, 0.3)
+    sweep.done()
+    raw = read_line(tmp_path / "torque_slices" / "TorqueSlice.mat")
+    assert raw.max() == pytest.approx(0.45)
+    np.testing.assert_allclose(raw, np.minimum(sweep.rest + 0.3, 0.45), atol=1e-6)
+
+
 def test_a_daemon_that_ends_with_the_last_hold_loses_no_slice(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)

@@ -64,8 +64,11 @@ async def test_a_full_disk_refuses_the_next_experiment_and_the_running_one_goes_
         filler = fill(small_disk)
         told = await watcher.until("health", lambda health: bool(health["tasks"]["recording"]["trouble"]))
         assert "No space left on device" in told["tasks"]["recording"]["trouble"]
-        state = await watcher.until("loop.state", lambda state: "the recording cannot be written" in state["reasons"])
-        assert state["phase"] == "running", "what runs goes on"
+        # What runs goes on. (A busy computer may hold the wrist for a moment meanwhile, as it must.)
+        await watcher.until(
+            "loop.state",
+            lambda state: "the recording cannot be written" in state["reasons"] and state["phase"] == "running",
+        )
         seq = watcher.seen["robot.state"][-1]["seq"]
         await watcher.until(
             "robot.state", lambda state: state["seq"] > seq + 5 and state["wrist_speed_rad_per_s"] > 0.005

@@ -1,5 +1,6 @@
 """Requests of the page: a reply, a failure, or a hang that keeps nobody."""
 
+import asyncio
 import threading
 from typing import Any
 
@@ -23,6 +24,28 @@ async def test_a_reply_and_a_failure_come_back(monkeypatch: pytest.MonkeyPatch) 
     with pytest.raises(UserError, match="no daemon answered"):
         await requests.ask("nowhere", {"command": "stop"}, 2.0, None)
     requests.close()
+
+
+async def test_the_end_waits_for_what_is_on_its_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    under_way, goes_on, order = threading.Event(), threading.Event(), []
+
+    def slow(*_: object) -> dict[str, Any]:
+        under_way.set()
+        assert goes_on.wait(20)
+        order.append("answered")
+        return {"ok": True}
+
+    monkeypatch.setattr(asked, "request", slow)
+    monkeypatch.setattr(asked, "GRACE_S", 20.0)
+    requests = Requests()
+    asking = asyncio.create_task(requests.ask("here", {"command": "stop"}, 0.0, None))
+    assert await asyncio.to_thread(under_way.wait, 20)
+    ending = threading.Thread(target=lambda: (requests.close(), order.append("ended")))
+    ending.start()
+    goes_on.set()
+    await asyncio.to_thread(ending.join, 20)
+    assert order == ["answered", "ended"]
+    assert await asking == {"ok": True}
 
 
 async def test_a_request_that_hangs_is_given_up_and_the_next_one_is_carried(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -87,7 +87,7 @@ class LoadCellConfig(ConfigModel):
     calibration: Path | None = Field(
         None, description="made by `shearloop calibrate load`; without one the board's lines are torques in N·m"
     )
-    rate_hz: float = Field(10.9, gt=0, le=1000)
+    rate_hz: float = Field(10.9, gt=0, le=1000, description="how many lines a second the board sends")
 
 
 class InstrumentSocket(ConfigModel):

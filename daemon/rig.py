@@ -55,7 +55,14 @@ def make_load_cell(
     """Return the load cell's task; raises DriverError when its calibration cannot be used."""
     calibration = load_cell_calibration(config)
     device = config.device
-    board = LoadCell(calibration, serial_number=device.serial_number, path=device.path, on_event=on_event, tap=tap)
+    board = LoadCell(
+        calibration,
+        serial_number=device.serial_number,
+        path=device.path,
+        rate_hz=config.rate_hz,
+        on_event=on_event,
+        tap=tap,
+    )
     return LoadCellTask(board, publisher, clock, hear, config.rate_hz)
 
 

@@ -1,5 +1,7 @@
 """The load cell of the torque rig: an HX711 on an Arduino Uno, one decimal a line, 115200 baud, 10.9 Hz.
 
+With its RATE pin high an HX711 converts eight times as often: whoever reads it says how often.
+
 A lever arm on the tool's shaft presses on the load cell; force times lever arm is the torque (Trehan et al. 2025,
 section 2). What the decimal means depends on the sketch: ours (`firmware/hx711_torque`) sends raw counts, the paper's
 sent N·m worked out on the board. One linear calibration covers both, see `LoadCalibration`.
@@ -152,7 +154,7 @@ class Despiker:
         self._candidates.clear()
 
     def _reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
-        # Arrival stamps bunch when the host was busy; two conversions are never closer than a period.
+        # Arrival stamps bunch when the host was busy; two conversions are hardly ever closer than the usual period.
         elapsed_s = max(after[1] - before[1], PERIOD_NS) * 1e-9
         return abs(after[0] - before[0]) <= self._limits.slew_nm_per_s * elapsed_s
 
@@ -160,9 +162,12 @@ class Despiker:
 class LoadParser:
     """Turns the board's bytes, in whatever slices they come, into samples; counts by kind what it refuses."""
 
-    def __init__(self, calibration: LoadCalibration) -> None:
-        """Start before the first byte after the port was opened."""
+    def __init__(self, calibration: LoadCalibration, rate_hz: float = RATE_HZ) -> None:
+        """Start before the first byte after the port was opened, of a board that sends so many lines a second."""
         self._limits = LoadLimits()
+        self._period_ns = round(1e9 / rate_hz)
+        # As long as that takes at the usual rate, and no fewer.
+        self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / RATE_HZ))
         self._lines = LineCutter(MAX_LINE_BYTES)
         self._refused: Counter[str] = Counter()
         self._seq = 0
@@ -214,7 +219,9 @@ class LoadParser:
             value = None if line is None else self._value(line)
             partial, self._first_line = self._first_line, False
             if line is not None and value is not None:
-                samples.append(self._sample(value, len(line) + 1, t_arrival_ns - age * PERIOD_NS, partial=partial))
+                samples.append(
+                    self._sample(value, len(line) + 1, t_arrival_ns - age * self._period_ns, partial=partial)
+                )
         return samples
 
     def _value(self, line: bytes) -> float | None:
@@ -226,7 +233,7 @@ class LoadParser:
 
     def _sample(self, raw: float, n_bytes: int, t_arrival_ns: int, *, partial: bool) -> LoadSample:
         torque_nm = self._calibration.torque_nm(raw)
-        t_mid_ns = t_arrival_ns - transfer_ns(n_bytes, BAUD_RATE) - PERIOD_NS // 2
+        t_mid_ns = t_arrival_ns - transfer_ns(n_bytes, BAUD_RATE) - self._period_ns // 2
         if self._last_mid_ns is not None:
             t_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
         self._last_mid_ns = t_mid_ns
@@ -241,7 +248,7 @@ class LoadParser:
             seq=self._seq,
             saturated=saturated,
             spike=self._is_spike(torque_nm, t_mid_ns, unreliable=saturated or partial),
-            stuck=self._repeats >= STUCK_AFTER,
+            stuck=self._repeats >= self._stuck_after,
             partial=partial,
         )
         self._seq += 1

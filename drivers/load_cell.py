@@ -5,7 +5,7 @@ import time
 from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import aclosing
 
-from drivers.hx711 import BAUD_RATE, PERIOD_NS, LoadCalibration, LoadParser, LoadSample, refusals
+from drivers.hx711 import BAUD_RATE, RATE_HZ, LoadCalibration, LoadParser, LoadSample, refusals
 from drivers.raw_input import InputKind, Tap, no_tap
 from drivers.sending_board import SendingBoard
 from drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
@@ -20,11 +20,15 @@ class LoadCell:
         *,
         serial_number: str | None = None,
         path: str | os.PathLike[str] | None = None,
+        rate_hz: float = RATE_HZ,
         policy: ReconnectPolicy | None = None,
         on_event: Callable[[LinkEvent], None] = lambda _: None,
         tap: Tap = no_tap,
     ) -> None:
-        """Name the board; nothing is opened yet. `tap` hears of all that the parser is told."""
+        """Name the board and how many lines a second it sends; nothing is opened yet.
+
+        `tap` hears of all that the parser is told.
+        """
         link = SerialLink(
             serial_number=serial_number,
             path=None if path is None else os.fspath(path),
@@ -32,11 +36,12 @@ class LoadCell:
             policy=policy,
             on_event=on_event,
         )
-        self._parser = LoadParser(calibration)
+        self._parser = LoadParser(calibration, rate_hz)
         self._board = SendingBoard(
             link,
             self._parser.take,
-            period_s=PERIOD_NS * 1e-9,
+            # One that is quicker is not silent yet where this computer was late; opening it anew would reset it.
+            period_s=1.0 / min(rate_hz, RATE_HZ),
             silent=_silent,
             tap=tap,
         )

@@ -153,7 +153,10 @@ async def _load_cell(config: LoadCellConfig, seconds: float) -> list[Finding]:
     if port.state == "trouble":
         return [port]
     cell = LoadCell(
-        LoadCalibration.of_torque_lines(), serial_number=config.device.serial_number, path=config.device.path
+        LoadCalibration.of_torque_lines(),
+        serial_number=config.device.serial_number,
+        path=config.device.path,
+        rate_hz=config.rate_hz,
     )
     times, saturated = [], 0
     with contextlib.suppress(TimeoutError):

@@ -42,7 +42,9 @@ class Chain:
             name: LineParser(ZERO_SLOTS, nominal_period_ns=round(fingertip.frame_period_s * 1e9))
             for name, fingertip in config.fingertips.items()
         }
-        self._load = LoadParser(load_cell_calibration(config.load_cell)) if config.load_cell is not None else None
+        self._load: LoadParser | None = None
+        if config.load_cell is not None:
+            self._load = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
         self._skin = RecordedSkin(config.skin) if config.skin is not None else None
 
     @property

@@ -66,7 +66,8 @@ class LoopTask:
         self._acceleration_rad_per_s2 = acceleration_rad_per_s2
         # Which of the robot's cycles, in fives, was published last.
         self._published = -1
-        self._unanswered: set[asyncio.Task[None]] = set()
+        # Commands that the robot's process has not answered yet.
+        self._unanswered = 0
         self._actions = DeviceActions(robot, gripper, take_zero, lambda: bool(self._sent_rad_per_s or self._unanswered))
         self._action: asyncio.Task[None] | None = None
         # What the loop, or a command of it, died of since the brain was told last.
@@ -211,26 +212,30 @@ class LoopTask:
         speed = orders.wrist_rad_per_s
         if speed == 0.0 and self._sent_rad_per_s == 0.0:
             return
-        if len(self._unanswered) < MOST_UNANSWERED:
+        if self._unanswered < MOST_UNANSWERED:
             self._send(WristSpeed(speed, self._acceleration_rad_per_s2))
 
     def _send(self, command: WristSpeed | Stop) -> None:
-        async def sent() -> None:
-            try:
-                self._answered(await self._robot.send(command))
-            except Exception as error:  # noqa: BLE001 - told by the next tick, which ends the experiment
-                structlog.get_logger().exception("a command to the robot died", command=repr(command))
-                self._own_death = _said(error)
-
-        task = asyncio.create_task(sent(), name="robot command")
-        self._unanswered.add(task)
-        task.add_done_callback(self._unanswered.discard)
+        self._unanswered += 1
+        try:
+            self._robot.tell(command, self._answered)
+        except Exception as error:  # noqa: BLE001 - told by the next tick, which ends the experiment
+            self._unanswered -= 1
+            self._died_of(error)
 
     def _answered(self, reply: Reply) -> None:
-        if not reply.accepted:
-            self._brain.note_refusal(reply.refused)
-        self._sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-        self._brain.sent(self._sent_rad_per_s)
+        self._unanswered -= 1
+        try:
+            if not reply.accepted:
+                self._brain.note_refusal(reply.refused)
+            self._sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
+            self._brain.sent(self._sent_rad_per_s)
+        except Exception as error:  # noqa: BLE001 - not the robot's process, which has answered, but the next tick's
+            self._died_of(error)
+
+    def _died_of(self, error: Exception) -> None:
+        structlog.get_logger().exception("a command to the robot died")
+        self._own_death = _said(error)
 
     def _begin(self, action: Awaitable[str], tell: Callable[[str], None]) -> None:
         """Carry an action out beside the loop; `tell` hears why it went wrong, or an empty text."""
@@ -261,7 +266,7 @@ class LoopTask:
             standing.phase,
             tuple(trouble.event for trouble in standing.verdict.troubles),
             standing.turn.reasons,
-            experiment and experiment.progress().step,
+            experiment and experiment.number,
         )
         held = experiment.wish.hold if experiment is not None else 0
         if (key, held) == (self._told, self._told_hold) and now_ns - self._told_ns < LOOP_STATE_PERIOD_S * 1e9:
@@ -322,10 +327,8 @@ class LoopTask:
 
     async def _end(self) -> None:
         self._cancel_action()
-        tasks = [task for task in (*self._unanswered, self._action) if task is not None]
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
+        if self._action is not None:
+            await asyncio.gather(self._action, return_exceptions=True)
 
 
 def _said(error: Exception) -> str:

@@ -35,6 +35,7 @@ class Experiment:
 
     def __init__(self, file: ExperimentFile, t_ns: int) -> None:
         self.file = file
+        self._expected_s = [expected_s(step) for step in file.steps]
         self.phase = Phase.RUNNING
         self.why = ""
         self._t_ns = t_ns
@@ -62,6 +63,28 @@ class Experiment:
         if own is None:
             return whole
         return Limits(torque_nm=min(own.torque_nm, whole.torque_nm), angle_rad=min(own.angle_rad, whole.angle_rad))
+
+    @property
+    def number(self) -> int:
+        """The number of that step, counted from one."""
+        return min(self._index + 1, len(self.file.steps))
+
+    @property
+    def doing(self) -> str:
+        """What is being done, or why nothing is any more."""
+        return self._wish.doing if self.running else self.why
+
+    @property
+    def overdue(self) -> str:
+        """Which step has taken longer than it may, or the empty string."""
+        longest_s = self.step.timeout_s
+        if not self.running or longest_s is None or self._spent_s <= longest_s:
+            return ""
+        return f"step {self._index + 1} ({self.step.do}) has taken {self._spent_s:.1f} s of at most {longest_s:g} s"
+
+    @property
+    def _spent_s(self) -> float:
+        return self._elapsed_s - self._step_began_s
 
     @property
     def wish(self) -> Wish:
@@ -102,23 +125,18 @@ class Experiment:
 
     def progress(self) -> Progress:
         """Return where it stands."""
-        ahead_s = sum(expected_s(step) for step in self.file.steps[self._index + 1 :])
-        spent_s = self._elapsed_s - self._step_began_s
-        planned_s = sum(expected_s(step) for step in self.file.steps)
-        here_s = max(0.0, expected_s(self.step) - spent_s) if self.running else 0.0
+        ahead_s = sum(self._expected_s[self._index + 1 :])
+        planned_s = sum(self._expected_s)
+        here_s = max(0.0, self._expected_s[self.number - 1] - self._spent_s)
         remaining_s = here_s + ahead_s if self.running else 0.0
-        overdue = ""
-        longest_s = self.step.timeout_s
-        if self.running and longest_s is not None and spent_s > longest_s:
-            overdue = f"step {self._index + 1} ({self.step.do}) has taken {spent_s:.1f} s of at most {longest_s:g} s"
         return Progress(
             phase=self.phase,
-            step=min(self._index + 1, len(self.file.steps)),
+            step=self.number,
             steps=len(self.file.steps),
-            doing=self._wish.doing if self.running else self.why,
+            doing=self.doing,
             share=1.0 if self.phase is Phase.DONE else max(0.0, 1.0 - remaining_s / max(planned_s, 1e-9)),
             remaining_s=remaining_s,
-            overdue=overdue,
+            overdue=self.overdue,
         )
 
     def _begin_next(self) -> None:

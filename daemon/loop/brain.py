@@ -237,7 +237,7 @@ class Brain:
             return self._ended(verdict)
         turn = self._turn(t_ns, wrist_rad, still=still)
         phase = "held" if held else experiment.phase.value
-        self.standing = Standing(phase, experiment.progress().doing, turn, verdict)
+        self.standing = Standing(phase, experiment.doing, turn, verdict)
         return Orders(turn.speed_rad_per_s, hold=still, begin=begin)
 
     def _begin(self, experiment: Experiment, t_ns: int, wrist_rad: float) -> Action | None:
@@ -312,7 +312,7 @@ class Brain:
             gripped=gripped,
             twisted_rad=twisted_rad,
             expected_nm=self._driving_wrist.expected_nm if running else None,
-            overdue=experiment.progress().overdue if running and experiment is not None else "",
+            overdue=experiment.overdue if running and experiment is not None else "",
             required=self._required,
         )
         return list(troubles(self.senses, watched, self._watch, t_ns))

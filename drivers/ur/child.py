@@ -58,7 +58,7 @@ class Pipe:
         """Take over both descriptors."""
         self._in, self._out = stdin, stdout
         self._decoder = Decoder()
-        self._unsent = bytearray()
+        self._unsent, self._held = bytearray(), bytearray()
         self.open = True
         os.set_blocking(stdin, False)
         os.set_blocking(stdout, False)
@@ -77,11 +77,17 @@ class Pipe:
         yield from self._decoder.feed(data)
 
     def send(self, message: Message, number: int = 0) -> None:
-        """Send a message that must arrive."""
-        self._unsent += encode(message, number)
-        if len(self._unsent) > MOST_UNSENT:
-            self.open = False
+        """Send a message that must arrive, and what was held back for the next one."""
+        self.hold(message, number)
+        self._unsent += self._held
+        self._held.clear()
         self._flush()
+
+    def hold(self, message: Message, number: int) -> None:
+        """Send a message that must arrive together with the next one: a write, and a daemon that wakes, less."""
+        self._held += encode(message, number)
+        if len(self._unsent) + len(self._held) > MOST_UNSENT:
+            self.open = False
 
     def send_latest(self, message: Message) -> None:
         """Send a message unless others are still waiting."""
@@ -212,7 +218,10 @@ def _obey(pipe: Pipe, pilot: Pilot, pace: Pace, reading: Reading) -> bool:
     goes = False
     for number, command in _newest(pipe, pilot, pace):
         reply = pilot.request(number, command, reading, time.monotonic_ns())
-        if reply is not None:
+        if isinstance(command, WristSpeed) and reply is not None:
+            # The loop asks for the next speed at the next state, and needs the reply no sooner.
+            pipe.hold(reply, number)
+        elif reply is not None:
             pipe.send(reply, number)
         goes = goes or isinstance(command, Disconnect)
     return goes

@@ -54,7 +54,7 @@ class UrRobot:
         self._on_link = on_link or (lambda _event: None)
         self._state: RobotState | None = None
         self._stdin: asyncio.StreamWriter | None = None
-        self._waiting: dict[int, asyncio.Future[Reply]] = {}
+        self._waiting: dict[int, Callable[[Reply], None]] = {}
         self._number = 0
         self._lost_s = -math.inf
         # How many states have come since the beginning.
@@ -126,22 +126,29 @@ class UrRobot:
                 timer.cancel()
 
     async def send(self, command: Command) -> Reply:
-        """Return the one reply to a command: what is sent after clipping, or why nothing is.
+        """Return the one reply to a command; `tell` says which."""
+        replied: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
 
-        A command whose process dies before it replied is answered as refused, and is not sent again.
+        def answered(reply: Reply) -> None:
+            if not replied.done():
+                replied.set_result(reply)
+
+        self.tell(command, answered)
+        return await replied
+
+    def tell(self, command: Command, answered: Callable[[Reply], None]) -> None:
+        """Send a command; `answered` hears the one reply: what is sent after clipping, or why nothing is.
+
+        A command whose process dies before it replied is answered as refused, and is not sent again. What `answered`
+        raises ends the conversation with the process.
         """
         if self._stdin is None or self._state is None:
-            return Reply(refused=f"The robot is not connected. {self.link.sentence}")
+            answered(Reply(refused=f"The robot is not connected. {self.link.sentence}"))
+            return
         self._number += 1
-        number = self._number
-        future: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
-        self._waiting[number] = future
+        self._waiting[self._number] = answered
         self._end_ease()
-        self._stdin.write(encode(command, number))
-        try:
-            return await future
-        finally:
-            self._waiting.pop(number, None)
+        self._stdin.write(encode(command, self._number))
 
     async def run(self) -> None:
         """Keep the robot connected until cancelled; then stop it and let it go.
@@ -206,10 +213,9 @@ class UrRobot:
         if self._state is not None:
             self._lost_s = time.monotonic()
         self._state = None
-        for future in self._waiting.values():
-            if not future.done():
-                future.set_result(Reply(refused="The robot's process ended before it answered; nothing is sent again."))
-        self._waiting.clear()
+        waiting, self._waiting = self._waiting, {}
+        for answered in waiting.values():
+            answered(Reply(refused="The robot's process ended before it answered; nothing is sent again."))
 
     def take(self, number: int, message: Message) -> None:
         """Act on a message of the process."""
@@ -224,9 +230,9 @@ class UrRobot:
                     if not arrived.done():
                         arrived.set_result(message)
             case Reply():
-                future = self._waiting.get(number)
-                if future is not None and not future.done():
-                    future.set_result(message)
+                answered = self._waiting.pop(number, None)
+                if answered is not None:
+                    answered(message)
             case Failed():
                 raise LostError(message.kind, message.sentence)
 

@@ -10,7 +10,7 @@ FailureKind = Literal["not-installed", "unreachable", "silent", "version", "regi
 
 _FINITE: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
 # What the controller reports is passed on even where it is no number; `limits.violation` then says so.
-STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "ser_json_inf_nan": "constants"}
+_STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "ser_json_inf_nan": "constants"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,28 +47,28 @@ class Stop:
 class ZeroForceTorque:
     """Take the present wrench as zero; only at rest."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class Enable:
     """Allow motion: after every start of the robot's process, and after everything that stopped the arm."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class Unlock:
     """The operator's word after a protective or emergency stop: unlock, power, start the control program, enable."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class Disconnect:
     """Stop, end the control program, go."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
 
 Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | Disconnect
@@ -78,7 +78,7 @@ Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | D
 class Reply:
     """The one answer to a command: what is sent to the robot after clipping, or why nothing is."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
     refused: str = ""
     sent: WristSpeed | MoveLinear | Stop | None = None
@@ -94,7 +94,7 @@ class Reply:
 class Reading:
     """One reading of the controller: SI units, base frame, joints from base to wrist 3."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
     t_mono_ns: int
     timestamp_s: float
@@ -159,7 +159,7 @@ class RobotState(Reading):
 class Configure:
     """The first message to the process."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
     settings: UrSettings
     # Whether a program that runs on the robot is one that a process before this one has just left behind.
@@ -170,7 +170,7 @@ class Configure:
 class Heartbeat:
     """The daemon is alive."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ class Ease:
     It holds until anything else comes. No signs of life are sent meanwhile: nothing moves that they would keep moving.
     """
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
     cycles: int
 
@@ -189,7 +189,7 @@ class Ease:
 class Phase:
     """What the process is about to do, said before doing it: it may hang or crash there."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
     doing: str
 
@@ -198,7 +198,7 @@ class Phase:
 class Failed:
     """Why the process ends."""
 
-    __pydantic_config__: ClassVar = STRICT
+    __pydantic_config__: ClassVar = _STRICT
 
     kind: FailureKind
     sentence: str

@@ -1,20 +1,20 @@
 """The bytes of the pipe between the daemon and the robot's own process: typed, length-prefixed, strictly decoded.
 
 A message is a header (length of the body, number, kind) and its fields as JSON, written and checked by pydantic in one
-pass; its strict mode for JSON takes neither a missing field nor an unknown one nor a value of another type. Of a state,
-which crosses up to 125 times a second, only what is no number is JSON, and that is nearly always the same as before.
+pass; its strict mode for JSON takes neither a missing field nor an unknown one nor a value of another type. Of what
+crosses 125 times a second while the wrist turns (states, wrist speeds and their replies) only the texts are JSON, and
+those are nearly always the same as the time before.
 """
 
 import struct
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar, Final, TypeVar
+from math import isfinite
+from typing import Final, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from drivers.errors import ProtocolError
 from drivers.ur.messages import (
-    STRICT,
     Configure,
     Disconnect,
     Ease,
@@ -35,24 +35,18 @@ from drivers.ur.messages import (
 
 T = TypeVar("T")
 
+_STRICT = ConfigDict(strict=True)
+
 _MOTIONS: Final[tuple[MotionKind, ...]] = ("idle", "wrist", "linear", "stopping")
-
-
-@dataclass(frozen=True, slots=True)
-class _Words:
-    """What of a state is no number."""
-
-    __pydantic_config__: ClassVar = STRICT
-
-    blocked: str
-    ended: str
-    sent: WristSpeed | MoveLinear | Stop | None
-    clipped: tuple[str, ...]
 
 
 # The numbers of a state in the order of its fields, its four vectors as one: t_mono_ns, timestamp_s, age_ns, vectors,
 # modes, speed_scaling, wrist_torque_nm, motion_id, cycle, motion, flags.
 _NUMBERS = struct.Struct("<qdq24diiiddIQB5?")
+# What was last sent to the robot: its kind, and its numbers in the order of its fields.
+_SENT = struct.Struct("<B8d")
+_WRIST_SPEED = struct.Struct("<2d")
+_NO_NUMBERS: Final = (0.0,) * 8
 
 _KINDS: Final[tuple[type[Message], ...]] = (
     WristSpeed, MoveLinear, Stop, ZeroForceTorque, Enable, Unlock, Disconnect,
@@ -60,8 +54,8 @@ _KINDS: Final[tuple[type[Message], ...]] = (
 )  # fmt: skip
 _ADAPTERS: Final[tuple[TypeAdapter[Message], ...]] = tuple(TypeAdapter(kind) for kind in _KINDS)
 _CODES: Final = {kind: code for code, kind in enumerate(_KINDS)}
-_STATE: Final = _CODES[RobotState]
-_WORDS: Final = TypeAdapter(_Words)
+_WORDS_OF_STATE: Final = TypeAdapter(tuple[str, str, tuple[str, ...]], config=_STRICT)
+_WORDS_OF_REPLY: Final = TypeAdapter(tuple[str, tuple[str, ...]], config=_STRICT)
 _HEADER = struct.Struct("<IIB")
 # The largest message, a state with every reason for clipping, has some 2 kB; more is not ours.
 LARGEST_BODY = 1 << 16
@@ -70,7 +64,15 @@ LARGEST_BODY = 1 << 16
 def encode(message: Message, number: int = 0) -> bytes:
     """Return a message with its header; `number` pairs a command with its reply."""
     code = _CODES[type(message)]
-    body = _state_body(message) if isinstance(message, RobotState) else _ADAPTERS[code].dump_json(message)
+    match message:
+        case RobotState():
+            body = _state_body(message)
+        case Reply():
+            body = _sent_body(message.sent) + _words_of_reply_body(message.refused, message.clipped)
+        case WristSpeed():
+            body = _WRIST_SPEED.pack(message.rad_per_s, message.acceleration_rad_per_s2)
+        case _:
+            body = _ADAPTERS[code].dump_json(message)
     return _HEADER.pack(len(body), number, code) + body
 
 
@@ -102,9 +104,21 @@ class Decoder:
 
 
 def _decode(code: int, body: bytes) -> Message:
-    if code == _STATE:
-        return _state(body)
-    return _checked(_ADAPTERS[code], body, _KINDS[code].__name__)
+    kind = _KINDS[code]
+    try:
+        if kind is RobotState:
+            return _state(body)
+        if kind is Reply:
+            sent = _sent(*_SENT.unpack_from(body))
+            refused, clipped = _words_of_reply(body[_SENT.size :])
+            return Reply(refused, sent, clipped)
+        if kind is WristSpeed:
+            return _wrist_speed(*_WRIST_SPEED.unpack(body))
+    except struct.error as error:
+        raise ProtocolError(f"The robot's pipe carries a bad {kind.__name__}: {len(body)} bytes.") from error
+    except ValueError as error:
+        raise ProtocolError(f"The robot's pipe carries a bad {kind.__name__}: {error}.") from error
+    return _checked(_ADAPTERS[code], body, kind.__name__)
 
 
 def _checked(adapter: TypeAdapter[T], body: bytes, name: str) -> T:
@@ -123,36 +137,78 @@ def _state_body(state: RobotState) -> bytes:
         state.robot_mode, state.safety_mode, state.runtime_state, state.speed_scaling, state.wrist_torque_nm,
         state.motion_id, state.cycle, _MOTIONS.index(state.motion),
         state.connected, state.moving_linearly, state.protective_stop, state.emergency_stop, state.recovering,
-    ) + _words_body(state.blocked, state.ended, state.sent, state.clipped)  # fmt: skip
+    ) + _sent_body(state.sent) + _words_of_state_body(state.blocked, state.ended, state.clipped)  # fmt: skip
+
+
+def _sent_body(sent: WristSpeed | MoveLinear | Stop | None) -> bytes:
+    match sent:
+        case WristSpeed():
+            return _SENT.pack(1, sent.rad_per_s, sent.acceleration_rad_per_s2, *_NO_NUMBERS[2:])
+        case MoveLinear():
+            return _SENT.pack(2, *sent.pose, sent.speed_m_per_s, sent.acceleration_m_per_s2)
+        case Stop():
+            return _SENT.pack(3, sent.deceleration_rad_per_s2, *_NO_NUMBERS[1:])
+    return _SENT.pack(0, *_NO_NUMBERS)
+
+
+def _sent(kind: int, *numbers: float) -> WristSpeed | MoveLinear | Stop | None:
+    a, b, c, d, e, f, speed, acceleration = _finite(numbers)
+    match kind:
+        case 0:
+            return None
+        case 1:
+            return WristSpeed(a, b)
+        case 2:
+            return MoveLinear((a, b, c, d, e, f), speed, acceleration)
+        case 3:
+            return Stop(a)
+    raise ValueError(f"there is no motion {kind} that could have been sent")
+
+
+def _wrist_speed(*numbers: float) -> WristSpeed:
+    return WristSpeed(*_finite(numbers))
+
+
+def _finite(numbers: tuple[float, ...]) -> tuple[float, ...]:
+    if not all(map(isfinite, numbers)):
+        raise ValueError("a command of what is no number")
+    return numbers
 
 
 @lru_cache(maxsize=4)
-def _words_body(
-    blocked: str, ended: str, sent: WristSpeed | MoveLinear | Stop | None, clipped: tuple[str, ...]
-) -> bytes:
-    return _WORDS.dump_json(_Words(blocked, ended, sent, clipped))
+def _words_of_state_body(blocked: str, ended: str, clipped: tuple[str, ...]) -> bytes:
+    return _WORDS_OF_STATE.dump_json((blocked, ended, clipped))
 
 
 @lru_cache(maxsize=4)
-def _words(body: bytes) -> _Words:
-    return _checked(_WORDS, body, RobotState.__name__)
+def _words_of_state(body: bytes) -> tuple[str, str, tuple[str, ...]]:
+    return _checked(_WORDS_OF_STATE, body, RobotState.__name__)
+
+
+@lru_cache(maxsize=4)
+def _words_of_reply_body(refused: str, clipped: tuple[str, ...]) -> bytes:
+    return _WORDS_OF_REPLY.dump_json((refused, clipped))
+
+
+@lru_cache(maxsize=4)
+def _words_of_reply(body: bytes) -> tuple[str, tuple[str, ...]]:
+    return _checked(_WORDS_OF_REPLY, body, Reply.__name__)
 
 
 def _state(body: bytes) -> RobotState:
-    if len(body) < _NUMBERS.size:
-        raise ProtocolError(f"The robot's pipe carries a bad RobotState: {len(body)} bytes.")
     (
         t_mono_ns, timestamp_s, age_ns, *v, robot_mode, safety_mode, runtime_state, speed_scaling, wrist_torque_nm,
         motion_id, cycle, motion, connected, moving_linearly, protective_stop, emergency_stop, recovering,
     ) = _NUMBERS.unpack_from(body)  # fmt: skip
     if motion >= len(_MOTIONS):
-        raise ProtocolError(f"The robot's pipe carries a bad RobotState: there is no motion {motion}.")
-    words = _words(body[_NUMBERS.size :])
+        raise ValueError(f"there is no motion {motion}")
+    sent = _sent(*_SENT.unpack_from(body, _NUMBERS.size))
+    blocked, ended, clipped = _words_of_state(body[_NUMBERS.size + _SENT.size :])
     return RobotState(
         t_mono_ns, timestamp_s, age_ns, connected,
         (v[0], v[1], v[2], v[3], v[4], v[5]), (v[6], v[7], v[8], v[9], v[10], v[11]),
         (v[12], v[13], v[14], v[15], v[16], v[17]), (v[18], v[19], v[20], v[21], v[22], v[23]),
         robot_mode, safety_mode, runtime_state, speed_scaling, moving_linearly,
-        wrist_torque_nm, protective_stop, emergency_stop, words.blocked, recovering,
-        _MOTIONS[motion], motion_id, words.ended, words.sent, words.clipped, cycle,
+        wrist_torque_nm, protective_stop, emergency_stop, blocked, recovering,
+        _MOTIONS[motion], motion_id, ended, sent, clipped, cycle,
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
@@ -18,7 +18,7 @@ from daemon.loop.watch import WatchSettings
 from daemon.loop.wrist import Wrist, WristSettings
 from daemon.loop_task import WRENCH, LoopTask, wrench_source
 from drivers.ur.client import UrRobot
-from drivers.ur.messages import Command, MoveLinear, Reply, RobotState
+from drivers.ur.messages import Command, MoveLinear, Reply, RobotState, WristSpeed
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
 
 SPEED_M_PER_S = 0.1
@@ -36,6 +36,7 @@ class Robot(UrRobot):
         # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
         self.brakes_for = 0
         self.flight.fly(5)
+        self._held: list[Callable[[], None]] = []
         # Of how many cycles the daemon needs one.
         self.of_cycles = 1
 
@@ -45,15 +46,22 @@ class Robot(UrRobot):
     def hurry(self) -> None:
         self.of_cycles = 1
 
-    async def send(self, command: Command) -> Reply:
+    def tell(self, command: Command, answered: Callable[[Reply], None]) -> None:
         self.hurry()
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
-        await asyncio.sleep(0)
+        asyncio.get_running_loop().call_soon(self._obey, command, answered)
+
+    def _obey(self, command: Command, answered: Callable[[Reply], None]) -> None:
         if isinstance(command, MoveLinear):
             self._goal = command
-        return self.flight.ask(command)
+        reply = self.flight.ask(command)
+        if isinstance(command, WristSpeed):
+            # Its reply comes with the next state.
+            self._held.append(partial(answered, reply))
+        else:
+            answered(reply)
 
     def cycle(self) -> None:
         """Let 8 ms pass, and tell who waits for the next state."""
@@ -71,6 +79,9 @@ class Robot(UrRobot):
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
         arm.be(t_mono_ns=self.flight.now_ns)
         self.flight.fly(1)
+        for answer in self._held:
+            answer()
+        self._held.clear()
         if self.flight.cycle % self.of_cycles == 0:
             self.take(0, self.flight.state)
 

@@ -20,11 +20,12 @@ from drivers.ur.messages import (
     Reading,
     Reply,
     RobotState,
+    Stop,
     Unlock,
     WristSpeed,
 )
 from drivers.ur.wire import Decoder, encode
-from tests.drivers.ur.flight import SETTINGS, FakeArm
+from tests.drivers.ur.flight import SETTINGS, FakeArm, Flight
 
 ROOT = Path(__file__).parents[3]
 
@@ -251,6 +252,31 @@ def test_an_arm_that_is_moved_is_watched_in_every_cycle(daemon: Daemon, monkeypa
 
     eased = Eased(daemon, monkeypatch, (0.101, Ease(5)), (0.301, Disconnect()), arm=Moved())
     assert eased.cycles_between(0.101, 0.301) == [13, 15, 20, 25, *range(30, 38)]
+
+
+def test_reply_to_a_wrist_speed_comes_with_the_next_state_in_one_piece(daemon: Daemon) -> None:
+    pipe, state = daemon.pipe, Flight().state
+    pipe.hold(Reply(sent=WristSpeed(0.1, 4.0)), 1)
+    with pytest.raises(BlockingIOError):
+        daemon.hear()
+    pipe.send_latest(state)
+    assert daemon.hear() == [(1, Reply(sent=WristSpeed(0.1, 4.0))), (0, state)]
+
+
+def test_what_was_held_back_comes_before_what_is_sent_at_once(daemon: Daemon) -> None:
+    daemon.pipe.hold(Reply(sent=WristSpeed(0.1, 4.0)), 1)
+    daemon.pipe.send(Reply(sent=Stop(4.0)), 2)
+    assert [number for number, _ in daemon.hear()] == [1, 2]
+
+
+def test_what_is_held_back_from_a_daemon_that_reads_nothing_has_a_bound(daemon: Daemon) -> None:
+    pipe, state = daemon.pipe, Flight().state
+    for _ in range(10_000):
+        pipe.hold(Reply(), 1)
+        pipe.send_latest(state)
+        if not pipe.open:
+            return
+    raise AssertionError("it grows and grows")
 
 
 CRASHING = """

@@ -3,6 +3,7 @@
 import contextlib
 import math
 import struct
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -78,39 +79,77 @@ def test_foreign_bytes_are_refused_or_waited_on(data: bytes) -> None:
 @pytest.mark.parametrize(
     "body",
     [
-        b'{"rad_per_s":0.1}',
-        b'{"rad_per_s":"0.1","acceleration_rad_per_s2":1.0}',
-        b'{"rad_per_s":true,"acceleration_rad_per_s2":1.0}',
-        b'{"rad_per_s":NaN,"acceleration_rad_per_s2":1.0}',
-        b'{"rad_per_s":1e999,"acceleration_rad_per_s2":1.0}',
-        b'{"rad_per_s":0.1,"acceleration_rad_per_s2":1.0,"time_s":1.0}',
-        b"[0.1,1.0]",
+        b"{}",
+        b'{"deceleration_rad_per_s2":"0.1"}',
+        b'{"deceleration_rad_per_s2":true}',
+        b'{"deceleration_rad_per_s2":NaN}',
+        b'{"deceleration_rad_per_s2":1e999}',
+        b'{"deceleration_rad_per_s2":1.0,"time_s":1.0}',
+        b"[0.1]",
         b"{",
     ],
 )
 def test_command_with_anything_missing_wrong_or_more_is_refused(body: bytes) -> None:
-    code = encode(WristSpeed(0.1, 1.0))[8]
+    with pytest.raises(ProtocolError, match="Stop"):
+        Decoder().feed(_with_body(Stop(0.1), body))
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        struct.pack("<2d", 0.1, 1.0)[:-1],
+        struct.pack("<3d", 0.1, 1.0, 0.0),
+        struct.pack("<2d", 0.1, math.nan),
+        struct.pack("<2d", -math.inf, 1.0),
+    ],
+)
+def test_wrist_speed_with_anything_missing_wrong_or_more_is_refused(body: bytes) -> None:
     with pytest.raises(ProtocolError, match="WristSpeed"):
-        Decoder().feed(struct.pack("<IIB", len(body), 1, code) + body)
+        Decoder().feed(_with_body(WristSpeed(0.1, 1.0), body))
 
 
-@pytest.mark.parametrize("change", ["a byte less of words", "a word more", "half of the numbers", "no such motion"])
+@pytest.mark.parametrize(
+    ("change", "wrong"),
+    [
+        (lambda body: body[:-1], "Invalid JSON"),
+        (lambda body: body[:-1] + b',"more"]', "2 items"),
+        (lambda body: body[:40], "40 bytes"),
+        (lambda body: b"\x04" + body[1:], "no motion 4"),
+        (lambda body: b"\x01" + struct.pack("<d", math.nan) + body[9:], "no number"),
+    ],
+)
+def test_reply_with_anything_missing_wrong_or_more_is_refused(change: Callable[[bytes], bytes], wrong: str) -> None:
+    reply = Reply("", WristSpeed(0.5, 4.0), ("force",))
+    with pytest.raises(ProtocolError, match=f"Reply: .*{wrong}"):
+        Decoder().feed(_with_body(reply, change(encode(reply)[9:])))
+
+
+@pytest.mark.parametrize(
+    "change", ["a byte less of words", "a word more", "half of the numbers", "no such motion", "nothing like it sent"]
+)
 def test_a_state_with_anything_missing_wrong_or_more_is_refused(change: str) -> None:
     state = RobotState(
         0, 0.0, 0, True, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, 7, 1, 2, 1.0, False,
         0.0, False, False, "", False, "stopping", 0, "", None, (), 3,
     )  # fmt: skip
-    header, body = encode(state)[:9], encode(state)[9:]
-    numbers = body.index(b"{")
+    body = encode(state)[9:]
+    # What was sent to the robot is a byte and eight numbers.
+    sent = body.index(b"[") - 65
     body = {
         "a byte less of words": body[:-1],
-        "a word more": body[:-1] + b',"time_s":1.0}',
-        "half of the numbers": body[: numbers // 2],
+        "a word more": body[:-1] + b',"more"]',
+        "half of the numbers": body[: sent // 2],
         # Before the five flags.
-        "no such motion": body[: numbers - 6] + b"\x04" + body[numbers - 5 :],
+        "no such motion": body[: sent - 6] + b"\x04" + body[sent - 5 :],
+        "nothing like it sent": body[:sent] + b"\x04" + body[sent + 1 :],
     }[change]
     with pytest.raises(ProtocolError, match="RobotState"):
-        Decoder().feed(struct.pack("<I", len(body)) + header[4:] + body)
+        Decoder().feed(_with_body(state, body))
+
+
+def _with_body(message: Message, body: bytes) -> bytes:
+    return struct.pack("<I", len(body)) + encode(message)[4:9] + body
 
 
 def test_states_carry_what_is_no_number() -> None:

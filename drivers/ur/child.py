@@ -47,6 +47,8 @@ EXIT_DONE, EXIT_FAILED = 0, 3
 COMMANDS = Command.__args__
 # Motion that the daemon leaves behind is braked in this time; the robot's watchdog ends what is not.
 FAREWELL_S = 1.0
+# A reading so old is as good as a new one: so late may ur-rtde see what the controller has sent.
+FRESH_S = 0.002
 # States that a slow daemon does not fetch are dropped, as the latest counts; replies wait, within this bound.
 MOST_UNSENT = 1 << 16
 
@@ -167,13 +169,15 @@ def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
     pilot = Pilot(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
     pace = Pace(settings, time.monotonic())
     leaving_s = 0.0
+    # Whether nothing of the daemon's has come until the cycle was due.
+    quiet = False
     while True:
         pace.begin()
         _alarm(settings.hang_timeout_s)
         reading = arm.read()
         if not reading.connected or reading.age_ns > 3 * settings.state_timeout_s * 1e9:
             _fail(pipe, "lost", sentences.unfit(reading, settings.host, settings.state_timeout_s))
-        if _obey(pipe, pilot, pace, reading):
+        if not quiet and _obey(pipe, pilot, pace, reading):
             leaving_s = time.monotonic() + FAREWELL_S
         if not pipe.open and not leaving_s:
             pilot.request(0, Disconnect(), reading, time.monotonic_ns())
@@ -190,11 +194,15 @@ def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
             _end_program(settings, pilot, arm)
             _leave(EXIT_DONE)
         pace.plan(time.monotonic(), rests=pilot.rests(reading) and not leaving_s)
+        quiet = False
         while pipe.open and not leaving_s and (left_s := pace.left_s(time.monotonic())) > 0:
             # A command is carried out when it comes: waiting for the next cycle would be a delay in the loop.
-            if not pipe.wait(left_s):
+            quiet = not pipe.wait(left_s)
+            if quiet:
                 continue
-            if _obey(pipe, pilot, pace, arm.read()):
+            if time.monotonic_ns() - reading.t_mono_ns > FRESH_S * 1e9:
+                reading = arm.read()
+            if _obey(pipe, pilot, pace, reading):
                 leaving_s = time.monotonic() + FAREWELL_S
             if not (pace.at_ease and pipe.open):
                 pace.hurry(time.monotonic())

@@ -44,15 +44,16 @@ def clip_wrist(asked: WristSpeed, reading: Reading, limits: Limits, reaction_s: 
     lag_s = _NO_OVERSHOOT * reaction_s
     brakeable = braking * (math.sqrt(lag_s**2 + 2 * room / braking) - lag_s)
     top = limits.wrist_speed_rad_per_s.inner
-    ceilings = [
-        (top, f"wrist speed is limited to {top:g} rad/s"),
-        (brakeable, f"wrist 3 at {reading.wrist_rad:.3f} rad is near the end of its range"),
-        *[(top * part, reason) for part, reason in _fading(reading, limits)],
-    ]
     speed = abs(asked.rad_per_s)
-    for ceiling, reason in ceilings:
-        if ceiling < speed:
-            speed = ceiling
+    if top < speed:
+        speed = top
+        reasons.append(f"wrist speed is limited to {top:g} rad/s")
+    if brakeable < speed:
+        speed = brakeable
+        reasons.append(f"wrist 3 at {reading.wrist_rad:.3f} rad is near the end of its range")
+    for part, reason in _fading(reading, limits):
+        if top * part < speed:
+            speed = top * part
             reasons.append(reason)
     target = math.copysign(speed, asked.rad_per_s)
     ramp = _safe_ramp(acceleration, target, reading, limits, reaction_s)

@@ -242,6 +242,20 @@ def test_a_command_at_ease_is_carried_out_when_it_comes_and_ends_the_ease(
     assert all(state.motion == "wrist" for state in eased.states if 26 <= state.cycle < 38)
 
 
+def test_for_a_command_soon_after_a_cycle_the_arm_is_not_read_again(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read_s: list[float] = []
+
+    class Told(TimedArm):
+        def read(self) -> Reading:
+            read_s.append(round(child.time.monotonic() - 1000.0, 6))
+            return super().read()
+
+    Eased(daemon, monkeypatch, (0.041, Enable()), (0.051, Enable()), (0.065, Disconnect()), arm=Told())
+    assert read_s[5:9] == [0.04, 0.048, 0.051, 0.056]
+
+
 def test_an_arm_that_is_moved_is_watched_in_every_cycle(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever moves it: at ease it takes one of the fewer cycles to be seen, and each one from then on."""
 

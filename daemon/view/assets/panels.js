@@ -49,22 +49,23 @@ export function torquePanel(link) {
   const valid = said?.valid ?? false;
   put(byId("torque-now"), valid ? number(said.torque_nm, 4, "N·m", { signed: true }) : "–");
   put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? interval(said.torque_low_nm, said.torque_high_nm, 4) : "");
-  warn(byId("torque-why"), said && !valid ? `no estimate: ${said.why}` : "");
+  const load = link.get("load.torque");
+  const silent = load && !load.content.valid && !link.isOld(load) ? `load cell: ${load.content.why}` : "";
+  warn(byId("torque-why"), [said && !valid ? `no estimate: ${said.why}` : "", silent].filter(Boolean).join("; "));
   const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop.content : {};
   put(byId("wanted"), number(wanted.ramp_nm, 4, "N·m", { signed: true }));
   put(byId("set-point"), wanted.set_point_nm == null ? "" : `set point ${number(wanted.set_point_nm, 3, "", { signed: true })}`);
-  loadFigure(link);
+  loadFigure(link, load);
   diameterFigure(link, estimate);
 }
 
-function loadFigure(link) {
-  const load = link.get("load.torque");
+function loadFigure(link, load) {
   show(byId("load"), load !== undefined);
   if (!load) return;
   const old = link.isOld(load);
-  const { torque_nm, valid, why } = load.content;
+  const { torque_nm, valid } = load.content;
   put(byId("load-torque"), old || !valid ? "–" : number(torque_nm, 4, "N·m", { signed: true }));
-  put(byId("load-note"), old ? `OLD, ${age(link.ageOf(load))}` : why);
+  put(byId("load-note"), old ? `OLD, ${age(link.ageOf(load))}` : valid ? "" : "not valid");
 }
 
 function diameterFigure(link, estimate) {

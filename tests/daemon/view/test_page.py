@@ -200,8 +200,9 @@ def test_a_fault_of_robot_and_gripper_stands_in_its_panel(browsed: Browsed) -> N
 def test_a_reading_of_the_load_cell_that_is_not_to_be_believed_is_no_figure(browsed: Browsed) -> None:
     browsed.open()
     browsed.daemon.say(load={"valid": False, "why": "the reading is the same for two seconds"})
-    browsed.until("#load-note", "the same for two seconds")
-    browsed.until_shown({"#load-torque": "–"})
+    why = "load cell: the reading is the same for two seconds"
+    browsed.until_shown({"#load-torque": "–", "#load-note": "not valid", "#torque-why": why})
+    assert browsed.layout()["spilt"] == []
 
 
 def test_what_has_gone_silent_is_old_while_the_rest_is_live(browsed: Browsed) -> None:

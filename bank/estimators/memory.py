@@ -26,9 +26,10 @@ from bank.estimators.values import BoolArray, FloatArray, TactileFrame
 
 # Frames that an idle baseline is averaged over at the most recent end.
 _BASELINE_FRAMES = 10
-# Frames further apart than this have lost the thread: two of a period of 0.54 s are missing. With single ones missing,
-# now and then, later twists are read with errors half as large again, within the same intervals.
+# Frames further apart than this have lost the thread: two of a period of 0.54 s are missing.
 _LARGEST_GAP_S = 1.4
+# Of so many steps in time the middle one is the period; a step longer than this share of it has one frame missing.
+_STEPS, _MISSING_SHARE = 9, 1.5
 # A session's baseline is made of at least so many frames before a grip is looked for that is not half as strong as the
 # calibration's.
 _LEAST_IDLE, _OUTRIGHT = 5, 0.5
@@ -126,6 +127,9 @@ class Memory:
         self._before: FloatArray | None = None
         self._refused: FloatArray | None = None
         self._t_s = -np.inf
+        self._steps_s: deque[float] = deque(maxlen=_STEPS)
+        # Whether a frame is missing between the last two.
+        self._missing = False
         self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
         self._let_go = [False for _ in guards]
         self._grips = [Grip(guard.grip_threshold) for guard in guards]
@@ -155,10 +159,7 @@ class Memory:
 
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
-        if not 0 < frame.t_s - self._t_s <= _LARGEST_GAP_S:
-            # A frame from before the last one says nothing of how the gel has moved since that.
-            self._forget()
-        self._t_s = frame.t_s
+        self._pass_time(frame.t_s)
         told = TactileFrame(
             frame.t_s,
             frame.channels,
@@ -196,6 +197,23 @@ class Memory:
         self._notice_release(channels)
         return self._judged(channels, frame.usable)
 
+    def _pass_time(self, t_s: float) -> None:
+        step_s, self._t_s, self._missing = t_s - self._t_s, t_s, False
+        if not 0 < step_s <= _LARGEST_GAP_S:
+            # A frame from before the last one says nothing of how the gel has moved since that.
+            self._forget()
+            return
+        self._missing = len(self._steps_s) == _STEPS and step_s > _MISSING_SHARE * float(np.median(self._steps_s))
+        self._steps_s.append(step_s)
+
+    def _remember(self, channels: FloatArray, *, bridged: bool) -> None:
+        """Add a frame to the last ones; where one is missing before it, that one lies halfway."""
+        if self._missing and self._recent:
+            self._recent.append(0.5 * (self._recent[-1] + channels))
+            self._bridged.append(True)
+        self._recent.append(channels)
+        self._bridged.append(bridged)
+
     def _taken_for_idle(self, channels: FloatArray, usable: BoolArray) -> Moment:
         self._refused, self._before = None, channels
         self._idle_taken.append(channels)
@@ -227,13 +245,12 @@ class Memory:
             self._recent.clear()
             self._bridged.clear()
             return Moment(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
-        self._recent.append(channels)
-        self._bridged.append(False)
+        self._remember(channels, bridged=False)
         missing = (self._recent.maxlen or 0) - len(self._recent)
         if missing:
             return Moment(channels, difference, (f"gripped too lately: {missing} more frames are needed",), usable)
         if sum(self._bridged) > _LARGEST_BRIDGED:
-            return Moment(channels, difference, ("too many of the last frames were disturbed",), usable)
+            return Moment(channels, difference, ("too many of the last frames were disturbed, or are missing",), usable)
         return Moment(channels, difference, (), usable)
 
     def _holds(self, layer: int, channels: FloatArray) -> bool:
@@ -265,8 +282,7 @@ class Memory:
         else:
             self._refused = channels
             if self._recent:
-                self._recent.append(self._recent[-1])
-                self._bridged.append(True)
+                self._remember(self._recent[-1], bridged=True)
         return Moment(channels, np.zeros_like(channels), (disturbed,), usable)
 
     def _disturbed(self, channels: FloatArray, usable: BoolArray) -> str | None:

@@ -248,3 +248,23 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(twisting):
     unknown.hold(Measured(14.0, 0.1))
     frames = [TactileFrame.of(float(t_s), x) for t_s, x in zip(twisted.t_s, twisted.channels, strict=True)]
     assert any(unknown.estimate(frame).valid for frame in frames)
+
+
+def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(fused_calibration, twisting):
+    whole = twisting(seed=5)
+    number = np.arange(len(whole.t_s))
+
+    def without(lost):
+        kept = ~lost
+        return changed(whole, t_s=whole.t_s[kept], channels=whole.channels[kept], diameter_mm=whole.diameter_mm[kept])
+
+    _, rmse, _ = judged(follow(fused_calibration, whole), whole)
+    some = without(number % 8 == 7)
+    _, with_some_lost, inside = judged(follow(fused_calibration, some), some)
+    assert with_some_lost < 1.1 * rmse
+    assert inside > 0.9
+    # More than three of the thirteen frames that are remembered would be made up.
+    many = without(number % 3 == 2)
+    estimates = follow(fused_calibration, many)
+    assert not any(one.valid for one in estimates)
+    assert any("are missing" in why for one in estimates for why in one.why)

@@ -3,9 +3,10 @@
 An estimator with a memory of seconds cannot tell by its error: what the load was a second ago, its frames still know.
 But a load that changes moves the gel within the same frame. How far single frames move, along the directions in which
 they move most, is regressed on the torque's change over the same time, which is shifted against it; where that explains
-most, on stretches of time that were left out, is how late the torques are. Recorded twists say 0.12 to 0.24 s, wherever
-they are cut, with a peak half a frame wide; half of it is the filter of the load cell's converter, whose output settles
-within 0.4 s (HX711 at ten samples a second).
+most, on stretches of time that were left out, is how late the torques are. Its uncertainty is that of stretches drawn
+anew. Recorded twists say 0.25 to 0.27 s, wherever they are cut, ± 0.02 to 0.06 s; most of it is the filter of the load
+cell's converter, whose output settles within 0.4 s (HX711 at ten samples a second). Played rigs, without that filter,
+say −0.03 to 0.04 s.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,9 @@ from bank.estimators.guard import channel_noise
 from bank.estimators.heads import left_out_blocks
 from bank.estimators.values import FloatArray, FrameSeries
 
-_SHIFTS_S = np.round(np.arange(-6.0, 6.01, 0.12), 2)
+_SHIFTS_S = np.round(np.arange(-6.0, 6.01, 0.06), 2)
+# A parabola through so much on both sides of the highest shift has the peak.
+_PEAK_S = 0.18
 _N_DIRECTIONS = 6
 # Held back a little: on a stretch without load nothing but noise moves.
 _STRENGTH = 1e-3
@@ -28,15 +31,27 @@ _LARGEST_MOVE = 4.0
 # The peak must explain this much, and so much more than any shift this far from it: otherwise nothing is said. A minute
 # with a single twist (`glitch_20241202_173837`) has a chance peak of 0.06 at five seconds.
 _LEAST_EXPLAINED, _ABOVE_OTHERS, _APART_S = 0.1, 1.5, 1.1
-# The filter's delay, and two thirds of a frame around it.
-_EXPECTED_S, _TOLERANCE_S = 0.2, 0.36
+# How late a load cell's reading is by itself, in its sampling periods: with a filter (an HX711 settles within four; the
+# recorded ones are 2.7 late), without one (at most the mean over a period), and where its noise does not say which.
+_PERIODS_LATE: dict[bool | None, tuple[float, float]] = {True: (1.6, 2.7), False: (0.0, 1.0), None: (0.0, 2.7)}
+# So much may the stamps be off beside that.
+_STAMPS_S = 0.05
+# What is surely outside is refused: by so many standard errors, found by drawing stretches of so many frames anew.
+_CERTAIN = 1.5
+_STRETCH_FRAMES, _DRAWS = 16, 200
+# Readings of which the noise is told, and how many such stretches that takes.
+_NOISE, _LEAST_QUIET = 64, 4
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How much later than the frames' motion the torques are stamped, in s, and what share of their change it tells."""
+    """How much later than the frames' motion the torques are stamped, in s, and what share of their change it tells.
+
+    error_s is the standard error of late_s.
+    """
 
     late_s: float
+    error_s: float
     explained: float
 
 
@@ -44,13 +59,43 @@ def check_alignment(recordings: Sequence[FrameSeries]) -> None:
     """Raise CalibrationError for a recording whose torques are clearly stamped at other times than its frames."""
     for one in recordings:
         found = alignment(one)
-        if found is not None and abs(found.late_s - _EXPECTED_S) > _TOLERANCE_S:
+        if found is None:
+            continue
+        period_s = float(np.median(np.diff(one.torque_t_s)))
+        earliest_s, latest_s = (each * period_s for each in _PERIODS_LATE[is_filtered(one.torque_nm)])
+        surely_s = _STAMPS_S + _CERTAIN * found.error_s
+        if not earliest_s - surely_s <= found.late_s <= latest_s + surely_s:
             order = "before" if found.late_s > 0 else "after"
+            usual_s = (earliest_s + latest_s) / 2
             raise CalibrationError(
-                f"the frames move {abs(found.late_s):.1f} s {order} the load that moves them is stamped: a calibration "
-                "would learn another moment's torque; set the load cell's clock right and record again, or calibrate "
-                f"with --load-late {found.late_s - _EXPECTED_S:.2f}"
+                f"the frames move {abs(found.late_s):.2f} ± {found.error_s:.2f} s {order} the load that moves them is "
+                f"stamped, and this load cell is {usual_s:.2f} s late by itself: a calibration would learn another "
+                "moment's torque; set the load cell's clock right and record again, or calibrate with --load-late "
+                f"{found.late_s - usual_s:.2f}"
             )
+
+
+def is_filtered(torque_nm: FloatArray) -> bool | None:
+    """Return whether a load cell's noise, in the quietest quarter of (p,) readings, has gone through a filter.
+
+    Where the noise of each reading is its own, the differences from one to the next correlate by −½ with those before
+    them. Where a reading shares half of its time with the one before, they correlate so with those before that.
+    Recorded HX711s say −0.07 and −0.34, played ones, which have no filter, −0.45 and 0. None where it is neither.
+    """
+    differences = np.diff(torque_nm)
+    stretches = differences[: len(differences) // _NOISE * _NOISE].reshape(-1, _NOISE)
+    stretches = stretches - stretches.mean(axis=1, keepdims=True)
+    power = (stretches**2).mean(axis=1)
+    quietest = np.argsort(power)[np.count_nonzero(power == 0) :][: np.count_nonzero(power) // 4]
+    if len(quietest) < _LEAST_QUIET:
+        return None
+    quiet = stretches[quietest]
+    next_one, one_after = (
+        float(np.median((quiet[:, :-k] * quiet[:, k:]).mean(axis=1) / power[quietest])) for k in (1, 2)
+    )
+    if next_one > -0.25 and -0.6 < one_after < -0.15:  # a lever that rings takes back more than half
+        return True
+    return False if next_one < -0.35 and one_after > -0.15 else None
 
 
 def alignment(series: FrameSeries) -> Alignment | None:
@@ -65,12 +110,30 @@ def alignment(series: FrameSeries) -> Alignment | None:
 
 def _of_side(series: FrameSeries, part: slice, layer: int) -> Alignment | None:
     moves, middles, span_s = _moves(series.t_s[part], series.channels[part, layer])
-    explained = _explained(moves, np.array([_changes(series, middles + late, span_s) for late in _SHIFTS_S]).T)
+    changes = np.array([_changes(series, middles + late, span_s) for late in _SHIFTS_S]).T
+    whole, left = changes**2, _left_over(moves, changes) ** 2
+    explained = _explained(whole.sum(axis=0), left.sum(axis=0))
     best = int(np.argmax(explained))
     others = explained[np.abs(_SHIFTS_S - _SHIFTS_S[best]) > _APART_S]
     if not explained[best] >= max(_LEAST_EXPLAINED, _ABOVE_OTHERS * float(others.max())):
         return None
-    return Alignment(float(_SHIFTS_S[best]), float(explained[best]))
+    near = np.abs(_SHIFTS_S - _SHIFTS_S[best]) <= _APART_S / 2
+    shifts_s = _SHIFTS_S[near]
+    parts = [np.add.reduceat(each[:, near], np.arange(0, len(moves), _STRETCH_FRAMES)) for each in (whole, left)]
+    drawn = np.random.default_rng(0).integers(0, len(parts[0]), (_DRAWS, len(parts[0])))
+    peaks = [_peak(shifts_s, _explained(*(each[some].sum(axis=0) for each in parts))) for some in drawn]
+    # Half of what two thirds of the draws span: a few find another peak.
+    error_s = float(np.diff(np.quantile(peaks, [0.16, 0.84]))[0]) / 2
+    return Alignment(_peak(shifts_s, explained[near]), error_s, float(explained[best]))
+
+
+def _peak(shifts_s: FloatArray, explained: FloatArray) -> float:
+    """Return the place of the highest of (s,) shares, between the shifts."""
+    best = shifts_s[np.argmax(explained)]
+    near = np.abs(shifts_s - best) <= _PEAK_S + 1e-9
+    bend, slope, _ = np.polyfit(shifts_s[near] - best, explained[near], 2)
+    beside = -slope / (2 * bend) if bend < 0 else 0.0
+    return float(best + np.clip(beside, -_PEAK_S, _PEAK_S))
 
 
 def _moves(t_s: FloatArray, channels: FloatArray) -> tuple[FloatArray, FloatArray, float]:
@@ -94,16 +157,16 @@ def _changes(series: FrameSeries, middles: FloatArray, span_s: float) -> FloatAr
     return np.asarray(change - change.mean())
 
 
-def _explained(moves: FloatArray, changes: FloatArray) -> FloatArray:
-    """Return the (s,) shares of the (n, s) changes' variance that a ridge on the (n, p) moves explains.
-
-    On blocks of time left out in turn; 0 for a shift at which no load changes.
-    """
-    left = np.zeros(changes.shape[1])
+def _left_over(moves: FloatArray, changes: FloatArray) -> FloatArray:
+    """Return what a ridge on the (n, p) moves leaves of the (n, s) changes, on blocks of time left out in turn."""
+    left = np.zeros_like(changes)
     for rest, block in left_out_blocks(len(moves)):
         gram = moves[rest].T @ moves[rest]
         penalty = _STRENGTH * float(np.trace(gram)) / len(gram) * np.eye(len(gram))
-        weights = np.linalg.solve(gram + penalty, moves[rest].T @ changes[rest])
-        left += ((changes[block] - moves[block] @ weights) ** 2).sum(axis=0)
-    whole = (changes**2).sum(axis=0)
+        left[block] = changes[block] - moves[block] @ np.linalg.solve(gram + penalty, moves[rest].T @ changes[rest])
+    return left
+
+
+def _explained(whole: FloatArray, left: FloatArray) -> FloatArray:
+    """Return the explained shares of (s,) sums of squares; 0 for a shift at which no load changes."""
     return np.where(whole > 0, 1.0 - left / np.where(whole > 0, whole, 1.0), 0.0)

@@ -19,7 +19,7 @@ from daemon.workers import Workers
 
 SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
 STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "fused")
-SHIFTS_S = (0.0, 0.27, 0.54, 1.08, 2.16, 4.33)
+SHIFTS_S = (-0.54, -0.27, -0.13, 0.0, 0.13, 0.27, 0.54, 1.08)
 
 
 def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, pool: Workers) -> list[Path]:

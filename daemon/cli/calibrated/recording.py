@@ -43,6 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Fit, write, and say what was fitted."""
     from bank.bank_file import Bank
     from bank.estimators import Physics, fit
+    from bank.estimators.alignment import alignment
     from bank.mesh import load_mesh
     from daemon.cli.recorded import parsed_part, parsed_sides
     from daemon.errors import UserError
@@ -80,9 +81,13 @@ def run(args: argparse.Namespace) -> int:
         "sides": list(calibration.sides),
         "source": source,
     }
-    sentence = (
+    sentences = [
         f"{args.out}: estimator {args.estimator}, {' and '.join(quantities)} from {frames} frames of the "
         f"{' and '.join(calibration.sides)} side."
-    )
-    tell(told, [sentence], as_json=args.json)
+    ]
+    if late_s is None and calibration.kind == "raw":
+        told["load_late_s"] = [found and round(found.late_s, 3) for found in map(alignment, parts)]
+        known = ", ".join(f"{each:.2f}" for each in told["load_late_s"] if each is not None)
+        sentences += [f"The load is stamped {known} s after the frames move."] if known else []
+    tell(told, sentences, as_json=args.json)
     return 0

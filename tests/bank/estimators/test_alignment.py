@@ -1,20 +1,23 @@
 """Torques that are stamped at other times than the frames: measured by how single frames move as the load changes."""
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bank.errors import CalibrationError
+from bank.estimators import alignment as alignments
 from bank.estimators import fit
-from bank.estimators.alignment import alignment
+from bank.estimators.alignment import Alignment, alignment, check_alignment, is_filtered
 
 
 @pytest.mark.parametrize("late_s", [-2.0, -0.5, 0.0, 0.3, 1.0, 4.0])
-def test_lateness_is_measured_to_a_quarter_of_a_frame(recorded, late_s):
+def test_lateness_is_measured_far_finer_than_a_frame(recorded, late_s):
     found = alignment(replace(recorded, torque_t_s=recorded.torque_t_s + late_s))
     assert found is not None
-    assert found.late_s == pytest.approx(late_s, abs=0.13)
+    assert found.late_s == pytest.approx(late_s, abs=0.03)
+    assert 0 < found.error_s < 0.03
 
 
 @pytest.mark.parametrize("late_s", [-0.6, 0.8, 4.0])
@@ -23,6 +26,51 @@ def test_torques_that_are_stamped_at_other_times_are_refused_unless_somebody_vou
     with pytest.raises(CalibrationError, match=f"s {'before' if late_s > 0 else 'after'} the load that moves"):
         fit("fused", [late], "late")
     assert fit("regression", [late], "vouched for", trust_times=True).torque is not None
+
+
+def noise(like: np.ndarray, taps: list[float]) -> np.ndarray:
+    white = np.random.default_rng(1).normal(0, 2e-5, len(like) + len(taps) - 1)
+    return np.convolve(white, taps, "valid")
+
+
+@pytest.mark.parametrize(
+    ("taps", "filtered"), [([1.0], False), ([0.5, 0.5], True), ([0.2] * 5, None), ([0.0], None), ([1, 1, -1, -1], None)]
+)
+def test_a_filter_shows_in_the_noise_of_a_load_cell(recorded, taps, filtered):
+    assert is_filtered(recorded.torque_nm + noise(recorded.torque_nm, taps)) is filtered
+    assert is_filtered(recorded.torque_nm[:200]) is None
+
+
+@pytest.mark.parametrize(
+    ("taps", "late_s", "sound"),
+    [
+        ([0.5, 0.5], 0.2, True),
+        ([0.5, 0.5], 0.0, False),  # a converter with a filter cannot be as early
+        ([0.5, 0.5], 0.4, False),
+        ([1.0], 0.0, True),
+        ([1.0], 0.3, False),  # and one without has no reason to be as late
+        ([0.0], 0.0, True),
+        ([0.0], 0.25, True),
+        ([0.0], 0.4, False),
+    ],
+)
+def test_what_is_late_depends_on_the_load_cell(recorded, taps, late_s, sound):
+    late = replace(
+        recorded,
+        torque_t_s=recorded.torque_t_s + late_s,
+        torque_nm=recorded.torque_nm + noise(recorded.torque_nm, taps),
+    )
+    with nullcontext() if sound else pytest.raises(CalibrationError, match="by itself"):
+        check_alignment([late])
+
+
+def test_lateness_that_is_uncertain_is_not_refused(recorded, monkeypatch):
+    late = replace(recorded, torque_t_s=recorded.torque_t_s + 0.4)
+    monkeypatch.setattr(alignments, "_of_side", lambda *_: Alignment(0.4, 0.1, 0.5))
+    check_alignment([late])
+    monkeypatch.setattr(alignments, "_of_side", lambda *_: Alignment(0.4, 0.02, 0.5))
+    with pytest.raises(CalibrationError, match=r"0\.40 ± 0\.02 s before the load .* --load-late 0\.28"):
+        check_alignment([late])
 
 
 def test_nothing_is_said_where_no_load_changes_the_frames(recorded):

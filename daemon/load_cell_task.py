@@ -3,6 +3,8 @@
 import contextlib
 from collections.abc import Callable, Mapping
 
+import structlog
+
 from daemon.clock import Clock
 from daemon.loop.senses import Source, Torque
 from daemon.messages import LoadTorque, Scalar
@@ -30,6 +32,9 @@ class LoadCellTask:
         self._clock = clock
         self._hear = hear
         self._zeroing: list[float] | None = None
+        # Until when a zero is taken, and why the last one was not.
+        self._zero_until_ns = 0
+        self._untaken = ""
         self._waiting = Waiting()
         self._why = ""
 
@@ -43,8 +48,9 @@ class LoadCellTask:
                 self._take_zero(sample)
 
     def tare(self) -> None:
-        """Take the mean of the next samples for zero."""
-        self._zeroing = []
+        """Take the mean of the next samples for zero; of those that come too late for it, it would be of any load."""
+        self._zeroing, self._untaken = [], ""
+        self._zero_until_ns = self._clock.now_ns() + round(ZERO_DEADLINE_S * 1e9)
 
     async def zero(self) -> str:
         """Take the mean of the next samples for zero; return why it could not be done, or an empty text."""
@@ -62,11 +68,20 @@ class LoadCellTask:
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board."""
-        return self._board.facts()
+        facts = self._board.facts()
+        return {**facts, "trouble": self._untaken if facts["connected"] else facts["last_loss"]}
 
     def _take_zero(self, sample: LoadSample) -> None:
         self._why = _why(sample)
         if self._zeroing is None:
+            return
+        if sample.t_arrival_ns > self._zero_until_ns:
+            self._zeroing = None
+            self._untaken = (
+                f"a zero that was asked for was not taken within {ZERO_DEADLINE_S:g} s, and is not taken any more; see "
+                "what the load cell says, and tare again"
+            )
+            structlog.get_logger().warning(self._untaken)
             return
         if sample.trusted:
             self._zeroing.append(sample.raw)

@@ -5,7 +5,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from daemon.clock import Clock
-from daemon.load_cell_task import ZERO_SAMPLES, LoadCellTask
+from daemon.load_cell_task import ZERO_DEADLINE_S, ZERO_SAMPLES, LoadCellTask
 from daemon.messages import LoadTorque
 from drivers.hx711 import LoadSample
 
@@ -26,14 +26,21 @@ class Board:
     def tare(self, raw_at_rest: float) -> None:
         self.tares.append(raw_at_rest)
 
-    def facts(self) -> dict[str, int]:
-        return {}
+    def facts(self) -> dict[str, bool | str]:
+        return {"connected": True, "last_loss": ""}
 
     async def send(self, raw: float, count: int = ZERO_SAMPLES, *, saturated: bool = False) -> None:
         for _ in range(count):
             self._seq += 1
             self.sent.put_nowait(LoadSample(raw, 0.1, self._seq, self._seq, self._seq, saturated=saturated))
         await self.sent.join()
+
+
+class Later(Clock):
+    """A minute from now."""
+
+    def now_ns(self) -> int:
+        return super().now_ns() + 60 * 10**9
 
 
 class Published:
@@ -90,6 +97,25 @@ async def test_the_operators_tare_is_taken_from_the_next_samples() -> None:
     async with reading() as (task, board):
         task.tare()
         await board.send(3.0)
+        assert board.tares == [3.0]
+
+
+async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_later_hour() -> None:
+    async with reading() as (task, board):
+        task.tare()
+        await board.send(8388607.0, saturated=True)
+        later_ns = Clock().now_ns() + round((ZERO_DEADLINE_S + 1.0) * 1e9)
+        for seq in range(2 * ZERO_SAMPLES):
+            board.sent.put_nowait(LoadSample(9.0, 0.1, later_ns + seq, later_ns + seq, seq))
+        await board.sent.join()
+        assert board.tares == []
+        assert "was not taken within 15 s" in str(task.facts()["trouble"])
+        task._clock = Later()
+        task.tare()
+        assert task.facts()["trouble"] == ""
+        for seq in range(ZERO_SAMPLES):
+            board.sent.put_nowait(LoadSample(3.0, 0.1, later_ns + seq, later_ns + seq, seq))
+        await board.sent.join()
         assert board.tares == [3.0]
 
 

@@ -189,7 +189,8 @@ def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
         decided = pilot.tick(reading, time.monotonic_ns())
         if decided is not None:
             pipe.send(decided[1], decided[0])
-        pipe.send_latest(pilot.state(reading, pace.cycle))
+        if not pilot.puzzled():
+            pipe.send_latest(pilot.state(reading, pace.cycle))
         if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
             _end_program(settings, pilot, arm)
             _leave(EXIT_DONE)

@@ -42,6 +42,8 @@ class Mover:
         self.sent: WristSpeed | MoveLinear | Stop | None = None
         self.clipped: tuple[str, ...] = ()
         self.barred = sentences.NOT_OURS
+        # Whether the robot did not take something since this was last set back.
+        self.puzzled = False
         self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
         self._speed_thread = False
         self._asked_ns = self._rested_ns = now_ns
@@ -68,7 +70,7 @@ class Mover:
         self._move_ns, self._move_end = now_ns, sent.pose
         taken = self._arm.move(sent)
         if not taken:
-            self.let_go(sentences.not_taken("linear move"))
+            self._not_taken("linear move")
         return taken
 
     def stop_as_asked(self, number: int, asked: Stop, reading: Reading, now_ns: int) -> None:
@@ -97,7 +99,7 @@ class Mover:
         self._braking = asked
         self._deadline_ns = now_ns + int(1e9 * longest_stop_s(asked, reading))
         if not self._speed_thread and not self._arm.stop_move(asked.deceleration_rad_per_s2):
-            self.let_go(sentences.not_taken("stop"))
+            self._not_taken("stop")
 
     def let_go(self, why: str) -> None:
         """Send nothing to this program any more: whatever it does now, the robot's watchdog ends it."""
@@ -190,8 +192,12 @@ class Mover:
         taken = self._arm.wrist(command)
         if not taken:
             # An earlier speed may still hold.
-            self.let_go(sentences.not_taken("wrist speed"))
+            self._not_taken("wrist speed")
         return taken
+
+    def _not_taken(self, what: str) -> None:
+        self.puzzled = True
+        self.let_go(sentences.not_taken(what))
 
     def _end_speed_thread(self) -> None:
         if self._speed_thread:

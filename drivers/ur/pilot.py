@@ -67,6 +67,14 @@ class Pilot:
         """Whether calls may take seconds: the dashboard's, and the first one to a new program."""
         return self._recovery is not None
 
+    def puzzled(self) -> bool:
+        """Return, once, whether the robot did not take something: the next reading may say why.
+
+        The connection that commands may see the end of the program before the one that reads.
+        """
+        puzzled, self._mover.puzzled = self._mover.puzzled, False
+        return puzzled
+
     def left_paused(self, reading: Reading) -> bool:
         """Whether the program that was started here is paused, and could be resumed by anybody."""
         return self._started and reading.runtime_state not in (RUNTIME_STOPPED, RUNTIME_PLAYING)

@@ -256,6 +256,26 @@ def test_for_a_command_soon_after_a_cycle_the_arm_is_not_read_again(
     assert read_s[5:9] == [0.04, 0.048, 0.051, 0.056]
 
 
+@pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
+def test_a_stop_that_the_readings_tell_later_than_the_commands_is_told_as_what_it_is(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, stopped_s: float
+) -> None:
+    class Late(TimedArm):
+        def wrist(self, command: WristSpeed) -> bool:
+            self.takes = child.time.monotonic() < 1000.0 + stopped_s
+            return super().wrist(command)
+
+        def read(self) -> Reading:
+            if child.time.monotonic() > 1000.003 + stopped_s and self.reading.safety_mode == 1:
+                self.protective_stop()
+            return super().read()
+
+    speeds = [(0.1005 + 0.008 * number, WristSpeed(0.1, 4.0)) for number in range(20)]
+    eased = Eased(daemon, monkeypatch, (0.1, Enable()), *speeds, (0.3, Disconnect()), arm=Late())
+    assert {state.blocked[:15] for state in eased.states if state.cycle > 15} == {"", "Protective stop"}
+    assert {state.motion for state in eased.states if state.blocked} == {"idle"}
+
+
 def test_an_arm_that_is_moved_is_watched_in_every_cycle(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever moves it: at ease it takes one of the fewer cycles to be seen, and each one from then on."""
 

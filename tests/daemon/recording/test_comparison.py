@@ -1,0 +1,68 @@
+"""What a replay made beside what was recorded: every difference is counted, and so is what has nothing beside it."""
+
+import json
+from typing import Any
+
+import pytest
+
+from daemon.clock import Clock
+from daemon.messages import EitEstimate, wire_map
+from daemon.recording.content import message_json
+from daemon.recording.recorded_run import Happened
+from daemon.recording.replay import Comparison
+from daemon.recording.schema import completed
+from tests.daemon.sample_messages import sample
+
+TOPIC = EitEstimate.topic
+
+
+def estimate(**changes: Any) -> dict[str, Any]:
+    content = wire_map(sample(EitEstimate), Clock().unix_s(0), 7)
+    return content | {"source": "right", "t_mono_ns": 5} | changes
+
+
+def recorded(content: dict[str, Any]) -> Happened:
+    """Return a message as it comes back from a recording, which leaves out what has no value."""
+    plain = json.loads(message_json(TOPIC, content, 0))
+    return Happened(TOPIC, content["t_mono_ns"], completed(TOPIC, plain), content["source"])
+
+
+@pytest.mark.parametrize(
+    ("then", "now", "told"),
+    [
+        ({}, {}, ""),
+        ({"latency_s": 0.1, "timestamp": 1.0, "seq": 3}, {"latency_s": 0.7, "timestamp": 2.0, "seq": 4}, ""),
+        ({"torque_nm": 0.1}, {"torque_nm": 0.1 + 1e-16}, "torque_nm was 0.1, is 0.100000000000000"),
+        ({"k": None}, {"k": 1.5}, "k was None, is 1.5"),
+        ({"k": 1.5}, {"k": None}, "k was 1.5, is None"),
+        ({"why": ""}, {"why": "no grip"}, "why was"),
+    ],
+)
+def test_a_message_is_the_recorded_one_bit_for_bit_or_told_with_what_differs(
+    then: dict[str, Any], now: dict[str, Any], told: str
+) -> None:
+    comparison = Comparison(("eit.estimate.right",))
+    comparison.made(TOPIC, estimate(**now))
+    comparison.recorded(recorded(estimate(**then)))
+    assert comparison.compared[TOPIC] == 1
+    assert comparison.different[TOPIC] == bool(told)
+    assert told in "".join(comparison.examples)
+    assert comparison.unrecorded == 0
+
+
+def test_what_was_recorded_and_not_made_again_differs() -> None:
+    comparison = Comparison(("eit.estimate.right", "eit.estimate.left"))
+    comparison.made(TOPIC, estimate(source="left"))
+    comparison.recorded(recorded(estimate()))
+    assert comparison.different[TOPIC] == 1
+    assert "it was not made again" in comparison.examples[0]
+    assert comparison.unrecorded == 1, "the left one has no message beside it"
+
+
+def test_what_is_in_no_topic_of_the_recording_is_counted_and_not_kept() -> None:
+    comparison = Comparison(("eit.estimate.right",))
+    for _ in range(3):
+        comparison.made(TOPIC, estimate(source="left"))
+        comparison.made("health", {"source": "daemon"})
+    assert comparison.unrecorded == 3
+    assert comparison._made == {}

@@ -183,7 +183,9 @@ def load_bank_plans(
         key = tuple(geometry.items())
         if key not in meshes:
             meshes[key] = _mesh_of(path, config, geometry)
-        plans[_shown(chosen)] = BankPlan(meshes[key], model, k.values(), sigma.values(), Variation(**varied))
+        if (name := _shown(chosen)) in plans:
+            raise UserError(f"{path}: two banks of `over` would be named {name}; take fewer values, or further apart")
+        plans[name] = BankPlan(meshes[key], model, k.values(), sigma.values(), Variation(**varied))
     return plans
 
 

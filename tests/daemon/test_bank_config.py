@@ -147,6 +147,10 @@ def test_a_configuration_over_more_parameters_is_a_bank_for_each_combination(con
     [
         ("over: {tilt: {low: 0, high: 1, count: 2}}", "`over.tilt` is not a known key, did you mean `tilt_deg`"),
         ("over: {amplitude: {low: 0, high: 1, count: 1001}}", "`over` makes 1001 banks; take fewer values, 1000"),
+        (
+            "over: {amplitude: {low: 0.5, high: 0.5000001, count: 3}}",
+            "two banks of `over` would be named amplitude=0.5",
+        ),
         ("over: {height_cm: {low: -1, high: 1, count: 2}}", r"tip\.yaml, with height_cm=-1.*: `height_cm` should be"),
         ("over: {height_cm: {low: 1, high: 2, count: 2}}", r"tip\.yaml, with height_cm=1"),
     ],

@@ -6,7 +6,7 @@ they move most, is regressed on the torque's change over the same time, which is
 most, on stretches of time that were left out, is how late the torques are. Its uncertainty is that of stretches drawn
 anew. Recorded twists say 0.25 to 0.27 s, wherever they are cut, ± 0.02 to 0.06 s; most of it is the filter of the load
 cell's converter, whose output settles within 0.4 s (HX711 at ten samples a second). Played rigs, without that filter,
-say −0.03 to 0.04 s.
+say −0.08 to 0.05 s.
 """
 
 from collections.abc import Sequence
@@ -32,8 +32,9 @@ _LARGEST_MOVE = 4.0
 # with a single twist (`glitch_20241202_173837`) has a chance peak of 0.06 at five seconds.
 _LEAST_EXPLAINED, _ABOVE_OTHERS, _APART_S = 0.1, 1.5, 1.1
 # How late a load cell's reading is by itself, in its sampling periods: with a filter (an HX711 settles within four; the
-# recorded ones are 2.7 late), without one (at most the mean over a period), and where its noise does not say which.
-_PERIODS_LATE: dict[bool | None, tuple[float, float]] = {True: (1.6, 2.7), False: (0.0, 1.0), None: (0.0, 2.7)}
+# recorded ones are 2.7 late), without one (at most the mean over a period; early, where a gel goes on moving after the
+# load: 0.9 on a played rig), and where its noise does not say which.
+_PERIODS_LATE: dict[bool | None, tuple[float, float]] = {True: (1.6, 2.7), False: (-1.0, 1.0), None: (-1.0, 2.7)}
 # So much may the stamps be off beside that.
 _STAMPS_S = 0.05
 # What is surely outside is refused: by so many standard errors, found by drawing stretches of so many frames anew.

@@ -154,7 +154,7 @@ class Despiker:
         self._candidates.clear()
 
     def _reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
-        # Arrival stamps bunch when the host was busy; two conversions are hardly ever closer than the usual period.
+        # Arrival stamps bunch when the host was busy: no less than a usual period is believed of them.
         elapsed_s = max(after[1] - before[1], PERIOD_NS) * 1e-9
         return abs(after[0] - before[0]) <= self._limits.slew_nm_per_s * elapsed_s
 

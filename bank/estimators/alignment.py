@@ -4,7 +4,7 @@ An estimator with a memory of seconds cannot tell by its error: what the load wa
 But a load that changes moves the gel within the same frame. How far single frames move, along the directions in which
 they move most, is regressed on the torque's change over the same time, which is shifted against it; where that explains
 most, on stretches of time that were left out, is how late the torques are. Its uncertainty is that of stretches drawn
-anew. Recorded twists say 0.25 to 0.27 s, wherever they are cut, ± 0.02 to 0.06 s; most of it is the filter of the load
+anew. Recorded twists say 0.25 to 0.28 s, wherever they are cut, ± 0.02 to 0.06 s; most of it is the filter of the load
 cell's converter, whose output settles within 0.4 s (HX711 at ten samples a second). Played rigs, without that filter,
 say −0.08 to 0.05 s.
 """

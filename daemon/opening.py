@@ -76,7 +76,9 @@ def open_both(config: Both, fingertips: dict[str, Fingertip]) -> TrackedEstimato
 def _tracked(fitted: FittedCalibration, config: Fingertip) -> TrackedEstimator:
     bank = Bank.open(config.bank) if config.bank is not None else None
     scoring = Scoring(_matcher(bank, config.matching), bank.model) if bank is not None else None
-    return TrackedEstimator(fitted, bank, scoring, baseline_frames=config.baseline_frames)
+    return TrackedEstimator(
+        fitted, bank, scoring, baseline_frames=config.baseline_frames, period_s=config.frame_period_s
+    )
 
 
 def _matcher(bank: Bank, matching: str) -> FastMatcher | FastZeroLagMatcher:

@@ -31,15 +31,24 @@ class TrackedEstimator:
     """Turns the frames of one fingertip, or of both together, into readings, one for each frame or pair, in order."""
 
     def __init__(
-        self, calibration: Calibration, bank: Bank | None, scoring: Scoring | None, *, baseline_frames: int
+        self,
+        calibration: Calibration,
+        bank: Bank | None,
+        scoring: Scoring | None,
+        *,
+        baseline_frames: int,
+        period_s: float = np.inf,
     ) -> None:
-        """Begin a session; raises CalibrationError for a bank that is needed and missing, or another one."""
+        """Begin a session; raises CalibrationError for a bank that is needed and missing, or another one.
+
+        Of a board whose frame period in s is known, frames that are missing are seen from the first one on.
+        """
         self.sides = calibration.sides
         self.name = calibration.estimator
         # One of diameters alone does not.
         self.measures_torque = calibration.torque is not None
         self.model = scoring.model if scoring is not None else ""
-        self._tracker = Tracker(calibration, bank)
+        self._tracker = Tracker(calibration, bank, period_s=period_s)
         self._scoring = scoring
         self._baseline_frames = baseline_frames
         self._is_quick = calibration.estimator in QUICK

@@ -146,12 +146,19 @@ PAPER_COLUMNS = {"torque": slice(1, 3), "diameter": slice(0, 1)}
 class Tracker:
     """Follows one session: `estimate` takes every frame in order and keeps what must be remembered, causally."""
 
-    def __init__(self, calibration: Calibration, bank: Bank | None = None, tool_mm: float = np.nan) -> None:
+    def __init__(
+        self,
+        calibration: Calibration,
+        bank: Bank | None = None,
+        tool_mm: float = np.nan,
+        period_s: float = np.inf,
+    ) -> None:
         """Begin a session; raises CalibrationError for a bank that is missing or another one.
 
-        Where the tool's diameter is known already, it is `tool_mm`.
+        Where the tool's diameter is known already, it is `tool_mm`; where the board's frame period is, `period_s`.
         """
         self.calibration = calibration
+        self._period_s = period_s
         self.hold(None if np.isnan(tool_mm) else Measured(tool_mm, 0.0))
         self._locator = calibration.locator(bank)
         self.tare()
@@ -173,7 +180,9 @@ class Tracker:
     def tare(self) -> None:
         """Forget the session: the next frame is its first."""
         calibration = self.calibration
-        self._memory = Memory(calibration.guards, calibration.motion) if calibration.kind == "raw" else None
+        self._memory: Memory | None = None
+        if calibration.kind == "raw":
+            self._memory = Memory(calibration.guards, calibration.motion, self._period_s)
         self._difference: FloatArray | None = None
 
     def take_idle(self, frames: int) -> None:

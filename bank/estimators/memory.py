@@ -28,7 +28,8 @@ from bank.estimators.values import BoolArray, FloatArray, TactileFrame
 _BASELINE_FRAMES = 10
 # Frames further apart than this have lost the thread: two of a period of 0.54 s are missing.
 _LARGEST_GAP_S = 1.4
-# Of so many steps in time the middle one is the period; a step longer than this share of it has one frame missing.
+# Of so many steps in time the middle one is the period, if that is not known to be shorter; a step longer than this
+# share of it has one frame missing.
 _STEPS, _MISSING_SHARE = 9, 1.5
 # A session's baseline is made of at least so many frames before a grip is looked for that is not half as strong as the
 # calibration's.
@@ -112,8 +113,10 @@ def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: Floa
 class Memory:
     """The state of one session; every frame goes through `see` in order."""
 
-    def __init__(self, guards: tuple[SideGuard, ...], motion: Motion | None) -> None:
+    def __init__(self, guards: tuple[SideGuard, ...], motion: Motion | None, period_s: float = np.inf) -> None:
         self._guards = guards
+        # The board's, where it is known beforehand: of one that leaves out half of its frames it cannot be learned.
+        self._period_s = period_s
         self._motion = motion
         n_lags = motion.n_lags if motion is not None else 0
         self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
@@ -203,7 +206,8 @@ class Memory:
             # A frame from before the last one says nothing of how the gel has moved since that.
             self._forget()
             return
-        self._missing = len(self._steps_s) == _STEPS and step_s > _MISSING_SHARE * float(np.median(self._steps_s))
+        learned_s = float(np.median(self._steps_s)) if len(self._steps_s) == _STEPS else np.inf
+        self._missing = step_s > _MISSING_SHARE * min(learned_s, self._period_s)
         self._steps_s.append(step_s)
 
     def _remember(self, channels: FloatArray, *, bridged: bool) -> None:

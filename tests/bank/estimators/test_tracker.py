@@ -12,7 +12,7 @@ def changed(series, **content):
 
 
 def follow(calibration, series, usable=None) -> list[Estimate]:
-    tracker = Tracker(calibration)
+    tracker = calibration if isinstance(calibration, Tracker) else Tracker(calibration)
     return [
         tracker.estimate(TactileFrame.of(float(t), x, usable)) for t, x in zip(series.t_s, series.channels, strict=True)
     ]
@@ -268,3 +268,23 @@ def test_single_lost_frames_cost_little_and_are_not_invented_in_numbers(fused_ca
     estimates = follow(fused_calibration, many)
     assert not any(one.valid for one in estimates)
     assert any("are missing" in why for one in estimates for why in one.why)
+
+
+@pytest.mark.parametrize("lost", [(2, {1}), (5, {1, 3}), (7, {1, 3, 5})])
+def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(fused_calibration, twisting, lost):
+    """What is remembered is twice as long ago as calibrated: 27 times the error, and intervals that tell nothing."""
+    whole = twisting(seed=5)
+    every, left_out = lost
+    kept = ~np.isin(np.arange(len(whole.t_s)) % every, list(left_out))
+    part = changed(whole, t_s=whole.t_s[kept], channels=whole.channels[kept], diameter_mm=whole.diameter_mm[kept])
+    period_s = float(whole.t_s[1] - whole.t_s[0])
+    estimates = follow(Tracker(fused_calibration, period_s=period_s), part)
+    assert not any(one.valid for one in estimates)
+    assert any("are missing" in why for one in estimates for why in one.why)
+
+
+def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(fused_calibration, twisting):
+    whole = twisting(seed=5)
+    fast = changed(whole, t_s=whole.t_s / 5, torque_t_s=whole.torque_t_s / 5)
+    configured = follow(Tracker(fused_calibration, period_s=0.54), fast)
+    assert [one.torque_nm for one in configured] == [one.torque_nm for one in follow(fused_calibration, whole)]

@@ -99,6 +99,8 @@ class LoopTask:
                 await self._tell(now_ns)
         except Exception as error:
             self._own_death = _said(error)
+            # First of all: it may be about to begin a straight move, which would come after the stop.
+            self._cancel_action()
             await self._brake()
             raise
         finally:

@@ -177,6 +177,28 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         assert Event.TASK_DIED in {trouble.event for trouble in cell.brain.standing.verdict.troubles}
 
 
+async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at_rest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The same state wakes the loop, which dies of it, and the move that waits for it; in which order is chance."""
+    for _ in range(12):
+        async with driven() as cell:
+            tick, running = cell.brain.tick, iter(range(2))
+
+            def dies_at_the_second(t_ns: int, tick: Any = tick, running: Any = running) -> Any:
+                if cell.brain.experiment is not None and next(running):
+                    raise ZeroDivisionError("a tick went wrong")
+                return tick(t_ns)
+
+            monkeypatch.setattr(cell.brain, "tick", dies_at_the_second)
+            await cell.start(MOVE)
+            await cell.cycles(5)
+            assert cell.task is not None
+            with pytest.raises(ZeroDivisionError):
+                await cell.task
+            assert cell.state.motion == "idle", cell.robot.commands
+
+
 async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refused() -> None:
     async with driven() as cell:
         await cell.start(TWIST)

@@ -1,6 +1,8 @@
 """The daemon's own parsers and estimators, told again what a recording says that they were told."""
 
 import asyncio
+from dataclasses import replace
+from functools import partial
 
 from bank.channels import ZERO_SLOTS
 from bank.estimators.pairing import Pairing
@@ -31,6 +33,9 @@ class Chain:
         """Open every file that is needed; raises BankError or UserError. `asides` is what the estimators were told."""
         self._publisher = publisher
         self._asides = asides
+        # By how much the numbers of a source's frames are higher than counted here, and up to which tools were told.
+        self._before: dict[str, int] = {}
+        self._told: dict[str, int] = {}
         self._estimators: dict[str, AnyEstimator] = {
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
@@ -62,7 +67,7 @@ class Chain:
     async def take(self, source: str, told: RawInput) -> None:
         """Publish all that an input leads to; an input of a source that is not configured leads to nothing."""
         if source in self._lines:
-            for frame in self._lines[source].take(told):
+            for frame in map(partial(self._as_numbered, source), self._lines[source].take(told)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
                 pair = self._pairing.take(source, frame.t_mid_ns, frame) if self._pairing is not None else None
@@ -75,13 +80,23 @@ class Chain:
             for message in self._skin.take(source, told):
                 self._publisher.publish(message)
 
+    def _as_numbered(self, source: str, frame: Frame) -> Frame:
+        """Return a frame with the number that it was published with: a later file of a run goes on counting."""
+        if source not in self._before:
+            numbers = self._asides.numbers.get(source, {})
+            self._before[source] = numbers.get(frame.t_arrival_ns, frame.seq) - frame.seq
+        before = self._before[source]
+        return replace(frame, seq=frame.seq + before) if before else frame
+
     async def _estimate(self, source: str, *frames: Frame) -> None:
-        estimator = self._estimators[source]
-        number, tools = frames[0].seq, self._asides.tools.get(source, {})
+        estimator, number = self._estimators[source], frames[0].seq
         if number in self._asides.tares.get(source, ()):
             estimator.tare()
-        if number in tools:
-            estimator.hold(tools[number])
+        tools = self._asides.tools.get(source, {})
+        due = [first for first in tools if self._told.get(source, -1) < first <= number]
+        if due:
+            estimator.hold(tools[max(due)])
+        self._told[source] = number
         reading = await asyncio.to_thread(estimator.update, *frames)  # type: ignore[arg-type]  # one a side
         # The recording's own time: how long it took then is in the recording, and here it took none of it.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)

@@ -16,6 +16,7 @@ from bank.estimators import Measured
 from daemon.config import DaemonConfig
 from daemon.config_file import ConfigModel, mistakes
 from daemon.errors import UserError
+from daemon.messages import EitFrame
 from daemon.recording.content import input_of
 from daemon.recording.opened import damaged, opened
 from daemon.recording.schema import (
@@ -39,10 +40,12 @@ class Asides:
     """What estimators were told beside their frames, by source and the number of the frame that it was told before.
 
     Zeros are asked for before the frame has come, and tools are held by the gripper: neither follows from the frames.
+    `numbers` has those of the frames by source and arrival (the first that arrived then): they go on from file to file.
     """
 
     tares: dict[str, set[int]] = field(default_factory=dict)
     tools: dict[str, dict[int, Measured | None]] = field(default_factory=dict)
+    numbers: dict[str, dict[int, int]] = field(default_factory=dict)
 
     def note(self, source: str, told: RawInput) -> None:
         """Take in a raw input, if it is one of these."""
@@ -51,6 +54,11 @@ class Asides:
         elif told.kind is InputKind.TOOL:
             frame, tool = from_text(told.data)
             self.tools.setdefault(source, {})[frame] = tool
+
+    def note_frame(self, source: str, content: Mapping[str, Any]) -> None:
+        """Take in a frame as it was published."""
+        arrival_ns = content["t_mono_ns"] + round(content["age_s"] * 1e9)
+        self.numbers.setdefault(source, {}).setdefault(arrival_ns, content["frame"])
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,9 +131,11 @@ class RecordedRun:
         found = Asides()
         if self.has_inputs:
             for one in self.happenings():
-                if one.told is not None:
-                    with damaged(self.path):
+                with damaged(self.path):
+                    if one.told is not None:
                         found.note(one.source, one.told)
+                    elif one.topic == EitFrame.topic:
+                        found.note_frame(one.source, one.content)
         return found
 
     def _happened(self, topic: str, content: dict[str, Any], log_ns: int, number: int) -> Iterator[Happened]:

@@ -9,7 +9,7 @@ import re
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -28,7 +28,7 @@ from daemon.recording.schema import (
     input_topic,
     recorded_topic,
 )
-from drivers.raw_input import RawInput, Tap
+from drivers.raw_input import InputKind, RawInput, Tap
 
 # A kill costs what came since the last flush: below a second, and so even where the machine is busy.
 FLUSH_S = 0.3
@@ -99,6 +99,8 @@ class Recorder:
         self._dropped = 0
         # How many of them before the file being written began.
         self._dropped_before = 0
+        # Which tool each source was told of last.
+        self._tools: dict[str, RawInput] = {}
         # One thread at a time writes: a flush that was cancelled may still be under way when the end comes.
         self._writing = threading.Lock()
         self._ended = False
@@ -232,6 +234,9 @@ class Recorder:
             return
         self._dropped_before = dropped
         self._finish(*finished)
+        for source, told in self._tools.items():
+            # It is held on, and a replay of this file has heard of it nowhere else.
+            self._put(_Input(source, replace(told, t_ns=self._began_ns), self._clock.offset_ns))
 
     def _begin(self) -> None:
         now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
@@ -271,6 +276,8 @@ class Recorder:
                 data = message_json(topic, content, offset_ns)
                 self._file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
             case _Input(source, told, offset_ns):
+                if told.kind is InputKind.TOOL:
+                    self._tools[source] = told
                 self._put_clock(told.t_ns, offset_ns)
                 t_unix_ns = told.t_ns + offset_ns
                 self._file.add(input_topic(source), t_unix_ns, t_unix_ns, input_json(told))

@@ -1,0 +1,80 @@
+"""The file of a further experiment, which begins in the middle of a run, replayed by itself."""
+
+import asyncio
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zmq.asyncio
+
+from bank.estimators import Measured
+from daemon.app import Daemon
+from daemon.config import load_daemon_config
+from daemon.estimator import Estimator
+from daemon.recording.recorded_run import RecordedRun
+from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.recording.test_replay import replayed
+from tests.daemon.test_run import recording
+
+OTHER_TOOL = Measured(14.0, 0.5)
+# The frames after which another tool is held, a further experiment is begun, and a zero is taken.
+HELD, BEGUN, ZEROED, ENOUGH = 6, 12, 18, 40
+
+
+async def record(config: Path, stream: Path) -> list[dict[str, Any]]:
+    """Run a daemon through two experiments; return what was published as estimates."""
+    estimates: list[dict[str, Any]] = []
+    news = asyncio.Event()
+
+    def listen(topic: str, content: dict[str, Any]) -> None:
+        if topic == "eit.estimate":
+            estimates.append(content)
+            news.set()
+
+    async def until(number: int) -> None:
+        while not any(one["frame"] >= number for one in estimates):
+            news.clear()
+            await news.wait()
+
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(config), context)
+        recorder, right = daemon._recorder, daemon._estimations["right"]
+        assert recorder is not None
+        right.held_tool = lambda _: OTHER_TOOL if right.count >= HELD else None
+        daemon.publisher.listen(listen)
+        async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
+            group.create_task(daemon.run())
+            play = ("--recording", str(stream), "--once", "--speed", "20", "--link", str(config.parent / "eit-right"))
+            async with shearloop("emulate", "eit-kit", *play, stdin=asyncio.subprocess.PIPE):
+                recorder.experiment("first")
+                await until(BEGUN)
+                recorder.experiment("second")
+                await until(ZEROED)
+                right._tare_wanted = True
+                await until(ENOUGH)
+            daemon.stop()
+    return estimates
+
+
+def test_numbers_zeros_and_tools_of_a_later_file_are_replayed_as_they_were(
+    config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live = asyncio.run(record(config(recording={"folder": "recordings"}), recording(tmp_path, 60)))
+    (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
+    ((zeroed,),) = RecordedRun(later).asides().tares.values()
+    assert zeroed >= ZEROED
+    held: list[object] = []
+    monkeypatch.setattr(Estimator, "hold", lambda _self, tool: held.append(tool))
+    again, _ = asyncio.run(replayed(later, math.inf, f"ipc://{tmp_path}/replay"))
+    assert held == [OTHER_TOOL], "which was told before the file began"
+    estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
+    assert min(estimates) >= BEGUN
+    said = ("why", "valid", "k", "sigma", "score", "torque_nm")
+    after = [one for one in live if one["frame"] >= zeroed]
+    assert len(after) > ENOUGH - ZEROED - 10
+    assert [[estimates[one["frame"]][key] for key in said] for one in after] == [
+        [one[key] for key in said] for one in after
+    ]
+    assert estimates[zeroed]["why"].startswith("taking the homogeneous frame, 1 of")

@@ -88,6 +88,8 @@ class DeviceActions:
             await self._free.wait()
             if why := await self._rest():
                 return why
+            # The state that told of the rest wakes the loop as well, which may want it held back: it decides first.
+            await asyncio.sleep(0)
             if not self._free.is_set():
                 continue
             here = self._robot.state

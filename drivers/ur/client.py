@@ -59,8 +59,8 @@ class UrRobot:
         self._lost_s = -math.inf
         # How many states have come since the beginning.
         self.states = 0
-        # Who waits for the next state; None is for those who wait no longer.
-        self._awaiting: set[asyncio.Future[RobotState | None]] = set()
+        # Who waits for the next state, in the order in which they are told; None is for those who wait no longer.
+        self._awaiting: dict[asyncio.Future[RobotState | None], None] = {}
         # Clear while the process was told that states are needed less often.
         self._hurried = asyncio.Event()
         self._hurried.set()
@@ -116,12 +116,12 @@ class UrRobot:
         # 125 times a second: a future and a timer are a third of the price of a condition and `asyncio.timeout`.
         loop = asyncio.get_running_loop()
         arrived: asyncio.Future[RobotState | None] = loop.create_future()
-        self._awaiting.add(arrived)
+        self._awaiting[arrived] = None
         timer = loop.call_later(seconds, _give_up, arrived) if seconds is not None else None
         try:
             return await arrived
         finally:
-            self._awaiting.discard(arrived)
+            self._awaiting.pop(arrived, None)
             if timer is not None:
                 timer.cancel()
 

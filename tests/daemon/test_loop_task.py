@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -100,8 +101,17 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() ->
         assert cell.robot.z_m == pytest.approx(end_m), "where it was to go from the start"
 
 
-async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> None:
+class Backwards(dict[Any, None]):
+    """Those who wait for a state, told in the other order."""
+
+    def __iter__(self) -> Iterator[Any]:
+        return reversed(list(super().__iter__()))
+
+
+@pytest.mark.parametrize("order", [dict, Backwards])
+async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused(order: type[dict[Any, None]]) -> None:
     async with driven() as cell:
+        cell.robot._awaiting = order(cell.robot._awaiting)
         starting = asyncio.create_task(
             cell.loop.start(ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": [MOVE]}))
         )

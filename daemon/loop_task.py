@@ -182,6 +182,10 @@ class LoopTask:
         if state is not None and state.motion == "idle":
             in_time = int(LONGEST_EASE_S * self._robot.settings.rate_hz)
             self._robot.ease(min(in_time, PUBLISH_EVERY))
+        elif state is not None:
+            # The state by which it was put at ease was from before a command that was on its way. Without signs of life
+            # a gentle stop becomes a hard one.
+            self._robot.hurry()
         return LONGEST_REST_S
 
     def _running(self) -> bool:

@@ -15,7 +15,7 @@ from daemon.loop.senses import Torque
 from daemon.loop_actions import along_tool
 from daemon.loop_task import PUBLISH_EVERY, WRENCH
 from daemon.safety import Event
-from drivers.ur.messages import MoveLinear, Stop, WristSpeed
+from drivers.ur.messages import Enable, MoveLinear, Stop, WristSpeed
 from tests.daemon.cell import SPEED_M_PER_S, driven
 from tests.drivers.ur.flight import SETTINGS
 
@@ -288,6 +288,17 @@ async def test_an_arm_that_was_told_to_stop_is_attended_to_until_it_rests() -> N
             await cell.cycles(1)
         await cell.cycles(2)
         assert cell.robot.of_cycles == PUBLISH_EVERY
+
+
+async def test_a_command_that_was_on_its_way_when_the_robot_was_put_at_ease_ends_the_ease() -> None:
+    async with driven() as cell:
+        await cell.cycles(10)
+        assert cell.robot.of_cycles == PUBLISH_EVERY
+        cell.robot.flight.ask(Enable())
+        cell.robot.flight.ask(WristSpeed(0.1, 4.0))
+        await cell.cycles(PUBLISH_EVERY)
+        assert cell.state.motion != "idle"
+        assert cell.robot.of_cycles == 1
 
 
 async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pause_in_the_same_moment() -> None:

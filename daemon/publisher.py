@@ -58,9 +58,9 @@ class Publisher:
         self.forward(message.topic, content)
 
     def forward(self, topic: str, content: dict[str, Any]) -> None:
-        """Send a message's map as it is, stamped and numbered already; nothing is made of it that nobody asks for."""
-        if self.wanted(topic):
-            self._socket.send_multipart([topic.encode(), encode(content)], zmq.NOBLOCK)
+        """Send a message's map as it is, stamped and numbered already."""
+        self._socket.send_multipart([topic.encode(), encode(content)], zmq.NOBLOCK)
+        self._hear_subscribers()
         for listener in self._listeners:
             listener(topic, content)
 

@@ -1,13 +1,10 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
-import pytest
 import zmq
 
 from daemon.clock import Clock
-from daemon.messages import LoadTorque, decode, encode
 from daemon.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
 
@@ -52,30 +49,3 @@ def test_subscriptions_to_what_there_is_not_are_not_kept(tmp_path: Path) -> None
             until(lambda: publisher.wanted("health"))
             assert publisher._subscribed == {b"health"}
         publisher.close()
-
-
-def test_a_message_that_nobody_asks_for_is_counted_and_heard_but_not_encoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    address = f"ipc://{tmp_path}/publish"
-    encoded: list[dict[str, Any]] = []
-    monkeypatch.setattr("daemon.publisher.encode", lambda content: encoded.append(content) or encode(content))
-    heard: list[str] = []
-    message = LoadTorque(
-        source="cell", t_mono_ns=1, torque_nm=0.1, raw=1, saturated=False, spike=False, valid=True, why=""
-    )
-    with zmq.Context() as context, context.socket(zmq.SUB) as subscriber:
-        publisher = Publisher(context, address, Clock())
-        try:
-            publisher.listen(lambda topic, _: heard.append(topic))
-            for _ in range(3):
-                publisher.publish(message)
-            assert (encoded, heard) == ([], ["load.torque"] * 3)
-            subscriber.setsockopt(zmq.RCVTIMEO, round(1e3 * DEADLINE_S))
-            subscriber.connect(address)
-            subscriber.subscribe("load")
-            until(lambda: publisher.wanted("load.torque"))
-            publisher.publish(message)
-            assert decode(subscriber.recv_multipart()[1])["seq"] == 3
-        finally:
-            publisher.close()

@@ -2,7 +2,6 @@
 
 import asyncio
 from dataclasses import replace
-from functools import partial
 
 from bank.channels import ZERO_SLOTS
 from bank.estimators.pairing import Pairing
@@ -67,7 +66,7 @@ class Chain:
     async def take(self, source: str, told: RawInput) -> None:
         """Publish all that an input leads to; an input of a source that is not configured leads to nothing."""
         if source in self._lines:
-            for frame in map(partial(self._as_numbered, source), self._lines[source].take(told)):
+            for frame in self._as_numbered(source, self._lines[source].take(told)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
                 pair = self._pairing.take(source, frame.t_mid_ns, frame) if self._pairing is not None else None
@@ -80,13 +79,14 @@ class Chain:
             for message in self._skin.take(source, told):
                 self._publisher.publish(message)
 
-    def _as_numbered(self, source: str, frame: Frame) -> Frame:
-        """Return a frame with the number that it was published with: a later file of a run goes on counting."""
-        if source not in self._before:
-            numbers = self._asides.numbers.get(source, {})
-            self._before[source] = numbers.get(frame.t_arrival_ns, frame.seq) - frame.seq
-        before = self._before[source]
-        return replace(frame, seq=frame.seq + before) if before else frame
+    def _as_numbered(self, source: str, frames: list[Frame]) -> list[Frame]:
+        """Return frames with the numbers that they were published with: a later file of a run goes on counting."""
+        if frames and source not in self._before:
+            # The last of them, for the first that came then may have begun in the file before.
+            last, numbers = frames[-1], self._asides.numbers.get(source, {})
+            self._before[source] = numbers.get(last.t_arrival_ns, last.seq) - last.seq
+        before = self._before.get(source, 0)
+        return [replace(frame, seq=frame.seq + before) for frame in frames] if before else frames
 
     async def _estimate(self, source: str, *frames: Frame) -> None:
         estimator, number = self._estimators[source], frames[0].seq

@@ -40,7 +40,7 @@ class Asides:
     """What estimators were told beside their frames, by source and the number of the frame that it was told before.
 
     Zeros are asked for before the frame has come, and tools are held by the gripper: neither follows from the frames.
-    `numbers` has those of the frames by source and arrival (the first that arrived then): they go on from file to file.
+    `numbers` has those of the frames by source and arrival (the last that arrived then): they go on from file to file.
     """
 
     tares: dict[str, set[int]] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class Asides:
     def note_frame(self, source: str, content: Mapping[str, Any]) -> None:
         """Take in a frame as it was published."""
         arrival_ns = content["t_mono_ns"] + round(content["age_s"] * 1e9)
-        self.numbers.setdefault(source, {}).setdefault(arrival_ns, content["frame"])
+        self.numbers.setdefault(source, {})[arrival_ns] = content["frame"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,6 +35,7 @@ from bench.daemon_parts import (
     tree,
 )
 from daemon.request import request
+from drivers.eit_format import FRAME_PERIOD_S
 
 REPEATS = 5
 # Between frames whose latency is measured: long enough for the daemon to be idle again.
@@ -56,19 +57,22 @@ TWISTS = {
 }
 
 
-def latency(bank: Path, matching: str, n_frames: int) -> dict[str, Any]:
-    """Return the milliseconds from the last byte of a frame to its estimate at a subscriber."""
+def latency(bank: Path, matching: str, n_frames: int, pause_s: float, *, in_packets: bool = True) -> dict[str, Any]:
+    """Return the milliseconds from the last byte of a frame to its estimate at a subscriber.
+
+    A line comes `in_packets` as from a USB port, or in one burst, as no port brings it.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         board = Board(folder / "right")
-        config = configuration(folder, bank, ["right"], matching=matching, frame_period_s=PAUSE_S)
+        config = configuration(folder, bank, ["right"], matching=matching, frame_period_s=pause_s)
         with daemon(config, folder) as (_, ready_s), subscription(folder, "eit.estimate") as estimates:
             board.wait_for_start()
             sent: list[int] = []
             taken, own = [], []
             for line in lines(Bank.open(bank), n_frames + 10):
-                time.sleep(PAUSE_S)
-                sent.append(board.send(line))
+                time.sleep(pause_s)
+                sent.append(board.send_in_packets(line) if in_packets else board.send(line))
                 arrived, content = received(estimates)
                 if content["k"] is not None:
                     taken.append((arrived - sent[content["frame"]]) / 1e6)
@@ -265,7 +269,14 @@ def main() -> None:
     if "help" in wanted:
         found["help_s"] = spread([command_s("--help") for _ in range(REPEATS)])
     if "latency" in wanted:
-        found["latency"] = {each: latency(args.bank, each, args.frames) for each in ("all_lags", "zero_lag")}
+        found["latency"] = {
+            each: {
+                "in_packets": latency(args.bank, each, args.frames, PAUSE_S),
+                "in_packets_at_the_boards_rate": latency(args.bank, each, args.frames // 3, FRAME_PERIOD_S),
+                "in_a_burst": latency(args.bank, each, args.frames, PAUSE_S, in_packets=False),
+            }
+            for each in ("zero_lag", "all_lags")
+        }
     if "flood" in wanted:
         found["flood"] = flood(args.bank, 10 * args.frames)
     if "rated" in wanted:

@@ -9,8 +9,9 @@ import math
 from drivers.ur.messages import Ease, Message
 from drivers.ur.settings import UrSettings
 
-# Of the robot's patience with a silent client (1/watchdog_hz): at ease too a whole cycle may be left out.
-OF_THE_WATCHDOG = 0.4
+# Of the robot's patience with a silent client (1/watchdog_hz): the three quarters left are for a busy computer. At rest
+# too the robot's program ends once they are over, and waits for the operator.
+OF_THE_WATCHDOG = 0.25
 
 
 class Pace:

@@ -47,7 +47,7 @@ def test_cycles_at_ease_are_the_multiples() -> None:
     cycles = Cycles()
     assert cycles.numbers(3) == [0, 1, 2]
     cycles.pace.hear(Ease(5))
-    assert cycles.numbers(4) == [3, 5, 10, 15]
+    assert cycles.numbers(4) == [3, 6, 9, 12]
 
 
 @pytest.mark.parametrize("message", [Heartbeat(), Enable(), Stop(4.0), Ease(1), Ease(0)])
@@ -63,7 +63,7 @@ def test_while_something_moves_there_is_no_ease() -> None:
     cycles = Cycles()
     cycles.pace.hear(Ease(5))
     assert cycles.numbers(3, rests=False) == [0, 1, 2]
-    assert cycles.numbers(3) == [3, 5, 10]
+    assert cycles.numbers(3) == [3, 6, 9]
 
 
 def test_a_late_cycle_begins_at_once_and_is_not_caught_up_with() -> None:
@@ -73,11 +73,11 @@ def test_a_late_cycle_begins_at_once_and_is_not_caught_up_with() -> None:
     assert cycles.pace.cycle == 1
 
 
-@pytest.mark.parametrize(("after", "cycle"), [(0.1, 1), (0.9, 1), (1.1, 2), (3.9, 4), (4.1, 5)])
+@pytest.mark.parametrize(("after", "cycle"), [(0.1, 1), (0.9, 1), (1.1, 2), (1.9, 2), (2.1, 3)])
 def test_who_hurries_at_ease_gets_the_next_cycle_of_the_rate(after: float, cycle: int) -> None:
     cycles = Cycles()
     cycles.pace.hear(Ease(5))
-    assert cycles.work() == pytest.approx(5 * PERIOD_S)
+    assert cycles.work() == pytest.approx(3 * PERIOD_S)
     cycles.now_s += after * PERIOD_S
     cycles.pace.hear(Stop(4.0))
     cycles.pace.hurry(cycles.now_s)
@@ -95,9 +95,9 @@ def test_who_hurries_after_a_late_cycle_gets_none_that_is_later() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "watchdog_hz", "most"), [(125.0, 10.0, 5), (125.0, 20.0, 2), (125.0, 40.0, 1), (500.0, 10.0, 20)]
+    ("rate_hz", "watchdog_hz", "most"), [(125.0, 10.0, 3), (125.0, 15.0, 2), (125.0, 20.0, 1), (500.0, 10.0, 12)]
 )
-def test_at_ease_the_robots_watchdog_allows_a_cycle_to_be_left_out(
+def test_at_ease_most_of_the_watchdogs_patience_is_left_for_a_busy_computer(
     rate_hz: float, watchdog_hz: float, most: int
 ) -> None:
     cycles = Cycles(rate_hz=rate_hz, watchdog_hz=watchdog_hz)
@@ -106,4 +106,4 @@ def test_at_ease_the_robots_watchdog_allows_a_cycle_to_be_left_out(
     cycles.pace.plan(cycles.now_s, rests=True)
     left_s = cycles.pace.left_s(cycles.now_s)
     assert left_s == pytest.approx(most / rate_hz)
-    assert most == 1 or 2 * left_s < 1.0 / watchdog_hz
+    assert most == 1 or left_s <= 0.25 / watchdog_hz

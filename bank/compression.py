@@ -97,7 +97,8 @@ def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
     least, most = np.ones(N_CHANNELS), np.zeros(N_CHANNELS)
     for part in parts():
         found.append(part @ basis)
-        up_to = np.cumsum(part**2, axis=1)
+        up_to = np.square(part)
+        np.cumsum(up_to, axis=1, out=up_to)
         least, most = np.minimum(least, up_to.min(axis=0)), np.maximum(most, up_to.max(axis=0))
     numbers = np.vstack(found)
     coarse = _rows_of_cells(numbers[:, :COARSE_RANK])

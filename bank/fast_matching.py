@@ -9,6 +9,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -41,6 +42,8 @@ _FEW_CELLS = 48
 _AT_ONCE = 8
 # With fewer cells at all lags, leaving out what cannot be the maximum costs more than the whole heatmap.
 FEWEST_PRUNED = 300
+# Cells compressed at a time: a process keeps most of the memory that it has once taken, which a daemon does not need.
+_COMPRESSED_CELLS = 128
 # Scoring more than this takes longer than about a millisecond.
 _QUICK_SCORES = 1 << 13
 
@@ -61,8 +64,9 @@ class _PruningMatcher(Matcher):
         Raises MatchingError as any matcher, and here, not at the first frame, where a valid cell has no signal.
         """
         super().__init__(signals, valid, k_grid, sigma_grid)
-        self._bank = compress(lambda: map(self._unit_signals, self._chunks()))
-        self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in self._chunks()])
+        chunks = partial(self._chunks, _COMPRESSED_CELLS)
+        self._bank = compress(lambda: map(self._unit_signals, chunks()))
+        self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in chunks()])
         self._row, self._column = (each.astype(np.int32) for each in np.divmod(self._cells, valid.shape[1]))
 
     def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:

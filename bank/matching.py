@@ -125,10 +125,10 @@ class Matcher(ABC):
         """
         return best_match(self.heatmap(difference), self.k_grid, self.sigma_grid)
 
-    def _chunks(self) -> Iterator[NDArray[np.int64]]:
+    def _chunks(self, size: int = CHUNK_CELLS) -> Iterator[NDArray[np.int64]]:
         """Yield the numbers of all valid cells, as many at a time as are in memory at once."""
-        for start in range(0, len(self._cells), CHUNK_CELLS):
-            yield self._cells[start : start + CHUNK_CELLS]
+        for start in range(0, len(self._cells), size):
+            yield self._cells[start : start + size]
 
     def _unit_signals(self, cells: NDArray[np.int64]) -> FloatArray:
         magnitudes = self._magnitudes(cells)

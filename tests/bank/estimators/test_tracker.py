@@ -1,5 +1,7 @@
 """The default estimator on a rig that is played by formulas, fitted to one recording and tried on another."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -217,10 +219,9 @@ def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(fused_calibratio
     assert all(one.valid for one in estimates[20:])
 
 
-def test_another_tool_is_refused_for_as_long_as_it_is_held(twisting):
-    twisted = twisting()
-    calibration = fit("fused", [changed(twisted, diameter_mm=np.full(len(twisted.t_s), 20.0))], "a tool of 20 mm")
-    assert calibration.tool_mm == 20.0
+def test_another_tool_is_refused_for_as_long_as_it_is_held(fused_calibration, twisting):
+    twisted = twisting(seed=5)
+    calibration = replace(fused_calibration, tool_mm=20.0)
     tracker, plain = Tracker(calibration), Tracker(calibration)
     held = {
         60: Measured(22.9, 0.1),
@@ -244,7 +245,7 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(twisting):
     assert set(refused) <= {*range(70, 80), *range(90, 100)}
     assert len(refused) > 15
     assert all(same), "what it was told of tools changes nothing that it remembers"
-    unknown = Tracker(fit("fused", [twisted], "a tool that nobody measured"))
+    unknown = Tracker(fused_calibration)
     unknown.hold(Measured(14.0, 0.1))
     frames = [TactileFrame.of(float(t_s), x) for t_s, x in zip(twisted.t_s, twisted.channels, strict=True)]
     assert any(unknown.estimate(frame).valid for frame in frames)

@@ -171,7 +171,7 @@ def _wrist_speed(*numbers: float) -> WristSpeed:
 
 def _finite(numbers: tuple[float, ...]) -> tuple[float, ...]:
     if not all(map(isfinite, numbers)):
-        raise ValueError("a command of what is no number")
+        raise ValueError("it asks for what is no finite number")
     return numbers
 
 

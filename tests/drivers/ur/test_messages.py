@@ -116,7 +116,7 @@ def test_wrist_speed_with_anything_missing_wrong_or_more_is_refused(body: bytes)
         (lambda body: body[:-1] + b',"more"]', "2 items"),
         (lambda body: body[:40], "40 bytes"),
         (lambda body: b"\x04" + body[1:], "no motion 4"),
-        (lambda body: b"\x01" + struct.pack("<d", math.nan) + body[9:], "no number"),
+        (lambda body: b"\x01" + struct.pack("<d", math.nan) + body[9:], "no finite number"),
     ],
 )
 def test_reply_with_anything_missing_wrong_or_more_is_refused(change: Callable[[bytes], bytes], wrong: str) -> None:

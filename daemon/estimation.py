@@ -11,6 +11,7 @@ from daemon.messages import EitEstimate
 from daemon.opening import AnyEstimator
 from daemon.publisher import Publisher
 from daemon.tool_diameter import HearDiameter, as_text, unheard, unknown
+from daemon.waiting import Waiting
 from drivers.eit_kit import Frame
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 
@@ -40,7 +41,7 @@ class Estimation:
         self.held_tool: Callable[[int], Measured | None] = unknown
         self._tool: Measured | None = None
         self._tare_wanted = False
-        self._tared: list[asyncio.Future[str]] = []
+        self._waiting = Waiting()
 
     def tare(self) -> None:
         """Take a new homogeneous frame, beginning with the next frame to be estimated."""
@@ -49,9 +50,7 @@ class Estimation:
     async def tare_to_the_end(self) -> str:
         """Take a new homogeneous frame and wait until it is complete; the text is empty, for nothing can go wrong."""
         self.tare()
-        tared: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        self._tared.append(tared)
-        return await tared
+        return await self._waiting.wait(None)
 
     async def of(self, *frames: Frame) -> Reading:
         """Estimate from the frames of one moment, one a side, publish it, and return what they said."""
@@ -91,12 +90,8 @@ class Estimation:
     def _finish(self, frames: tuple[Frame, ...], reading: Reading) -> None:
         self._publish(frames, reading)
         self.count += 1
-        if self._tared and not self._tare_wanted and self.estimator.baseline_complete:
-            for waiting in self._tared:
-                # Who gave up waiting has cancelled it.
-                if not waiting.done():
-                    waiting.set_result("")
-            self._tared.clear()
+        if self._waiting and not self._tare_wanted and self.estimator.baseline_complete:
+            self._waiting.tell("")
 
     def _publish(self, frames: tuple[Frame, ...], reading: Reading) -> None:
         torque, now_ns = reading.torque_nm, self._clock.now_ns()

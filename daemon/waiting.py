@@ -13,8 +13,8 @@ class Waiting:
         """Whether anybody waits."""
         return bool(self._futures)
 
-    async def wait(self, seconds: float) -> str:
-        """Return what is told; raises TimeoutError where nothing is within so many seconds."""
+    async def wait(self, seconds: float | None) -> str:
+        """Return what is told; raises TimeoutError where nothing is within so many seconds, if there is a limit."""
         told: asyncio.Future[str] = asyncio.get_running_loop().create_future()
         self._futures.append(told)
         try:

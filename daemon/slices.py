@@ -36,6 +36,7 @@ CLIPPED_V = 0.45
 MOST_FRAMES, MOST_TORQUES = 256, 4096
 _ENDS = ("done", "stopped")
 TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
+RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,12 +82,16 @@ class SliceRecorder:
         self._held: tuple[int, int] | None = None
         self._pending: _Hold | None = None
         self._largest_nm = 0.0
+        # What this run's raw frame beside the slices is called; None until there is one.
+        self._raw: tuple[Path, Path] | None = None
 
     @property
     def summary(self) -> str:
         """What was kept and what was not, in a sentence."""
         with self._counting:
             kept = ", ".join(f"{count} {kind} slices" for kind, count in self.written.items()) or "no slice was kept"
+            if self._raw is not None and self._raw[0].name != RAW_FRAME:
+                kept += f", their raw frame in {self._raw[0].name} (that of an earlier run stays in {RAW_FRAME})"
             return kept + "".join(f"; {count} missed: {why}" for why, count in self.missed.items())
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
@@ -213,9 +218,10 @@ class SliceRecorder:
         number = _next(folder, r"Data_Slice_(\d+)\.mat")
         _save(folder / f"Data_Slice_{number}.mat", data_diff=difference[None], torque_value=[[torque_nm]])
         if abs(torque_nm) > self._largest_nm:
-            # One raw frame and its homogeneous frame, clipped as the paper's were.
-            _save(folder / "TorqueSlice.mat", clipped_data=np.clip(line, 0.0, CLIPPED_V)[None])
-            _save(folder / "TorqueSliceHom.mat", clipped_data_hom=np.clip(rest, 0.0, CLIPPED_V)[None])
+            # One raw frame and its homogeneous frame, clipped as the paper's were: a pair for each run.
+            self._raw = self._raw or _raw_names(folder)
+            _save(self._raw[0], clipped_data=np.clip(line, 0.0, CLIPPED_V)[None])
+            _save(self._raw[1], clipped_data_hom=np.clip(rest, 0.0, CLIPPED_V)[None])
             self._largest_nm = abs(torque_nm)
         return "torque"
 
@@ -252,3 +258,12 @@ def _next(folder: Path, pattern: str) -> int:
     folder.mkdir(exist_ok=True)
     found = (re.fullmatch(pattern, path.name) for path in folder.iterdir())
     return 1 + max((int(match[1]) for match in found if match), default=0)
+
+
+def _raw_names(folder: Path) -> tuple[Path, Path]:
+    """Return the first names of a raw frame and its homogeneous frame that no run has taken: numbered from 2 on."""
+    frame, rest, number = folder / RAW_FRAME, folder / RAW_HOMOGENEOUS, 1
+    while frame.exists() or rest.exists():
+        number += 1
+        frame, rest = (folder / name.replace(".mat", f"_{number}.mat") for name in (RAW_FRAME, RAW_HOMOGENEOUS))
+    return frame, rest

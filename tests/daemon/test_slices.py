@@ -97,6 +97,23 @@ def test_a_second_sweep_goes_on_where_the_first_ended(tmp_path: Path) -> None:
     np.testing.assert_allclose(slices.diameter_mm, [10, 10, 20, 20])
 
 
+def test_a_second_sweep_leaves_the_raw_frame_of_the_first(tmp_path: Path) -> None:
+    """One raw frame a run, of its largest torque; that of another run is nowhere else."""
+    for torques_nm in ((0.05, 0.15), (0.1, 0.2)):
+        sweep = Sweep(tmp_path)
+        for number, torque_nm in enumerate(torques_nm, start=1):
+            sweep.hold(number, torque_nm)
+        sweep.done()
+    folder = tmp_path / "torque_slices"
+    np.testing.assert_allclose(read_torque_slices(folder).torque_nm, [0.05, 0.15, 0.1, 0.2])
+    for suffix, torque_nm in (("", 0.15), ("_2", 0.2)):
+        raw, rest = (read_line(folder / f"{name}{suffix}.mat") for name in ("TorqueSlice", "TorqueSliceHom"))
+        np.testing.assert_allclose(raw - rest, torque_nm, atol=1e-6)
+    assert sweep.recorder.summary == (
+        "2 torque slices, their raw frame in TorqueSlice_2.mat (that of an earlier run stays in TorqueSlice.mat)"
+    )
+
+
 def test_frames_and_torques_are_smoothed_alike_around_the_middle_of_a_hold(tmp_path: Path) -> None:
     """The gel relaxes while it is held: what is said of its frame has to be said of its torque."""
     sweep = Sweep(tmp_path)

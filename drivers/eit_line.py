@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.compiled import cells
 from drivers.eit_format import (
     EXCERPT_BYTES,
     FULL_SCALE_SINE_RMS_V,
@@ -175,9 +176,8 @@ class LineParser:
     def _frame(self, line: bytes, values: NDArray[np.float64], sent_ns: int, t_arrival_ns: int) -> Frame:
         channels = values[self._slots]
         repeated = line == self._last_line
-        if not repeated:
-            self._fresh += 1
-            self._changed_in[channels != self._last_channels] = self._fresh
+        self._fresh += not repeated
+        saturates = look(channels, self._last_channels, self._changed_in, self._fresh, self._full_scale_v)
         self._last_line, self._last_channels = line, channels
         t_mid_ns = sent_ns - self._transfer_ns - self.clock.period_ns // 2
         # Where another period has just been learned, time still goes forward.
@@ -189,7 +189,7 @@ class LineParser:
             t_mid_ns=self._last_mid_ns,
             t_arrival_ns=t_arrival_ns,
             seq=self.frames,
-            saturated=channels > self._full_scale_v,
+            saturated=channels > self._full_scale_v if saturates else self._no_channels,
             dead=self._dead(),
             repeated=repeated,
         )
@@ -210,3 +210,18 @@ class LineParser:
         self.refused[refusal.kind] += 1
         self.last_refusal = refusal
         self._missed = True
+
+
+def _look_by_numpy(
+    channels: NDArray[np.float64],
+    before: NDArray[np.float64],
+    changed_in: NDArray[np.int64],
+    number: int,
+    full_scale: float,
+) -> bool:
+    """Note the number in `changed_in` of each channel that is not what it was; whether one exceeds full scale."""
+    changed_in[channels != before] = number
+    return bool((channels > full_scale).any())
+
+
+look = _look_by_numpy if cells is None else cells.look

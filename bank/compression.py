@@ -43,7 +43,7 @@ _CROWDING = 0.1
 # What float32 may take from a bound, and from the square that t is the root of. Sums of 98 products and a Fourier
 # transform of 1792 values, of norm 1, lose 5e-6 by the usual estimates; what is seen is 3e-7.
 ROUNDING = 2e-5
-_SQUARE_ROUNDING = 4e-6
+SQUARE_ROUNDING = 4e-6
 # The same for ρ, whose square is summed in float64.
 _SQUARE_ROUNDING_64 = 1e-12
 
@@ -129,12 +129,12 @@ def column(parts: Single, rank: int) -> tuple[Single, np.float32]:
     """Return the (r + 2,) column of a frame y of norm 1, and its t at a lower rank; parts (r,) are Φᵀ y."""
     along, coarse, rest = float(parts[0]) ** 2, parts[1:rank], parts[rank:]
     across = float(coarse @ coarse)
-    t = np.float32(math.sqrt(max(1.0 - along - across, 0.0) + _SQUARE_ROUNDING))
+    t = np.float32(math.sqrt(max(1.0 - along - across, 0.0) + SQUARE_ROUNDING))
     across += float(rest @ rest)
     found = np.empty(len(parts) + 2, dtype=np.float32)
     found[:-2] = parts
     found[-2] = math.sqrt(across)
-    found[-1] = math.sqrt(max(1.0 - along - across, 0.0) + _SQUARE_ROUNDING)
+    found[-1] = math.sqrt(max(1.0 - along - across, 0.0) + SQUARE_ROUNDING)
     return found, t
 
 
@@ -144,7 +144,7 @@ def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Sing
     found = np.empty((len(parts) + 2, parts.shape[1]), dtype=np.float32)
     found[:-2] = parts
     found[-2] = np.sqrt(across)
-    found[-1] = np.sqrt(np.maximum(squared_norms - parts[0] ** 2 - across, 0.0) + _SQUARE_ROUNDING)
+    found[-1] = np.sqrt(np.maximum(squared_norms - parts[0] ** 2 - across, 0.0) + SQUARE_ROUNDING)
     return found
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, spectra_of
+from bank.compiled import search_of
 from bank.compression import ROUNDING, Indices, compress
 from bank.errors import MatchingError
 from bank.matching import (
@@ -168,7 +169,8 @@ class _PruningMatcher(Matcher):
 class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     """Matches at lag 0 alone; its heatmaps are those of `ZeroLagMatcher`, at that one's price.
 
-    With one lag all cells are estimated at once, and a search is a few operations on one number per cell.
+    Where there was a compiler, one call searches. Without, all cells are estimated at once, for with one lag that is a
+    few operations on one number per cell.
     """
 
     def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
@@ -177,6 +179,37 @@ class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
         # Every place of the grid has the number of its cell; those that are not valid share one that is none.
         self._numbers = np.full(valid.shape, len(self._cells))
         self._numbers[valid] = np.arange(len(self._cells))
+        self._compiled = search_of(
+            *(self._bank, self._signals, self._cells, self._norms, (self._row, self._column)),
+            tie=TIE,
+            tie_rounding=_ROUNDING_64,
+            radius=RUNNER_UP_RADIUS,
+        )
+
+    def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
+        """Return what any pruning matcher returns; errors too."""
+        found = self._found(difference, runner_up, len(self._cells))
+        return super().match(difference, runner_up=runner_up) if found is None else found
+
+    def match_quickly(self, difference: ArrayLike) -> Match | None:
+        """Return what `match` returns, or None where that takes more than a few milliseconds."""
+        if self._compiled is None:
+            return super().match_quickly(difference)
+        found = self._found(difference, True, _QUICK_SCORES)
+        if found is None:
+            # What cannot be matched is told here as anywhere.
+            unit_magnitude(difference)
+        return found
+
+    def _found(self, difference: ArrayLike, runner_up: bool, most_scores: int) -> Match | None:
+        """Return the match, or None: nothing is compiled, or it cannot be decided with so many scores."""
+        if self._compiled is None:
+            return None
+        found = self._compiled.match(np.ascontiguousarray(difference, dtype=np.float64), runner_up, most_scores)
+        if found is None:
+            return None
+        cell, score, other, other_score = found
+        return self._match((cell, score), None if other < 0 else (other, other_score))
 
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match:
         bounds = ZeroLagBounds(self._bank, frame)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
-from bank import bounds, fast_matching
+from bank import bounds, compiled, fast_matching
 from bank.channels import N_CHANNELS, channels_of_line
 from bank.compression import COARSE_RANK, ROUNDING, columns
 from bank.errors import MatchingError
@@ -49,10 +49,22 @@ class Searching(FastMatcher):
     _fewest = 0
 
 
-KINDS = ((ReferenceMatcher, Searching), (ZeroLagMatcher, FastZeroLagMatcher))
+class WithoutCompiler(FastZeroLagMatcher):
+    """Searches with numpy, as where there was no C compiler."""
+
+    def __init__(self, *args) -> None:
+        super().__init__(*args)
+        self._compiled = None
+
+
+KINDS = ((ReferenceMatcher, Searching), (ZeroLagMatcher, WithoutCompiler))
 BANK = smooth_bank()
 PAIRS = [pair(*kind, BANK) for kind in KINDS]
-both = pytest.mark.parametrize(("slow", "fast"), PAIRS, ids=["all lags", "zero lag"])
+by_numpy = pytest.mark.parametrize(("slow", "fast"), PAIRS, ids=["all lags", "zero lag"])
+EVERY_KIND = (*KINDS, (ZeroLagMatcher, FastZeroLagMatcher))
+EVERY_PAIR = [*PAIRS, pair(*EVERY_KIND[-1], BANK)]
+both = pytest.mark.parametrize(("slow", "fast"), EVERY_PAIR, ids=["all lags", "zero lag", "zero lag, compiled"])
+is_compiled = pytest.mark.skipif(not compiled.IS_COMPILED, reason="nothing is compiled here")
 amplitudes = hnp.arrays(np.float64, N_CHANNELS, elements=st.floats(-10, 10, width=32)).filter(np.any)
 cells = st.sampled_from([tuple(cell) for cell in np.argwhere(BANK[1]).tolist()])
 
@@ -124,7 +136,7 @@ def test_constant_frames_and_cells_that_tie(slow, fast) -> None:
     assert fast.match(BANK[0][12, 6]).cell == (10, 3)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EVERY_KIND)
 @given(n_k=st.integers(1, 14), n_sigma=st.integers(1, 14), few=st.integers(1, 40), seed=st.integers(0, 1000))
 @settings(max_examples=8, deadline=None)
 def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, seed) -> None:
@@ -137,7 +149,7 @@ def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, se
         assert_same(fast.match(frame), slow.match(frame))
 
 
-@both
+@by_numpy
 def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, monkeypatch) -> None:
     frame = BANK[0][6, 6] + BANK[0][16, 5]
     expected = slow.match(frame)
@@ -151,7 +163,7 @@ def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, mo
     assert_same(fast.match(frame, runner_up=False), dataclasses.replace(expected, runner_up=None, runner_up_cell=None))
 
 
-@both
+@by_numpy
 @pytest.mark.parametrize(("module", "limit", "value"), [(bounds, "_MOST_BOUNDS", 10), (fast_matching, "_FEW_LAGS", 0)])
 def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, module, limit, value) -> None:
     monkeypatch.setattr(module, limit, value)
@@ -211,7 +223,7 @@ def test_no_bound_at_any_lag_is_below_its_score(chosen, noise, seed) -> None:
             assert (left.bounds - each[left.cells])[reaching].min() >= -ROUNDING / 2
 
 
-@both
+@by_numpy
 def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
     """What makes it fast: of a frame near to the bank's, most cells are never read."""
     read = []
@@ -263,17 +275,74 @@ def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast) -> None
     np.testing.assert_array_equal(fast.heatmap(frame), slow.heatmap(frame))
 
 
-@pytest.mark.parametrize("fast", [fast for _, fast in PAIRS], ids=["all lags", "zero lag"])
-def test_a_quick_match_is_the_same_or_none(fast, monkeypatch) -> None:
+@by_numpy
+def test_a_quick_match_is_the_same_or_none(slow, fast, monkeypatch) -> None:
     frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(8).normal(size=N_CHANNELS))
     for limit in ("_QUICK_SCORES", "_FEW_LAGS"):
         monkeypatch.setattr(fast_matching, limit, 1 << 30)
     assert fast.match_quickly(frame) == fast.match(frame)
+    assert_same(fast.match_quickly(frame), slow.match(frame))
     monkeypatch.setattr(fast_matching, "_QUICK_SCORES", 0)
     assert fast.match_quickly(frame) is None
     monkeypatch.undo()
     monkeypatch.setattr(fast_matching, "_ROUNDING_64", 2.0)
     assert fast.match_quickly(frame) is None
+
+
+@is_compiled
+def test_the_compiled_search_scores_few_cells_and_gives_up_on_many() -> None:
+    slow, fast = EVERY_PAIR[-1]
+    frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(6).normal(size=N_CHANNELS))
+    few = int(BANK[1].sum()) // 4
+    assert_same(fast._found(frame, True, few), slow.match(frame))
+    among_ties = BANK[0][12, 6].astype(np.float64)
+    assert fast._found(among_ties, True, 3) is None
+    assert_same(fast.match(among_ties), slow.match(among_ties))
+
+
+@is_compiled
+def test_the_compiled_search_leaves_a_tie_that_hangs_on_rounding(monkeypatch) -> None:
+    monkeypatch.setattr(fast_matching, "_ROUNDING_64", 2.0)
+    slow, fast = pair(ZeroLagMatcher, FastZeroLagMatcher, BANK)
+    frame = BANK[0][6, 6] + BANK[0][16, 5]
+    assert fast._found(frame, True, len(fast._cells)) is None
+    assert fast.match_quickly(frame) is None
+    monkeypatch.undo()
+    assert_same(fast.match(frame), slow.match(frame))
+
+
+@is_compiled
+@pytest.mark.parametrize(
+    ("argument", "broken"),
+    [
+        (0, lambda rows: rows[:, :-1].copy()),
+        (1, lambda rows: rows[:-1]),
+        (2, lambda rows: rows.astype(np.float64)),
+        (4, lambda places: places + 10_000),
+        (5, lambda norms: norms[:-1]),
+        (7, lambda columns: columns[::2]),
+        (8, lambda levels: levels[:-1]),
+        (8, lambda levels: levels[:0]),
+        (8, lambda levels: levels * 4),
+        (8, lambda levels: ((*levels[0][:3], levels[0][3] + 1), *levels[1:])),
+        (8, lambda levels: ((*levels[0][:2], levels[0][2][::-1].copy(), levels[0][3]), *levels[1:])),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused_and_not_searched(monkeypatch, argument, broken) -> None:
+    """What a compiled search is handed decides where it reads."""
+    _, fast = PAIRS[1]
+    handed = []
+    monkeypatch.setattr(compiled._search, "Search", lambda *arguments: handed.append(arguments))
+    compiled.search_of(
+        *(fast._bank, fast._signals, fast._cells, fast._norms, (fast._row, fast._column)),
+        **{"tie": 1e-12, "tie_rounding": 1e-14, "radius": 5},
+    )
+    monkeypatch.undo()
+    arguments = list(handed[0])
+    assert compiled._search.Search(*arguments).match(np.ones(N_CHANNELS), True, 1000) is not None
+    arguments[argument] = broken(arguments[argument])
+    with pytest.raises((ValueError, BufferError, TypeError)):
+        compiled._search.Search(*arguments)
 
 
 def test_a_frame_that_leaves_many_bounds_is_not_matched_quickly(monkeypatch) -> None:
@@ -289,6 +358,9 @@ def test_what_cannot_be_matched_is_refused_alike(slow, fast) -> None:
         for matcher in (slow, fast):
             with pytest.raises(MatchingError, match=says):
                 matcher.match(frame)
+            if matcher is fast:
+                with pytest.raises(MatchingError, match=says):
+                    matcher.match_quickly(frame)
     with pytest.raises(MatchingError, match="build the bank anew"):
         type(fast)(np.zeros_like(BANK[0]), BANK[1], np.arange(22.0), np.arange(20.0))
 

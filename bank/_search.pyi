@@ -1,0 +1,26 @@
+import numpy as np
+from numpy.typing import NDArray
+
+class Search:
+    def __init__(
+        self,
+        basis: NDArray[np.float32],
+        coarse: NDArray[np.float32],
+        fine: NDArray[np.float32],
+        signals: NDArray[np.float32],
+        places: NDArray[np.int64],
+        norms: NDArray[np.float64],
+        k_of: NDArray[np.int32],
+        sigma_of: NDArray[np.int32],
+        levels: tuple[tuple[int, NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]], ...],
+        rounding: float,
+        square_rounding: float,
+        tie: float,
+        tie_rounding: float,
+        radius: int,
+    ) -> None: ...
+    def match(
+        self, difference: NDArray[np.float64], runner_up: bool, most_scores: int, /
+    ) -> tuple[int, float, int, float] | None: ...
+
+def energy(difference: NDArray[np.float64], noise: NDArray[np.float64], /) -> float: ...

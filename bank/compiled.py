@@ -1,0 +1,66 @@
+"""What is compiled of the bank's work, where there was a C compiler when this was installed.
+
+The compiled code is `_search.c`; numpy does the same without, and the tests compare the two. Its one purpose is the
+time from a frame to its estimate.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.compression import ROUNDING, SQUARE_ROUNDING, CompressedBank, FloatArray, Indices, Single
+
+try:
+    from bank import _search
+except ImportError:
+    # No compiler, or none that could build it; docs/speed.md tells what that costs.
+    _search = None  # type: ignore[assignment]
+
+IS_COMPILED = _search is not None
+
+
+def search_of(
+    bank: CompressedBank,
+    signals: Single,
+    places: Indices,
+    norms: FloatArray,
+    grid: tuple[NDArray[np.int32], NDArray[np.int32]],
+    *,
+    tie: float,
+    tie_rounding: float,
+    radius: int,
+) -> "_search.Search | None":
+    """Return what finds the best cell of a compressed bank at lag 0, None where nothing is compiled.
+
+    signals (m, 896) hold cell i of n in row places[i], with the norm norms[i]; `grid` are the rows and columns (n,) of
+    the cells. Scores that differ by less than `tie` are the same, and a difference within `tie_rounding` of that is
+    left undecided; a runner-up is more than `radius` rows or columns away.
+    """
+    if not IS_COMPILED:
+        return None
+    parts_of = [*(level.part_of for level in bank.levels[1:]), bank.group_of]
+    levels = tuple(
+        (len(level.rows), level.rows, *_by_group(part_of, len(level.rows)))
+        for level, part_of in zip(bank.levels, parts_of, strict=True)
+    )
+    return _search.Search(
+        *(bank.basis, bank.coarse, bank.fine, signals, places, norms, *grid, levels),
+        *(ROUNDING, SQUARE_ROUNDING, tie, tie_rounding, radius),
+    )
+
+
+def energy(difference: FloatArray, noise: FloatArray) -> float | None:
+    """Return Σ (difference/noise)² of two (896,) arrays, or None.
+
+    None: nothing is compiled, or a value is not finite, or a noise is not above zero.
+    """
+    if not IS_COMPILED:
+        return None
+    found = _search.energy(np.ascontiguousarray(difference), np.ascontiguousarray(noise))
+    return None if found < 0 else found
+
+
+def _by_group(group_of: Indices, n_groups: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return where the parts of each group begin, (n + 1,), and all parts, one group after the other."""
+    parts = np.argsort(group_of, kind="stable")
+    starts = np.searchsorted(group_of[parts], np.arange(n_groups + 1))
+    return starts.astype(np.int32), parts.astype(np.int32)

@@ -13,28 +13,16 @@ from contextlib import contextmanager
 
 import dashboard_client
 import rtde_control
-import rtde_receive
 
 from drivers.errors import DriverError
 from drivers.ur.messages import MoveLinear, Reading, WristSpeed
-from drivers.ur.settings import Six, UrSettings
+from drivers.ur.receiver import Receiver
+from drivers.ur.settings import UrSettings
 
-_VARIABLES = [
-    "timestamp",
-    "actual_q",
-    "actual_qd",
-    "actual_TCP_pose",
-    "actual_TCP_force",
-    "robot_mode",
-    "safety_mode",
-    "runtime_state",
-    "speed_scaling",
-]
-# A sample may arrive while it is being read; then it is read again.
-_READ_AGAIN = 3
-# Each of the client's two threads asks its socket for data, sleeps for 0.1 ms, and asks again: 5 % of a core each.
-# Woken up to so much later, they ask five hundred times a second, and a state is so much older at most.
-_POLL_SLACK_NS = 2_000_000
+# A thread of the client asks its socket for data, sleeps for 0.1 ms, and asks again: 5 % of a core. Woken up to so much
+# later it asks once in a cycle. A call to it waits so much longer for the end of what it began, which none of those is
+# that turn the wrist or keep the watchdog quiet.
+_POLL_SLACK_NS = 8_000_000
 _PR_SET_TIMERSLACK = 29
 
 
@@ -50,41 +38,35 @@ class Arm:
 
         Raises:
             RuntimeError: whatever ur-rtde says.
+            ProbeError: the controller does not send its state.
         """
         self._settings = settings
+        self._receiver = Receiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
         kind = rtde_control.RTDEControlInterface
         with _woken_late(_POLL_SLACK_NS):
-            self._receive = rtde_receive.RTDEReceiveInterface(settings.host, settings.rate_hz, _VARIABLES)
             self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
         self._timestamp_s = -1.0
         self._changed_ns = time.monotonic_ns()
 
     def read(self) -> Reading:
         """Return the controller's latest sample and its age."""
-        receive = self._receive
-        for _ in range(_READ_AGAIN):
-            timestamp_s = receive.getTimestamp()
-            sample = (
-                _six(receive.getActualQ()),
-                _six(receive.getActualQd()),
-                _six(receive.getActualTCPPose()),
-                _six(receive.getActualTCPForce()),
-                receive.getRobotMode(),
-                receive.getSafetyMode(),
-                receive.getRuntimeState(),
-                receive.getSpeedScaling(),
-            )
-            if receive.getTimestamp() == timestamp_s:
-                break
+        sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
-        if timestamp_s != self._timestamp_s:
-            self._timestamp_s, self._changed_ns = timestamp_s, now_ns
+        if sample.timestamp_s != self._timestamp_s:
+            self._timestamp_s, self._changed_ns = sample.timestamp_s, now_ns
         return Reading(
             now_ns,
-            timestamp_s,
+            sample.timestamp_s,
             now_ns - self._changed_ns,
-            receive.isConnected() and self._control.isConnected(),
-            *sample,
+            self._receiver.connected and self._control.isConnected(),
+            sample.q_rad,
+            sample.qd_rad_per_s,
+            sample.tcp_pose,
+            sample.wrench,
+            sample.robot_mode,
+            sample.safety_mode,
+            sample.runtime_state,
+            sample.speed_scaling,
             self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
 
@@ -189,8 +171,3 @@ def _set_timer_slack(slack_ns: int) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) != 0:
         sys.stderr.write(f"The robot's threads are woken more often than needed: {os.strerror(ctypes.get_errno())}.\n")
-
-
-def _six(values: list[float]) -> Six:
-    a, b, c, d, e, f = values
-    return (a, b, c, d, e, f)

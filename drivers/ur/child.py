@@ -152,6 +152,8 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "Arm":
     pipe.send(Phase("connecting"))
     try:
         return Arm(settings)
+    except ProbeError as error:
+        _fail(pipe, error.kind, str(error))
     except RuntimeError as error:
         _fail(pipe, *_explain(settings.host, str(error)))
 

@@ -5,12 +5,10 @@ setting up inputs, which answers IN_USE for a register that another client write
 """
 
 import socket
-import struct
 from dataclasses import dataclass
 
 from drivers.errors import DriverError
-from drivers.ur import sentences
-from drivers.ur.probe import RTDE_PORT, ProbeError, agree_on_protocol, probe, request
+from drivers.ur.probe import RTDE_PORT, agree_on_protocol, explained, probe, request
 
 DASHBOARD_PORT = 29999
 # What ur-rtde's control script takes its commands from.
@@ -36,13 +34,9 @@ def look(host: str, timeout_s: float) -> Look:
     The registers are given back at once: they belong to a connection, which is closed.
     """
     version = probe(host, timeout_s)
-    try:
+    with explained(host, timeout_s, "asking for its mode"):
         robot_mode, safety_mode, remote = _ask(host, timeout_s, ("robotmode", "safetymode", "is in remote control"))
         free = _registers_free(host, timeout_s)
-    except TimeoutError as error:
-        raise ProbeError("silent", sentences.silent(host, timeout_s, "asking for its mode")) from error
-    except (OSError, struct.error) as error:
-        raise ProbeError("unreachable", sentences.unreachable(host, str(error) or type(error).__name__)) from error
     return Look(
         version,
         robot_mode.removeprefix("Robotmode: "),

@@ -5,6 +5,8 @@ ur-rtde does not look at the answer to its protocol request, and waits for ever 
 
 import socket
 import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from drivers.errors import DriverError
 from drivers.ur import sentences
@@ -12,7 +14,7 @@ from drivers.ur.messages import FailureKind
 
 RTDE_PORT = 30004
 _PROTOCOL, _CONTROLLER_VERSION = ord("V"), ord("v")
-_HEADER = struct.Struct(">HB")
+HEADER = struct.Struct(">HB")
 _OTHER_PACKAGES = 20
 
 
@@ -31,18 +33,27 @@ def probe(host: str, timeout_s: float) -> str:
     Raises:
         ProbeError: it is not there, stays silent, or refuses the protocol.
     """
-    try:
-        with socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection:
-            answer = request(connection, _CONTROLLER_VERSION)
-            version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
-            accepted = agree_on_protocol(connection)
-    except TimeoutError as error:
-        raise ProbeError("silent", sentences.silent(host, timeout_s, "greeting it")) from error
-    except (OSError, struct.error) as error:
-        raise ProbeError("unreachable", sentences.unreachable(host, str(error) or type(error).__name__)) from error
+    with (
+        explained(host, timeout_s, "greeting it"),
+        socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection,
+    ):
+        answer = request(connection, _CONTROLLER_VERSION)
+        version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
+        accepted = agree_on_protocol(connection)
     if not accepted:
         raise ProbeError("version", sentences.version_refused(host, version))
     return version
+
+
+@contextmanager
+def explained(host: str, timeout_s: float, doing: str) -> Iterator[None]:
+    """Raise ProbeError for a conversation with a controller that fails, or stays without an answer."""
+    try:
+        yield
+    except TimeoutError as error:
+        raise ProbeError("silent", sentences.silent(host, timeout_s, doing)) from error
+    except (OSError, struct.error) as error:
+        raise ProbeError("unreachable", sentences.unreachable(host, str(error) or type(error).__name__)) from error
 
 
 def agree_on_protocol(connection: socket.socket) -> bool:
@@ -52,10 +63,10 @@ def agree_on_protocol(connection: socket.socket) -> bool:
 
 def request(connection: socket.socket, kind: int, payload: bytes = b"") -> bytes:
     """Send an RTDE package, and return the next one of its kind; OSError where none comes among the first twenty."""
-    connection.sendall(_HEADER.pack(_HEADER.size + len(payload), kind) + payload)
+    connection.sendall(HEADER.pack(HEADER.size + len(payload), kind) + payload)
     for _ in range(_OTHER_PACKAGES):
-        size, got = _HEADER.unpack(_exactly(connection, _HEADER.size))
-        answer = _exactly(connection, size - _HEADER.size)
+        size, got = HEADER.unpack(_exactly(connection, HEADER.size))
+        answer = _exactly(connection, size - HEADER.size)
         if got == kind:
             return answer
     raise OSError("something else than RTDE listens on its port")

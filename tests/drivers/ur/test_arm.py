@@ -25,14 +25,15 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     """The module `drivers.ur.arm` over such clients."""
     for name, kinds in (
         ("rtde_control", ["RTDEControlInterface"]),
-        ("rtde_receive", ["RTDEReceiveInterface"]),
         ("dashboard_client", ["DashboardClient"]),
     ):
         module = ModuleType(name)
         for kind in kinds:
             setattr(module, kind, Client)
         monkeypatch.setitem(sys.modules, name, module)
-    yield importlib.import_module("drivers.ur.arm")
+    arm = importlib.import_module("drivers.ur.arm")
+    monkeypatch.setattr(arm, "Receiver", Client)
+    yield arm
     del sys.modules["drivers.ur.arm"]
 
 
@@ -40,5 +41,5 @@ def test_kernel_that_does_not_let_threads_be_woken_late_does_not_prevent_connect
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
-    assert arm.Arm(SETTINGS)._receive.connected
+    assert arm.Arm(SETTINGS)._control.connected
     assert "woken more often than needed" in capsys.readouterr().err

@@ -1,0 +1,149 @@
+"""What the controller says of itself, on an RTDE connection of our own that waits to be asked.
+
+ur-rtde has an interface for it, and with that a thread which looks at its socket five hundred times a second: a third
+of what the robot's process costs at rest. Here samples wait in the kernel until one is wanted, and each is taken whole.
+UR's RTDE guide, protocol 2: setting up outputs, start, and the data package.
+"""
+
+import socket
+import struct
+from dataclasses import dataclass
+
+from drivers.errors import ProtocolError
+from drivers.ur.probe import HEADER, RTDE_PORT, agree_on_protocol, explained, request
+from drivers.ur.settings import Six
+
+_OUTPUTS, _START, _DATA = ord("O"), ord("S"), ord("U")
+# The outputs, with their types, in the order of a sample's fields.
+_TYPES = {
+    "timestamp": "DOUBLE",
+    "actual_q": "VECTOR6D",
+    "actual_qd": "VECTOR6D",
+    "actual_TCP_pose": "VECTOR6D",
+    "actual_TCP_force": "VECTOR6D",
+    "robot_mode": "INT32",
+    "safety_mode": "INT32",
+    "runtime_state": "UINT32",
+    "speed_scaling": "DOUBLE",
+}
+# The same after the header and the number of the recipe.
+_VALUES = struct.Struct(">d24d2iId")
+_PACKAGE_BYTES = HEADER.size + 1 + _VALUES.size
+_RATE = struct.Struct(">d")
+# A second's worth of samples.
+_READ_BYTES = 1 << 15
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One sample of the controller: SI units, base frame, joints from base to wrist 3."""
+
+    timestamp_s: float
+    q_rad: Six
+    qd_rad_per_s: Six
+    tcp_pose: Six
+    wrench: Six
+    robot_mode: int
+    safety_mode: int
+    runtime_state: int
+    speed_scaling: float
+
+
+class SampleParser:
+    """Finds the newest sample in what a controller sends, however it was cut. No I/O."""
+
+    def __init__(self) -> None:
+        """Start with nothing received."""
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> Sample | None:
+        """Return the newest sample that is complete by now, and was not before; None where there is none.
+
+        Raises:
+            ProtocolError: a package that cannot be one; where the next one begins is not known then.
+        """
+        buffer = self._buffer
+        buffer += data
+        start, newest = 0, -1
+        while len(buffer) - start >= HEADER.size:
+            size, kind = HEADER.unpack_from(buffer, start)
+            if size < HEADER.size or (kind == _DATA and size != _PACKAGE_BYTES):
+                raise ProtocolError(f"The controller sent a package of kind {kind} with {size} bytes.")
+            if len(buffer) - start < size:
+                break
+            if kind == _DATA:
+                newest = start
+            start += size
+        sample = _sample(buffer, newest + HEADER.size + 1) if newest >= 0 else None
+        del buffer[:start]
+        return sample
+
+
+class Receiver:
+    """A connection on which the controller sends samples; `connected` is False once it has ended."""
+
+    def __init__(self, host: str, rate_hz: float, timeout_s: float) -> None:
+        """Connect, and wait for the first sample.
+
+        Raises:
+            ProbeError: the controller is not there, stays silent, or does not send what is needed.
+        """
+        self._parser = SampleParser()
+        self.connected = True
+        with explained(host, timeout_s, "asking for its state"):
+            self._connection = socket.create_connection((host, RTDE_PORT), timeout=timeout_s)
+            try:
+                self._sample = self._first_sample(rate_hz)
+            except BaseException:
+                self.close()
+                raise
+        self._connection.setblocking(False)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.connected = False
+        self._connection.close()
+
+    def _first_sample(self, rate_hz: float) -> Sample:
+        agree_on_protocol(self._connection)
+        answer = request(self._connection, _OUTPUTS, _RATE.pack(rate_hz) + ",".join(_TYPES).encode())
+        types = answer[1:].decode(errors="replace")
+        if types != ",".join(_TYPES.values()):
+            raise OSError(f"its outputs are of the types {types}")
+        if request(self._connection, _START) != b"\x01":
+            raise OSError("it does not send its state")
+        while self.connected:
+            sample = self._received()
+            if sample is not None:
+                return sample
+        raise OSError("it closed the connection on which it was to send its state")
+
+    def latest(self) -> Sample:
+        """Return the newest sample that has arrived, which is the last one again where none has; never waits."""
+        if self.connected:
+            self._sample = self._received() or self._sample
+        return self._sample
+
+    def _received(self) -> Sample | None:
+        """Return the newest sample of all that has arrived since the last call."""
+        newest, more = None, True
+        while more:
+            try:
+                data = self._connection.recv(_READ_BYTES)
+                newest = self._parser.feed(data) or newest
+            except BlockingIOError:
+                break
+            except (ConnectionError, ProtocolError):
+                data = b""
+            self.connected, more = bool(data), len(data) == _READ_BYTES
+        return newest
+
+
+def _sample(buffer: bytearray, start: int) -> Sample:
+    timestamp_s, *v, robot_mode, safety_mode, runtime_state, speed_scaling = _VALUES.unpack_from(buffer, start)
+    return Sample(
+        timestamp_s,
+        (v[0], v[1], v[2], v[3], v[4], v[5]), (v[6], v[7], v[8], v[9], v[10], v[11]),
+        (v[12], v[13], v[14], v[15], v[16], v[17]), (v[18], v[19], v[20], v[21], v[22], v[23]),
+        robot_mode, safety_mode, runtime_state, speed_scaling,
+    )  # fmt: skip

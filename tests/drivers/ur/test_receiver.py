@@ -1,0 +1,161 @@
+"""Samples of the controller, from bytes as UR's RTDE guide has them, and on a connection."""
+
+import socket
+import struct
+import threading
+from collections.abc import Callable, Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.errors import ProtocolError
+from drivers.ur import receiver as receiver_module
+from drivers.ur.probe import ProbeError
+from drivers.ur.receiver import Receiver, Sample, SampleParser
+
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE"
+
+
+def package(kind: bytes, payload: bytes) -> bytes:
+    return struct.pack(">Hc", 3 + len(payload), kind) + payload
+
+
+def data(number: int) -> bytes:
+    """Return the package of the sample that has this number for a timestamp."""
+    values = [number + 0.01 * index for index in range(24)]
+    return package(b"U", b"\x01" + struct.pack(">d24diiId", number, *values, 7, -1, 2, 0.5))
+
+
+def text(length: int) -> bytes:
+    return package(b"M", bytes(length))
+
+
+def test_sample_has_the_values_in_their_order() -> None:
+    sample = SampleParser().feed(data(3))
+    assert sample == Sample(
+        timestamp_s=3.0,
+        q_rad=(3.0, 3.01, 3.02, 3.03, 3.04, 3.05),
+        qd_rad_per_s=(3.06, 3.07, 3.08, 3.09, 3.1, 3.11),
+        tcp_pose=(3.12, 3.13, 3.14, 3.15, 3.16, 3.17),
+        wrench=(3.18, 3.19, 3.2, 3.21, 3.22, 3.23),
+        robot_mode=7,
+        safety_mode=-1,
+        runtime_state=2,
+        speed_scaling=0.5,
+    )
+
+
+@given(st.lists(st.one_of(st.none(), st.integers(0, 40)), max_size=8), st.lists(st.integers(1, 300), max_size=20))
+def test_newest_sample_is_found_however_the_stream_is_cut(kinds: list[int | None], cuts: list[int]) -> None:
+    """None is a sample, a number the length of a text message between them."""
+    packages = [data(index) if kind is None else text(kind) for index, kind in enumerate(kinds)]
+    ends = [sum(map(len, packages[: index + 1])) for index in range(len(packages))]
+    stream = b"".join(packages)
+    parser, at, latest = SampleParser(), 0, None
+    for cut in (*cuts, len(stream)):
+        found = parser.feed(stream[at : at + cut])
+        at += cut
+        complete = [index for index, end in enumerate(ends) if end <= at and kinds[index] is None]
+        newest = complete[-1] if complete else None
+        assert (found.timestamp_s if found is not None else None) == (newest if newest != latest else None)
+        latest = newest
+
+
+@pytest.mark.parametrize("bad", [package(b"U", bytes(8)), b"\x00\x02U", data(1)[:-1] + b"\x00" + data(2)])
+def test_what_cannot_be_a_package_is_told(bad: bytes) -> None:
+    with pytest.raises(ProtocolError):
+        SampleParser().feed(bad + bytes(300))
+
+
+class Controller:
+    """A controller's port at an address of the test's own, which answers as it is told."""
+
+    def __init__(self, types: bytes = TYPES, started: bytes = b"\x01") -> None:
+        self._listening = socket.create_server(("127.0.0.1", 0))
+        self.port = self._listening.getsockname()[1]
+        self._answers = {b"V": b"\x01", b"O": b"\x01" + types, b"S": started}
+        self.asked: dict[bytes, bytes] = {}
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        self._peer, _ = self._listening.accept()
+        while len(self.asked) < len(self._answers):
+            header = self._peer.recv(3, socket.MSG_WAITALL)
+            if not header:
+                return
+            size, kind = struct.unpack(">Hc", header)
+            self.asked[kind] = self._peer.recv(size - 3, socket.MSG_WAITALL)
+            self._peer.sendall(package(kind, self._answers[kind]))
+        self._peer.sendall(data(1))
+
+    def send(self, stream: bytes) -> None:
+        self._thread.join()
+        self._peer.sendall(stream)
+
+    def close(self) -> None:
+        self._thread.join()
+        self._peer.close()
+        self._listening.close()
+
+
+@pytest.fixture
+def play(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Controller]]:
+    played: list[Controller] = []
+
+    def begin(*answers: bytes) -> Controller:
+        played.append(Controller(*answers))
+        monkeypatch.setattr(receiver_module, "RTDE_PORT", played[-1].port)
+        return played[-1]
+
+    yield begin
+    for controller in played:
+        controller.close()
+
+
+def arrived(receiver: Receiver, timestamp_s: float) -> bool:
+    """Look until the sample is there, or the connection's end."""
+    while receiver.latest().timestamp_s != timestamp_s and receiver.connected:
+        pass
+    return receiver.latest().timestamp_s == timestamp_s
+
+
+def test_outputs_are_asked_for_at_the_rate_and_the_newest_is_kept(play: Callable[..., Controller]) -> None:
+    controller = play()
+    receiver = Receiver("127.0.0.1", 125.0, 5.0)
+    assert controller.asked[b"O"].startswith(struct.pack(">d", 125.0) + b"timestamp,actual_q,")
+    assert receiver.latest().timestamp_s == 1.0
+    controller.send(data(2) + data(3) + data(4)[:100])
+    assert arrived(receiver, 3.0)
+    assert receiver.latest().timestamp_s == 3.0
+    controller.send(data(4)[100:])
+    assert arrived(receiver, 4.0)
+    receiver.close()
+
+
+@pytest.mark.parametrize("last", [b"", package(b"U", bytes(8))])
+def test_connection_that_ends_or_carries_something_else_is_no_connection(
+    play: Callable[..., Controller], last: bytes
+) -> None:
+    controller = play()
+    receiver = Receiver("127.0.0.1", 125.0, 5.0)
+    controller.send(data(2) + last)
+    if not last:
+        controller.close()
+    while receiver.connected:
+        receiver.latest()
+    assert receiver.latest().timestamp_s in (1.0, 2.0)
+    receiver.close()
+
+
+@pytest.mark.parametrize(
+    ("answers", "told"),
+    [((TYPES.replace(b"UINT32", b"NOT_FOUND"),), "NOT_FOUND"), ((TYPES, b"\x00"), "does not send its state")],
+)
+def test_controller_that_does_not_send_what_is_needed_is_refused(
+    play: Callable[..., Controller], answers: tuple[bytes, ...], told: str
+) -> None:
+    play(*answers)
+    with pytest.raises(ProbeError, match=told):
+        Receiver("127.0.0.1", 125.0, 5.0)

@@ -109,6 +109,7 @@ def _once_a_second(t_ns: int, torque_nm: float) -> Iterator[Message]:
         step_name="twist",
         hold=1,
         slices="",
+        tool_mm=None,
         stiffness_nm_per_rad=0.75,
         delay_s=0.5,
         noise_nm=0.01,

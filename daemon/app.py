@@ -31,7 +31,7 @@ from daemon.load_cell_task import LOAD_CELL
 from daemon.loop.senses import Source
 from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Listener, Publisher
-from daemon.recording.identity import Attached, identity_of
+from daemon.recording.identity import Attached, identity_of, notes_of
 from daemon.recording.recorder import Recorder
 from daemon.rig import Rig, make_load_cell
 from daemon.rig_check import checked_experiment
@@ -260,7 +260,8 @@ class Daemon:
         if why is None and self._experiment is not None:
             self._experiment.has_begun(path)
         if why is None and recorder is not None and rig.brain.experiment is not None:
-            recorder.experiment(rig.brain.experiment.file.name, attached)
+            file = rig.brain.experiment.file
+            recorder.experiment(file.name, attached, notes_of(file))
         return why
 
     def _give_up_waiting(self) -> Path | None:

@@ -308,6 +308,7 @@ class LoopTask:
             doing=standing.doing,
             progress=progress.share if progress else 0.0,
             remaining_s=progress.remaining_s if progress else 0.0,
+            tool_mm=experiment.file.tool_mm if experiment is not None else None,
             driving=driving,
             torque_nm=latest.torque_nm if latest is not None else None,
             set_point_nm=believed.set_point_nm if believed else None,

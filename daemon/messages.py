@@ -190,6 +190,7 @@ class LoopState(Message):
     doing: str = column("", "what is being done or waited for")
     progress: float = column("", "share of the experiment that is done, 0 to 1")
     remaining_s: float = column("s", "about how long it will still take")
+    tool_mm: float | None = column("mm", "diameter of the tool, where the experiment names it")
     driving: str = column("", "the torque that drives the loop")
     torque_nm: float | None = column("N·m", "its latest valid value")
     set_point_nm: float | None = column("N·m", "the torque that is wanted at the end of the ramp")

@@ -58,6 +58,7 @@ class _Run:
     driving: str
     steps_planned: int
     from_ns: int
+    tool_mm: float | None
     steps: list[_Step] = field(default_factory=list)
     identified: tuple[float, float, float] | None = None
     held_s: float = 0.0
@@ -96,7 +97,8 @@ class RunSummary:
         if phase == "idle" or (run is None and phase in _ENDS):
             return
         if run is None:
-            run = self._run = _Run(content["experiment"], content["driving"], content["steps"], content["t_mono_ns"])
+            named = content["experiment"], content["driving"], content["steps"]
+            run = self._run = _Run(*named, content["t_mono_ns"], content["tool_mm"])
         _note(run, content)
         if phase in _ENDS:
             self._run = None
@@ -226,6 +228,8 @@ def _back_s(known: Known, since_ns: float, set_nm: float) -> float | None:
 
 
 def _counted(run: _Run) -> Iterator[str]:
+    if run.tool_mm is not None:
+        yield f"  the tool is of {run.tool_mm:g} mm, as the experiment names it"
     for source, values in run.diameters.items():
         yield f"  diameter by {source}: {np.mean(values):.1f} mm ± {np.std(values):.1f} of one reading"
     total = sum(run.held_why.values())

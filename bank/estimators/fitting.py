@@ -40,7 +40,7 @@ from bank.estimators.reader import (
     fit_reader,
     one_sided,
 )
-from bank.estimators.values import FloatArray, FrameSeries, TactileFrame
+from bank.estimators.values import FloatArray, FrameSeries, Measured, TactileFrame, distinct
 
 if TYPE_CHECKING:
     from bank.mesh import Mesh
@@ -109,7 +109,7 @@ def fit(
         sides=sides,
         source=source,
         bank_identity=physics.bank.identity if physics.bank is not None and name in NEEDS_BANK else "",
-        tool_mm=next(iter(tools)) if len(tools := _tools(recordings)) == 1 else np.nan,
+        tool_mm=tools[0].value if len(tools := _tools(recordings)) == 1 else np.nan,
         registration=NOT_TURNED,
         scale=np.ones((len(sides), N_CHANNELS)),
         guards=(),
@@ -230,7 +230,12 @@ def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics
     features = np.array([row.features for row in rows])
     calibration, reader, unexplained = _torque_reader(calibration, features, np.array([row.torque_nm for row in rows]))
     torque, diameter = Task(reader, None, _ks(calibration.estimator, features)), _diameter_task(calibration, rows)
-    if diameter is not None and _undetermined(recordings, unexplained):
+    if _undetermined(recordings, unexplained):
+        if diameter is None:
+            tools = " and ".join(f"{one.value:.3g}" for one in _tools(recordings))
+            raise CalibrationError(
+                f"the tools of {tools} mm turn so differently that no torque is common to them; calibrate on each alone"
+            )
         return replace(calibration, diameter=diameter)
     return replace(calibration, torque=torque, diameter=diameter)
 
@@ -297,10 +302,9 @@ def _undetermined(recordings: list[FrameSeries], unexplained: float) -> bool:
     return len(_tools(recordings)) > 1 and unexplained > _TOOLS_MAY_LEAVE
 
 
-def _tools(recordings: Sequence[FrameSeries]) -> set[float]:
-    """Return the known diameters of raw recordings' tools in mm."""
-    known = [one.diameter_mm[0] for one in recordings if one.kind == "raw" and len(one.t_s)]
-    return {float(one) for one in known if np.isfinite(one)}
+def _tools(recordings: Sequence[FrameSeries]) -> list[Measured]:
+    """Return the diameters of raw recordings' different tools in mm, as far as they are known."""
+    return distinct([tool for one in recordings if (tool := one.tool_mm) is not None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,8 @@
 """What estimators are made from and what they give: series of frames, single frames, estimates. No I/O, no clock."""
 
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -22,13 +24,22 @@ LARGEST_TORQUE_NM = 20.0
 _FURTHEST_TORQUE_S = 1.0
 
 
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A value and the half width of its 95 % interval."""
+
+    value: float
+    half_width: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameSeries:
     """Frames in time order with what was known beside them.
 
     t_s (n,) is the middle of each acquisition in seconds, not its arrival; channels (n, m, 896) in volts, one layer
     for each of the m sides. torque_nm (p,) was measured at torque_t_s (p,) on the same clock; diameter_mm (n,) is NaN
-    where it is not known. Raises CalibrationError for shapes that do not belong together and for times that fall.
+    where it is not known. Then `gripped_mm` may tell of it: the gripper's width, which is no truth to fit a diameter
+    to. Raises CalibrationError for shapes that do not belong together and for times that fall.
     """
 
     kind: Kind
@@ -38,6 +49,7 @@ class FrameSeries:
     torque_t_s: FloatArray
     torque_nm: FloatArray
     diameter_mm: FloatArray
+    gripped_mm: Measured | None = None
 
     def __post_init__(self) -> None:
         """Refuse what is no series."""
@@ -75,21 +87,20 @@ class FrameSeries:
                 "calibrate on the sides that are there"
             )
         layers = [self.sides.index(side) for side in sides]
-        return FrameSeries(
-            self.kind, sides, self.t_s, self.channels[:, layers], self.torque_t_s, self.torque_nm, self.diameter_mm
-        )
+        return replace(self, sides=sides, channels=self.channels[:, layers])
 
     def between(self, start: int, stop: int) -> "FrameSeries":
         """Return frames `start` to `stop` with all of the torques."""
-        return FrameSeries(
-            self.kind,
-            self.sides,
-            self.t_s[start:stop],
-            self.channels[start:stop],
-            self.torque_t_s,
-            self.torque_nm,
-            self.diameter_mm[start:stop],
-        )
+        part = slice(start, stop)
+        return replace(self, t_s=self.t_s[part], channels=self.channels[part], diameter_mm=self.diameter_mm[part])
+
+    @property
+    def tool_mm(self) -> Measured | None:
+        """The diameter of the one tool that raw frames are of, as far as it is known."""
+        if self.kind != "raw" or not len(self.t_s):
+            return None
+        known_mm = float(self.diameter_mm[0])
+        return Measured(known_mm, 0.0) if np.isfinite(known_mm) else self.gripped_mm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,12 +143,16 @@ class Estimate:
     runner_up: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """A value and the half width of its 95 % interval."""
+def distinct(measured: Sequence[Measured]) -> list[Measured]:
+    """Return the things that were measured, the most certain measurement of each, by rising value.
 
-    value: float
-    half_width: float
+    Two measurements that their 95 % intervals cannot tell apart are of one thing.
+    """
+    things: list[Measured] = []
+    for one in sorted(measured, key=lambda one: (one.half_width, one.value)):
+        if all(abs(one.value - other.value) > math.hypot(one.half_width, other.half_width) for other in things):
+            things.append(one)
+    return sorted(things, key=lambda one: one.value)
 
 
 def fused(*measured: Measured | None) -> Measured | None:

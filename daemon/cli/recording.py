@@ -66,6 +66,7 @@ def _told(found: "Summary") -> str:
         lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.size / 1e6:.2f} MB")
     lines.append(f"  source   {found.metadata.get('source', 'unknown: it is no recording of shearloop')}")
     lines += [f"  ran      {name}" for name in found.experiments]
+    lines += [f"  tool     of {found.tool_mm} mm"] if found.tool_mm is not None else []
     if software := found.metadata.get("software"):
         here = "the same code as here" if found.same_code else f"other code than here ({software_version()})"
         lines.append(f"  made by  shearloop {software}, {here}")

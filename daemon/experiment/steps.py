@@ -165,6 +165,9 @@ class ExperimentFile(_Section):
         "right", description="the torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
     limits: Limits = Limits()
+    tool_mm: Annotated[float, Field(gt=0, lt=140)] | None = Field(
+        None, description="diameter of the tool that it is done with; recordings name it, and calibrations go by it"
+    )
     slices: Literal["torque", "diameter"] | None = Field(
         None, description="what `shearloop run --slices DIR` keeps of each held angle; nothing by default"
     )

@@ -27,8 +27,8 @@ class Track:
 def follow(calibration: Calibration, series: FrameSeries, bank: Bank | None = None) -> Track:
     """Estimate every frame of a series in order, as live; raises CalibrationError for a series of other sides."""
     chosen = series.of_sides(calibration.sides)
-    known = chosen.kind == "raw" and len(chosen.t_s) > 0
-    tracker = Tracker(calibration, bank, float(chosen.diameter_mm[0]) if known else np.nan)
+    tracker = Tracker(calibration, bank)
+    tracker.hold(chosen.tool_mm)
     estimates, latency = [], []
     for t_s, channels in zip(chosen.t_s, chosen.channels, strict=True):
         begun = time.perf_counter()

@@ -14,7 +14,8 @@ from bank.bank_file import Bank
 from bank.channels import CHANNEL_TABLE_HASH
 from daemon.config import DaemonConfig
 from daemon.config_file import ConfigModel
-from daemon.recording.schema import CONFIGURATION, FORMAT_VERSION
+from daemon.experiment.steps import ExperimentFile
+from daemon.recording.schema import CONFIGURATION, DIAMETER_NOTE, FORMAT_VERSION
 
 _PACKAGES = ("bank", "drivers", "daemon")
 # Keys of the configuration whose files are attached. Never a secret key; and a bank is named by its hash.
@@ -75,6 +76,11 @@ def identity_of(config: DaemonConfig) -> Identity:
             attached.append(one)
             metadata[f"sha256 {path}"] = hashlib.sha256(one.data).hexdigest()
     return Identity(metadata, tuple(attached))
+
+
+def notes_of(experiment: ExperimentFile) -> dict[str, str]:
+    """Return what an experiment tells beside its steps that whoever reads its recording should know."""
+    return {} if experiment.tool_mm is None else {DIAMETER_NOTE: f"{experiment.tool_mm:g}"}
 
 
 def software_version() -> str:

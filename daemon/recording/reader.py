@@ -12,12 +12,26 @@ from mcap.records import Channel, Message
 from numpy.typing import NDArray
 
 from bank.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
+from bank.estimators import Measured
 from daemon.errors import UserError
+from daemon.recording.content import as_json, input_of
 from daemon.recording.opened import opened
-from daemon.recording.schema import FORMAT_VERSION, FRAME_TOPIC, LOAD_TOPIC, METADATA
+from daemon.recording.schema import (
+    DIAMETER_NOTE,
+    EXPERIMENT_METADATA,
+    FORMAT_VERSION,
+    FRAME_TOPIC,
+    LOAD_TOPIC,
+    METADATA,
+    input_topic,
+)
+from daemon.tool_diameter import from_text
+from drivers.raw_input import InputKind
 
 # What every recording says of itself, beside the notes of this one.
 _IDENTITIES = ("format_version", "channel_table_hash", "software", "code_sha256")
+# How a raw input of this kind is written; see `input_json`.
+_TELLS_OF_A_TOOL = as_json({"kind": InputKind.TOOL.value})[1:-1]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
@@ -41,6 +55,8 @@ class Recording:
     sides: dict[str, SideFrames]
     torque_t_ns: IntArray
     torque_nm: FloatArray
+    # Which tool a calibrated gripper told of from when on (Unix ns), None where it held nothing.
+    tools: tuple[tuple[int, Measured | None], ...] = ()
 
 
 def read_recording(path: str | Path) -> Recording:
@@ -49,10 +65,21 @@ def read_recording(path: str | Path) -> Recording:
     with opened(path) as recording:
         metadata = recording.metadata()
         _check(path, metadata.get(METADATA))
-        topics = recording.counts
-        wanted = [topic for topic in topics if topic == LOAD_TOPIC or topic.startswith(f"{FRAME_TOPIC}.")]
-        messages = list(recording.messages(wanted))
-    return _sorted(path, metadata[METADATA], messages)
+        inputs = {input_topic(topic.removeprefix(f"{FRAME_TOPIC}.")) for topic in recording.counts}
+        wanted = [
+            topic
+            for topic in recording.counts
+            if topic == LOAD_TOPIC or topic.startswith(f"{FRAME_TOPIC}.") or topic in inputs
+        ]
+        # Most of what the inputs hold is the lines once more.
+        messages = [
+            (channel, message)
+            for channel, message in recording.messages(wanted)
+            if channel.topic not in inputs or _TELLS_OF_A_TOOL in message.data
+        ]
+    named = metadata.get(EXPERIMENT_METADATA, {})
+    told = {DIAMETER_NOTE: named[DIAMETER_NOTE]} if DIAMETER_NOTE in named else {}
+    return _sorted(path, {**metadata[METADATA], **told}, messages)
 
 
 def _check(path: Path, identities: dict[str, str] | None) -> None:
@@ -70,6 +97,7 @@ def _check(path: Path, identities: dict[str, str] | None) -> None:
 def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel, Message]]) -> Recording:
     frames: dict[str, list[tuple[int, int, list[float]]]] = {}
     torques: list[tuple[int, float]] = []
+    tools: list[tuple[int, Measured | None]] = []
     for channel, message in messages:
         content = _content(path, channel, message)
         try:
@@ -83,6 +111,8 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
                     raise ValueError(f"a line of {len(line)} values")
                 side = channel.topic.removeprefix(f"{FRAME_TOPIC}.")
                 frames.setdefault(side, []).append((message.log_time, int(content["arrival_unix_ns"]), line))
+            else:
+                tools.append((message.log_time, from_text(input_of(content).data)[1]))
         except (KeyError, TypeError, ValueError) as error:
             raise _unusable(path, f"a message on {channel.topic} is not what its schema says ({error!r})") from error
     torques.sort(key=lambda pair: pair[0])
@@ -104,6 +134,7 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
         sides,
         np.array([t for t, _ in torques], dtype=np.int64),
         np.array([torque for _, torque in torques], dtype=np.float64),
+        tuple(sorted(tools, key=lambda pair: pair[0])),
     )
 
 

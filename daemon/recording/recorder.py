@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeAlias
 
 from daemon.clock import Clock
@@ -60,6 +61,7 @@ class _Input:
 class _Experiment:
     name: str
     attached: tuple[Attached, ...]
+    notes: Mapping[str, str]
     t_unix_ns: int
 
 
@@ -133,9 +135,11 @@ class Recorder:
 
         return hear
 
-    def experiment(self, name: str, attached: tuple[Attached, ...] = ()) -> None:
+    def experiment(
+        self, name: str, attached: tuple[Attached, ...] = (), notes: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
         """Take note that an experiment was started: another file begins, unless this one has had none yet."""
-        self._add(_Experiment(name, attached, self._clock.now_ns() + self._clock.offset_ns), _OVERHEAD_BYTES)
+        self._add(_Experiment(name, attached, notes, self._clock.now_ns() + self._clock.offset_ns), _OVERHEAD_BYTES)
 
     async def run(self) -> None:
         """Write every FLUSH_S until cancelled."""
@@ -281,9 +285,9 @@ class Recorder:
                 self._put_clock(told.t_ns, offset_ns)
                 t_unix_ns = told.t_ns + offset_ns
                 self._file.add(input_topic(source), t_unix_ns, t_unix_ns, input_json(told))
-            case _Experiment(name, attached, t_unix_ns):
+            case _Experiment(name, attached, notes, t_unix_ns):
                 self._experiment = name
-                self._file.metadata(EXPERIMENT_METADATA, {"name": name, "t_unix_ns": str(t_unix_ns)})
+                self._file.metadata(EXPERIMENT_METADATA, {**notes, "name": name, "t_unix_ns": str(t_unix_ns)})
                 for one in attached:
                     if one not in self._identity.attached:
                         self._file.attach(one.name, one.media_type, one.data, t_unix_ns)

@@ -38,7 +38,8 @@ CONFIGURATION = "configuration.json"
 FORMAT_VERSION = "1"
 PROFILE = "shearloop"
 SIDES = ("right", "left")
-# The note that tells the tool's diameter in mm, where it was known; the gripper opens no wider.
+# The note that tells the tool's diameter in mm, where it was known: of an imported recording, or of the experiment in
+# one of a daemon. The gripper opens no wider.
 DIAMETER_NOTE = "diameter_mm"
 LARGEST_DIAMETER_MM = 140.0
 

@@ -1,6 +1,5 @@
 """From recordings and folders of slices to the series of frames that estimators are made from and judged by."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +9,8 @@ from bank.channels import channels_of_line
 from bank.estimators.values import FrameSeries
 from daemon.errors import UserError
 from daemon.recording.reader import Recording, read_recording
-from daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
+from daemon.recording.schema import SIDES
+from daemon.recording.tools import tool_of
 from daemon.recordings import read_diameter_slices, read_torque_slices
 
 FloatArray = NDArray[np.float64]
@@ -22,13 +22,14 @@ _LARGEST_APART = 0.75
 _TORQUE_FOLDER, _DIAMETER_FOLDER = "torque_slices", "diameter_slices"
 
 
-def read_series(path: Path, sides: tuple[str, ...] | None = None) -> list[FrameSeries]:
+def read_series(path: Path, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> list[FrameSeries]:
     """Return the series of a recording, of a folder of slices, or of a folder with torque_slices and diameter_slices.
 
-    `sides` chooses the sides of a recording, by default all that are there. Raises UserError for what is neither.
+    `sides` chooses the sides of a recording, by default all that are there; `tool_mm` is the diameter of its tool,
+    unless it names it itself. Raises UserError for what is neither.
     """
     if not path.is_dir():
-        return [series_of(read_recording(path), sides)]
+        return [series_of(read_recording(path), sides, tool_mm)]
     inside = [path / name for name in (_TORQUE_FOLDER, _DIAMETER_FOLDER) if (path / name).is_dir()]
     if inside:
         return [series for folder in inside for series in read_series(folder)]
@@ -42,7 +43,7 @@ def read_series(path: Path, sides: tuple[str, ...] | None = None) -> list[FrameS
     )
 
 
-def series_of(recording: Recording, sides: tuple[str, ...] | None = None) -> FrameSeries:
+def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_mm: float | None = None) -> FrameSeries:
     """Return a recording's frames, those of two sides paired by time; times are in seconds since its first frame."""
     wanted = sides or tuple(side for side in SIDES if side in recording.sides) or tuple(recording.sides)
     missing = [side for side in wanted if side not in recording.sides]
@@ -59,6 +60,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None) -> Fra
     lines = [recording.sides[side].lines[row][paired] for side, row in zip(wanted, rows, strict=True)]
     start = int(first.t_mid_ns[0])
     t_s = (times[:, paired] - start).mean(axis=0) / 1e9
+    diameter_mm, gripped_mm = tool_of(recording, first.t_mid_ns, tool_mm)
     return FrameSeries(
         "raw",
         wanted,
@@ -66,29 +68,9 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None) -> Fra
         np.stack([channels_of_line(one) for one in lines], axis=1),
         (recording.torque_t_ns - start) / 1e9,
         recording.torque_nm,
-        np.full(len(t_s), _diameter_mm(recording)),
+        np.full(len(t_s), diameter_mm),
+        gripped_mm,
     )
-
-
-def _diameter_mm(recording: Recording) -> float:
-    """Return the diameter of the tool that the recording's notes name, NaN where they do not."""
-    text = recording.notes.get(DIAMETER_NOTE)
-    if text is None:
-        return float("nan")
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not 0 < value < LARGEST_DIAMETER_MM:
-        raise UserError(f"{recording.path}: the diameter in its notes is {text!r}, and not one in mm; record it again")
-    return value
-
-
-def on_tool(series: FrameSeries, tool_mm: float) -> FrameSeries:
-    """Return a series whose tool has this diameter, unless it says itself which it has; slices tell of their own."""
-    if series.kind != "raw" or np.isfinite(series.diameter_mm).any():
-        return series
-    return replace(series, diameter_mm=np.full(len(series.t_s), tool_mm))
 
 
 def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:

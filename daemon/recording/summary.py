@@ -8,7 +8,7 @@ from mcap.records import Attachment, Channel, Message, Metadata
 
 from daemon.recording.identity import code_digest
 from daemon.recording.salvage import Progress, condition_of, records
-from daemon.recording.schema import END_METADATA, EXPERIMENT_METADATA, METADATA
+from daemon.recording.schema import DIAMETER_NOTE, END_METADATA, EXPERIMENT_METADATA, METADATA
 
 
 @dataclass(slots=True)
@@ -47,6 +47,8 @@ class Summary:
     dropped: int | None = None
     metadata: dict[str, str] = field(default_factory=dict)
     experiments: list[str] = field(default_factory=list)
+    # The diameter of the tool in mm as the recording names it.
+    tool_mm: str | None = None
     attachments: list[str] = field(default_factory=list)
     topics: dict[str, Topic] = field(default_factory=dict)
 
@@ -79,6 +81,7 @@ class Summary:
             "duration_s": self.duration_s,
             "same_code": self.same_code,
             "experiments": self.experiments,
+            "tool_mm": self.tool_mm,
             "metadata": self.metadata,
             "attachments": self.attachments,
             "topics": {
@@ -101,8 +104,10 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> Summary:
                 found.topics.setdefault(topics[record.channel_id], Topic()).count(record)
             case Metadata(name=name) if name == METADATA:
                 found.metadata = dict(record.metadata)
+                found.tool_mm = record.metadata.get(DIAMETER_NOTE)
             case Metadata(name=name) if name == EXPERIMENT_METADATA:
                 found.experiments.append(record.metadata.get("name", ""))
+                found.tool_mm = record.metadata.get(DIAMETER_NOTE)
             case Metadata(name=name) if name == END_METADATA:
                 found.dropped = int(record.metadata.get("dropped", "0"))
             case Attachment():

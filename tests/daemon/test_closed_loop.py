@@ -64,7 +64,7 @@ def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
 def experiment(folder: Path, *steps: Mapping[str, Any]) -> str:
     path = folder / "experiment.yaml"
     begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
-    content = {"name": "test", "drive": "load_cell", "steps": [*begin, *map(dict, steps)]}
+    content = {"name": "test", "drive": "load_cell", "tool_mm": 20, "steps": [*begin, *map(dict, steps)]}
     path.write_text(yaml.safe_dump(content))
     return str(path)
 

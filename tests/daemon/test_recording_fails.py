@@ -48,6 +48,7 @@ def check_recordings(disk: Path, torques: int) -> None:
     """Hold the two experiments' recordings to have all that came, and so many torques at least."""
     recordings = [summarise(path) for path in sorted(disk.glob("*.mcap"))]
     assert [one.experiments for one in recordings] == [["test"], ["test"]]
+    assert [one.tool_mm for one in recordings] == ["20", "20"], "as their experiments name it"
     assert not any(one.dropped for one in recordings)
     # The second was stopped at once.
     found = [one.topics["load.torque"].messages for one in recordings if "load.torque" in one.topics]

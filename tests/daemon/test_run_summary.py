@@ -15,6 +15,7 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
         "phase": "running",
         "experiment": "hold",
         "driving": "right",
+        "tool_mm": None,
         "step": 2,
         "steps": 3,
         "step_name": "hold_torque",
@@ -69,6 +70,15 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
 
 def test_without_a_truth_nothing_is_said_of_it() -> None:
     assert "truth" not in told(None, [])
+
+
+def test_a_tool_that_the_experiment_names_is_told() -> None:
+    lines: list[str] = []
+    summary = RunSummary(lines.extend)
+    for phase in ("running", "done"):
+        summary("loop.state", loop_state(0, tool_mm=20.0, phase=phase))
+    assert "  the tool is of 20 mm, as the experiment names it" in lines
+    assert "the tool is" not in told(None, [])
 
 
 def test_a_disturbance_that_is_not_overcome_is_said_to_be_none() -> None:

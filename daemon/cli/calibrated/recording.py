@@ -2,6 +2,7 @@
 
 import argparse
 from dataclasses import replace
+from math import isnan
 from pathlib import Path
 
 from daemon.cli.result import add_json, tell
@@ -48,18 +49,16 @@ def run(args: argparse.Namespace) -> int:
     from daemon.cli.recorded import parsed_part, parsed_sides
     from daemon.errors import UserError
     from daemon.recording.schema import LARGEST_DIAMETER_MM
-    from daemon.recording.series import on_tool, part_of, read_series
+    from daemon.recording.series import part_of, read_series
 
     start, stop = parsed_part(args.part)
-    series = [one for path in args.recordings for one in read_series(path, parsed_sides(args.sides))]
     late_s = args.load_late
     if late_s is not None and not abs(late_s) <= _LARGEST_LATE_S:
         raise UserError(f"--load-late must be seconds from -{_LARGEST_LATE_S:g} to {_LARGEST_LATE_S:g}, not {late_s:g}")
     tool_mm = args.tool_mm
     if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
         raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
-    if tool_mm is not None:
-        series = [on_tool(one, tool_mm) for one in series]
+    series = [one for path in args.recordings for one in read_series(path, parsed_sides(args.sides), tool_mm)]
     parts = [part_of(one, start, stop) for one in series]
     if late_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]
@@ -89,5 +88,10 @@ def run(args: argparse.Namespace) -> int:
         told["load_late_s"] = [found and round(found.late_s, 3) for found in map(alignment, parts)]
         known = ", ".join(f"{each:.2f}" for each in told["load_late_s"] if each is not None)
         sentences += [f"The load is stamped {known} s after the frames move."] if known else []
+    if calibration.kind == "raw":
+        known_mm = None if isnan(calibration.tool_mm) else calibration.tool_mm
+        told["tool_mm"] = known_mm
+        unknown = "Its tool is not known to be one, and on another the torque would be wrong: name it with --tool-mm."
+        sentences.append(unknown if known_mm is None else f"Its tool is of {known_mm:.3g} mm.")
     tell(told, sentences, as_json=args.json)
     return 0

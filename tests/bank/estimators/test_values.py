@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from bank.errors import CalibrationError
 from bank.estimators import FrameSeries, Measured, TactileFrame, fused
+from bank.estimators.values import distinct
 
 measurements = st.builds(Measured, st.floats(-1e3, 1e3, allow_nan=False), st.floats(1e-3, 1e3, allow_nan=False))
 
@@ -19,6 +20,22 @@ def test_fused_measurements_lie_between_and_cover_the_ones_that_contradict_each_
     alike = fused(*(Measured(low, m.half_width) for m in several))
     assert alike is not None
     assert alike.half_width <= min(m.half_width for m in several) * (1 + 1e-12)
+
+
+@given(st.lists(measurements, max_size=6), st.randoms())
+def test_things_are_as_many_as_their_measurements_tell_apart(several, random):
+    things = distinct(several)
+    assert set(things) <= set(several)
+    assert (things == []) == (several == [])
+    assert len(distinct([Measured(one.value, 0.0) for one in several])) == len({one.value for one in several})
+    assert len(distinct([Measured(one.value, 3e3) for one in several])) == min(len(several), 1)
+    random.shuffle(several)
+    assert distinct(several) == things
+
+
+def test_a_gripper_tells_tools_apart_by_its_own_uncertainty():
+    told = [Measured(20.4, 1.2), Measured(10.1, 1.2), Measured(19.3, 1.2), Measured(20.0, 0.0)]
+    assert distinct(told) == [Measured(10.1, 1.2), Measured(20.0, 0.0)]
 
 
 def test_two_that_contradict_each_other_are_not_a_sure_one_in_between():

@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,7 +6,6 @@ import pytest
 from bank.estimators import Estimate, FrameSeries
 from daemon.cli import main
 from daemon.recording.evaluation import Track, judge, reasons
-from daemon.recording.series import on_tool
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "valid_fraction", "latency_ms_p50", "latency_ms_p99", "frames"}
 
@@ -106,13 +104,3 @@ def test_figures_are_what_their_names_say():
     assert figures["valid_fraction"] == 0.75
     assert (figures["latency_ms_p50"], figures["frames"]) == (2.5, 4)
     assert "diameter_rmse_mm" not in figures
-
-
-def test_a_tool_is_named_for_recordings_that_do_not_name_it():
-    nothing = np.full(4, np.nan)
-    raw = FrameSeries("raw", ("right",), np.arange(4.0), np.zeros((4, 1, 896)), nothing[:0], nothing[:0], nothing)
-    named = on_tool(raw, 12.0)
-    assert named.diameter_mm.tolist() == [12.0] * 4
-    assert on_tool(named, 20.0) is named, "a recording that says it knows better"
-    slices = replace(raw, kind="difference")
-    assert on_tool(slices, 12.0) is slices

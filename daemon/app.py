@@ -115,8 +115,10 @@ class Daemon:
         if self._rig is not None and self._rig.gripper is not None:
             self._rig.gripper.fingertips_say = diameters.at
 
-        def estimation(name: str, estimator: AnyEstimator) -> Estimation:
-            made = Estimation(name, estimator, self.publisher, self._clock, hear, diameters.hear, self._tap(name))
+        def estimation(name: str, estimator: AnyEstimator, period_s: Callable[[], float]) -> Estimation:
+            made = Estimation(
+                name, estimator, self.publisher, self._clock, period_s, hear, diameters.hear, self._tap(name)
+            )
             if self._rig is not None and self._rig.gripper is not None:
                 made.held_tool = self._rig.gripper.held_tool
             return made
@@ -124,17 +126,19 @@ class Daemon:
         self._both: BothTask | None = None
         if both is not None:
             period_s = config.fingertips[both.sides[0]].frame_period_s
-            self._both = BothTask(estimation(BOTH, both), both.sides, period_s)
-        self._fingertips = {
-            name: FingertipTask(
-                _board(config.fingertips[name], name, self._link_of(name), self._tap(name), self._both),
-                estimation(name, estimator),
+            self._both = BothTask(estimation(BOTH, both, lambda: period_s), both.sides, period_s)
+
+        def fingertip(name: str, estimator: AnyEstimator) -> FingertipTask:
+            board = _board(config.fingertips[name], name, self._link_of(name), self._tap(name), self._both)
+            return FingertipTask(
+                board,
+                estimation(name, estimator, lambda: board.period_s),
                 self.publisher,
                 **({"room": self._both.room} if self._both is not None and name in self._both.sides else {}),
                 always_heatmap=config.fingertips[name].heatmap == "always",
             )
-            for name, estimator in estimators.items()
-        }
+
+        self._fingertips = {name: fingertip(name, estimator) for name, estimator in estimators.items()}
         self._estimations = {name: task.estimation for name, task in self._fingertips.items()}
         if self._both is not None:
             self._estimations[BOTH] = self._both.estimation

@@ -25,10 +25,13 @@ class Estimation:
         estimator: AnyEstimator,
         publisher: Publisher,
         clock: Clock,
+        period_s: Callable[[], float],
         hear: Callable[[Torque], None],
         hear_diameter: HearDiameter = unheard,
         tap: Tap = no_tap,
     ) -> None:
+        """Take what is tied together; `period_s` says how long the acquisition of a frame takes."""
+        self._period_s = period_s
         self._tap = tap
         self.name = name
         self.estimator = estimator
@@ -40,12 +43,16 @@ class Estimation:
         # Who knows the diameter of the tool that is held, and what the estimator was told of it last.
         self.held_tool: Callable[[int], Measured | None] = unknown
         self._tool: Measured | None = None
-        self._tare_wanted = False
+        # Since when a new homogeneous frame is wanted, until it is begun.
+        self._tare_since_ns: int | None = None
         self._waiting = Waiting()
 
     def tare(self) -> None:
-        """Take a new homogeneous frame, beginning with the next frame to be estimated."""
-        self._tare_wanted = True
+        """Take a new homogeneous frame, beginning with the first frame that is measured from now on.
+
+        What is on its way is of the time before, when something may have been gripped.
+        """
+        self._tare_since_ns = self._clock.now_ns()
 
     async def tare_to_the_end(self) -> str:
         """Take a new homogeneous frame and wait until it is complete; the text is empty, for nothing can go wrong."""
@@ -62,8 +69,8 @@ class Estimation:
 
         Most frames take less than it costs to hand them to a thread.
         """
-        if self._tare_wanted:
-            self._tare_wanted = False
+        if self._tare_since_ns is not None and self._began_ns(frames) >= self._tare_since_ns:
+            self._tare_since_ns = None
             # A replay takes its zero before the same frame.
             self._tap(RawInput(InputKind.TARE, self._clock.now_ns(), str(frames[0].seq).encode()))
             self.estimator.tare()
@@ -72,6 +79,10 @@ class Estimation:
         if reading is not None:
             self._finish(frames, reading)
         return reading
+
+    def _began_ns(self, frames: tuple[Frame, ...]) -> int:
+        """Return when the first of these frames was begun to be measured."""
+        return min(frame.t_mid_ns for frame in frames) - round(0.5e9 * self._period_s())
 
     def _take_note_of_the_tool(self, frame: int) -> None:
         now_ns = self._clock.now_ns()
@@ -90,7 +101,7 @@ class Estimation:
     def _finish(self, frames: tuple[Frame, ...], reading: Reading) -> None:
         self._publish(frames, reading)
         self.count += 1
-        if self._waiting and not self._tare_wanted and self.estimator.baseline_complete:
+        if self._waiting and self._tare_since_ns is None and self.estimator.baseline_complete:
             self._waiting.tell("")
 
     def _publish(self, frames: tuple[Frame, ...], reading: Reading) -> None:

@@ -16,6 +16,9 @@ from drivers.load_cell import LoadCell
 LOAD_CELL = "load_cell"
 # Two seconds at 10.9 Hz; their mean is known ten times better than one reading moves.
 ZERO_SAMPLES = 22
+# So many conversions a reading is of, the last of them its own: an HX711 settles within four (data sheet, "Output
+# settling time": 400 ms at 10 a second, 50 ms at 80).
+SETTLING_PERIODS = 4
 # A zero takes two seconds; what keeps it for longer than this does not go away by waiting.
 ZERO_DEADLINE_S = 15.0
 
@@ -32,8 +35,8 @@ class LoadCellTask:
         self._clock = clock
         self._hear = hear
         self._zeroing: list[float] | None = None
-        # Until when a zero is taken, and why the last one was not.
-        self._zero_until_ns = 0
+        # From when on and until when a zero is taken, and why the last one was not.
+        self._zero_from_ns = self._zero_until_ns = 0
         self._untaken = ""
         self._waiting = Waiting()
         self._why = ""
@@ -48,9 +51,15 @@ class LoadCellTask:
                 self._take_zero(sample)
 
     def tare(self) -> None:
-        """Take the mean of the next samples for zero; of those that come too late for it, it would be of any load."""
+        """Take the mean of the samples that are measured from now on for zero.
+
+        Those under way know of the load before; with those that come too late for it, it would be of any load.
+        """
         self._zeroing, self._untaken = [], ""
-        self._zero_until_ns = self._clock.now_ns() + round(ZERO_DEADLINE_S * 1e9)
+        now_ns = self._clock.now_ns()
+        # The middle of the first reading that knows of nothing before.
+        self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self.source.period_s * 1e9)
+        self._zero_until_ns = now_ns + round(ZERO_DEADLINE_S * 1e9)
 
     async def zero(self) -> str:
         """Take the mean of the next samples for zero; return why it could not be done, or an empty text."""
@@ -83,7 +92,7 @@ class LoadCellTask:
             )
             structlog.get_logger().warning(self._untaken)
             return
-        if sample.trusted:
+        if sample.trusted and sample.t_mid_ns >= self._zero_from_ns:
             self._zeroing.append(sample.raw)
         if len(self._zeroing) == ZERO_SAMPLES:
             mean = sum(self._zeroing) / ZERO_SAMPLES

@@ -75,8 +75,9 @@ class SkinEstimator:
         self._last: tuple[Zero, float] | None = None
         self.tare()
 
-    def tare(self) -> None:
-        """Take a new zero from the samples to come."""
+    def tare(self, from_ns: int = 0) -> None:
+        """Take a new zero from the samples to come that are measured from then on (monotonic clock)."""
+        self._zero_from_ns = from_ns
         self._taker = ZeroTaker(self._zero_samples, self._calibration.rest_ohm, self._calibration.slope_per_n)
         self._zero: Zero | None = None
         self.refused = ""
@@ -97,6 +98,9 @@ class SkinEstimator:
             self._forget_direction()
             return SkinReading(why=tuple(map(str, sample.faults)))
         if self._zero is None:
+            # It is measured as long before its middle as after it, and was there then or later.
+            if 2 * sample.t_mid_ns - sample.t_arrival_ns < self._zero_from_ns:
+                return SkinReading(why=("measured before the zero was asked for",))
             waits = self._take_zero(sample.r1_ohm, sample.r2_ohm, sample.t_mid_ns)
             if waits or self._zero is None:
                 return SkinReading(why=(waits,))

@@ -114,7 +114,7 @@ class RecordedSkin:
                 for sample in samples
             ]
         elif told.kind is InputKind.TARE:
-            self._estimator.tare()
+            self._estimator.tare(told.t_ns)
         return []
 
 

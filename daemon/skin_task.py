@@ -58,9 +58,10 @@ class SkinTask:
                 self._tell_zero()
 
     def tare(self) -> None:
-        """Take a new zero, beginning with the next sample."""
-        self._tap(RawInput(InputKind.TARE, self._clock.now_ns()))
-        self._estimator.tare()
+        """Take a new zero, beginning with the first sample that is measured from now on."""
+        now_ns = self._clock.now_ns()
+        self._tap(RawInput(InputKind.TARE, now_ns))
+        self._estimator.tare(now_ns)
 
     async def zero(self) -> str:
         """Take a new zero and wait until it is there; return why it could not be taken, or an empty text."""

@@ -9,7 +9,7 @@ import io
 import re
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -75,8 +75,9 @@ class SliceRecorder:
         self._counting = threading.Lock()
         self._frames: dict[str, deque[_Frame]] = {}
         self._torques: deque[tuple[int, float]] = deque(maxlen=MOST_TORQUES)
-        self._taring: dict[str, list[FloatArray]] = {}
+        self._taring: dict[str, list[_Frame]] = {}
         self._tares = False
+        self._tares_from_ns = 0
         self._homogeneous: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._diameter_mm: float | None = None
         self._held: tuple[int, int] | None = None
@@ -125,7 +126,7 @@ class SliceRecorder:
         frame = _Frame(t_ns, _array(content["channels"]), _array(content["line"]))
         self._frames.setdefault(source, deque(maxlen=MOST_FRAMES)).append(frame)
         if self._tares:
-            self._taring.setdefault(source, []).append(frame.line)
+            self._taring.setdefault(source, []).append(frame)
         pending = self._pending
         if pending is not None and source == pending.source and t_ns > pending.to_ns:
             self._pending = None
@@ -135,6 +136,7 @@ class SliceRecorder:
         now_ns, tares = content["t_mono_ns"], content["step_name"] == "tare" and content["phase"] == "running"
         if tares and not self._tares:
             self._taring.clear()
+            self._tares_from_ns = now_ns
         elif self._tares and not tares:
             self._end_tare()
         self._tares = tares
@@ -159,15 +161,19 @@ class SliceRecorder:
         return driving
 
     def _end_tare(self) -> None:
-        for source, lines in self._taring.items():
-            mean = np.mean(lines, axis=0)
-            self._homogeneous[source] = (channels_of_line(mean), mean)
+        for source, frames in self._taring.items():
+            # The first to come was under way before, when something may have been gripped.
+            from_ns = self._tares_from_ns + _half_period_ns(self._frames[source])
+            within = [frame.line for frame in frames if frame.t_ns >= from_ns]
+            if within:
+                mean = np.mean(within, axis=0)
+                self._homogeneous[source] = (channels_of_line(mean), mean)
         self._taring.clear()
 
     def _write(self, hold: _Hold) -> None:
         known = self._frames.get(hold.source, ())
         # A frame is of the hold when the whole of its acquisition is.
-        half_ns = 0.5 * float(np.median(np.diff([frame.t_ns for frame in known]))) if len(known) > 1 else 0.0
+        half_ns = _half_period_ns(known)
         frames = [frame for frame in known if hold.from_ns + half_ns <= frame.t_ns <= hold.to_ns - half_ns]
         torques = np.array([row for row in self._torques if hold.from_ns < row[0] < hold.to_ns]).reshape(-1, 2)
         if hold.source not in self._homogeneous:
@@ -238,6 +244,11 @@ def _save(path: Path, **arrays: Any) -> None:
     savemat(content, arrays)  # type: ignore[arg-type]  # any file will do
     with replaced(path) as file:
         file.write(content.getbuffer())
+
+
+def _half_period_ns(known: Collection[_Frame]) -> float:
+    """Return half the time that the acquisition of a frame takes, 0 where that is not known."""
+    return 0.5 * float(np.median(np.diff([frame.t_ns for frame in known]))) if len(known) > 1 else 0.0
 
 
 def _array(wire: bytes) -> FloatArray:

@@ -76,7 +76,7 @@ class Reader:
 
 def task_of(told: Told, reader: Reader) -> FingertipTask:
     publisher = cast(Publisher, told)
-    estimation = Estimation("right", cast(Any, reader), publisher, Clock(), lambda _: None)
+    estimation = Estimation("right", cast(Any, reader), publisher, Clock(), lambda: Board.period_s, lambda _: None)
     return FingertipTask(cast(EitKit, Board()), estimation, publisher)
 
 

@@ -16,7 +16,8 @@ class Board:
     def __init__(self) -> None:
         self.sent: asyncio.Queue[LoadSample] = asyncio.Queue()
         self.tares: list[float] = []
-        self._seq = 0
+        # Later than all that a test asks for.
+        self._seq = Clock().now_ns() + 10**9
 
     async def samples(self) -> AsyncGenerator[LoadSample]:
         while True:
@@ -100,6 +101,21 @@ async def test_the_operators_tare_is_taken_from_the_next_samples() -> None:
         assert board.tares == [3.0]
 
 
+async def test_readings_that_know_of_the_load_before_are_not_of_the_zero() -> None:
+    """An HX711 settles within four conversions: a reading is of the time since three before its own began."""
+    async with reading() as (task, board):
+        now_ns, period_ns = Clock().now_ns(), round(1e9 / 10.9)
+        task._clock = type("Held", (Clock,), {"now_ns": lambda _: now_ns})()
+        task.tare()
+        for number in range(6 + ZERO_SAMPLES):
+            arrives_ns = now_ns + number * period_ns
+            sample = LoadSample(float(number), 0.1, arrives_ns - period_ns // 2, arrives_ns, number)
+            board.sent.put_nowait(sample)
+        await board.sent.join()
+        # That of number 4 began exactly when it was asked for, and took a period.
+        assert board.tares == [4 + (ZERO_SAMPLES - 1) / 2]
+
+
 async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_later_hour() -> None:
     async with reading() as (task, board):
         task.tare()
@@ -113,6 +129,7 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
         task._clock = Later()
         task.tare()
         assert task.facts()["trouble"] == ""
+        later_ns = task._clock.now_ns() + 10**9
         for seq in range(ZERO_SAMPLES):
             board.sent.put_nowait(LoadSample(3.0, 0.1, later_ns + seq, later_ns + seq, seq))
         await board.sent.join()

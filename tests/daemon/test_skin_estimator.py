@@ -1,6 +1,7 @@
 """From resistances to shear force: every bad input is either refused with its reason or stated in the interval."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -141,6 +142,18 @@ def test_a_zero_under_load_is_refused_until_the_load_is_off(calibration: SkinCal
         reading = bench.at(0.0, 0.0)
     assert reading.valid
     assert not bench.estimator.refused
+
+
+def test_a_sample_that_was_under_way_when_a_zero_was_asked_for_is_not_of_it(calibration: SkinCalibration) -> None:
+    bench = Bench(calibration).zeroed()
+    asked_ns = round(bench.time_s * 1e9) + 3 * PERIOD_NS // 4
+    bench.estimator.tare(asked_ns)
+    whys = []
+    for _ in range(3):
+        sample = bench.sample()
+        known_ns = sample.t_mid_ns + PERIOD_NS // 2
+        whys += bench.estimator.update(replace(sample, t_arrival_ns=known_ns)).why
+    assert whys == ["measured before the zero was asked for", "taking the zero, 1 of 20", "taking the zero, 2 of 20"]
 
 
 @pytest.mark.parametrize("shear_n", [0.1, -0.15])

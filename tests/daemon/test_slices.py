@@ -131,6 +131,20 @@ def test_frames_and_torques_are_smoothed_alike_around_the_middle_of_a_hold(tmp_p
     np.testing.assert_allclose(slices.torque_nm[0], slices.differences[0].mean(), rtol=0.02)
 
 
+def test_the_frame_that_was_under_way_when_the_tare_began_is_no_homogeneous_one(tmp_path: Path) -> None:
+    sweep = Sweep(tmp_path, tared=False)
+    sweep.frames(0.3, 4.0)
+    sweep.t_s += 0.3 * PERIOD_S
+    sweep._loop(step_name="tare")
+    sweep.t_s -= 0.9 * PERIOD_S
+    sweep.frames(0.3, PERIOD_S)
+    sweep.frames(0.0, 4.0)
+    sweep._loop(step_name="grip")
+    sweep.hold(1, 0.1)
+    sweep.done()
+    np.testing.assert_allclose(read_torque_slices(tmp_path / "torque_slices").differences, 0.1, atol=1e-6)
+
+
 def test_frames_of_a_hold_that_arrive_after_its_end_are_of_it(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)

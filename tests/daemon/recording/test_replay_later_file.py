@@ -52,7 +52,7 @@ async def record(config: Path, stream: Path) -> list[dict[str, Any]]:
                 await until(BEGUN)
                 recorder.experiment("second")
                 await until(ZEROED)
-                right._tare_wanted = True
+                right.tare()
                 await until(ENOUGH)
             daemon.stop()
     return estimates

@@ -14,34 +14,37 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bank.estimators import Name, Physics
-from bench.charts.faults import FAULTS
-from bench.charts.sources import bank_of, own_fingertip, splits
-from bench.charts.stability import sweeps
 from daemon.cli import main
 from daemon.errors import UserError
-from daemon.reproduce.banks import Grid
 from daemon.workers import Cluster, InTurn, Processes, workers
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 
+# Every worker imports this module for its tasks: what takes long to import is imported by the test that needs it.
 ROOT = Path(__file__).parents[2]
 STARTED_S = 90
 
 
 @pytest.fixture(scope="session")
 def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """Start a scheduler and two workers, each a process of its own, and return the address."""
+    """Start a scheduler and two workers, all processes of their own, and return the address."""
     from distributed import Client
 
     # Spawned processes have a tracker of resources, which stays with this one for good.
     resource_tracker.ensure_running()
     folder = tmp_path_factory.mktemp("dask")
     found, log = folder / "scheduler.json", folder / "log"
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1"}
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "OPENBLAS_NUM_THREADS": "1",
+        # A worker is forked, also the one that takes a killed one's place, instead of importing everything anew.
+        "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver",
+        "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    }
     common = ["--scheduler-file", str(found), "--no-dashboard"]
-    commands = [["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", *common]] + [
-        ["distributed.cli.dask_worker", "--nthreads", "1", "--name", name, "--local-directory", str(folder), *common]
-        for name in ("one", "two")
+    two = ["--nworkers", "2", "--nthreads", "1", "--local-directory", str(folder)]
+    commands = [
+        ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", *common],
+        ["distributed.cli.dask_worker", *two, *common],
     ]
     processes: list[subprocess.Popen[bytes]] = []
     with ExitStack() as stack:
@@ -58,9 +61,9 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
                 address = str(client.scheduler.address)
             yield address
         finally:
+            # The workers first: without their scheduler they would wait for it.
             for process in reversed(processes):
                 process.terminate()
-            for process in processes:
                 process.wait(STARTED_S)
 
 
@@ -199,6 +202,12 @@ def test_a_bank_that_a_worker_is_killed_under_has_the_same_bytes(
 def test_a_chart_has_the_same_numbers_from_a_cluster_that_a_worker_is_killed_of(
     scheduler: str, killed: list[int], tmp_path: Path
 ) -> None:
+    from bank.estimators import Name, Physics
+    from bench.charts.faults import FAULTS
+    from bench.charts.sources import bank_of, own_fingertip, splits
+    from bench.charts.stability import sweeps
+    from daemon.reproduce.banks import Grid
+
     bank = bank_of(None, own_fingertip(0.4).mesh(), tmp_path, Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8)))
     split = next(one for one in splits([], 0.6, tmp_path) if one.past.kind == "difference")
     # The quickest one, twice: a task each.

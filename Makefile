@@ -6,6 +6,8 @@ BIN := $(VENV)/bin
 COMPILED := setup.py bank/_search.c drivers/_cells.c
 # Many small solves: one BLAS thread each, on every machine.
 export OPENBLAS_NUM_THREADS := 1
+# Some containers forbid Python to keep what it compiled; every process of the tests would then compile all of them anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install install-dev system-packages demo docs test lint format clean
 
@@ -45,13 +47,13 @@ run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
 	mkdir -p run
 	$(BIN)/shearloop bank build --config $< --out $@
 
-# Files are shared out over the processors; those that wait for devices leave theirs to the others. What drives a robot
-# runs by itself afterwards, the longest test beside all others: a robot stops when its computer is busy. Others may keep
-# it busy all the same, so such a test has a second and a third try, which the summary names. (Status 5: nothing of this
-# kind was asked for.)
+# Files are shared out over the processors, the longest first (tests/conftest.py); those that wait for devices leave
+# theirs to the others. What drives a robot runs by itself afterwards, the longest test beside all others: a robot stops
+# when its computer is busy. Others may keep it busy all the same, so such a test has a second and a third try, which
+# the summary names. (Status 5: nothing of this kind was asked for.)
 PYTEST := $(BIN)/python -m pytest
 test: install-dev
-	$(PYTEST) -n 3 --dist loadfile -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
+	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 	$(PYTEST) -n 2 --dist loadfile --no-loadscope-reorder -m real_time --reruns 2 --reruns-delay 2 -rR $(PYTEST_ARGS) || [ $$? -eq 5 ]
 
 lint: install-dev

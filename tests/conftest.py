@@ -13,10 +13,21 @@ import hypothesis
 import pytest
 import structlog
 
+# Before numpy is imported, as the command line and the Makefile do: threads that wait for a busy machine's other
+# processor make a calibration twenty times as slow.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # How long an example takes on a busy machine says nothing about what is tested.
 hypothesis.settings.register_profile("shearloop", deadline=None)
 hypothesis.settings.load_profile("shearloop")
 
+# Files of more than some five seconds, the longest first (`make test PYTEST_ARGS=--durations=60` shows them).
+LONGEST = (
+    *("test_workers.py", "test_shared_recordings.py", "test_run.py", "test_charts.py", "test_stability_chart.py"),
+    *("test_page.py", "test_page_controls.py", "test_under_systemd.py", "test_control_benches.py"),
+    *("test_cli_reproduce.py", "test_tracker.py", "test_design.py", "test_skin_run.py", "test_fast_matching.py"),
+    *("test_scene.py", "test_fuzz.py", "test_cli_bank.py", "test_replay_both.py"),
+)
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 
 
@@ -39,9 +50,20 @@ def fonts() -> None:
     figure.savefig(io.BytesIO(), format="svg")
 
 
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """For `-m real_time` do not import the nine files of ten that have no such test, in each worker."""
+    wanted = config.getoption("markexpr") == "real_time" and collection_path.match("test_*.py")
+    return True if wanted and "real_time" not in collection_path.read_text(encoding="utf-8") else None
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the tests that may take longest: what is shared out last ends alone."""
-    items.sort(key=lambda item: item.get_closest_marker("timeout") is None)
+    """Begin with the files and the tests that take longest: what is shared out last ends alone."""
+
+    def turn(item: pytest.Item) -> tuple[bool, int]:
+        place = LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST)
+        return item.get_closest_marker("timeout") is None, place
+
+    items.sort(key=turn)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from bank.errors import CalibrationError
-from bank.estimators import FrameSeries, fit
+from bank.estimators import Calibration, FrameSeries, fit
 from bank.estimators.alignment import alignment, is_filtered
 from bank.estimators.familiar import DifferenceGuard
 from daemon.cli import main
@@ -47,11 +47,20 @@ def cylinders(shared, tmp_path_factory) -> dict[int, FrameSeries]:
     return {mm: series_of(read_recording(out / f"{mm}.mcap")) for mm in (10, 20, 30, 40)}
 
 
-def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders):
+@pytest.fixture(scope="module")
+def of_one_cylinder(cylinders) -> dict[int, Calibration]:
+    return {mm: fit("fused", [series], "one cylinder") for mm, series in cylinders.items()}
+
+
+@pytest.fixture(scope="module")
+def of_all_twists(twists) -> Calibration:
+    return fit("fused", [twists], "all")
+
+
+def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders, of_one_cylinder):
     """Fitted to one cylinder each, whose grips are from a tenth to eight times as strong as on the others."""
     idle_s, held_s = 7.0, (24.5, 87.0)
-    for fitted in cylinders.values():
-        calibration = fit("fused", [fitted], "one cylinder")
+    for calibration in of_one_cylinder.values():
         for cylinder in cylinders.values():
             other = replace(cylinder, diameter_mm=np.full(len(cylinder.t_s), np.nan))
             estimates = follow(calibration, other).estimates
@@ -60,8 +69,8 @@ def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders):
             assert not any(one.valid for one in np.array(estimates)[(other.t_s < idle_s) | (other.t_s > 97.5)])
 
 
-def test_the_torque_of_one_tool_is_not_read_as_that_of_another(cylinders):
-    calibration = fit("fused", [cylinders[20]], "one cylinder")
+def test_the_torque_of_one_tool_is_not_read_as_that_of_another(cylinders, of_one_cylinder):
+    calibration = of_one_cylinder[20]
     estimates = follow(calibration, cylinders[10]).estimates
     assert not any(one.valid for one in estimates)
     assert "the tool is of 10 mm and the calibration of one of 20 mm" in estimates[80].why[0]
@@ -97,9 +106,8 @@ def test_later_twists(twists, sides, r, rmse_nm):
     assert 0.6 <= figures["valid_fraction"] <= 0.75
 
 
-def test_idle_disturbed_and_foreign_frames_are_never_valid(twists):
-    calibration = fit("fused", [twists], "all")
-    whole = follow(calibration, twists)
+def test_idle_disturbed_and_foreign_frames_are_never_valid(twists, of_all_twists):
+    whole = follow(of_all_twists, twists)
     idle = (twists.t_s < 22) | (twists.t_s > 380)
     assert not any(one.valid for one, free in zip(whole.estimates, idle, strict=True) if free)
     assert np.mean([one.valid for one in whole.estimates]) > 0.7
@@ -111,14 +119,14 @@ def test_idle_disturbed_and_foreign_frames_are_never_valid(twists):
             layer[rng.choice(896, 224, replace=False)] = np.abs(rng.normal(0, 0.05, 224))
     for channels in (noisy, some.channels[:, ::-1]):
         strange = FrameSeries("raw", some.sides, some.t_s, channels, some.torque_t_s, some.torque_nm, some.diameter_mm)
-        assert not any(one.valid for one in follow(calibration, strange).estimates)
+        assert not any(one.valid for one in follow(of_all_twists, strange).estimates)
 
 
-def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(twists, shared, tmp_path):
+def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(of_all_twists, shared, tmp_path):
     imported = import_mat([shared / "recordings/streams/20241202_153632"], tmp_path / "other.mcap")
     assert "46 s in all" in imported.remarks[0]
     other = series_of(read_recording(tmp_path / "other.mcap"))
-    assert judge([follow(fit("fused", [twists], "all"), other)])["valid_fraction"] == 0
+    assert judge([follow(of_all_twists, other)])["valid_fraction"] == 0
 
 
 def test_later_torque_slices(shared):

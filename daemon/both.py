@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from bank.estimators.pairing import Pairing
 from daemon.estimation import Estimation
-from daemon.messages import EitFrame, Scalar
+from daemon.messages import Scalar
 from drivers.eit_kit import Frame
 
 BOTH = "both"
@@ -20,6 +20,7 @@ class BothTask:
         """Take the sides in the order of the calibration, and their frame period."""
         self.estimation = estimation
         self.sides = sides
+        self._period_s = period_s
         self._pairing: Pairing[Frame] = Pairing(sides, round(period_s * 1e9))
         self._backlog: asyncio.Queue[tuple[Frame, ...]] = asyncio.Queue()
         self._room = asyncio.Event()
@@ -52,7 +53,7 @@ class BothTask:
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the estimates."""
         return {
-            "expected_hz": EitFrame.rate_hz,
+            "expected_hz": 1.0 / self._period_s,
             "estimates": self.estimation.count,
             "backlog": self._backlog.qsize(),
         }

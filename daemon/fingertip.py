@@ -103,7 +103,6 @@ class FingertipTask:
         return {
             **facts,
             "rate_hz": facts["measured_hz"],
-            "expected_hz": EitFrame.rate_hz,
             "trouble": facts["last_refusal"] if facts["connected"] else facts["last_loss"],
             "estimates": self.estimation.count,
             "backlog": self._backlog.qsize(),

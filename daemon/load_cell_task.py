@@ -78,7 +78,8 @@ class LoadCellTask:
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board."""
         facts = self._board.facts()
-        return {**facts, "trouble": self._untaken if facts["connected"] else facts["last_loss"]}
+        told = {"expected_hz": 1.0 / self.source.period_s}
+        return {**facts, **told, "trouble": self._untaken if facts["connected"] else facts["last_loss"]}
 
     def _take_zero(self, sample: LoadSample) -> None:
         self._why = _why(sample)

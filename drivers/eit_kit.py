@@ -48,6 +48,7 @@ class EitKit:
             serial_number=serial_number, path=None if path is None else os.fspath(path), on_event=on_event
         )
         self._parser = LineParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
+        self._expected_hz = 1.0 / frame_period_s
         self._unanswered = 0
         self._silences = 0
 
@@ -117,5 +118,6 @@ class EitKit:
             "openings": self._link.openings,
             "silences": self._silences,
             "last_loss": self._link.last_error,
+            "expected_hz": self._expected_hz,
             "measured_hz": 1e9 / clock.period_ns if clock.learned else None,
         }

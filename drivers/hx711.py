@@ -126,9 +126,10 @@ class Despiker:
     with each other become the new level: the first of them stay flagged, and no step is flagged for ever.
     """
 
-    def __init__(self, limits: LoadLimits) -> None:
-        """Know no value yet: the first within the capacity is believed."""
+    def __init__(self, limits: LoadLimits, period_ns: int = PERIOD_NS) -> None:
+        """Know no value yet, of a board that sends one each `period_ns`: the first within the capacity is believed."""
         self._limits = limits
+        self._period_ns = period_ns
         self._good: tuple[float, int] | None = None
         self._candidates: list[tuple[float, int]] = []
 
@@ -155,7 +156,7 @@ class Despiker:
 
     def _reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
         # Arrival stamps bunch when the host was busy: no less than a usual period is believed of them.
-        elapsed_s = max(after[1] - before[1], PERIOD_NS) * 1e-9
+        elapsed_s = max(after[1] - before[1], self._period_ns) * 1e-9
         return abs(after[0] - before[0]) <= self._limits.slew_nm_per_s * elapsed_s
 
 
@@ -194,7 +195,7 @@ class LoadParser:
         self._first_line = True
         self._last_raw: float | None = None
         self._repeats = 0
-        self._despiker = Despiker(self._limits)
+        self._despiker = Despiker(self._limits, self._period_ns)
 
     @property
     def refused(self) -> Counter[str]:
@@ -209,7 +210,7 @@ class LoadParser:
     @calibration.setter
     def calibration(self, calibration: LoadCalibration) -> None:
         self._calibration = calibration
-        self._despiker = Despiker(self._limits)
+        self._despiker = Despiker(self._limits, self._period_ns)
 
     def feed(self, data: bytes, t_arrival_ns: int) -> list[LoadSample]:
         """Return the samples that `data` completes. Of several lines at once, the earlier are a period older each."""

@@ -11,7 +11,7 @@ import structlog
 from aiohttp import WSCloseCode, web
 
 from daemon.errors import UserError
-from daemon.topics import TOPICS, stale_after_s
+from daemon.topics import STALE_AFTER_PERIODS, TOPICS, stale_after_s
 from daemon.view.access import host_allowed, origin_allowed, token_given
 from daemon.view.bridge import Bridge, BusyError
 
@@ -89,6 +89,7 @@ class _Page:
             "fingertip": fingertip,
             "publish": publish,
             "dead_after_s": DEAD_AFTER_S,
+            "stale_after_periods": STALE_AFTER_PERIODS,
             "stale_after_s": {
                 topic: max(stale_after_s(topic), LEAST_STALE_S)
                 for topic, kind in TOPICS.items()

@@ -98,6 +98,7 @@ class Judge:
         self._current_a = current_a
         self._limits = limits or CircuitLimits()
         self._stale_ns = round(self._limits.source_stale_periods * source_period_s * 1e9)
+        self.expected_hz = 1.0 / daq_period_s
         self._period_ns = round(daq_period_s * 1e9)
         self._seq = 0
         self._last: Voltages | None = None

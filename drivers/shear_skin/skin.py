@@ -46,6 +46,7 @@ class ShearSkin:
         errors = facts.get("errors")
         if isinstance(errors, Mapping):
             facts["errors"] = {**errors, **self._judge.faults}
+        facts["expected_hz"] = self._judge.expected_hz
         return {**facts, "samples": self._samples, "missed": self._judge.missed}
 
     def source_facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:

@@ -183,6 +183,16 @@ def test_after_a_gap_the_rig_may_have_moved_further() -> None:
     assert not despiker.is_spike(1.5, 10**9)
 
 
+@pytest.mark.parametrize("rate_hz", [1.0, 10.9, 80.0])
+def test_a_spike_is_what_the_rig_cannot_do_within_the_boards_own_period(rate_hz: float) -> None:
+    within_nm = LoadLimits().slew_nm_per_s / rate_hz
+    for share, spike in ((0.9, False), (1.1, True)):
+        parser, torque_nm = LoadParser(TORQUE_LINES, rate_hz), min(share * within_nm, 1.74)
+        lines = [f"{value:.4f}\n".encode() for value in (0.0, 0.0, torque_nm)]
+        samples = [one for n, line in enumerate(lines) for one in parser.feed(line, round(n * 1e9 / rate_hz))]
+        assert samples[-1].spike == (spike and rate_hz > 2.0), "within a second it may reach all that the cell bears"
+
+
 def test_a_tare_forgets_the_level_that_spikes_are_judged_by() -> None:
     parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-4))
     assert not feed_lines(parser, ["200000", "200000"])[-1].spike

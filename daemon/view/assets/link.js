@@ -79,7 +79,14 @@ export class Link {
 
   // Whether a message says nothing of the present any more.
   isOld(message) {
-    return this.state() !== "live" || this.ageOf(message) > (this.settings.stale_after_s[message.topic] ?? 3);
+    return this.state() !== "live" || this.ageOf(message) > this.staleAfter(message);
+  }
+
+  // A device that is slower than its topic's usual one is given the time that its task expects of it.
+  staleAfter({ topic, content }) {
+    const usual = this.settings.stale_after_s[topic] ?? 3;
+    const expectedHz = this.get("health")?.content.tasks?.[content.source]?.expected_hz;
+    return expectedHz > 0 ? Math.max(usual, this.settings.stale_after_periods / expectedHz) : usual;
   }
 
   // The latest message of a topic: of one source, or of the first that was heard.

@@ -214,6 +214,16 @@ def test_what_has_gone_silent_is_old_while_the_rest_is_live(browsed: Browsed) ->
     browsed.until_old(1)
 
 
+def test_a_load_cell_that_is_slower_than_usual_is_not_old_between_its_readings(browsed: Browsed) -> None:
+    browsed.open()
+    slow = {"load_cell": {"alive": True, "restarts": 0, "expected_hz": 0.05}}
+    browsed.daemon.say(health={"tasks": slow})
+    browsed.until("#tasks", "load_cell")
+    browsed.daemon.say(health={"tasks": slow}, robot=None, load=None)
+    browsed.until("#robot .age", "OLD, 2")
+    browsed.until_shown({"#load-torque": "+0.1012 N·m", "#load-note": ""})
+
+
 def test_the_page_is_redrawn_thirty_times_a_second(browsed: Browsed) -> None:
     page = browsed.open()
     # At some moment of a busy machine, that is: what a redraw costs is what the page can answer for.

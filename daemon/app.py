@@ -189,6 +189,8 @@ class Daemon:
                 sd_notify.notify("READY=1")
                 await self._stop.wait()
                 sd_notify.notify("STOPPING=1")
+                if self._rig is not None:
+                    await self._rig.loop.released()
                 for task in running:
                     task.cancel()
             if self._experiment is not None:

@@ -35,6 +35,8 @@ MOST_UNANSWERED = 1
 LOOP_STATE_PERIOD_S = 1.0
 # A loop that died tells the arm to stop, and waits no longer than this for the answer.
 BRAKE_S = 0.5
+# A release is tried for five seconds and then opens the fingers; systemd ends a service ten seconds after it said so.
+RELEASED_WITHIN_S = 7.0
 
 
 def wrench_source(rate_hz: float) -> Source:
@@ -70,6 +72,8 @@ class LoopTask:
         self._unanswered = 0
         self._actions = DeviceActions(robot, gripper, take_zero, lambda: bool(self._sent_rad_per_s or self._unanswered))
         self._action: asyncio.Task[None] | None = None
+        # The last of them that lets a tool go after a stop.
+        self._release: asyncio.Task[None] | None = None
         # What the loop, or a command of it, died of since the brain was told last.
         self._own_death = ""
         self._sent_rad_per_s = 0.0
@@ -99,9 +103,12 @@ class LoopTask:
                 await self._tell(now_ns)
         except Exception as error:
             self._own_death = _said(error)
-            # First of all: it may be about to begin a straight move, which would come after the stop.
-            self._cancel_action()
+            if self._action is not self._release:
+                # First of all: it may be about to begin a straight move, which would come after the stop.
+                self._cancel_action()
             await self._brake()
+            # Broken off before the gripper has heard of it, the tool would stay gripped: nobody would ask again.
+            await self.released()
             raise
         finally:
             await self._end()
@@ -131,6 +138,11 @@ class LoopTask:
                 await self._news.wait()
             await self._news.wait_for(lambda: not experiment.running)
             return experiment
+
+    async def released(self) -> None:
+        """Wait until the gripper has opened, or could not, where a stop has told it to."""
+        if self._release is not None:
+            await asyncio.wait({self._release}, timeout=RELEASED_WITHIN_S)
 
     async def unlock(self) -> str | None:
         """Let robot and gripper move again after a stop, on the operator's word; return why they would not."""
@@ -206,7 +218,8 @@ class LoopTask:
                 self._cancel_action()
                 self._send(Stop(self._acceleration_rad_per_s2))
             if orders.release and self._gripper is not None:
-                self._begin(self._gripper.release(), self._released)
+                self._begin(self._gripper.release(), self._has_released)
+                self._release = self._action
             return
         self._stopped = False
         if not orders.hold:
@@ -257,7 +270,7 @@ class LoopTask:
 
         self._action = asyncio.create_task(carried_out(), name="action")
 
-    def _released(self, failure: str) -> None:
+    def _has_released(self, failure: str) -> None:
         if failure:
             structlog.get_logger().error("the gripper was told to open and did not", why=failure)
         self._brain.release_ended(failure)

@@ -265,6 +265,18 @@ async def test_a_daemon_that_ends_with_its_experiment_knows_whether_it_is_done(
         assert daemon.finished is finished
 
 
+async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig_config: Path, tiny_bank: Path) -> None:
+    """The stop that opens the gripper ends the experiment, and that the daemon, within the same millisecond."""
+    twist = {"do": "twist", "angles_rad": [0.3], "speed_rad_per_s": 0.1, "limits": {"torque_nm": 0.02}}
+    path = ending_with(rig_config, {"do": "grip", "width_mm": 5, "force_n": 60}, twist)
+    async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):
+        await daemon.stopped()
+    states = watcher.seen["gripper.state"]
+    assert "the torque is beyond its limit" in watcher.seen["loop.state"][-1]["reasons"]
+    held_mm = [state["diameter_mm"] for state in states if state["diameter_mm"] is not None][-1]
+    assert states[-1]["width_mm"] > held_mm + 5.0
+
+
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [

@@ -187,6 +187,41 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         assert Event.TASK_DIED in {trouble.event for trouble in cell.brain.standing.verdict.troubles}
 
 
+async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before the gripper has heard of it there is nothing that would open by itself."""
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        heard, answered = asyncio.Event(), asyncio.Event()
+
+        async def at_length() -> str:
+            heard.set()
+            await answered.wait()
+            return "it did not open"
+
+        monkeypatch.setattr(cell.gripper, "release", at_length)
+        now_ns = cell.robot.flight.now_ns
+        cell.brain.hear(Torque(WRENCH, 0.9, "", now_ns, now_ns))
+        await cell.until_ended(10)
+        await heard.wait()
+        tick = cell.brain.tick
+
+        def dies_once(_t_ns: int) -> Any:
+            monkeypatch.setattr(cell.brain, "tick", tick)
+            raise ZeroDivisionError("a tick went wrong")
+
+        monkeypatch.setattr(cell.brain, "tick", dies_once)
+        await cell.cycles(20)
+        assert cell.task is not None
+        assert not cell.task.done(), "it waits for the gripper"
+        answered.set()
+        with pytest.raises(ZeroDivisionError):
+            await cell.task
+        cell.drive()
+        await cell.cycles(20)
+        assert "the gripper was told to open and did not" in cell.published.reasons
+        assert "it did not open" in cell.published.reasons
+
+
 async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at_rest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -88,8 +88,7 @@ class DeviceActions:
             await self._free.wait()
             if why := await self._rest():
                 return why
-            # The state that told of the rest wakes the loop as well, which may want it held back: it decides first.
-            await asyncio.sleep(0)
+            # The loop has decided upon the state that told of the rest, and may want it held back.
             if not self._free.is_set():
                 continue
             here = self._robot.state

@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
 
-import numpy as np
 import structlog
 
 from daemon.clock import Clock
@@ -14,10 +13,12 @@ from daemon.loop.brain import Brain, Orders
 from daemon.loop.senses import Arm, Source, Torque
 from daemon.loop.watch import ARM_STALE_S
 from daemon.loop_actions import DeviceActions
-from daemon.messages import LoopState, RobotStateMessage, Scalar
+from daemon.loop_messages import loop_state, robot_state
+from daemon.messages import Scalar
 from daemon.publisher import Publisher
+from daemon.silence import Silence
 from daemon.supervisor import LONGEST_ERROR
-from drivers.ur.client import UrRobot
+from drivers.ur.client import UrRobot, unheard
 from drivers.ur.messages import Enable, Reply, RobotState, Stop, Unlock, WristSpeed
 
 WRENCH = "wrench"
@@ -80,38 +81,64 @@ class LoopTask:
         self._stopped = True
         self._told: tuple[object, ...] = ()
         self._told_ns = self._told_hold = 0
-        self._news = asyncio.Condition()
+        self._news = asyncio.Event()
+        # When the brain was asked last, and how long it may take until it is asked again.
+        self._decided_ns, self._longest_s = 0, 0.0
+        self._silence = Silence(self._decide)
+        self._over: asyncio.Future[None] | None = None
 
     async def drive(self) -> None:
         """Ask the brain and carry out what it says, until cancelled; the robot stands still afterwards.
 
         Where something unexpected ends it, the arm is told to stop; begun again, it stops the experiment.
         """
+        # Each state is decided upon where it is read: 125 times a second, waking a task would cost as much again.
+        over = self._over = asyncio.get_running_loop().create_future()
+        self._decided_ns = self._clock.now_ns()
+        self._robot.on_state = self._decide
         try:
-            decided_ns = self._clock.now_ns()
-            while True:
-                longest_s = self._pace()
-                state = await self._robot.state_within(longest_s)
-                now_ns = self._clock.now_ns()
-                # From one decision to the next: what a decision itself takes is late as well.
-                self._brain.senses.late_s = max(0.0, (now_ns - decided_ns) / 1e9 - longest_s)
-                decided_ns = now_ns
-                self._brain.senses.died = self._deaths()
-                if state is not None:
-                    self._sense(state)
-                self._carry_out(self._brain.tick(now_ns))
-                await self._tell(now_ns)
+            self._listen()
+            await over
         except Exception as error:
             self._own_death = _said(error)
-            if self._action is not self._release:
-                # First of all: it may be about to begin a straight move, which would come after the stop.
-                self._cancel_action()
+            self._listen_no_more()
             await self._brake()
             # Broken off before the gripper has heard of it, the tool would stay gripped: nobody would ask again.
             await self.released()
             raise
         finally:
+            self._listen_no_more()
             await self._end()
+
+    def _decide(self, state: RobotState | None = None) -> None:
+        """Ask the brain, with a new state or because none has come for too long; what goes wrong ends `drive`."""
+        now_ns = self._clock.now_ns()
+        # From one decision to the next: what a decision itself takes is late as well.
+        self._brain.senses.late_s = max(0.0, (now_ns - self._decided_ns) / 1e9 - self._longest_s)
+        self._decided_ns = now_ns
+        try:
+            self._brain.senses.died = self._deaths()
+            if state is not None:
+                self._sense(state)
+            self._carry_out(self._brain.tick(now_ns))
+            self._tell(now_ns)
+            self._listen()
+        except Exception as error:  # noqa: BLE001 - raised again by `drive`, whose task it ends
+            if self._action is not self._release:
+                # First of all: it may be about to begin a straight move, which would come after the stop.
+                self._cancel_action()
+            self._listen_no_more()
+            if self._over is not None and not self._over.done():
+                self._over.set_exception(error)
+
+    def _listen(self) -> None:
+        """Agree with the robot on how often a state is needed, and decide without one where none comes in time."""
+        self._longest_s = self._pace()
+        self._silence.heard(self._longest_s)
+
+    def _listen_no_more(self) -> None:
+        self._robot.on_state = unheard
+        self._silence.end()
 
     async def start(self, file: ExperimentFile) -> str | None:
         """Begin an experiment, or return why it cannot be begun."""
@@ -133,11 +160,11 @@ class LoopTask:
 
     async def ended(self) -> Experiment:
         """Return the experiment that runs, or the next to run, once it has ended; another may be running by then."""
-        async with self._news:
-            while (experiment := self._brain.experiment) is None:
-                await self._news.wait()
-            await self._news.wait_for(lambda: not experiment.running)
-            return experiment
+        while (experiment := self._brain.experiment) is None:
+            await self._news.wait()
+        while experiment.running:
+            await self._news.wait()
+        return experiment
 
     async def released(self) -> None:
         """Wait until the gripper has opened, or could not, where a stop has told it to."""
@@ -180,7 +207,7 @@ class LoopTask:
             self._brain.hear(
                 Torque(WRENCH, -state.wrist_torque_nm, "", state.t_mono_ns - state.age_ns, self._clock.now_ns())
             )
-            self._publisher.publish(_message(state))
+            self._publisher.publish(robot_state(state))
 
     def _pace(self) -> float:
         """Have the robot tell its state in each of its cycles, unless nothing can move; return how long to wait for it.
@@ -204,11 +231,12 @@ class LoopTask:
         experiment = self._brain.experiment
         return experiment is not None and experiment.running
 
-    def _deaths(self) -> dict[str, str]:
+    def _deaths(self) -> Mapping[str, str]:
         """Return what each dead task died of, and what the loop itself did; that, once."""
-        died = dict(self._died())
+        died = self._died()
         if self._own_death:
-            died["loop"], self._own_death = self._own_death, ""
+            died = {**died, "loop": self._own_death}
+            self._own_death = ""
         return died
 
     def _carry_out(self, orders: Orders) -> None:
@@ -279,7 +307,7 @@ class LoopTask:
         if self._action is not None:
             self._action.cancel()
 
-    async def _tell(self, now_ns: int) -> None:
+    def _tell(self, now_ns: int) -> None:
         standing, experiment = self._brain.standing, self._brain.experiment
         key = (
             standing.phase,
@@ -296,45 +324,10 @@ class LoopTask:
                 "loop", phase=standing.phase, doing=standing.doing, reasons=" ".join(standing.verdict.reasons)
             )
         self._told, self._told_ns = key, now_ns
-        self._publisher.publish(self._loop_state(now_ns))
-        async with self._news:
-            self._news.notify_all()
-
-    def _loop_state(self, now_ns: int) -> LoopState:
-        standing, experiment = self._brain.standing, self._brain.experiment
-        progress = experiment.progress() if experiment is not None else None
-        driving = experiment.file.drive if experiment is not None else ""
-        latest = self._brain.senses.torques.get(driving)
-        controller = self._brain.controller
-        believed = controller.state if controller is not None else None
-        found = self._brain.identified
-        return LoopState(
-            source="loop",
-            t_mono_ns=now_ns,
-            phase=standing.phase,
-            experiment=experiment.file.name if experiment is not None else "",
-            step=progress.step if progress else 0,
-            steps=progress.steps if progress else 0,
-            step_name=experiment.step.do if experiment is not None else "",
-            slices=experiment.file.slices or "" if experiment is not None else "",
-            hold=experiment.wish.hold if experiment is not None else 0,
-            doing=standing.doing,
-            progress=progress.share if progress else 0.0,
-            remaining_s=progress.remaining_s if progress else 0.0,
-            tool_mm=experiment.file.tool_mm if experiment is not None else None,
-            driving=driving,
-            torque_nm=latest.torque_nm if latest is not None else None,
-            set_point_nm=believed.set_point_nm if believed else None,
-            ramp_nm=believed.ramp_nm if believed else None,
-            expected_nm=believed.torque_nm if believed else None,
-            stiffness_nm_per_rad=found.stiffness_nm_per_rad if found is not None else None,
-            delay_s=found.age_s + found.significant_lag_s if found is not None else None,
-            noise_nm=found.noise_nm if found is not None else None,
-            speed_wanted_rad_per_s=standing.turn.speed_rad_per_s,
-            speed_sent_rad_per_s=self._sent_rad_per_s,
-            response=standing.verdict.response.name.lower().replace("_", " "),
-            reasons=" ".join((*standing.verdict.reasons, *standing.turn.reasons)),
-        )
+        self._publisher.publish(loop_state(self._brain, self._sent_rad_per_s, now_ns))
+        # Whoever waits now is woken, and whoever comes later waits for the next.
+        self._news.set()
+        self._news.clear()
 
     async def _brake(self) -> None:
         """Tell the arm to stop, whatever it does: nobody renews a wrist's speed now, but a straight move would end."""
@@ -353,23 +346,3 @@ class LoopTask:
 
 def _said(error: Exception) -> str:
     return f"{type(error).__name__}: {error}"[:LONGEST_ERROR]
-
-
-def _message(state: RobotState) -> RobotStateMessage:
-    return RobotStateMessage(
-        source="robot",
-        t_mono_ns=state.t_mono_ns,
-        joints_rad=np.array(state.q_rad),
-        tcp_pose=np.array(state.tcp_pose),
-        wrench=np.array(state.wrench),
-        wrist_rad=state.wrist_rad,
-        wrist_speed_rad_per_s=state.qd_rad_per_s[5],
-        wrist_torque_nm=state.wrist_torque_nm,
-        robot_mode=state.robot_mode,
-        safety_mode=state.safety_mode,
-        speed_scaling=state.speed_scaling,
-        protective_stop=state.protective_stop,
-        emergency_stop=state.emergency_stop,
-        blocked=state.blocked,
-        age_s=state.age_ns / 1e9,
-    )

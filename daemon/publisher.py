@@ -37,8 +37,9 @@ class Publisher:
         self._clock = clock
         self._numbers: Counter[tuple[str, str]] = Counter()
         self._listeners: list[Listener] = []
-        # Beginnings of topics that are subscribed to at present.
+        # Beginnings of topics that are subscribed to at present, and what that means for each topic asked about since.
         self._subscribed: set[bytes] = set()
+        self._wanted: dict[str, bool] = {}
         # To subscribers an XPUB is a PUB; to us it tells their subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
@@ -51,23 +52,30 @@ class Publisher:
         self._listeners.append(listener)
 
     def publish(self, message: Message) -> None:
-        """Stamp, number and send one message."""
+        """Stamp and number one message, and send it to those who subscribe to it."""
         stream = (message.topic, message.source)
-        content = wire_map(message, self._clock.unix_s(message.t_mono_ns), self._numbers[stream])
-        self._numbers[stream] += 1
-        self.forward(message.topic, content)
+        number = self._numbers[stream]
+        self._numbers[stream] = number + 1
+        if self._listeners or self.wanted(message.topic):
+            self.forward(message.topic, wire_map(message, self._clock.unix_s(message.t_mono_ns), number))
 
     def forward(self, topic: str, content: dict[str, Any]) -> None:
         """Send a message's map as it is, stamped and numbered already."""
-        self._socket.send_multipart([topic.encode(), encode(content)], zmq.NOBLOCK)
-        self._hear_subscribers()
+        # Most topics are listened to by nobody most of the time, and what goes nowhere needs no bytes.
+        if self.wanted(topic):
+            self._socket.send(topic.encode(), zmq.NOBLOCK | zmq.SNDMORE)
+            self._socket.send(encode(content), zmq.NOBLOCK)
         for listener in self._listeners:
             listener(topic, content)
 
     def wanted(self, topic: str) -> bool:
         """Return whether any subscriber asks for this topic: what is dear to compute waits for that."""
         self._hear_subscribers()
-        return any(topic.encode().startswith(beginning) for beginning in self._subscribed)
+        wanted = self._wanted.get(topic)
+        if wanted is None:
+            wanted = any(topic.encode().startswith(beginning) for beginning in self._subscribed)
+            self._wanted[topic] = wanted
+        return wanted
 
     @property
     def subscribed(self) -> bool:
@@ -81,8 +89,10 @@ class Publisher:
 
     def _hear_subscribers(self) -> None:
         for _ in range(SUBSCRIPTIONS_AT_ONCE):
-            if not self._socket.poll(0, zmq.POLLIN):
+            # Asked at every message: a poller would have to be made for each.
+            if not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 return
+            self._wanted.clear()
             message = self._socket.recv(zmq.NOBLOCK)
             kind, beginning = message[:1], message[1:]
             # Only beginnings of our own topics are kept: nobody can fill the memory with others.

@@ -40,11 +40,11 @@ class Supervisor:
     @property
     def dead(self) -> tuple[str, ...]:
         """The tasks that should run and do not: between a death and the next start."""
-        return tuple(name for name, record in self.records.items() if not (record.alive or record.done))
+        return tuple(self.deaths())
 
     def deaths(self) -> dict[str, str]:
-        """Return what each of them died of."""
-        return {name: self.records[name].last_error for name in self.dead}
+        """Return what each of them died of; asked for at every state of the robot."""
+        return {name: record.last_error for name, record in self.records.items() if not (record.alive or record.done)}
 
     async def keep_running(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
         """Run `run()` until it returns; when it raises, tell it and start it again."""

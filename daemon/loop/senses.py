@@ -2,6 +2,7 @@
 
 import math
 from bisect import bisect_left, bisect_right
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
@@ -108,7 +109,7 @@ class Senses:
     arm: Arm | None = None
     hand: Hand | None = None
     lost: dict[str, str] = field(default_factory=dict)
-    died: dict[str, str] = field(default_factory=dict)
+    died: Mapping[str, str] = field(default_factory=dict)
     recording_failed: str = ""
     late_s: float = 0.0
 

@@ -191,12 +191,13 @@ def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
         decided = pilot.tick(reading, time.monotonic_ns())
         if decided is not None:
             pipe.send(decided[1], decided[0])
-        if not pilot.puzzled():
+        rests = pilot.rests(reading) and not leaving_s
+        if not pilot.puzzled() and pace.tells(rests=rests):
             pipe.send_latest(pilot.state(reading, pace.cycle))
         if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
             _end_program(settings, pilot, arm)
             _leave(EXIT_DONE)
-        pace.plan(time.monotonic(), rests=pilot.rests(reading) and not leaving_s)
+        pace.plan(time.monotonic(), rests=rests)
         quiet = False
         while pipe.open and not leaving_s and (left_s := pace.left_s(time.monotonic())) > 0:
             # A command is carried out when it comes: waiting for the next cycle would be a delay in the loop.

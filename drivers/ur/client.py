@@ -52,6 +52,8 @@ class UrRobot:
         self.losses: Counter[str] = Counter()
         self.pid: int | None = None
         self._on_link = on_link or (lambda _event: None)
+        # Hears of each state where it is read, before those who wait for one: no task has to be woken for it.
+        self.on_state: Callable[[RobotState], None] = unheard
         self._state: RobotState | None = None
         self._stdin: asyncio.StreamWriter | None = None
         self._waiting: dict[int, Callable[[Reply], None]] = {}
@@ -59,7 +61,7 @@ class UrRobot:
         self._lost_s = -math.inf
         # How many states have come since the beginning.
         self.states = 0
-        # Who waits for the next state, in the order in which they are told; None is for those who wait no longer.
+        # Who waits for the next state; None is for those who wait no longer.
         self._awaiting: dict[asyncio.Future[RobotState | None], None] = {}
         # Clear while the process was told that states are needed less often.
         self._hurried = asyncio.Event()
@@ -113,7 +115,6 @@ class UrRobot:
         return at_ease
 
     async def _awaited(self, seconds: float | None) -> RobotState | None:
-        # 125 times a second: a future and a timer are a third of the price of a condition and `asyncio.timeout`.
         loop = asyncio.get_running_loop()
         arrived: asyncio.Future[RobotState | None] = loop.create_future()
         self._awaiting[arrived] = None
@@ -226,6 +227,7 @@ class UrRobot:
                 if first:
                     self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
                 self.states += 1
+                self.on_state(message)
                 for arrived in self._awaiting:
                     if not arrived.done():
                         arrived.set_result(message)
@@ -239,6 +241,10 @@ class UrRobot:
     def _tell(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
         self.link = LinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
         self._on_link(self.link)
+
+
+def unheard(_state: RobotState) -> None:
+    """Hear of a state as long as nobody else does."""
 
 
 def _give_up(arrived: "asyncio.Future[RobotState | None]") -> None:

@@ -175,7 +175,7 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class Ease:
-    """The daemon is alive, and needs a state only every so many cycles while nothing moves.
+    """The daemon is alive, and needs a state of every so many cycles alone while nothing moves.
 
     It holds until anything else comes. No signs of life are sent meanwhile: nothing moves that they would keep moving.
     """

@@ -45,7 +45,7 @@ class Mover:
         # Whether the robot did not take something since this was last set back.
         self.puzzled = False
         self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
-        self._speed_thread = False
+        self._speed_thread = self._just_sent = False
         self._asked_ns = self._rested_ns = now_ns
         self._deadline_ns = self._move_ns = 0
         self._move_seen = False
@@ -57,6 +57,7 @@ class Mover:
         """Turn the wrist so from now on; return whether the robot took it."""
         self._begin("wrist", number)
         self._asked, self._asked_ns = asked, now_ns
+        self._just_sent = True
         return self._send_wrist(reading)
 
     def move(self, number: int, asked: MoveLinear, reading: Reading, now_ns: int) -> bool:
@@ -138,8 +139,11 @@ class Mover:
         if now_ns - self._asked_ns > self._settings.command_timeout_s * 1e9:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
             self.stop_now(reading, now_ns, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
-        else:
+        elif not self._just_sent:
             self._send_wrist(reading)
+        # One that was given since the last cycle was sent then, within the limits of a reading as new as that; the loop
+        # gives one in every cycle.
+        self._just_sent = False
 
     def _keep_moving(self, reading: Reading, now_ns: int) -> None:
         self._move_seen = self._move_seen or reading.moving_linearly

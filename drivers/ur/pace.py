@@ -1,7 +1,8 @@
 """When the robot's process goes through its next cycle: at the rate, or at ease. No clock: the time is an argument.
 
 Each waking costs, whatever is done then. While the daemon needs few states and nothing moves, all that can come between
-two of them is a message, and that is answered when it comes.
+two of them is a message, and that is answered when it comes. The robot needs its signs of life more often than the
+daemon needs a state: not every cycle at ease tells one.
 """
 
 import math
@@ -21,7 +22,8 @@ class Pace:
         """Begin with a cycle that is due now, and with a daemon that needs every one."""
         self._period_s = 1.0 / settings.rate_hz
         self._most = max(1, int(OF_THE_WATCHDOG * settings.rate_hz / settings.watchdog_hz))
-        self._wanted = 1
+        # How many cycles the daemon needs one state of, and which such stretch was the last to have one told.
+        self._wanted, self._told = 1, -1
         self.cycle, self._due_s = 0, now_s
         self._next, self._next_s = 0, now_s
 
@@ -32,11 +34,17 @@ class Pace:
 
     def hear(self, message: Message) -> None:
         """Note what the daemon needs: every cycle, once it has said anything but `Ease`."""
-        self._wanted = min(max(1, message.cycles), self._most) if isinstance(message, Ease) else 1
+        self._wanted = max(1, message.cycles) if isinstance(message, Ease) else 1
+
+    def tells(self, *, rests: bool) -> bool:
+        """Return whether this cycle's state is needed; at ease only the first one's in each stretch that was named."""
+        told, self._told = self._told, self.cycle // self._wanted
+        return not rests or self._told != told
 
     def plan(self, now_s: float, *, rests: bool) -> None:
         """Choose the next cycle once the work of this one is done; `rests`: nothing moves, and nothing is under way."""
-        self._next = self.cycle + (self._wanted - self.cycle % self._wanted if rests else 1)
+        step = min(self._wanted, self._most) if rests else 1
+        self._next = self.cycle + step - self.cycle % step
         # A late cycle is not caught up with: two commands at once are no use to anyone.
         self._next_s = max(self._due_s + (self._next - self.cycle) * self._period_s, now_s)
 

@@ -169,10 +169,15 @@ class Time:
 
 
 class TimedArm(CyclingArm):
-    """An arm that is read in the process's own time."""
+    """An arm that is read in the process's own time; `read_s` keeps when."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.read_s: list[float] = []
 
     def read(self) -> Reading:
         super().read()
+        self.read_s.append(child.time.monotonic() - 1000.0)
         self.be(t_mono_ns=child.time.monotonic_ns())
         return self.reading
 
@@ -206,7 +211,12 @@ class Eased:
         return False
 
     def cycles_between(self, from_s: float, to_s: float) -> list[int]:
-        """Return the numbers of the cycles that were gone through in that time."""
+        """Return the numbers of the cycles that were gone through in that time, as the readings tell."""
+        periods = [read_s * SETTINGS.rate_hz for read_s in self.arm.read_s if from_s < read_s < to_s]
+        return sorted({round(period) for period in periods if abs(period - round(period)) < 1e-6})
+
+    def told_between(self, from_s: float, to_s: float) -> list[int]:
+        """Return the numbers of the cycles whose states were told in that time."""
         return sorted({state.cycle for state in self.states if from_s < state.t_mono_ns / 1e9 - 1000.0 < to_s})
 
 
@@ -219,6 +229,18 @@ def test_at_ease_every_third_cycle_is_gone_through_until_the_daemon_says_somethi
     assert eased.cycles_between(0.225, 0.301) == [*range(29, 38)]
     assert eased.cycles_between(0.301, 0.405) == [38, 39, 42, 45, 48]
     assert eased.cycles_between(0.405, 1.0) == [51]
+
+
+def test_at_ease_one_state_is_told_of_so_many_cycles_as_the_daemon_says(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    eased = Eased(daemon, monkeypatch, (0.101, Ease(5)), (0.225, Heartbeat()), (0.301, Ease(5)), (0.405, Disconnect()))
+    assert eased.told_between(-0.001, 0.101) == [*range(13)]
+    # Of those that are gone through the first in each five; once the daemon has said something, the next one.
+    assert eased.told_between(0.101, 0.225) == [13, 15, 21, 27]
+    assert eased.told_between(0.225, 0.301) == [*range(29, 38)]
+    assert eased.told_between(0.301, 0.405) == [38, 42, 45]
+    assert eased.told_between(0.405, 1.0) == [51]
 
 
 def test_a_command_at_ease_is_carried_out_when_it_comes_and_ends_the_ease(
@@ -238,22 +260,15 @@ def test_a_command_at_ease_is_carried_out_when_it_comes_and_ends_the_ease(
     )  # fmt: skip
     assert told_s[0] == pytest.approx(1000.203, abs=1e-9)
     # It turns: at ease or not, nothing is left out.
-    assert eased.cycles_between(0.201, 0.3) == [*range(26, 38)]
+    assert eased.told_between(0.201, 0.3) == [*range(26, 38)]
     assert all(state.motion == "wrist" for state in eased.states if 26 <= state.cycle < 38)
 
 
 def test_for_a_command_soon_after_a_cycle_the_arm_is_not_read_again(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read_s: list[float] = []
-
-    class Told(TimedArm):
-        def read(self) -> Reading:
-            read_s.append(round(child.time.monotonic() - 1000.0, 6))
-            return super().read()
-
-    Eased(daemon, monkeypatch, (0.041, Enable()), (0.051, Enable()), (0.065, Disconnect()), arm=Told())
-    assert read_s[5:9] == [0.04, 0.048, 0.051, 0.056]
+    eased = Eased(daemon, monkeypatch, (0.041, Enable()), (0.051, Enable()), (0.065, Disconnect()))
+    assert eased.arm.read_s[5:9] == pytest.approx([0.04, 0.048, 0.051, 0.056])
 
 
 @pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
@@ -286,6 +301,7 @@ def test_an_arm_that_is_moved_is_watched_in_every_cycle(daemon: Daemon, monkeypa
 
     eased = Eased(daemon, monkeypatch, (0.101, Ease(5)), (0.301, Disconnect()), arm=Moved())
     assert eased.cycles_between(0.101, 0.301) == [13, 15, 18, 21, 24, *range(27, 38)]
+    assert eased.told_between(0.101, 0.301) == [13, 15, 21, *range(27, 38)]
 
 
 def test_reply_to_a_wrist_speed_comes_with_the_next_state_in_one_piece(daemon: Daemon) -> None:

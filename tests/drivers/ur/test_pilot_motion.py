@@ -21,6 +21,17 @@ def test_wrist_speed_is_sent_every_cycle_and_ends_when_it_is_not_renewed() -> No
     assert flight.arm.calls[-3:] == ["kick"] * 3
 
 
+def test_speed_is_sent_once_in_a_cycle_whether_it_was_given_anew_or_not() -> None:
+    flight = flying()
+    flight.arm.calls.clear()
+    for _ in range(3):
+        assert flight.ask(WristSpeed(0.1, 4.0)).accepted
+        flight.fly(1)
+    assert flight.arm.calls == ["wrist"] * 3
+    flight.fly(2)
+    assert flight.arm.calls == ["wrist"] * 5
+
+
 def test_silence_of_the_daemon_ends_whatever_moves() -> None:
     flight = flying()
     assert flight.ask(MoveLinear(POSE, 0.05, 0.1)).accepted

@@ -85,7 +85,8 @@ class LoopTask:
         # When the brain was asked last, and how long it may take until it is asked again.
         self._decided_ns, self._longest_s = 0, 0.0
         self._silence = Silence(self._decide)
-        self._over: asyncio.Future[None] | None = None
+        # What a decision has died of.
+        self._over: asyncio.Future[Exception] | None = None
 
     async def drive(self) -> None:
         """Ask the brain and carry out what it says, until cancelled; the robot stands still afterwards.
@@ -98,7 +99,7 @@ class LoopTask:
         self._robot.on_state = self._decide
         try:
             self._listen()
-            await over
+            raise await over
         except Exception as error:
             self._own_death = _said(error)
             self._listen_no_more()
@@ -129,7 +130,7 @@ class LoopTask:
                 self._cancel_action()
             self._listen_no_more()
             if self._over is not None and not self._over.done():
-                self._over.set_exception(error)
+                self._over.set_result(error)
 
     def _listen(self) -> None:
         """Agree with the robot on how often a state is needed, and decide without one where none comes in time."""

@@ -44,13 +44,20 @@ class Event(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """One row: the response, what the operator reads, and how long a hold may last before it becomes a stop."""
+    """One row: the response, what the operator reads, and how long a hold may last before it becomes a stop.
+
+    A hold that comes back counts on: see `FORGETS`.
+    """
 
     response: Response
     sentence: str
     cure: str
     hold_at_most_s: float | None = None
 
+
+# Of how long an event has held, so much is forgotten for each second in which it does not: what is wrong for more than
+# a third of the time becomes a stop, as what is wrong all the time does.
+FORGETS = 0.5
 
 _KEEP, _RELEASE, _HOLD = Response.STOP_AND_KEEP_GRIP, Response.STOP_AND_RELEASE, Response.HOLD
 
@@ -190,14 +197,17 @@ class SafetyGate:
     """Judges what is wrong, lets holds go when their cause has gone, and keeps a stop until it is acknowledged."""
 
     def __init__(self) -> None:
-        self._since_ns: dict[Event, int] = {}
+        # For how long each event has held, less what is forgotten, and which of them did at the last judgement.
+        self._held_ns: dict[Event, int] = {}
+        self._holding: frozenset[Event] = frozenset()
+        self._judged_ns = 0
         self._stopped: Verdict | None = None
 
     def judge(self, troubles: Iterable[Trouble], t_ns: int) -> Verdict:
         """Return the response to the troubles of this moment (t_ns on the monotonic clock)."""
         active = tuple(troubles)
-        self._since_ns = {each.event: self._since_ns.get(each.event, t_ns) for each in active}
-        response = max((self._response(trouble, t_ns) for trouble in active), default=Response.NOTE)
+        self._count(frozenset(each.event for each in active), t_ns)
+        response = max(map(self._response, active), default=Response.NOTE)
         verdict = Verdict(response, active)
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stopped is None or response > self._stopped.response):
             self._stopped = verdict
@@ -208,6 +218,7 @@ class SafetyGate:
     def look(self, troubles: Iterable[Trouble]) -> Verdict:
         """Return what is wrong while nothing moves: a stop that waits is kept, but none is begun."""
         active = tuple(troubles)
+        self._forget()
         if self._stopped is None:
             return Verdict(Response.NOTE, active)
         return self._with_the_stop(self._stopped, active)
@@ -215,7 +226,7 @@ class SafetyGate:
     def acknowledge(self) -> None:
         """Let a stop go, on the operator's word; what is still wrong stops again at the next judgement."""
         self._stopped = None
-        self._since_ns.clear()
+        self._forget()
 
     @property
     def stopped(self) -> bool:
@@ -229,9 +240,22 @@ class SafetyGate:
         first = (trouble for trouble in stop.troubles if trouble.event not in events)
         return Verdict(stop.response, (*first, *active))
 
-    def _response(self, trouble: Trouble, t_ns: int) -> Response:
+    def _count(self, events: frozenset[Event], t_ns: int) -> None:
+        """Take in which events there are at t_ns: what held until now has held for longer, the rest is forgotten."""
+        passed_ns = t_ns - self._judged_ns
+        for event, held_ns in tuple(self._held_ns.items()):
+            change_ns = passed_ns if event in self._holding else -round(FORGETS * passed_ns)
+            self._held_ns[event] = max(0, held_ns + change_ns)
+        self._held_ns.update((event, 0) for event in events if event not in self._held_ns)
+        self._holding, self._judged_ns = events, t_ns
+
+    def _forget(self) -> None:
+        self._held_ns.clear()
+        self._holding = frozenset()
+
+    def _response(self, trouble: Trouble) -> Response:
         rule = trouble.rule
-        held_s = (t_ns - self._since_ns[trouble.event]) / 1e9
+        held_s = self._held_ns[trouble.event] / 1e9
         if rule.hold_at_most_s is not None and held_s > rule.hold_at_most_s:
             return Response.STOP_AND_KEEP_GRIP
         return rule.response

@@ -44,11 +44,50 @@ def test_a_hold_that_lasts_too_long_becomes_a_stop(event: Event) -> None:
     assert gate.judge([trouble(event)], int(longest_s * SECOND) + 1).response is Response.STOP_AND_KEEP_GRIP
 
 
-def test_a_hold_that_comes_and_goes_starts_its_time_anew() -> None:
+TICK_S = 0.008
+
+
+def flapping(event: Event, held: int, gone: int, for_s: float = 60.0) -> float | None:
+    """Judge an event that is there for some ticks and gone for some; return when it became a stop, None where never."""
     gate = SafetyGate()
-    for second in range(0, 60, 2):
-        assert gate.judge([trouble(Event.ESTIMATE_STALE)], second * SECOND).response is Response.HOLD
-        assert gate.judge([], (second + 1) * SECOND).response is Response.NOTE
+    for tick in range(round(for_s / TICK_S)):
+        active = [trouble(event)] if tick % (held + gone) < held else []
+        if gate.judge(active, round(tick * TICK_S * SECOND)).response in STOPS:
+            return tick * TICK_S
+    return None
+
+
+HOLDS = [(event, rule.hold_at_most_s) for event, rule in TABLE.items() if rule.hold_at_most_s is not None]
+
+
+@pytest.mark.parametrize(("event", "longest_s"), HOLDS)
+@pytest.mark.parametrize(("held", "gone"), [(1, 1), (50, 50), (125, 125), (125, 12)])
+def test_a_hold_that_flaps_becomes_a_stop(event: Event, longest_s: float, held: int, gone: int) -> None:
+    """Of each cycle's time so much is held and half of the rest forgotten, until it is as long as it may be."""
+    stopped_s = flapping(event, held, gone)
+    assert stopped_s is not None
+    cycle_s, gained_s = (held + gone) * TICK_S, (held - 0.5 * gone) * TICK_S
+    cycles_before = (longest_s - held * TICK_S) / gained_s
+    assert stopped_s == pytest.approx(cycle_s * cycles_before, abs=cycle_s + held * TICK_S + 4 * TICK_S)
+
+
+@pytest.mark.parametrize(("event", "longest_s"), HOLDS)
+@pytest.mark.parametrize(("held", "gone"), [(1, 3), (12, 36), (125, 260)])
+def test_a_hold_that_is_gone_for_more_than_two_thirds_of_the_time_stays_one(
+    event: Event, longest_s: float, held: int, gone: int
+) -> None:
+    assert held * TICK_S < longest_s
+    assert flapping(event, held, gone) is None
+
+
+def test_a_hold_begins_anew_with_the_next_experiment_and_after_the_operators_word() -> None:
+    for ends in (SafetyGate.acknowledge, lambda gate: gate.look([trouble(Event.STATE_STALE)])):
+        gate = SafetyGate()
+        gate.judge([trouble(Event.STATE_STALE)], 0)
+        ends(gate)
+        assert gate.judge([trouble(Event.STATE_STALE)], 3600 * SECOND).response is Response.HOLD
+        assert gate.judge([trouble(Event.STATE_STALE)], 3602 * SECOND).response is Response.HOLD
+        assert gate.judge([trouble(Event.STATE_STALE)], 3603 * SECOND).response is Response.STOP_AND_KEEP_GRIP
 
 
 def test_a_stop_outlives_its_cause_until_it_is_acknowledged() -> None:

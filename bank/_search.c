@@ -1,338 +1,147 @@
-/* The search at lag 0 of bank/fast_matching.py, compiled: the same bounds, the same scores, in one call.
+/* bank/search.c for Python: holds the arrays of a compressed bank, and searches it for one frame after another.
 
-   A frame comes after half a second in which others had the processor's caches, and then each call of numpy costs some
-   ten microseconds whatever it computes. Here the groups of the compressed bank (bank/compression.py) are gone through
-   from few to many, and only what may reach the highest score so far is looked at: little code and little memory.
-
-   The arrays that are handed in have been made by bank/compiled.py, which says what they are; their lengths are checked,
-   their types are not. Everything runs with the interpreter's lock held, so that a search may use the object's own
-   memory. */
+   The arrays that are handed in have been made by bank/compiled.py, which says what they are. Their sizes and whatever
+   points into another one are checked, for they decide where is read. A search keeps the interpreter's lock, except while
+   Python computes transforms for it, so that all searches of a bank can use the same memory. */
 
 #define Py_LIMITED_API 0x030B0000
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
+#include "search.h"
+
 #include <math.h>
-#include <stdint.h>
-#include <stdlib.h>
 #include <string.h>
 
-#define CHANNELS 896
-#define LANES 8
-#define MOST_LEVELS 8
-#define MOST_BUFFERS (10 + 3 * MOST_LEVELS)
-#define MOST_RANK 128
+/* How the capsules begin in which scipy hands out its BLAS with integers of 32 bits. */
+#define SGEMM "void (char *, char *, int *, int *, int *, "
 
-/* With fewer candidates, scoring them costs less than to bound them anew. */
-#define FEW_CANDIDATES 16
-
-typedef struct {
-    const float *rows;       /* (n, coarse_rank + 2): bounds of the groups */
-    const int32_t *starts;   /* (n + 1,): where the parts of each group begin in `parts` */
-    const int32_t *parts;    /* groups of the next level; after the last one, cells */
-    Py_ssize_t n;
-} Level;
-
-typedef struct {
-    float bound;
-    int32_t cell;
-    double score;            /* below 0 until it is known */
-} Candidate;
-
-typedef struct {
-    float estimate;
-    float bound;
-    int32_t group;
-} Root;
+enum { MOST_BUFFERS = 10 + 3 * MOST_LEVELS, LEAST_CANDIDATES = 1 << 14 };
 
 typedef struct {
     PyObject_HEAD
     Py_buffer held[MOST_BUFFERS];
     int n_held;
-    Py_ssize_t coarse_rank, fine_rank, n_cells;
-    const float *basis;      /* (fine_rank, 896) */
-    const float *coarse;     /* (n_cells, coarse_rank + 2) */
-    const float *fine;       /* (n_cells, fine_rank + 2) */
-    const float *signals;    /* (any, 896) */
-    const int64_t *places;   /* (n_cells,): the row of each cell in `signals` */
-    const double *norms;     /* (n_cells,) */
-    const int32_t *k_of, *sigma_of; /* (n_cells,): the place of each cell in the grid */
-    Level levels[MOST_LEVELS];
-    int n_levels;
-    double rounding, square_rounding, tie, tie_rounding;
-    long radius;
-    Candidate *candidates;   /* (n_cells,) */
-    Root *roots;             /* (levels[0].n,) */
+    Bank bank;
 } Search;
 
-/* A frame that is being searched for, and what has been found of it. */
-typedef struct {
-    Search *search;
-    double frame[CHANNELS];
-    float single[CHANNELS];
-    float parts[MOST_RANK];
-    float column[MOST_RANK + 2], fine_column[MOST_RANK + 2];
-    int has_fine;
-    /* Of one of the two searches, for the best cell and for the runner-up. */
-    long scores_left;        /* so many cells may still be scored */
-    int32_t apart_from;      /* only cells outside the peak of this one count; -1: all */
-    double reached;          /* the highest score so far */
-    float highest;           /* the highest bound so far */
-    Py_ssize_t n_candidates;
-} Pass;
-
-static float product(const float *a, const float *b, Py_ssize_t n)
+static PyObject *as_tuple(const Found *best, const Found *other)
 {
-    float lanes[LANES] = {0};
-    float sum = 0;
-    Py_ssize_t whole = n - n % LANES;
-    for (Py_ssize_t i = 0; i < whole; i += LANES)
-        for (int lane = 0; lane < LANES; lane++)
-            lanes[lane] += a[i + lane] * b[i + lane];
-    for (Py_ssize_t i = whole; i < n; i++)
-        sum += a[i] * b[i];
-    for (int lane = 0; lane < LANES; lane++)
-        sum += lanes[lane];
-    return sum;
+    return Py_BuildValue("ldld", (long)best->cell, best->score, (long)other->cell, other->score);
 }
 
-static double score_of(Pass *pass, int32_t cell)
+static PyObject *match(PyObject *self, PyObject *args)
 {
-    const Search *s = pass->search;
-    const float *signal = s->signals + s->places[cell] * CHANNELS;
-    double lanes[LANES] = {0};
-    double sum = 0;
-    for (int i = 0; i < CHANNELS; i += LANES)
-        for (int lane = 0; lane < LANES; lane++)
-            lanes[lane] += pass->frame[i + lane] * fabs((double)signal[i + lane]);
-    for (int lane = 0; lane < LANES; lane++)
-        sum += lanes[lane];
-    pass->scores_left--;
-    return sum / s->norms[cell];
-}
-
-static void reach(Pass *pass, Candidate *candidate)
-{
-    candidate->score = score_of(pass, candidate->cell);
-    if (candidate->score > pass->reached)
-        pass->reached = candidate->score;
-}
-
-static int may_reach(const Pass *pass, float bound)
-{
-    return (double)bound >= pass->reached - pass->search->rounding;
-}
-
-static int in_its_peak(const Pass *pass, int32_t cell)
-{
-    const Search *s = pass->search;
-    if (pass->apart_from < 0)
-        return 0;
-    return labs((long)s->k_of[cell] - s->k_of[pass->apart_from]) <= s->radius
-        && labs((long)s->sigma_of[cell] - s->sigma_of[pass->apart_from]) <= s->radius;
-}
-
-/* The column of bank/compression.py: the frame's first `rank` numbers, the norm of all of these but the first, and what
-   is left of the frame. */
-static void make_column(const Pass *pass, Py_ssize_t rank, float *column)
-{
-    const float *parts = pass->parts;
-    double across = 0;
-    for (Py_ssize_t i = 1; i < rank; i++)
-        across += (double)parts[i] * parts[i];
-    double left = 1.0 - (double)parts[0] * parts[0] - across;
-    memcpy(column, parts, (size_t)rank * sizeof(float));
-    column[rank] = (float)sqrt(across);
-    column[rank + 1] = (float)sqrt((left > 0 ? left : 0) + pass->search->square_rounding);
-}
-
-static void project(Pass *pass, Py_ssize_t from, Py_ssize_t to)
-{
-    for (Py_ssize_t i = from; i < to; i++)
-        pass->parts[i] = product(pass->search->basis + i * CHANNELS, pass->single, CHANNELS);
-}
-
-/* Take the magnitudes of a difference, scaled to the norm 1; 0 where they have none. */
-static int take_frame(Pass *pass, const double *difference)
-{
-    double largest = 0, sum = 0;
-    for (int i = 0; i < CHANNELS; i++) {
-        pass->frame[i] = fabs(difference[i]);
-        /* Not fmax, which would pass over what is not a number. */
-        if (!(pass->frame[i] <= largest))
-            largest = pass->frame[i];
-    }
-    if (!(largest > 0 && largest < INFINITY))
-        return 0;
-    for (int i = 0; i < CHANNELS; i++) {
-        pass->frame[i] /= largest;
-        sum += pass->frame[i] * pass->frame[i];
-    }
-    double norm = sqrt(sum);
-    if (!(norm > 0 && norm < INFINITY))
-        return 0;
-    for (int i = 0; i < CHANNELS; i++) {
-        pass->frame[i] /= norm;
-        pass->single[i] = (float)pass->frame[i];
-    }
-    project(pass, 0, pass->search->coarse_rank);
-    make_column(pass, pass->search->coarse_rank, pass->column);
-    return 1;
-}
-
-static void look_at_cell(Pass *pass, int32_t cell)
-{
-    const Search *s = pass->search;
-    float bound = product(s->coarse + cell * (s->coarse_rank + 2), pass->column, s->coarse_rank + 2);
-    if (!may_reach(pass, bound) || in_its_peak(pass, cell))
-        return;
-    Candidate *found = &s->candidates[pass->n_candidates++];
-    *found = (Candidate){bound, cell, -1.0};
-    if (bound > pass->highest) {
-        /* The higher the score that is known, the more can be left out. */
-        pass->highest = bound;
-        reach(pass, found);
-    }
-}
-
-static void look_into(Pass *pass, int level, int32_t group)
-{
-    const Search *s = pass->search;
-    const Level *here = &s->levels[level];
-    for (int32_t i = here->starts[group]; i < here->starts[group + 1]; i++) {
-        int32_t part = here->parts[i];
-        if (level + 1 == s->n_levels) {
-            look_at_cell(pass, part);
-            continue;
-        }
-        const float *row = s->levels[level + 1].rows + part * (s->coarse_rank + 2);
-        if (may_reach(pass, product(row, pass->column, s->coarse_rank + 2)))
-            look_into(pass, level + 1, part);
-    }
-}
-
-static int by_estimate(const void *one, const void *other)
-{
-    float a = ((const Root *)one)->estimate, b = ((const Root *)other)->estimate;
-    return (a < b) - (a > b);
-}
-
-static int by_bound(const void *one, const void *other)
-{
-    float a = ((const Candidate *)one)->bound, b = ((const Candidate *)other)->bound;
-    return (a < b) - (a > b);
-}
-
-static void bound_roots(Pass *pass)
-{
-    const Search *s = pass->search;
-    Py_ssize_t rank = s->coarse_rank;
-    for (Py_ssize_t group = 0; group < s->levels[0].n; group++) {
-        const float *row = s->levels[0].rows + group * (rank + 2);
-        float estimate = product(row, pass->column, rank);
-        float bound = estimate + row[rank] * pass->column[rank] + row[rank + 1] * pass->column[rank + 1];
-        s->roots[group] = (Root){estimate, bound, (int32_t)group};
-    }
-    qsort(s->roots, (size_t)s->levels[0].n, sizeof(Root), by_estimate);
-}
-
-static Py_ssize_t keep_what_may_reach(Pass *pass)
-{
-    Candidate *all = pass->search->candidates;
-    Py_ssize_t kept = 0;
-    for (Py_ssize_t i = 0; i < pass->n_candidates; i++)
-        if (may_reach(pass, all[i].bound))
-            all[kept++] = all[i];
-    return pass->n_candidates = kept;
-}
-
-static void bound_anew(Pass *pass)
-{
-    const Search *s = pass->search;
-    if (!pass->has_fine) {
-        project(pass, s->coarse_rank, s->fine_rank);
-        make_column(pass, s->fine_rank, pass->fine_column);
-        pass->has_fine = 1;
-    }
-    for (Py_ssize_t i = 0; i < pass->n_candidates; i++) {
-        Candidate *each = &s->candidates[i];
-        each->bound = product(s->fine + each->cell * (s->fine_rank + 2), pass->fine_column, s->fine_rank + 2);
-    }
-}
-
-typedef enum { NONE, FOUND, UNDECIDED } Outcome;
-
-/* Find the cell of the highest score, the first of those that tie, among those that are not in the peak of
-   `apart_from`. UNDECIDED: it hangs on rounding which cells tie, or too many would have to be scored. */
-static Outcome find(Pass *pass, int32_t apart_from, long most_scores, int32_t *cell, double *score)
-{
-    const Search *s = pass->search;
-    pass->apart_from = apart_from;
-    pass->scores_left = most_scores;
-    pass->reached = 0.0;
-    pass->highest = -1.0f;
-    pass->n_candidates = 0;
-    for (Py_ssize_t i = 0; i < s->levels[0].n; i++)
-        if (may_reach(pass, s->roots[i].bound))
-            look_into(pass, 0, s->roots[i].group);
-    if (keep_what_may_reach(pass) > FEW_CANDIDATES) {
-        bound_anew(pass);
-        qsort(s->candidates, (size_t)pass->n_candidates, sizeof(Candidate), by_bound);
-    }
-    for (Py_ssize_t i = 0; i < pass->n_candidates; i++) {
-        if (s->candidates[i].score >= 0 || !may_reach(pass, s->candidates[i].bound))
-            continue;
-        if (pass->scores_left <= 0)
-            return UNDECIDED;
-        reach(pass, &s->candidates[i]);
-    }
-    *cell = -1;
-    for (Py_ssize_t i = 0; i < pass->n_candidates; i++) {
-        const Candidate *each = &s->candidates[i];
-        double behind = pass->reached - each->score;
-        if (each->score < 0)
-            continue;
-        if (fabs(behind - s->tie) < s->tie_rounding)
-            return UNDECIDED;
-        if (behind <= s->tie && (*cell < 0 || each->cell < *cell)) {
-            *cell = each->cell;
-            *score = each->score < 1.0 ? each->score : 1.0;
-        }
-    }
-    return *cell < 0 ? NONE : FOUND;
-}
-
-static PyObject *search_match(PyObject *self, PyObject *args)
-{
-    Search *s = (Search *)self;
+    const Bank *bank = &((Search *)self)->bank;
+    Hunt hunt;
     Py_buffer difference;
     int with_runner_up;
     long most_scores;
-    Pass pass;
+    Found best = {-1, 0}, other = {-1, 0};
     if (!PyArg_ParseTuple(args, "y*pl", &difference, &with_runner_up, &most_scores))
         return NULL;
-    int sound = difference.len == CHANNELS * sizeof(double);
-    pass.search = s;
-    pass.has_fine = 0;
-    sound = sound && take_frame(&pass, difference.buf);
+    int sound = difference.len == CHANNELS * sizeof(double) && take_frame(&hunt, bank, difference.buf);
     PyBuffer_Release(&difference);
-    int32_t best = -1, other = -1;
-    double score = 0, other_score = 0;
-    if (sound) {
-        bound_roots(&pass);
-        sound = find(&pass, -1, most_scores, &best, &score) == FOUND;
-        if (sound && with_runner_up)
-            sound = find(&pass, best, most_scores, &other, &other_score) != UNDECIDED;
-    }
-    if (!sound)
+    if (!sound || find_at_lag_0(&hunt, -1, most_scores, &best) != FOUND)
         Py_RETURN_NONE;
-    return Py_BuildValue("ldld", (long)best, score, (long)other, other_score);
+    if (with_runner_up && find_at_lag_0(&hunt, best.cell, most_scores, &other) == UNDECIDED)
+        Py_RETURN_NONE;
+    return as_tuple(&best, &other);
 }
 
 PyDoc_STRVAR(match_doc,
 "match(difference, runner_up, most_scores) -> (cell, score, cell, score) | None\n\n"
-"Search for a (896,) float64 difference: the best cell and the best one outside its peak, -1 where there is none.\n"
-"None: the difference has no magnitude, a tie hangs on rounding, or more cells than that have to be scored for one of them.");
+"Search at lag 0 for a (896,) float64 difference: the best cell and the best one outside its peak, -1 where there is\n"
+"none. None: the difference has no magnitude, a tie hangs on rounding, or more scores would have to be computed.");
+
+/* What the frame's numbers are at some lags, by Python: `correlate` has the transforms. Held until it is released. */
+static int correlated(PyObject *correlate, const Hunt *hunt, int first, int end, Py_buffer *parts)
+{
+    PyObject *made = PyObject_CallFunction(correlate, "y#ii", (const char *)(hunt->single + CHANNELS),
+                                           (Py_ssize_t)(CHANNELS * sizeof(float)), first, end);
+    int failed = !made || PyObject_GetBuffer(made, parts, PyBUF_C_CONTIGUOUS) < 0;
+    Py_XDECREF(made);
+    if (failed)
+        return 0;
+    if (parts->len != hunt->bank->coarse_rank * (end - first) * (Py_ssize_t)sizeof(float)) {
+        PyBuffer_Release(parts);
+        PyErr_SetString(PyExc_ValueError, "a frame's numbers are not those of the lags that were asked for");
+        return 0;
+    }
+    return 1;
+}
+
+/* The highest score that is known of a cell outside the peak of another; -1 where none is. */
+static double highest_apart(const Bank *bank, const Found *known, int n, int32_t cell)
+{
+    double highest = -1;
+    for (int i = 0; i < n; i++)
+        if (!in_peak_of(bank, known[i].cell, cell) && known[i].score > highest)
+            highest = known[i].score;
+    return highest;
+}
+
+/* Find the best cell at all lags and, if one is wanted, the runner-up. */
+static Outcome find_at_all_lags(Hunt *hunt, const float *parts, int first, int end, int with_runner_up,
+                                long most_scores, Found *known, Found *best, Found *other)
+{
+    const Bank *bank = hunt->bank;
+    double least = known[with_runner_up].score;
+    take_lags(hunt, parts, first, end);
+    int lag = likeliest_lag(hunt, least);
+    if (lag < 0)
+        return UNDECIDED;
+    /* The higher the scores that are known to be reached, the less is left to look at. */
+    int n = 1 + with_runner_up;
+    if (find_at_lag(hunt, lag, -1, most_scores, &known[n]) != FOUND)
+        return UNDECIDED;
+    *best = known[n].score > known[0].score ? known[n] : known[0];
+    n++;
+    if (with_runner_up && find_at_lag(hunt, lag, best->cell, most_scores, &known[n]) == FOUND)
+        n++;
+    least = with_runner_up ? highest_apart(bank, known, n, best->cell) : best->score;
+    if (least < 0 || !collect(hunt, least) || settle(hunt, -1, best->score, most_scores, best) != FOUND)
+        return UNDECIDED;
+    if (!with_runner_up)
+        return FOUND;
+    /* All that reaches `least` was collected; outside the peak of the best cell no such score may be known any more. */
+    double reached = highest_apart(bank, known, n, best->cell);
+    return reached < least ? UNDECIDED : settle(hunt, best->cell, reached, most_scores, other);
+}
+
+static PyObject *match_at_all_lags(PyObject *self, PyObject *args)
+{
+    const Bank *bank = &((Search *)self)->bank;
+    Hunt hunt;
+    Py_buffer difference, parts;
+    PyObject *correlate;
+    int with_runner_up, first, end;
+    long most_scores;
+    Found known[4], best, other = {-1, 0};
+    if (!PyArg_ParseTuple(args, "y*Opl", &difference, &correlate, &with_runner_up, &most_scores))
+        return NULL;
+    int sound = difference.len == CHANNELS * sizeof(double) && take_frame(&hunt, bank, difference.buf);
+    PyBuffer_Release(&difference);
+    if (!sound || find_at_lag_0(&hunt, -1, most_scores, &known[0]) != FOUND)
+        Py_RETURN_NONE;
+    if (with_runner_up && find_at_lag_0(&hunt, known[0].cell, most_scores, &known[1]) != FOUND)
+        Py_RETURN_NONE;
+    if (!lags_that_may_reach(&hunt, known[with_runner_up].score, &first, &end))
+        Py_RETURN_NONE;
+    if (!correlated(correlate, &hunt, first, end, &parts))
+        return NULL;
+    Outcome outcome = find_at_all_lags(&hunt, parts.buf, first, end, with_runner_up, most_scores, known, &best, &other);
+    PyBuffer_Release(&parts);
+    if (outcome != FOUND)
+        Py_RETURN_NONE;
+    return as_tuple(&best, &other);
+}
+
+PyDoc_STRVAR(match_at_all_lags_doc,
+"match_at_all_lags(difference, correlate, runner_up, most_scores) -> (cell, score, cell, score) | None\n\n"
+"Search at all lags; as `match`, and None also where there are many bounds to compute, which numpy does quicker.\n"
+"correlate(frame, first, end) returns the (rank, end - first) float32 products of the basis and the frame, (896,) float32\n"
+"in bytes, at the lags from `first` up to before `end`.");
 
 /* Σ (difference / noise)², or −1 where a value is not finite or a noise not above zero. */
 static PyObject *energy(PyObject *module, PyObject *args)
@@ -408,14 +217,14 @@ static int hold_levels(Search *s, PyObject *levels)
     }
     for (Py_ssize_t i = 0; i < n; i++) {
         PyObject *rows, *starts, *parts;
-        Level *level = &s->levels[i];
+        Level *level = &s->bank.levels[i];
         if (!PyArg_ParseTuple(PyTuple_GetItem(levels, i), "nOOO", &level->n, &rows, &starts, &parts))
             return -1;
         if (i > 0 && level->n != n_parts) {
             PyErr_SetString(PyExc_ValueError, "the groups of a level are not the parts of the level before");
             return -1;
         }
-        level->rows = hold(s, rows, level->n * (s->coarse_rank + 2), sizeof(float));
+        level->rows = hold(s, rows, level->n * (s->bank.coarse_rank + 2), sizeof(float));
         level->starts = level->rows ? hold(s, starts, level->n + 1, sizeof(int32_t)) : NULL;
         if (!level->starts)
             return -1;
@@ -427,56 +236,82 @@ static int hold_levels(Search *s, PyObject *levels)
             return -1;
         }
     }
-    s->n_levels = (int)n;
-    if (n_parts != s->n_cells) {
+    s->bank.n_levels = (int)n;
+    if (n_parts != s->bank.n_cells) {
         PyErr_SetString(PyExc_ValueError, "the parts of the last level are not the cells");
         return -1;
     }
     return 0;
 }
 
-static int search_init(PyObject *self, PyObject *args, PyObject *named)
+/* Hold the arrays of a bank, in the order of the arguments of `Search`. */
+static int hold_bank(Search *s, PyObject *const *arrays, PyObject *levels)
 {
-    static char *names[] = {"basis", "coarse", "fine", "signals", "places", "norms", "k_of", "sigma_of", "levels",
-                            "rounding", "square_rounding", "tie", "tie_rounding", "radius", NULL};
-    Search *s = (Search *)self;
-    PyObject *basis, *coarse, *fine, *signals, *places, *norms, *k_of, *sigma_of, *levels;
-    if (!PyArg_ParseTupleAndKeywords(args, named, "OOOOOOOOO!ddddl", names, &basis, &coarse, &fine, &signals, &places,
-                                     &norms, &k_of, &sigma_of, &PyTuple_Type, &levels, &s->rounding,
-                                     &s->square_rounding, &s->tie, &s->tie_rounding, &s->radius))
+    Bank *bank = &s->bank;
+    if (!(bank->norms = hold(s, arrays[5], -1, sizeof(double))))
         return -1;
-    if (s->n_held) {
-        PyErr_SetString(PyExc_ValueError, "a search is made once");
+    bank->n_cells = s->held[0].len / (Py_ssize_t)sizeof(double);
+    if (!bank->n_cells) {
+        PyErr_SetString(PyExc_ValueError, "a bank without cells");
         return -1;
     }
-    if (!(s->norms = hold(s, norms, -1, sizeof(double))) || !(s->basis = hold(s, basis, -1, sizeof(float))))
+    if (!(bank->basis = hold(s, arrays[0], -1, sizeof(float)))
+        || !(bank->coarse = hold(s, arrays[1], -1, sizeof(float))))
         return -1;
-    s->n_cells = s->held[0].len / (Py_ssize_t)sizeof(double);
-    s->fine_rank = s->held[1].len / (CHANNELS * (Py_ssize_t)sizeof(float));
-    if (!(s->coarse = hold(s, coarse, -1, sizeof(float))))
-        return -1;
-    s->coarse_rank = s->n_cells ? s->held[2].len / (s->n_cells * (Py_ssize_t)sizeof(float)) - 2 : 0;
-    if (s->coarse_rank < 1 || s->fine_rank < s->coarse_rank || s->fine_rank > MOST_RANK) {
+    bank->fine_rank = s->held[1].len / (CHANNELS * (Py_ssize_t)sizeof(float));
+    bank->coarse_rank = s->held[2].len / (bank->n_cells * (Py_ssize_t)sizeof(float)) - 2;
+    if (bank->coarse_rank < 1 || bank->fine_rank < bank->coarse_rank || bank->fine_rank > MOST_RANK
+        || s->held[2].len != bank->n_cells * (bank->coarse_rank + 2) * (Py_ssize_t)sizeof(float)) {
         PyErr_SetString(PyExc_ValueError, "the bank's ranks are not sound");
         return -1;
     }
-    if (!(s->fine = hold(s, fine, s->n_cells * (s->fine_rank + 2), sizeof(float)))
-        || !(s->signals = hold(s, signals, -1, sizeof(float)))
-        || !(s->places = hold(s, places, s->n_cells, sizeof(int64_t)))
-        || !(s->k_of = hold(s, k_of, s->n_cells, sizeof(int32_t)))
-        || !(s->sigma_of = hold(s, sigma_of, s->n_cells, sizeof(int32_t)))
-        || hold_levels(s, levels) < 0)
+    if (!(bank->fine = hold(s, arrays[2], bank->n_cells * (bank->fine_rank + 2), sizeof(float)))
+        || !(bank->places = hold(s, arrays[4], bank->n_cells, sizeof(int64_t)))
+        || !(bank->k_of = hold(s, arrays[6], bank->n_cells, sizeof(int32_t)))
+        || !(bank->sigma_of = hold(s, arrays[7], bank->n_cells, sizeof(int32_t)))
+        || !(bank->overlaps = hold(s, arrays[8], 2 * CHANNELS, sizeof(double)))
+        || !(bank->signals = hold(s, arrays[3], -1, sizeof(float))))
         return -1;
-    const Py_buffer *read = &s->held[4];
-    for (Py_ssize_t i = 0; i < s->n_cells; i++) {
-        if (s->places[i] < 0 || s->places[i] >= read->len / (CHANNELS * (Py_ssize_t)sizeof(float))) {
+    Py_ssize_t n_signals = s->held[s->n_held - 1].len / (CHANNELS * (Py_ssize_t)sizeof(float));
+    for (Py_ssize_t i = 0; i < bank->n_cells; i++) {
+        if (bank->places[i] < 0 || bank->places[i] >= n_signals) {
             PyErr_SetString(PyExc_ValueError, "a cell's place is not in the signals");
             return -1;
         }
     }
-    s->candidates = PyMem_Malloc((size_t)s->n_cells * sizeof(Candidate));
-    s->roots = PyMem_Malloc((size_t)s->levels[0].n * sizeof(Root));
-    if (!s->candidates || !s->roots) {
+    return hold_levels(s, levels);
+}
+
+static int search_init(PyObject *self, PyObject *args, PyObject *named)
+{
+    Search *s = (Search *)self;
+    Bank *bank = &s->bank;
+    PyObject *arrays[9], *levels, *multiply;
+    if (s->n_held || (named && PyDict_Size(named))) {
+        PyErr_SetString(PyExc_TypeError, "a search is made once, and its arguments have no names");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "OOOOOOOOOO!Oddddl", &arrays[0], &arrays[1], &arrays[2], &arrays[3], &arrays[4],
+                          &arrays[5], &arrays[6], &arrays[7], &arrays[8], &PyTuple_Type, &levels, &multiply, &bank->rounding,
+                          &bank->square_rounding, &bank->tie, &bank->tie_rounding, &bank->radius))
+        return -1;
+    const char *signature = PyCapsule_GetName(multiply);
+    if (!signature || strncmp(signature, SGEMM, strlen(SGEMM)) != 0) {
+        if (!PyErr_Occurred())
+            PyErr_SetString(PyExc_TypeError, "this is no sgemm of scipy's");
+        return -1;
+    }
+    if (!(bank->multiply = (Multiply *)PyCapsule_GetPointer(multiply, signature)))
+        return -1;
+    if (hold_bank(s, arrays, levels) < 0)
+        return -1;
+    bank->most_candidates = bank->n_cells > LEAST_CANDIDATES ? bank->n_cells : LEAST_CANDIDATES;
+    bank->candidates = PyMem_Malloc((size_t)bank->most_candidates * sizeof(Candidate));
+    bank->roots = PyMem_Malloc((size_t)bank->levels[0].n * sizeof(Root));
+    bank->bounds = PyMem_Malloc((size_t)bank->levels[0].n * 2 * CHANNELS * sizeof(float));
+    bank->columns = PyMem_Malloc(2 * CHANNELS * (size_t)(bank->coarse_rank + 2) * sizeof(float));
+    bank->lags = PyMem_Malloc(2 * CHANNELS * sizeof(Lag));
+    if (!bank->candidates || !bank->roots || !bank->bounds || !bank->columns || !bank->lags) {
         PyErr_NoMemory();
         return -1;
     }
@@ -489,20 +324,24 @@ static void search_dealloc(PyObject *self)
     PyTypeObject *type = Py_TYPE(self);
     while (s->n_held)
         PyBuffer_Release(&s->held[--s->n_held]);
-    PyMem_Free(s->candidates);
-    PyMem_Free(s->roots);
+    PyMem_Free(s->bank.candidates);
+    PyMem_Free(s->bank.roots);
+    PyMem_Free(s->bank.bounds);
+    PyMem_Free(s->bank.columns);
+    PyMem_Free(s->bank.lags);
     freefunc release = (freefunc)PyType_GetSlot(type, Py_tp_free);
     release(self);
     Py_DECREF(type);
 }
 
 static PyMethodDef search_methods[] = {
-    {"match", search_match, METH_VARARGS, match_doc},
+    {"match", match, METH_VARARGS, match_doc},
+    {"match_at_all_lags", match_at_all_lags, METH_VARARGS, match_at_all_lags_doc},
     {NULL, NULL, 0, NULL},
 };
 
 static PyType_Slot search_slots[] = {
-    {Py_tp_doc, "A compressed bank, searched at lag 0; see bank/compiled.py."},
+    {Py_tp_doc, "A compressed bank that is searched; see bank/compiled.py."},
     {Py_tp_init, search_init},
     {Py_tp_dealloc, search_dealloc},
     {Py_tp_methods, search_methods},

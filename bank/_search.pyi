@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,15 +14,26 @@ class Search:
         norms: NDArray[np.float64],
         k_of: NDArray[np.int32],
         sigma_of: NDArray[np.int32],
+        overlaps: NDArray[np.float64],
         levels: tuple[tuple[int, NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]], ...],
+        multiply: object,
         rounding: float,
         square_rounding: float,
         tie: float,
         tie_rounding: float,
         radius: int,
+        /,
     ) -> None: ...
     def match(
         self, difference: NDArray[np.float64], runner_up: bool, most_scores: int, /
+    ) -> tuple[int, float, int, float] | None: ...
+    def match_at_all_lags(
+        self,
+        difference: NDArray[np.float64],
+        correlate: Callable[[bytes, int, int], NDArray[np.float32]],
+        runner_up: bool,
+        most_scores: int,
+        /,
     ) -> tuple[int, float, int, float] | None: ...
 
 def energy(difference: NDArray[np.float64], noise: NDArray[np.float64], /) -> float: ...

@@ -1,11 +1,12 @@
 """What is compiled of the bank's work, where there was a C compiler when this was installed.
 
-The compiled code is `_search.c`; numpy does the same without, and the tests compare the two. Its one purpose is the
+The compiled code is `search.c`; numpy does the same without, and the tests compare the two. Its one purpose is the
 time from a frame to its estimate.
 """
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cython_blas
 
 from bank.compression import ROUNDING, SQUARE_ROUNDING, CompressedBank, FloatArray, Indices, Single
 
@@ -15,7 +16,9 @@ except ImportError:
     # No compiler, or none that could build it; docs/speed.md tells what that costs.
     _search = None  # type: ignore[assignment]
 
-IS_COMPILED = _search is not None
+# BLAS as scipy hands it to compiled code.
+_SGEMM = getattr(cython_blas, "__pyx_capi__", {}).get("sgemm")
+IS_COMPILED = _search is not None and _SGEMM is not None
 
 
 def search_of(
@@ -29,7 +32,7 @@ def search_of(
     tie_rounding: float,
     radius: int,
 ) -> "_search.Search | None":
-    """Return what finds the best cell of a compressed bank at lag 0, None where nothing is compiled.
+    """Return what finds the best cell of a compressed bank, None where nothing is compiled.
 
     signals (m, 896) hold cell i of n in row places[i], with the norm norms[i]; `grid` are the rows and columns (n,) of
     the cells. Scores that differ by less than `tie` are the same, and a difference within `tie_rounding` of that is
@@ -43,7 +46,7 @@ def search_of(
         for level, part_of in zip(bank.levels, parts_of, strict=True)
     )
     return _search.Search(
-        *(bank.basis, bank.coarse, bank.fine, signals, places, norms, *grid, levels),
+        *(bank.basis, bank.coarse, bank.fine, signals, places, norms, *grid, bank.overlaps, levels, _SGEMM),
         *(ROUNDING, SQUARE_ROUNDING, tie, tie_rounding, radius),
     )
 

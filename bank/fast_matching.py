@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, spectra_of
+from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, correlated, spectra_of
 from bank.compiled import search_of
 from bank.compression import ROUNDING, Indices, compress
 from bank.errors import MatchingError
@@ -49,6 +49,10 @@ _COMPRESSED_CELLS = 128
 _QUICK_SCORES = 1 << 13
 
 
+# Number and score of the best cell, then of the runner-up.
+Searched = tuple[int, float, int, float]
+
+
 class _Undecided(Exception):  # noqa: N818 - it is not an error
     """It hangs on the rounding of float64 which cells tie."""
 
@@ -69,6 +73,12 @@ class _PruningMatcher(Matcher):
         self._bank = compress(lambda: map(self._unit_signals, chunks()))
         self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in chunks()])
         self._row, self._column = (each.astype(np.int32) for each in np.divmod(self._cells, valid.shape[1]))
+        self._compiled = search_of(
+            *(self._bank, self._signals, self._cells, self._norms, (self._row, self._column)),
+            tie=TIE,
+            tie_rounding=_ROUNDING_64,
+            radius=RUNNER_UP_RADIUS,
+        )
 
     def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
         """Return what `best_match` finds in the heatmap of one (896,) difference, at a fraction of its cost.
@@ -76,6 +86,9 @@ class _PruningMatcher(Matcher):
         Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
         """
         if len(self._cells) >= self._fewest:
+            found = self._found(difference, runner_up, len(self._cells))
+            if found is not None:
+                return found
             frame = unit_magnitude(difference)
             with suppress(_Undecided):
                 return self._search(frame, runner_up)
@@ -89,6 +102,9 @@ class _PruningMatcher(Matcher):
         """
         if len(self._cells) < self._fewest:
             return super().match(difference)
+        found = self._found(difference, True, _QUICK_SCORES)
+        if found is not None:
+            return found
         try:
             return self._search(unit_magnitude(difference), runner_up=True, quick=True)
         except (_Undecided, TakesLongError):
@@ -103,6 +119,18 @@ class _PruningMatcher(Matcher):
         # Wrong input is told before any work.
         unit_magnitudes(frames)
         return [self.match(frame, runner_up=False) for frame in frames]
+
+    def _found(self, difference: ArrayLike, runner_up: bool, most_scores: int) -> Match | None:
+        """Return the match, or None: nothing is compiled, or numpy has to decide, or to say what is wrong."""
+        found = self._compiled_search(np.ascontiguousarray(difference, dtype=np.float64), runner_up, most_scores)
+        if found is None:
+            return None
+        cell, score, other, other_score = found
+        return self._match((cell, score), None if other < 0 else (other, other_score))
+
+    @abstractmethod
+    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
+        """Return the numbers and scores of the best cell and the runner-up, −1 if there is none; None as `_found`."""
 
     @abstractmethod
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match: ...
@@ -179,37 +207,9 @@ class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
         # Every place of the grid has the number of its cell; those that are not valid share one that is none.
         self._numbers = np.full(valid.shape, len(self._cells))
         self._numbers[valid] = np.arange(len(self._cells))
-        self._compiled = search_of(
-            *(self._bank, self._signals, self._cells, self._norms, (self._row, self._column)),
-            tie=TIE,
-            tie_rounding=_ROUNDING_64,
-            radius=RUNNER_UP_RADIUS,
-        )
 
-    def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
-        """Return what any pruning matcher returns; errors too."""
-        found = self._found(difference, runner_up, len(self._cells))
-        return super().match(difference, runner_up=runner_up) if found is None else found
-
-    def match_quickly(self, difference: ArrayLike) -> Match | None:
-        """Return what `match` returns, or None where that takes more than a few milliseconds."""
-        if self._compiled is None:
-            return super().match_quickly(difference)
-        found = self._found(difference, True, _QUICK_SCORES)
-        if found is None:
-            # What cannot be matched is told here as anywhere.
-            unit_magnitude(difference)
-        return found
-
-    def _found(self, difference: ArrayLike, runner_up: bool, most_scores: int) -> Match | None:
-        """Return the match, or None: nothing is compiled, or it cannot be decided with so many scores."""
-        if self._compiled is None:
-            return None
-        found = self._compiled.match(np.ascontiguousarray(difference, dtype=np.float64), runner_up, most_scores)
-        if found is None:
-            return None
-        cell, score, other, other_score = found
-        return self._match((cell, score), None if other < 0 else (other, other_score))
+    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
+        return None if self._compiled is None else self._compiled.match(difference, runner_up, most_scores)
 
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match:
         bounds = ZeroLagBounds(self._bank, frame)
@@ -281,6 +281,12 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
             (left,) = bounds.left([least])
         left = left.among(peak.lacks(left.cells))
         return self._match(best, self._settled(frame, left, least, quick=quick) if len(left.cells) else None)
+
+    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
+        if self._compiled is None:
+            return None
+        correlate = partial(correlated, self._spectra)
+        return self._compiled.match_at_all_lags(difference, correlate, runner_up, most_scores)
 
     def _around(self, cell: int, radius: int) -> Neighbourhood:
         return Neighbourhood(self._row, self._column, cell, radius)

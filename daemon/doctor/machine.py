@@ -103,10 +103,10 @@ def robot_library_finding() -> Finding:
 def compiled_finding() -> Finding:
     """Say whether the way from a frame to its estimate is compiled, for which installing needs a C compiler."""
     if bank.compiled.IS_COMPILED and drivers.compiled.cells is not None:
-        return good("compiled parts", "reading a frame and matching it at lag 0 are compiled")
+        return good("compiled parts", "reading a frame and matching it are compiled")
     return note(
         "compiled parts",
-        "reading a frame and matching it at lag 0 are not compiled: there was no C compiler when this was installed",
+        "reading a frame and matching it are not compiled: there was no C compiler when this was installed",
         "the same estimates come about half a millisecond later",
         "`sudo apt install gcc python3-dev`, then install shearloop again",
     )

@@ -1,0 +1,389 @@
+/* The bounds, scores and ties of bank/fast_matching.py, for one frame.
+
+   A frame comes after half a second in which others had the processor's caches, and then each call of numpy costs some
+   ten microseconds whatever it computes. Here the groups of the compressed bank are gone through from few to many, and
+   only what may reach a score that some cell has is looked at: little code and little memory. */
+
+#include "search.h"
+
+#include <limits.h>
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+enum {
+    LANES = 8,
+    /* With fewer candidates, scoring them costs less than to bound them anew. */
+    FEW_CANDIDATES = 16,
+    /* More bounds than this at all lags take longer than numpy, whose products are quicker where much is left. */
+    MOST_LOOKS = 1 << 16
+};
+
+/* Four numbers side by side, as the processors that we know of have them in a register. */
+typedef float Four __attribute__((vector_size(16)));
+
+static inline Four four(const float *from)
+{
+    Four found;
+    memcpy(&found, from, sizeof found);
+    return found;
+}
+
+static float product(const float *a, const float *b, ptrdiff_t n)
+{
+    Four even = {0}, odd = {0};
+    float rest = 0;
+    ptrdiff_t whole = n - n % 8;
+    for (ptrdiff_t i = 0; i < whole; i += 8) {
+        even += four(a + i) * four(b + i);
+        odd += four(a + i + 4) * four(b + i + 4);
+    }
+    for (ptrdiff_t i = whole; i < n; i++)
+        rest += a[i] * b[i];
+    even += odd;
+    return (even[0] + even[2]) + (even[1] + even[3]) + rest;
+}
+
+static double score_of(const Hunt *hunt, int32_t cell, int32_t lag)
+{
+    const Bank *bank = hunt->bank;
+    const float *signal = bank->signals + bank->places[cell] * CHANNELS;
+    const double *frame = hunt->padded + CHANNELS + lag;
+    double lanes[LANES] = {0};
+    double sum = 0;
+    for (int i = 0; i < CHANNELS; i += LANES)
+        for (int lane = 0; lane < LANES; lane++)
+            lanes[lane] += frame[i + lane] * fabs((double)signal[i + lane]);
+    for (int lane = 0; lane < LANES; lane++)
+        sum += lanes[lane];
+    return sum / bank->norms[cell];
+}
+
+static void reaches(Hunt *hunt, double score)
+{
+    hunt->reached = score;
+    hunt->least = (float)(score - hunt->bank->rounding);
+}
+
+static void look_up(Hunt *hunt, Candidate *candidate)
+{
+    candidate->score = score_of(hunt, candidate->cell, candidate->lag);
+    hunt->scores_left--;
+    if (candidate->score > hunt->reached)
+        reaches(hunt, candidate->score);
+}
+
+static int may_reach(const Hunt *hunt, float bound)
+{
+    return bound >= hunt->least;
+}
+
+int in_peak_of(const Bank *bank, int32_t cell, int32_t other)
+{
+    return other >= 0 && labs((long)bank->k_of[cell] - bank->k_of[other]) <= bank->radius
+        && labs((long)bank->sigma_of[cell] - bank->sigma_of[other]) <= bank->radius;
+}
+
+/* The column of bank/compression.py at a lag: the frame's first `rank` numbers, the norm of all of these but the first,
+   and what is left of the frame. */
+static void make_column(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
+{
+    const Bank *bank = hunt->bank;
+    const float *frame = hunt->single + CHANNELS + lag;
+    double across = 0;
+    for (ptrdiff_t i = 0; i < rank; i++) {
+        column[i] = product(bank->basis + i * CHANNELS, frame, CHANNELS);
+        across += i ? (double)column[i] * column[i] : 0;
+    }
+    double left = hunt->energies[CHANNELS + lag] - (double)column[0] * column[0] - across;
+    column[rank] = (float)sqrt(across);
+    column[rank + 1] = (float)sqrt((left > 0 ? left : 0) + bank->square_rounding);
+}
+
+int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
+{
+    double *frame = hunt->padded + CHANNELS;
+    double largest = 0, sum = 0;
+    for (int i = 0; i < CHANNELS; i++) {
+        frame[i] = fabs(difference[i]);
+        /* Not fmax, which would pass over what is not a number. */
+        if (!(frame[i] <= largest))
+            largest = frame[i];
+    }
+    if (!(largest > 0 && largest < INFINITY))
+        return 0;
+    for (int i = 0; i < CHANNELS; i++) {
+        /* Scaled by the largest first, so that the squares of no finite input overflow or vanish. */
+        frame[i] /= largest;
+        sum += frame[i] * frame[i];
+    }
+    double norm = sqrt(sum);
+    if (!(norm > 0 && norm < INFINITY))
+        return 0;
+    memset(hunt->padded, 0, CHANNELS * sizeof(double));
+    memset(hunt->padded + 2 * CHANNELS, 0, CHANNELS * sizeof(double));
+    memset(hunt->single, 0, sizeof hunt->single);
+    sum = 0;
+    for (int i = 0; i < CHANNELS; i++) {
+        frame[i] /= norm;
+        hunt->single[CHANNELS + i] = (float)frame[i];
+        hunt->energies[i] = sum;
+        hunt->energies[CHANNELS + i] = sum < 1 ? 1 - sum : 0;
+        sum += frame[i] * frame[i];
+    }
+    hunt->bank = bank;
+    make_column(hunt, 0, bank->coarse_rank, hunt->column);
+    return 1;
+}
+
+static void look_at_cell(Hunt *hunt, const float *column, int32_t lag, int32_t cell)
+{
+    const Bank *bank = hunt->bank;
+    float bound = product(bank->coarse + cell * (bank->coarse_rank + 2), column, bank->coarse_rank + 2);
+    hunt->looks_left--;
+    if (!may_reach(hunt, bound) || in_peak_of(bank, cell, hunt->apart_from))
+        return;
+    if (hunt->n_candidates == bank->most_candidates) {
+        hunt->looks_left = -1;
+        return;
+    }
+    Candidate *found = &bank->candidates[hunt->n_candidates++];
+    *found = (Candidate){bound, cell, lag, -1.0};
+    if (bound > hunt->highest) {
+        /* The higher the score that is known, the more can be left out. */
+        hunt->highest = bound;
+        look_up(hunt, found);
+    }
+}
+
+static void look_into(Hunt *hunt, const float *column, int32_t lag, int level, int32_t group)
+{
+    const Bank *bank = hunt->bank;
+    const Level *here = &bank->levels[level];
+    for (int32_t i = here->starts[group]; i < here->starts[group + 1] && hunt->looks_left >= 0; i++) {
+        int32_t part = here->parts[i];
+        if (level + 1 == bank->n_levels) {
+            look_at_cell(hunt, column, lag, part);
+            continue;
+        }
+        const float *row = bank->levels[level + 1].rows + part * (bank->coarse_rank + 2);
+        hunt->looks_left--;
+        if (may_reach(hunt, product(row, column, bank->coarse_rank + 2)))
+            look_into(hunt, column, lag, level + 1, part);
+    }
+}
+
+static int by_estimate(const void *one, const void *other)
+{
+    float a = ((const Root *)one)->estimate, b = ((const Root *)other)->estimate;
+    return (a < b) - (a > b);
+}
+
+static int by_bound(const void *one, const void *other)
+{
+    float a = ((const Candidate *)one)->bound, b = ((const Candidate *)other)->bound;
+    return (a < b) - (a > b);
+}
+
+static int by_lag(const void *one, const void *other)
+{
+    int32_t a = ((const Candidate *)one)->lag, b = ((const Candidate *)other)->lag;
+    return (a > b) - (a < b);
+}
+
+static void bound_roots(const Hunt *hunt, const float *column)
+{
+    const Bank *bank = hunt->bank;
+    ptrdiff_t rank = bank->coarse_rank;
+    for (ptrdiff_t group = 0; group < bank->levels[0].n; group++) {
+        const float *row = bank->levels[0].rows + group * (rank + 2);
+        float estimate = product(row, column, rank);
+        float bound = estimate + row[rank] * column[rank] + row[rank + 1] * column[rank + 1];
+        bank->roots[group] = (Root){estimate, bound, (int32_t)group};
+    }
+    /* A high score is known the sooner. */
+    qsort(bank->roots, (size_t)bank->levels[0].n, sizeof(Root), by_estimate);
+}
+
+static ptrdiff_t those_that_may_reach(const Hunt *hunt)
+{
+    Candidate *all = hunt->bank->candidates;
+    ptrdiff_t kept = 0;
+    for (ptrdiff_t i = 0; i < hunt->n_candidates; i++)
+        if (may_reach(hunt, all[i].bound))
+            all[kept++] = all[i];
+    return kept;
+}
+
+/* Bound the candidates anew at each lag that has many: the frame's numbers there cost as much as some scores. */
+static void bound_anew(const Hunt *hunt)
+{
+    const Bank *bank = hunt->bank;
+    Candidate *all = bank->candidates;
+    float column[MOST_RANK + 2];
+    ptrdiff_t n;
+    qsort(all, (size_t)hunt->n_candidates, sizeof(Candidate), by_lag);
+    for (ptrdiff_t i = 0; i < hunt->n_candidates; i += n) {
+        for (n = 1; i + n < hunt->n_candidates && all[i + n].lag == all[i].lag; n++)
+            ;
+        if (n <= FEW_CANDIDATES)
+            continue;
+        make_column(hunt, all[i].lag, bank->fine_rank, column);
+        for (ptrdiff_t j = i; j < i + n; j++)
+            all[j].bound = product(bank->fine + all[j].cell * (bank->fine_rank + 2), column, bank->fine_rank + 2);
+    }
+}
+
+static void keep_what_may_reach(Hunt *hunt)
+{
+    hunt->n_candidates = those_that_may_reach(hunt);
+    if (hunt->n_candidates > FEW_CANDIDATES) {
+        bound_anew(hunt);
+        hunt->n_candidates = those_that_may_reach(hunt);
+        qsort(hunt->bank->candidates, (size_t)hunt->n_candidates, sizeof(Candidate), by_bound);
+    }
+}
+
+Outcome settle(Hunt *hunt, int32_t apart_from, double reached, long most_scores, Found *found)
+{
+    const Bank *bank = hunt->bank;
+    reaches(hunt, reached);
+    hunt->scores_left = most_scores;
+    found->cell = -1;
+    for (ptrdiff_t i = 0; i < hunt->n_candidates; i++) {
+        Candidate *each = &bank->candidates[i];
+        if (!may_reach(hunt, each->bound) || in_peak_of(bank, each->cell, apart_from))
+            continue;
+        if (each->score < 0) {
+            if (hunt->scores_left <= 0)
+                return UNDECIDED;
+            look_up(hunt, each);
+        } else if (each->score > hunt->reached) {
+            reaches(hunt, each->score);
+        }
+    }
+    for (ptrdiff_t i = 0; i < hunt->n_candidates; i++) {
+        const Candidate *each = &bank->candidates[i];
+        double behind = hunt->reached - each->score;
+        if (each->score < 0 || in_peak_of(bank, each->cell, apart_from))
+            continue;
+        if (fabs(behind - bank->tie) < bank->tie_rounding)
+            return UNDECIDED;
+        if (behind <= bank->tie && (found->cell < 0 || each->cell < found->cell)) {
+            found->cell = each->cell;
+            found->score = each->score < 1 ? each->score : 1;
+        }
+    }
+    return found->cell < 0 ? NONE : FOUND;
+}
+
+static void begin(Hunt *hunt, int32_t apart_from, double reached, float highest, long most_looks)
+{
+    hunt->apart_from = apart_from;
+    reaches(hunt, reached);
+    hunt->highest = highest;
+    hunt->looks_left = most_looks;
+    hunt->scores_left = 0;
+    hunt->n_candidates = 0;
+}
+
+static Outcome find_at(Hunt *hunt, const float *column, int32_t lag, int32_t apart_from, long most_scores, Found *found)
+{
+    const Bank *bank = hunt->bank;
+    bound_roots(hunt, column);
+    begin(hunt, apart_from, 0, -1, LONG_MAX);
+    for (ptrdiff_t i = 0; i < bank->levels[0].n; i++)
+        if (may_reach(hunt, bank->roots[i].bound))
+            look_into(hunt, column, lag, 0, bank->roots[i].group);
+    keep_what_may_reach(hunt);
+    return settle(hunt, apart_from, hunt->reached, most_scores, found);
+}
+
+Outcome find_at_lag_0(Hunt *hunt, int32_t apart_from, long most_scores, Found *found)
+{
+    return find_at(hunt, hunt->column, 0, apart_from, most_scores, found);
+}
+
+int lags_that_may_reach(const Hunt *hunt, double score, int *first, int *end)
+{
+    const Bank *bank = hunt->bank;
+    int n = 0;
+    for (int i = 0; i < 2 * CHANNELS; i++) {
+        if (bank->overlaps[i] * sqrt(hunt->energies[i]) < score - bank->rounding)
+            continue;
+        *end = i + 1 - CHANNELS;
+        if (!n++)
+            *first = i - CHANNELS;
+    }
+    return n;
+}
+
+void take_lags(Hunt *hunt, const float *parts, int first, int end)
+{
+    const Bank *bank = hunt->bank;
+    ptrdiff_t rank = bank->coarse_rank;
+    hunt->first = first;
+    hunt->n_lags = end - first;
+    for (int j = 0; j < hunt->n_lags; j++) {
+        float *column = bank->columns + j * (rank + 2);
+        double across = 0;
+        for (ptrdiff_t i = 0; i < rank; i++) {
+            column[i] = parts[i * hunt->n_lags + j];
+            across += i ? (double)column[i] * column[i] : 0;
+        }
+        double left = hunt->energies[CHANNELS + first + j] - (double)column[0] * column[0] - across;
+        column[rank] = (float)sqrt(across);
+        column[rank + 1] = (float)sqrt((left > 0 ? left : 0) + bank->square_rounding);
+    }
+    /* bounds = rows columns; BLAS takes a matrix by columns, and so all of them for transposed. */
+    int size = (int)rank + 2, n_groups = (int)bank->levels[0].n;
+    float one = 1, none = 0;
+    bank->multiply("T", "N", &hunt->n_lags, &n_groups, &size, &one, bank->columns, &size, bank->levels[0].rows, &size,
+                   &none, bank->bounds, &hunt->n_lags);
+}
+
+int likeliest_lag(Hunt *hunt, double score)
+{
+    const Bank *bank = hunt->bank;
+    int n = hunt->n_lags, kept = 0, likeliest = 0;
+    for (int j = 0; j < n; j++)
+        bank->lags[j] = (Lag){j, -INFINITY};
+    for (ptrdiff_t group = 0; group < bank->levels[0].n; group++)
+        for (int j = 0; j < n; j++)
+            if (bank->bounds[group * n + j] > bank->lags[j].highest)
+                bank->lags[j].highest = bank->bounds[group * n + j];
+    for (int j = 0; j < n; j++) {
+        if ((double)bank->lags[j].highest < score - bank->rounding)
+            continue;
+        bank->lags[kept] = bank->lags[j];
+        if (bank->lags[kept].highest > bank->lags[likeliest].highest)
+            likeliest = kept;
+        kept++;
+    }
+    hunt->n_left = kept;
+    return kept ? bank->lags[likeliest].number : -1;
+}
+
+Outcome find_at_lag(Hunt *hunt, int number, int32_t apart_from, long most_scores, Found *found)
+{
+    const float *column = hunt->bank->columns + number * (hunt->bank->coarse_rank + 2);
+    return find_at(hunt, column, hunt->first + number, apart_from, most_scores, found);
+}
+
+int collect(Hunt *hunt, double score)
+{
+    const Bank *bank = hunt->bank;
+    /* No score is looked up meanwhile: the runner-up's must not be raised by the best cell's. */
+    begin(hunt, -1, score, INFINITY, MOST_LOOKS);
+    for (ptrdiff_t group = 0; group < bank->levels[0].n && hunt->looks_left >= 0; group++)
+        for (int i = 0; i < hunt->n_left; i++) {
+            int number = bank->lags[i].number;
+            if (may_reach(hunt, bank->bounds[group * hunt->n_lags + number]))
+                look_into(hunt, bank->columns + number * (bank->coarse_rank + 2), hunt->first + number, 0,
+                          (int32_t)group);
+        }
+    if (hunt->looks_left < 0)
+        return 0;
+    keep_what_may_reach(hunt);
+    return 1;
+}

@@ -141,7 +141,7 @@ class UrRobot:
         """Send a command; `answered` hears the one reply: what is sent after clipping, or why nothing is.
 
         A command whose process dies before it replied is answered as refused, and is not sent again. What `answered`
-        raises ends the conversation with the process.
+        raises ends the conversation with the process; where that is over already, the event loop's handler hears of it.
         """
         if self._stdin is None or self._state is None:
             answered(Reply(refused=f"The robot is not connected. {self.link.sentence}"))
@@ -216,7 +216,11 @@ class UrRobot:
         self._state = None
         waiting, self._waiting = self._waiting, {}
         for answered in waiting.values():
-            answered(Reply(refused="The robot's process ended before it answered; nothing is sent again."))
+            try:
+                answered(Reply(refused="The robot's process ended before it answered; nothing is sent again."))
+            except Exception as error:  # noqa: BLE001 - the others are told all the same, and the process is ended
+                said = {"message": "who waited for a reply of the robot's process died of its end", "exception": error}
+                asyncio.get_running_loop().call_exception_handler(said)
 
     def take(self, number: int, message: Message) -> None:
         """Act on a message of the process."""

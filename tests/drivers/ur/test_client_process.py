@@ -1,14 +1,17 @@
 """The daemon's end of the robot where there is no controller: what is said of a process that ends."""
 
+import asyncio
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from drivers.errors import DriverError
 from drivers.ur.client import UrRobot
 from drivers.ur.conversation import LAST_WORDS_BYTES
+from drivers.ur.messages import Reply, Stop
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
 
@@ -76,6 +79,46 @@ with open(sys.argv[1], "a") as told:
     print(heard[0][1].takes_over, file=told)
 os.write(1, encode(Pilot(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
 """
+
+
+LEAVES_IN_GOOD_ORDER = """
+import os, sys
+from drivers.ur.messages import Disconnect
+from drivers.ur.pilot import Pilot
+from drivers.ur.wire import Decoder, encode
+from tests.drivers.ur.flight import SETTINGS, FakeArm
+
+os.write(1, encode(Pilot(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
+decoder, last = Decoder(), None
+while heard := os.read(0, 1 << 16):
+    for _, last in decoder.feed(heard):
+        pass
+with open(sys.argv[1], "a") as told:
+    print(isinstance(last, Disconnect), file=told)
+"""
+
+
+async def test_process_is_ended_in_good_order_though_who_waits_for_a_reply_dies_of_it(
+    play: Callable[[str], None], tmp_path: Path
+) -> None:
+    told = tmp_path / "told"
+    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{LEAVES_IN_GOOD_ORDER}' '{told}'")
+    unheard: list[dict[str, Any]] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: unheard.append(context))
+    replies: list[Reply] = []
+
+    def dies(_reply: Reply) -> None:
+        raise ZeroDivisionError("nothing to divide")
+
+    async with asyncio.timeout(60):
+        async with running(settings_for("127.0.0.254"), Link()) as robot:
+            await robot.next_state()
+            robot.tell(Stop(1.0), dies)
+            robot.tell(Stop(1.0), replies.append)
+    assert robot.pid is None
+    assert told.read_text() == "True\n", "it was told to go, and went by itself"
+    assert ["ended before it answered" in reply.refused for reply in replies] == [True]
+    assert [repr(context["exception"]) for context in unheard] == ["ZeroDivisionError('nothing to divide')"]
 
 
 async def test_process_after_one_that_was_connected_may_stop_what_that_left_running(

@@ -20,6 +20,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings",
         nargs="*",
+        default=[],
         type=Path,
         metavar="REC",
         help="recordings (.mcap) or folders of slices; synthetic frames where none is given",

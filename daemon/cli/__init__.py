@@ -10,7 +10,7 @@ import importlib
 import os
 import sys
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, NoReturn, Protocol
 
 # Many small solves and products: a BLAS that spreads each over all cores is slower. Before numpy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -56,6 +56,14 @@ EXIT_UNFINISHED = 3
 EXIT_INTERRUPTED = 130
 
 
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one sentence, and where the rest stands; actions of a command have one of their own."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with the sentence and exit status 2."""
+        self.exit(EXIT_USAGE, f"{self.prog}: {message}; see `{self.prog} --help`\n")
+
+
 class CommandModule(Protocol):
     """What a command's module provides."""
 
@@ -73,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     known = overview.parse_args(arguments[:1])
     command = COMMANDS[known.command]
     module: CommandModule = importlib.import_module(command.module)
-    parser = argparse.ArgumentParser(prog=f"shearloop {known.command}", description=command.summary)
+    parser = Parser(prog=f"shearloop {known.command}", description=command.summary)
     module.configure(parser)
     spelled_out = getattr(module, "spelled_out", list)
     args = parser.parse_args(spelled_out(arguments[1:]))
@@ -101,7 +109,7 @@ def _user_errors() -> tuple[type[Exception], ...]:
 def _overview() -> argparse.ArgumentParser:
     width = max(map(len, COMMANDS))
     listing = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items())
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="shearloop",
         description="Closed-loop twisting with soft shear-sensing skins.",
         epilog=f"commands:\n{listing}\n\n`shearloop COMMAND --help` explains one.",

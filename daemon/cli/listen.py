@@ -8,7 +8,9 @@ from daemon.cli.connection import add_connection, client_keys
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `listen`."""
-    parser.add_argument("topics", nargs="*", metavar="TOPIC", help="topics, or their beginnings (eit); all by default")
+    parser.add_argument(
+        "topics", nargs="*", default=[], metavar="TOPIC", help="topics, or their beginnings (eit); all by default"
+    )
     add_connection(parser, PUBLISH_ADDRESS)
     parser.add_argument("--json", action="store_true", help="one JSON object a line, arrays included")
     parser.add_argument("--count", type=int, metavar="N", help="stop after N messages")

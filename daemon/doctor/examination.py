@@ -9,7 +9,7 @@ from daemon.addresses import stop_address
 from daemon.config import DaemonConfig, load_daemon_config
 from daemon.doctor.devices import examine_devices
 from daemon.doctor.files import examine_files
-from daemon.doctor.finding import Finding, from_sentence, good, note
+from daemon.doctor.finding import Finding, from_file, good, note
 from daemon.doctor.live import examine_daemon, listen, tasks_of_daemon
 from daemon.doctor.machine import disk_finding, examine_machine
 from daemon.errors import UserError
@@ -29,7 +29,7 @@ def examine(config_path: Path | None, seconds: float, geometry: Path | None = No
     try:
         config = load_daemon_config(config_path)
     except UserError as error:
-        yield from_sentence("configuration", str(error), "the daemon will not start")
+        yield from_file("configuration", str(error), "the daemon will not start")
         return
     yield good("configuration", f"{config_path} is in order")
     yield disk_finding(Path() if config.recording is None else config.recording.folder)

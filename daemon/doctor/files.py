@@ -8,7 +8,7 @@ from bank.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from bank.errors import BankError
 from daemon.config import Both, CurveConfig, DaemonConfig, Fingertip
 from daemon.config_file import load_yaml_model
-from daemon.doctor.finding import Finding, from_sentence, good, note, trouble
+from daemon.doctor.finding import Finding, from_file, from_sentence, good, note, trouble
 from daemon.errors import UserError
 from daemon.experiment.steps import ExperimentFile
 from daemon.opening import open_both, open_estimator
@@ -133,7 +133,7 @@ def _settings_finding(path: Path) -> Finding:
     try:
         host = read_settings(path).host
     except DriverError as error:
-        return from_sentence("robot's settings", str(error), "the daemon will not start")
+        return from_file("robot's settings", str(error), "the daemon will not start")
     return good("robot's settings", f"{path} are in order; the robot is {host}")
 
 
@@ -141,5 +141,5 @@ def _experiment_finding(path: Path) -> Finding:
     try:
         experiment = load_yaml_model(path, ExperimentFile)
     except UserError as error:
-        return from_sentence("experiment", str(error), "it cannot be started")
+        return from_file("experiment", str(error), "it cannot be started")
     return good("experiment", f"{path}: {experiment.name}, {len(experiment.steps)} steps, driven by {experiment.drive}")

@@ -33,9 +33,14 @@ def trouble(subject: str, found: str, means: str, next_step: str) -> Finding:
 
 
 def from_sentence(subject: str, sentence: str, means: str) -> Finding:
-    """Return the finding of an error, whose sentence says what happened and, after the last `;` or `:`, the cure."""
-    for mark in ("; ", ": "):
+    """Return the finding of an error, whose last sentence, or what follows its last `;`, is the cure."""
+    for mark in ("; ", ". "):
         what, found, cure = sentence.rpartition(mark)
         if found:
             return trouble(subject, what, means, cure.rstrip("."))
-    return trouble(subject, sentence, means, "see the sentence itself")
+    return from_file(subject, sentence, means)
+
+
+def from_file(subject: str, sentence: str, means: str) -> Finding:
+    """Return the finding of a file whose mistakes a sentence names, all of them."""
+    return trouble(subject, sentence, means, "mend what it names, then `shearloop doctor CONFIG` again")

@@ -39,7 +39,8 @@ def read_series(path: Path, sides: tuple[str, ...] | None = None, tool_mm: float
     if any("mm_Data_" in name for name in names):
         return [_diameter_slices(path)]
     raise UserError(
-        f"{path} is a folder without slices; name a recording made by `shearloop import`, or a folder of slices"
+        f"{path} is a folder without slices; name a recording (.mcap, of `shearloop run --record` or of `shearloop "
+        "import`), or a folder of slices"
     )
 
 

@@ -32,6 +32,10 @@ def read_inputs(recordings: Path) -> Inputs:
     """
     torque_folder, diameter_folder = recordings / TORQUE_FOLDER, recordings / DIAMETER_FOLDER
     if not torque_folder.is_dir() and not diameter_folder.is_dir():
+        if not recordings.is_dir():
+            raise UserError(
+                f"{recordings} is no folder; name the one that has {TORQUE_FOLDER} or {DIAMETER_FOLDER} in it"
+            )
         raise UserError(f"{recordings} has neither a folder {TORQUE_FOLDER} nor a folder {DIAMETER_FOLDER}")
     notes: list[str] = []
     torque = diameter = raw = None

@@ -130,6 +130,19 @@ def test_a_mistake_on_the_command_line_is_one_sentence(
     assert part in mistake(capsys, *arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "missing"), [([], "COMMAND"), (["chart"], "NAME, --out"), (["bank", "info"], "PATH")]
+)
+def test_what_is_left_out_is_named_in_one_sentence_too(
+    arguments: list[str], missing: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    program = " ".join(["shearloop", *arguments])
+    said = f"{program}: the following arguments are required: {missing}; see `{program} --help`\n"
+    assert (end.value.code, *capsys.readouterr()) == (2, "", said)
+
+
 def test_a_recording_for_a_configuration_without_an_emulator_is_refused(
     config: Write, capsys: pytest.CaptureFixture[str]
 ) -> None:

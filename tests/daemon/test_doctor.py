@@ -179,7 +179,12 @@ def test_a_secret_key_that_others_can_read_is_told(tmp_path: Path) -> None:
 def test_an_error_sentence_becomes_a_finding_with_its_cure() -> None:
     finding = from_sentence("bank", "a.bank: it is cut off; build it anew.", "nothing")
     assert (finding.found, finding.next_step) == ("a.bank: it is cut off", "build it anew")
-    assert from_sentence("x", "oh no", "nothing").next_step
+    finding = from_sentence("robot", "No controller at arm: refused. Look at the pendant.", "nothing")
+    assert (finding.found, finding.next_step) == ("No controller at arm: refused", "Look at the pendant")
+    for sentence in ("oh no", "c.yaml: `bnk` is not a known key, did you mean `bank`?"):
+        finding = from_sentence("x", sentence, "nothing")
+        assert finding.found == sentence
+        assert "shearloop doctor CONFIG" in finding.next_step
 
 
 def port(**changes: Any) -> Any:

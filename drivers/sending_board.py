@@ -1,22 +1,19 @@
-"""A board on a serial port that only ever sends: kept connected, and lost when it falls silent."""
+"""A board on a serial port that only ever sends: lost when it falls silent."""
 
-import time
-from collections.abc import AsyncGenerator, Callable, Sequence
-from typing import Generic, TypeVar
+from collections.abc import Callable, Sequence
 
-from drivers.errors import DeviceLostError, DriverError
-from drivers.raw_input import InputKind, RawInput, Tap, no_tap
-from drivers.serial_port import Link, Received
+from drivers.board import Board, ValueT
+from drivers.errors import DeviceLostError
+from drivers.raw_input import RawInput, Tap, no_tap
+from drivers.serial_port import Link, Port
 
 # Opening the port resets an Uno, whose boot loader waits before it starts the sketch.
 BOOT_S = 4.0
 SILENT_PERIODS = 8
 
-ValueT = TypeVar("ValueT")
 
-
-class SendingBoard(Generic[ValueT]):
-    """One board behind a link, and the parser that is told all that happens to it."""
+class SendingBoard(Board[ValueT]):
+    """One board behind a link; there is nothing to command."""
 
     def __init__(
         self,
@@ -31,50 +28,19 @@ class SendingBoard(Generic[ValueT]):
 
         `period_s` is between two lines; `silent` is the sentence for a port that has sent nothing for so many seconds.
         """
-        self._link = link
-        self._take = take
+        super().__init__(link, take, tap)
         self._silence_s = SILENT_PERIODS * period_s
-        self._silent = silent
-        self._tap = tap
-        self._patience_s = BOOT_S
+        self._says_silent = silent
+        self._has_begun = False
 
-    async def values(self) -> AsyncGenerator[ValueT]:
-        """Yield what the parser makes of every line, in order and for ever, whatever becomes of the board meanwhile.
+    async def _opened(self, _port: Port) -> None:
+        self._has_begun = False
 
-        Iterate within `contextlib.aclosing`, so that the port is closed when the iteration is left.
-        """
-        with self._link:
-            while True:
-                try:
-                    received = await self._receive()
-                except DriverError as error:
-                    await self._link.lost(error)
-                    continue
-                for value in self.tell(InputKind.DATA, received.t_arrival_ns, received.data):
-                    yield value
+    def _patience_s(self) -> float:
+        return self._silence_s if self._has_begun else BOOT_S
 
-    def tell(self, kind: InputKind, t_ns: int, data: bytes = b"") -> Sequence[ValueT]:
-        """Tell the parser, and whoever listens, what has happened."""
-        told = RawInput(kind, t_ns, data)
-        self._tap(told)
-        return self._take(told)
+    def _heard(self) -> None:
+        self._has_begun = True
 
-    async def _receive(self) -> Received:
-        port = self._link.port
-        if port is None:
-            port = await self._link.open()
-            self.tell(InputKind.OPENED, time.monotonic_ns())
-            self._patience_s = BOOT_S
-        received = await port.read(self._patience_s)
-        if received is None:
-            raise DeviceLostError(self._silent(port.path, self._patience_s))
-        self._patience_s = self._silence_s
-        return received
-
-    def facts(self) -> dict[str, bool | int | str]:
-        """Return what health tells of the connection."""
-        return {
-            "connected": self._link.port is not None,
-            "openings": self._link.openings,
-            "last_loss": self._link.last_error,
-        }
+    async def _silent(self, port: Port, waited_s: float) -> None:
+        raise DeviceLostError(self._says_silent(port.path, waited_s))

@@ -16,7 +16,12 @@
 /* How the capsules begin in which scipy hands out its BLAS with integers of 32 bits. */
 #define SGEMM "void (char *, char *, int *, int *, int *, "
 
-enum { MOST_BUFFERS = 10 + 3 * MOST_LEVELS, LEAST_CANDIDATES = 1 << 14 };
+enum {
+    MOST_BUFFERS = 10 + 3 * MOST_LEVELS,
+    LEAST_CANDIDATES = 1 << 14,
+    /* Of so few lags, products with the basis cost less than transforms. */
+    FEW_LAGS = 48
+};
 
 typedef struct {
     PyObject_HEAD
@@ -128,10 +133,13 @@ static PyObject *match_at_all_lags(PyObject *self, PyObject *args)
         Py_RETURN_NONE;
     if (!lags_that_may_reach(&hunt, known[with_runner_up].score, &first, &end))
         Py_RETURN_NONE;
-    if (!correlated(correlate, &hunt, first, end, &parts))
+    int few = end - first <= FEW_LAGS;
+    if (!few && !correlated(correlate, &hunt, first, end, &parts))
         return NULL;
-    Outcome outcome = find_at_all_lags(&hunt, parts.buf, first, end, with_runner_up, most_scores, known, &best, &other);
-    PyBuffer_Release(&parts);
+    Outcome outcome = find_at_all_lags(&hunt, few ? NULL : parts.buf, first, end, with_runner_up, most_scores, known,
+                                       &best, &other);
+    if (!few)
+        PyBuffer_Release(&parts);
     if (outcome != FOUND)
         Py_RETURN_NONE;
     return as_tuple(&best, &other);

@@ -84,20 +84,23 @@ int in_peak_of(const Bank *bank, int32_t cell, int32_t other)
         && labs((long)bank->sigma_of[cell] - bank->sigma_of[other]) <= bank->radius;
 }
 
-/* The column of bank/compression.py at a lag: the frame's first `rank` numbers, the norm of all of these but the first,
-   and what is left of the frame. */
-static void make_column(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
+/* Complete a column of bank/compression.py at a lag: after the frame's first `rank` numbers come the norm of all of these
+   but the first, and what is left of the frame. */
+static void complete_column(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
 {
-    const Bank *bank = hunt->bank;
-    const float *frame = hunt->single + CHANNELS + lag;
     double across = 0;
-    for (ptrdiff_t i = 0; i < rank; i++) {
-        column[i] = product(bank->basis + i * CHANNELS, frame, CHANNELS);
-        across += i ? (double)column[i] * column[i] : 0;
-    }
+    for (ptrdiff_t i = 1; i < rank; i++)
+        across += (double)column[i] * column[i];
     double left = hunt->energies[CHANNELS + lag] - (double)column[0] * column[0] - across;
     column[rank] = (float)sqrt(across);
-    column[rank + 1] = (float)sqrt((left > 0 ? left : 0) + bank->square_rounding);
+    column[rank + 1] = (float)sqrt((left > 0 ? left : 0) + hunt->bank->square_rounding);
+}
+
+static void project(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
+{
+    for (ptrdiff_t i = 0; i < rank; i++)
+        column[i] = product(hunt->bank->basis + i * CHANNELS, hunt->single + CHANNELS + lag, CHANNELS);
+    complete_column(hunt, lag, rank, column);
 }
 
 int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
@@ -132,7 +135,7 @@ int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
         sum += frame[i] * frame[i];
     }
     hunt->bank = bank;
-    make_column(hunt, 0, bank->coarse_rank, hunt->column);
+    project(hunt, 0, bank->coarse_rank, hunt->column);
     return 1;
 }
 
@@ -228,7 +231,7 @@ static void bound_anew(const Hunt *hunt)
             ;
         if (n <= FEW_CANDIDATES)
             continue;
-        make_column(hunt, all[i].lag, bank->fine_rank, column);
+        project(hunt, all[i].lag, bank->fine_rank, column);
         for (ptrdiff_t j = i; j < i + n; j++)
             all[j].bound = product(bank->fine + all[j].cell * (bank->fine_rank + 2), column, bank->fine_rank + 2);
     }
@@ -318,25 +321,27 @@ int lags_that_may_reach(const Hunt *hunt, double score, int *first, int *end)
     return n;
 }
 
+static void take_parts(const Hunt *hunt, int32_t lag, const float *parts, ptrdiff_t stride, float *column)
+{
+    for (ptrdiff_t i = 0; i < hunt->bank->coarse_rank; i++)
+        column[i] = parts[i * stride];
+    complete_column(hunt, lag, hunt->bank->coarse_rank, column);
+}
+
 void take_lags(Hunt *hunt, const float *parts, int first, int end)
 {
     const Bank *bank = hunt->bank;
-    ptrdiff_t rank = bank->coarse_rank;
     hunt->first = first;
     hunt->n_lags = end - first;
     for (int j = 0; j < hunt->n_lags; j++) {
-        float *column = bank->columns + j * (rank + 2);
-        double across = 0;
-        for (ptrdiff_t i = 0; i < rank; i++) {
-            column[i] = parts[i * hunt->n_lags + j];
-            across += i ? (double)column[i] * column[i] : 0;
-        }
-        double left = hunt->energies[CHANNELS + first + j] - (double)column[0] * column[0] - across;
-        column[rank] = (float)sqrt(across);
-        column[rank + 1] = (float)sqrt((left > 0 ? left : 0) + bank->square_rounding);
+        float *column = bank->columns + j * (bank->coarse_rank + 2);
+        if (parts)
+            take_parts(hunt, first + j, parts + j, hunt->n_lags, column);
+        else
+            project(hunt, first + j, bank->coarse_rank, column);
     }
     /* bounds = rows columns; BLAS takes a matrix by columns, and so all of them for transposed. */
-    int size = (int)rank + 2, n_groups = (int)bank->levels[0].n;
+    int size = (int)bank->coarse_rank + 2, n_groups = (int)bank->levels[0].n;
     float one = 1, none = 0;
     bank->multiply("T", "N", &hunt->n_lags, &n_groups, &size, &one, bank->columns, &size, bank->levels[0].rows, &size,
                    &none, bank->bounds, &hunt->n_lags);

@@ -102,7 +102,8 @@ Outcome find_at_lag_0(Hunt *hunt, int32_t apart_from, long most_scores, Found *f
 /* The lags, from `first` up to before `end`, at which any cell may have a score; 0 where there is none. */
 int lags_that_may_reach(const Hunt *hunt, double score, int *first, int *end);
 
-/* Look at the lags from `first` up to before `end`, at which `parts` (coarse_rank, end - first) are the frame's numbers. */
+/* Look at the lags from `first` up to before `end`, at which `parts` (coarse_rank, end - first) are the frame's numbers;
+   NULL: compute them here. */
 void take_lags(Hunt *hunt, const float *parts, int first, int end);
 
 /* Leave out the lags at which no cell has a score; the number of the lag of the highest bound, -1 if none is left. */

@@ -4,7 +4,7 @@ This is the paper's way (Trehan et al. 2025, section 2): the difference to the h
 the bank, and the best cell's sigma and k become torque and diameter through the calibration.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, TypeAlias
 
@@ -208,8 +208,15 @@ class Estimator:
     def _read(self, found: "_Difference", match: Match) -> Reading:
         self._latest = latest = found.latest
         middle_ns = sum(each.t_mid_ns for each in latest) // len(latest)
-        lag_ns = latest[-1].t_mid_ns - middle_ns
-        return replace(self._calibrated(match), difference=found.difference, lag_ns=lag_ns)
+        torque_nm, diameter_mm, why = self._calibrated(match)
+        return Reading(
+            match=match,
+            torque_nm=torque_nm,
+            diameter_mm=diameter_mm,
+            why=why,
+            lag_ns=latest[-1].t_mid_ns - middle_ns,
+            difference=found.difference,
+        )
 
     def heatmap(self, reading: Reading) -> FloatArray | None:
         """Return the (K, S) scores of what a reading was made from, None where nothing was matched.
@@ -220,26 +227,26 @@ class Estimator:
             return reading.heatmap
         return self._matcher.heatmap(reading.difference)
 
-    def _calibrated(self, match: Match) -> Reading:
+    def _calibrated(self, match: Match) -> tuple[Interval | None, Interval | None, tuple[str, ...]]:
+        """Return torque and diameter of a match, or what speaks against them."""
         calibration = self._calibration
         if calibration is None:
-            return Reading(match, why=("no calibration is configured: k and sigma have no torque",))
+            return None, None, ("no calibration is configured: k and sigma have no torque",)
         if calibration.torque_fit is None:
-            return Reading(match, why=("the calibration was made without torques: sigma has no torque",))
+            return None, None, ("the calibration was made without torques: sigma has no torque",)
         why = calibration.out_of_range(match.k, match.sigma)
         if why:
-            return Reading(match, why=why)
+            return None, None, why
         diameter = None if calibration.diameter_fit is None else calibration.diameter(match.k)
-        return Reading(match, torque_nm=calibration.torque(match.sigma), diameter_mm=diameter)
+        return calibration.torque(match.sigma), diameter, ()
 
 
 def _unusable(frame: Frame) -> tuple[str, ...]:
     if frame.repeated:
         return ("the board sent the same frame again",)
-    unusable = int(np.count_nonzero(frame.saturated | frame.dead))
-    if unusable > LARGEST_UNUSABLE_SHARE * frame.channels.size:
+    if frame.unusable > LARGEST_UNUSABLE_SHARE * frame.channels.size:
         return (
-            f"{unusable} of {frame.channels.size} channels are saturated or dead; "
+            f"{frame.unusable} of {frame.channels.size} channels are saturated or dead; "
             "look at the ribbon cable and the gel's contact with the electrodes",
         )
     return ()

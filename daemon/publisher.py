@@ -56,15 +56,16 @@ class Publisher:
         stream = (message.topic, message.source)
         number = self._numbers[stream]
         self._numbers[stream] = number + 1
-        if self._listeners or self.wanted(message.topic):
+        if self._listeners or self._goes_out(message.topic):
             self.forward(message.topic, wire_map(message, self._clock.unix_s(message.t_mono_ns), number))
 
     def forward(self, topic: str, content: dict[str, Any]) -> None:
         """Send a message's map as it is, stamped and numbered already."""
         # Most topics are listened to by nobody most of the time, and what goes nowhere needs no bytes.
-        if self.wanted(topic):
+        if self._goes_out(topic):
             self._socket.send(topic.encode(), zmq.NOBLOCK | zmq.SNDMORE)
             self._socket.send(encode(content), zmq.NOBLOCK)
+            self._hear_subscribers()
         for listener in self._listeners:
             listener(topic, content)
 
@@ -76,6 +77,10 @@ class Publisher:
             wanted = any(topic.encode().startswith(beginning) for beginning in self._subscribed)
             self._wanted[topic] = wanted
         return wanted
+
+    def _goes_out(self, topic: str) -> bool:
+        # What was wanted is sent before it is asked whether it still is: one message to nobody does no harm.
+        return self._wanted.get(topic) or self.wanted(topic)
 
     @property
     def subscribed(self) -> bool:

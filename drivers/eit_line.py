@@ -38,8 +38,8 @@ class Frame:
     `channels` (896,) and `raw` (1024,) are in volts and line order; `line` is the line as it came, without its end.
     `t_mid_ns` is the middle of the acquisition and `t_arrival_ns` when the last byte was read, on the monotonic clock.
     `seq` counts frames from 0, over reconnections too. `saturated` (896,): the signal exceeds what the ADC can follow;
-    `dead` (896,): unchanged for so many frames that nothing can be connected; `repeated`: the same line as the frame
-    before, which noise rules out, so no new measurement.
+    `dead` (896,): unchanged for so many frames that nothing can be connected; `unusable`: how many are one or both;
+    `repeated`: the same line as the frame before, which noise rules out, so no new measurement.
     """
 
     channels: NDArray[np.float64]
@@ -50,6 +50,7 @@ class Frame:
     seq: int
     saturated: NDArray[np.bool_]
     dead: NDArray[np.bool_]
+    unusable: int
     repeated: bool
 
 
@@ -180,6 +181,10 @@ class LineParser:
         saturates = look(channels, self._last_channels, self._changed_in, self._fresh, self._full_scale_v)
         self._last_line, self._last_channels = line, channels
         t_mid_ns = sent_ns - self._transfer_ns - self.clock.period_ns // 2
+        # Every call of numpy that is spared is: most frames have no such channel.
+        saturated = channels > self._full_scale_v if saturates else self._no_channels
+        dead = self._dead()
+        flawless = not saturates and dead is self._no_channels
         # Where another period has just been learned, time still goes forward.
         self._last_mid_ns = t_mid_ns if self._last_mid_ns is None else max(t_mid_ns, self._last_mid_ns + 1)
         frame = Frame(
@@ -189,8 +194,9 @@ class LineParser:
             t_mid_ns=self._last_mid_ns,
             t_arrival_ns=t_arrival_ns,
             seq=self.frames,
-            saturated=channels > self._full_scale_v if saturates else self._no_channels,
-            dead=self._dead(),
+            saturated=saturated,
+            dead=dead,
+            unusable=0 if flawless else int(np.count_nonzero(saturated | dead)),
             repeated=repeated,
         )
         for array in (frame.channels, frame.raw, frame.saturated, frame.dead):

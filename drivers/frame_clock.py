@@ -14,7 +14,7 @@ from statistics import median
 
 # Frames from which the period is learned: at 0.54 s the last 35 s, in which a crystal drifts by microseconds.
 PERIOD_WINDOW = 64
-# The hull is computed anew at every so many frames only: it is most of the cost, and the period hardly moves.
+# The period is learned anew at every so many frames only: that is most of the cost, and it hardly moves.
 LEARN_EVERY = 4
 # Frames whose earliest fixes the phase: short, so that a board that paused for a moment is followed within 6 s.
 PHASE_WINDOW = 12
@@ -90,14 +90,15 @@ class FrameClock:
         return self._straight_ns
 
     def _learn(self, number: int) -> None:
-        if len(self._spacings) < LEARN_FROM:
+        due = number % LEARN_EVERY == 0
+        if len(self._spacings) < LEARN_FROM or (self._learned and not due):
             return
         spacing = median(self._spacings)
         if spacing <= 0:
             return
         if abs(self._period_ns - spacing) > PLAUSIBLE * spacing:
             self._period_ns, self._learned = spacing, True
-        if len(self._seen) >= LEARN_FROM and number % LEARN_EVERY == 0:
+        if due and len(self._seen) >= LEARN_FROM:
             slope = slope_below(self._seen)
             if abs(slope - spacing) <= PLAUSIBLE * spacing:
                 self._period_ns, self._learned = slope, True

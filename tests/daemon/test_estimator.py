@@ -52,6 +52,7 @@ def frame(number: int, channels: NDArray[np.float64], **flags: NDArray[np.bool_]
         t_mid_ns=number * 541_000_000,
         t_arrival_ns=number * 541_000_000 + 270_000_000,
         seq=number,
+        unusable=int(np.count_nonzero(given["saturated"] | given["dead"])),
         **given,  # type: ignore[arg-type]
     )
 

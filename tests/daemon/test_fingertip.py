@@ -39,7 +39,7 @@ class Told:
 def frame(number: int) -> Frame:
     values = np.full(896, 0.1)
     none = np.zeros(896, dtype=np.bool_)
-    return Frame(values, np.zeros(1024), b"", number, number, number, none, none, False)
+    return Frame(values, np.zeros(1024), b"", number, number, number, none, none, 0, False)
 
 
 class Board:

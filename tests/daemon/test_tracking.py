@@ -44,7 +44,7 @@ def frame(
     t_ns = round(number * PERIOD_S * 1e9)
     return Frame(
         channels=channels, raw=np.zeros(1024), line=b"", t_mid_ns=t_ns, t_arrival_ns=t_ns + 270_000_000, seq=number,
-        saturated=NO_CHANNEL, dead=dead, repeated=repeated,
+        saturated=NO_CHANNEL, dead=dead, unusable=int(dead.sum()), repeated=repeated,
     )  # fmt: skip
 
 

@@ -301,13 +301,16 @@ def test_a_channel_above_the_largest_sine_the_adc_follows_is_saturated() -> None
     line[LINE_SLOTS[[3, 7]]] = [FULL_SCALE_SINE_RMS_V + ADC_STEP_V, FULL_SCALE_SINE_RMS_V - ADC_STEP_V]
     (frame,) = flagged([line])
     assert np.flatnonzero(frame.saturated).tolist() == [3]
+    assert frame.unusable == 1
 
 
 def test_a_channel_that_has_not_changed_for_n_frames_is_dead_until_it_changes() -> None:
     lines = noisy(8)
     for line in lines[:6]:
         line[LINE_SLOTS[10]] = 0.5
-    dead = [frame.dead[10] for frame in flagged(lines, dead_after=4)]
+    frames = flagged(lines, dead_after=4)
+    dead = [frame.dead[10] for frame in frames]
+    assert [frame.unusable for frame in frames] == dead
     assert dead == [False, False, False, True, True, True, False, False]
 
 

@@ -119,7 +119,7 @@ def test_what_is_no_line_is_taken_by_neither_reader(line: bytes) -> None:
     read_either_way(line)
 
 
-@pytest.mark.parametrize("look", {eit_line._look_by_numpy, eit_line.look})
+@pytest.mark.parametrize("look", [eit_line._look_by_numpy, eit_line.look])
 def test_a_look_at_the_channels_notes_which_changed_and_sees_the_largest(look) -> None:
     before, now = np.array([np.nan, 0.1, 0.2, 0.3]), np.array([0.1, 0.1, 0.2, 0.4])
     changed_in = np.array([1, 2, 3, 4])

@@ -31,6 +31,7 @@ def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw where that is asked for."""
     from bank.bank_file import Bank
     from bank.estimators import Calibration
+    from bank.estimators.alignment import doubt
     from daemon.cli.recorded import check_kind, parsed_part
     from daemon.errors import UserError
     from daemon.recording.evaluation import followed, judge, reasons
@@ -40,13 +41,16 @@ def run(args: argparse.Namespace) -> int:
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
     start, stop = parsed_part(args.part)
-    series = [one for path in args.recordings for one in read_series(path)]
-    check_kind(args.calibration, calibration, series)
-    parts = [part_of(one, start, stop) for one in series]
+    named = [(path, one) for path in args.recordings for one in read_series(path)]
+    check_kind(args.calibration, calibration, [one for _, one in named])
+    parts = [part_of(one, start, stop) for _, one in named]
     shared = (calibration, None if bank is None else str(args.bank.resolve()))
     with workers(args.cluster) as pool:
         tracks = in_order(pool.map(followed, shared, parts))
     figures = judge(tracks)
+    for (path, _), part in zip(named, parts, strict=True):
+        if why := doubt(part):
+            print(f"Doubtful is {path.name}: {why}.", file=sys.stderr)
     if args.plot or args.out:
         out = args.out or args.calibration.with_suffix(".png")
         try:

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     """Fit, write, and say what was fitted."""
     from bank.bank_file import Bank
     from bank.estimators import Physics, fit
-    from bank.estimators.alignment import alignment
+    from bank.estimators.alignment import alignment, doubt
     from bank.mesh import load_mesh
     from daemon.cli.recorded import parsed_part, parsed_sides
     from daemon.errors import UserError
@@ -58,8 +58,9 @@ def run(args: argparse.Namespace) -> int:
     tool_mm = args.tool_mm
     if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
         raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
-    series = [one for path in args.recordings for one in read_series(path, parsed_sides(args.sides), tool_mm)]
-    parts = [part_of(one, start, stop) for one in series]
+    sides = parsed_sides(args.sides)
+    series = [(path.name, one) for path in args.recordings for one in read_series(path, sides, tool_mm)]
+    parts = [part_of(one, start, stop) for _, one in series]
     if late_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]
     physics = Physics(
@@ -88,6 +89,9 @@ def run(args: argparse.Namespace) -> int:
         told["load_late_s"] = [found and round(found.late_s, 3) for found in map(alignment, parts)]
         known = ", ".join(f"{each:.2f}" for each in told["load_late_s"] if each is not None)
         sentences += [f"The load is stamped {known} s after the frames move."] if known else []
+        doubts = [f"{name}: {why}" for (name, _), one in zip(series, parts, strict=True) if (why := doubt(one))]
+        told["load_doubts"] = doubts
+        sentences += [f"Doubtful is {why}." for why in doubts]
     if calibration.kind == "raw":
         known_mm = None if isnan(calibration.tool_mm) else calibration.tool_mm
         told["tool_mm"] = known_mm

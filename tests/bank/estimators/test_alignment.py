@@ -9,7 +9,8 @@ import pytest
 from bank.errors import CalibrationError
 from bank.estimators import alignment as alignments
 from bank.estimators import fit
-from bank.estimators.alignment import Alignment, alignment, check_alignment, is_filtered
+from bank.estimators.alignment import Alignment, alignment, check_alignment, doubt, is_filtered
+from bank.estimators.gripped import gripped_part
 
 
 @pytest.mark.parametrize("late_s", [-2.0, -0.5, 0.0, 0.3, 1.0, 4.0])
@@ -86,3 +87,18 @@ def test_a_knocked_frame_does_not_hide_the_rest(recorded):
     found = alignment(replace(recorded, channels=knocked))
     assert found is not None
     assert abs(found.late_s) < 0.2
+
+
+def test_what_would_be_refused_is_doubted_and_so_is_a_clear_peak_of_few_frames(recorded, monkeypatch):
+    assert doubt(recorded) == ""
+    assert doubt(replace(recorded, torque_nm=0.0 * recorded.torque_nm)) == ""
+    late = replace(recorded, torque_t_s=recorded.torque_t_s + 0.8)
+    assert "s before the load that moves them is stamped" in doubt(late)
+    assert "too few" not in doubt(late)
+    gripped = len(recorded.t_s[gripped_part(recorded)[1]])
+    monkeypatch.setattr(alignments, "_SURE_FRAMES", gripped + 1)
+    assert alignment(late) is None
+    check_alignment([late])
+    assert f"though {gripped} gripped frames are too few to be sure" in doubt(late)
+    monkeypatch.setattr(alignments, "_SUSPECT_EXPLAINED", 1.0)
+    assert doubt(late) == "", "a peak that is less high may be chance"

@@ -5,6 +5,7 @@ and the reason stands in docs/decisions/0042-default-estimator.md.
 """
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 from bank.errors import CalibrationError
 from bank.estimators import Calibration, FrameSeries, fit
-from bank.estimators.alignment import alignment, is_filtered
+from bank.estimators.alignment import alignment, doubt, is_filtered
 from bank.estimators.familiar import DifferenceGuard
 from daemon.cli import main
 from daemon.recording.evaluation import follow, judge
@@ -178,6 +179,30 @@ def test_calibrate_says_how_late_the_load_is_unless_somebody_vouches_for_it(twis
 def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(shared, tmp_path, name):
     import_mat([shared / "recordings/streams" / name], tmp_path / "other.mcap")
     assert alignment(series_of(read_recording(tmp_path / "other.mcap"))) is None
+
+
+def test_a_load_that_seems_stamped_early_is_told_and_not_refused(shared, twists_file, tmp_path, capsys):
+    """Fifty-seven gripped frames show it clearly, and are too few to refuse the recording for."""
+    other, calibration = tmp_path / "other.mcap", str(tmp_path / "a.cal")
+    import_mat([shared / "recordings/streams/20241202_153632"], other)
+    assert main(["calibrate", str(other), "--estimator", "regression", "--out", calibration]) == 0
+    told = capsys.readouterr().out
+    assert re.search(
+        r"Doubtful is other\.mcap: the frames move 2\.67 ± 0\.\d+ s after the load that moves them is", told
+    )
+    assert "though 57 gripped frames are too few to be sure" in told
+    assert main(["evaluate", calibration, str(other), str(twists_file)]) == 0
+    assert re.findall(r"Doubtful is (\S+):", capsys.readouterr().err) == ["other.mcap"]
+
+
+def test_no_good_recording_is_doubted(shared, twists_file, tmp_path):
+    streams = shared / "recordings/streams"
+    cylinders = [[streams / "cylinders" / f"{mm}mm_1_{of}.mat" for of in ("right", "truth")] for mm in (10, 20, 30, 40)]
+    paths = [twists_file]
+    for n, sources in enumerate([[streams / "glitch_20241202_173837"], *cylinders]):
+        paths.append(tmp_path / f"{n}.mcap")
+        import_mat(sources, paths[-1])
+    assert [doubt(series_of(read_recording(path))) for path in paths] == [""] * 6
 
 
 @pytest.mark.parametrize("n", [19, 24, 29, 34, 39, 44])

@@ -183,16 +183,8 @@ class Daemon:
     async def run(self) -> None:
         """Run until `stop` is called, then end every task and close the sockets."""
         try:
-            async with asyncio.TaskGroup() as group:
-                running = [group.create_task(task, name=name) for name, task in self._tasks()]
-                structlog.get_logger().info("running", fingertips=list(self._fingertips))
-                sd_notify.notify("READY=1")
-                await self._stop.wait()
-                sd_notify.notify("STOPPING=1")
-                if self._rig is not None:
-                    await self._rig.loop.released()
-                for task in running:
-                    task.cancel()
+            with self.publisher.told():
+                await self._run_tasks()
             if self._experiment is not None:
                 self._experiment.end()
         finally:
@@ -205,6 +197,18 @@ class Daemon:
                 self._close()
                 self._tell_of_recordings()
         structlog.get_logger().info("stopped")
+
+    async def _run_tasks(self) -> None:
+        async with asyncio.TaskGroup() as group:
+            running = [group.create_task(task, name=name) for name, task in self._tasks()]
+            structlog.get_logger().info("running", fingertips=list(self._fingertips))
+            sd_notify.notify("READY=1")
+            await self._stop.wait()
+            sd_notify.notify("STOPPING=1")
+            if self._rig is not None:
+                await self._rig.loop.released()
+            for task in running:
+                task.cancel()
 
     def stop(self) -> None:
         """End `run` as soon as the tasks have ended."""

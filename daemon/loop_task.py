@@ -28,6 +28,8 @@ LONGEST_TICK_S = 0.02
 PUBLISH_EVERY = 5
 # While nothing can move no other state is needed; without one the brain is asked no less often than this.
 LONGEST_REST_S = PUBLISH_EVERY * LONGEST_TICK_S
+# As long as states come, they are published then, and decided upon no more often than this: it is for who looks on.
+SHORTEST_REST_S = 0.5 * LONGEST_REST_S
 # Then too states come twice within the time after which the arm's is stale.
 LONGEST_EASE_S = 0.5 * ARM_STALE_S
 # Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
@@ -114,15 +116,17 @@ class LoopTask:
     def _decide(self, state: RobotState | None = None) -> None:
         """Ask the brain, with a new state or because none has come for too long; what goes wrong ends `drive`."""
         now_ns = self._clock.now_ns()
-        # From one decision to the next: what a decision itself takes is late as well.
-        self._brain.senses.late_s = max(0.0, (now_ns - self._decided_ns) / 1e9 - self._longest_s)
-        self._decided_ns = now_ns
+        passed_s = (now_ns - self._decided_ns) / 1e9
         try:
-            self._brain.senses.died = self._deaths()
             if state is not None:
                 self._sense(state)
-            self._carry_out(self._brain.tick(now_ns))
-            self._tell(now_ns)
+            if passed_s >= SHORTEST_REST_S or state is None or not self._at_rest():
+                # From one decision to the next: what a decision itself takes is late as well.
+                self._brain.senses.late_s = max(0.0, passed_s - self._longest_s)
+                self._decided_ns = now_ns
+                self._brain.senses.died = self._deaths()
+                self._carry_out(self._brain.tick(now_ns))
+                self._tell(now_ns)
             self._listen()
         except Exception as error:  # noqa: BLE001 - raised again by `drive`, whose task it ends
             if self._action is not self._release:
@@ -215,7 +219,7 @@ class LoopTask:
 
         While no experiment runs and the arm was told to stop, and does rest, the states that are published will do.
         """
-        if not self._stopped or self._running():
+        if not self._at_rest():
             self._robot.hurry()
             return LONGEST_TICK_S
         state = self._robot.state
@@ -227,6 +231,10 @@ class LoopTask:
             # a gentle stop becomes a hard one.
             self._robot.hurry()
         return LONGEST_REST_S
+
+    def _at_rest(self) -> bool:
+        """Whether no experiment runs and the arm was told to stop."""
+        return self._stopped and not self._running()
 
     def _running(self) -> bool:
         experiment = self._brain.experiment

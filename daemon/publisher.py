@@ -1,10 +1,12 @@
 """Sends messages over ZeroMQ and hands them to whoever else listens in the process."""
 
+import asyncio
 import os
 import socket as sockets
 import stat
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeAlias
 
 import zmq
@@ -40,6 +42,9 @@ class Publisher:
         # Beginnings of topics that are subscribed to at present, and what that means for each topic asked about since.
         self._subscribed: set[bytes] = set()
         self._wanted: dict[str, bool] = {}
+        # The loop that tells of subscribers, and whether there may be news of them; without a loop, always.
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._told = False
         # To subscribers an XPUB is a PUB; to us it tells their subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
@@ -65,9 +70,23 @@ class Publisher:
         if self._goes_out(topic):
             self._socket.send(topic.encode(), zmq.NOBLOCK | zmq.SNDMORE)
             self._socket.send(encode(content), zmq.NOBLOCK)
+            # Whoever sends may have been told of subscribers by the way.
+            self._told = True
             self._hear_subscribers()
         for listener in self._listeners:
             listener(topic, content)
+
+    @contextmanager
+    def told(self) -> Iterator[None]:
+        """Have the running event loop tell of subscribers, so that they are not looked for at every message."""
+        self._loop, self._told = asyncio.get_running_loop(), True
+        descriptor = self._descriptor
+        self._loop.add_reader(descriptor, self._there_is_news)
+        try:
+            yield
+        finally:
+            self._loop.remove_reader(descriptor)
+            self._loop = None
 
     def wanted(self, topic: str) -> bool:
         """Return whether any subscriber asks for this topic: what is dear to compute waits for that."""
@@ -92,10 +111,25 @@ class Publisher:
         """Close the socket; what is not yet sent is dropped."""
         self._socket.close()
 
+    @property
+    def _descriptor(self) -> int:
+        return int(self._socket.getsockopt(zmq.FD))
+
+    def _there_is_news(self) -> None:
+        if self._loop is not None:
+            # It stays readable until the news is heard, which the next message does.
+            self._loop.remove_reader(self._descriptor)
+            self._told = True
+
     def _hear_subscribers(self) -> None:
+        if self._loop is not None and not self._told:
+            return
         for _ in range(SUBSCRIPTIONS_AT_ONCE):
-            # Asked at every message: a poller would have to be made for each.
+            # A poller would have to be made for each look.
             if not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+                if self._loop is not None:
+                    self._told = False
+                    self._loop.add_reader(self._descriptor, self._there_is_news)
                 return
             self._wanted.clear()
             message = self._socket.recv(zmq.NOBLOCK)

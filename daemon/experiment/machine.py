@@ -101,7 +101,7 @@ class Experiment:
             return replace(self._wish, wrist=Still())
         self._elapsed_s += passed_s
         try:
-            self._wish = replace(self._programme.send(view), number=self._index)
+            self._wish = self._numbered(self._programme.send(view))
         except StopIteration:
             self._begin_next()
         except StepFailedError as failure:
@@ -139,13 +139,17 @@ class Experiment:
             overdue=self.overdue,
         )
 
+    def _numbered(self, wish: Wish) -> Wish:
+        # In every cycle of the robot: `replace` would look the fields up each time.
+        return Wish(wish.wrist, wish.action, wish.doing, self._index, wish.hold)
+
     def _begin_next(self) -> None:
         while self._index + 1 < len(self.file.steps):
             self._index += 1
             self._step_began_s = self._elapsed_s
             self._programme = programme_of(self.step, lambda: self._elapsed_s)
             try:
-                self._wish = replace(next(self._programme), number=self._index)
+                self._wish = self._numbered(next(self._programme))
             except StopIteration:  # nothing to do, such as a wait of 0 s
                 continue
             return

@@ -13,15 +13,21 @@ from drivers.raw_input import InputKind, RawInput
 # Of arrays, which are float32 on the wire: a microvolt, a microradian.
 _DECIMALS = 6
 _SHAPE = "_shape"
+# Made once: `json.dumps` makes one for each text that is not written in its own style.
+_ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 
 
 def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
     """Return a message's map, as it goes on the wire, as JSON: arrays as flat lists, without what has no value."""
     plain: dict[str, Any] = {}
     for key, value in content.items():
-        if f"{key}{_SHAPE}" in content:
+        if isinstance(value, float):
+            if math.isfinite(value):
+                plain[key] = value
+        elif isinstance(value, bytes):
+            # Nothing else on the wire is bytes.
             plain[key] = _numbers(np.frombuffer(value, "<f4"))
-        elif not (key.endswith(_SHAPE) or value is None or (isinstance(value, float) and not math.isfinite(value))):
+        elif value is not None and not key.endswith(_SHAPE):
             plain[key] = value
     if topic == EitFrame.topic:
         plain["arrival_unix_ns"] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns
@@ -41,9 +47,9 @@ def input_of(content: Mapping[str, Any]) -> RawInput:
 def as_json(content: Mapping[str, Any]) -> bytes:
     """Return compact JSON of what has a JSON form, with null for the numbers that have none."""
     try:
-        text = json.dumps(content, separators=(",", ":"), allow_nan=False)
+        text = _ENCODER.encode(content)
     except ValueError:
-        text = json.dumps(_finite(content), separators=(",", ":"), allow_nan=False)
+        text = _ENCODER.encode(_finite(content))
     return text.encode()
 
 

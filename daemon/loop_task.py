@@ -22,8 +22,10 @@ from drivers.ur.client import UrRobot, unheard
 from drivers.ur.messages import Enable, Reply, RobotState, Stop, Unlock, WristSpeed
 
 WRENCH = "wrench"
-# The brain is asked at each state of the robot while an experiment runs, and no less often than this without a state.
+# The brain is asked at each state of the robot while an experiment runs, and is late where that takes longer than this.
 LONGEST_TICK_S = 0.02
+# Without a state it is asked after so long: half of the time after which the arm's is stale.
+LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
 # Of every fifth of the robot's cycles the state is published, and speaks as the torque of the wrench: 25 a second.
 PUBLISH_EVERY = 5
 # While nothing can move no other state is needed; without one the brain is asked no less often than this.
@@ -139,7 +141,7 @@ class LoopTask:
     def _listen(self) -> None:
         """Agree with the robot on how often a state is needed, and decide without one where none comes in time."""
         self._longest_s = self._pace()
-        self._silence.heard(self._longest_s)
+        self._silence.heard(max(self._longest_s, LONGEST_SILENCE_S))
 
     def _listen_no_more(self) -> None:
         self._robot.on_state = unheard

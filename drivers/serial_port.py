@@ -24,6 +24,8 @@ DEFAULT_BAUD = 115_200
 # this much the other tasks have their turn, and the rest waits in the kernel.
 READ_BYTES = 65_536
 READS_AT_ONCE = 8
+# A read that gives less than the kernel hands over at once gave all that there was.
+SHORT_READ_BYTES = 4_000
 # Commands to these devices are a few bytes long; a larger write is a mistake of ours.
 LONGEST_WRITE_BYTES = 4_096
 WRITE_TIMEOUT_S = 1.0
@@ -81,6 +83,9 @@ class SerialPort:
             raise _cannot_open(path, error) from error
         self._descriptor: int = self._serial.fileno()
         self._read: Received | DeviceLostError | None = None
+        # The loop that tells when something has come, while it does, and what ends the wait for it.
+        self._listening: asyncio.AbstractEventLoop | None = None
+        self._over: asyncio.Future[None] | None = None
 
     def __enter__(self) -> Self:
         """Return the port itself, open."""
@@ -94,6 +99,7 @@ class SerialPort:
 
     def close(self) -> None:
         """Give the port back; it may be gone already."""
+        self._listen_no_more()
         with contextlib.suppress(OSError):
             self._serial.close()
 
@@ -116,25 +122,35 @@ class SerialPort:
     async def _readable(self, timeout_s: float) -> None:
         """Wait until something was read, but no longer; a future and a timer, for every frame comes this way."""
         loop = asyncio.get_running_loop()
-        over: asyncio.Future[None] = loop.create_future()
-
-        def read() -> None:
-            # Here rather than in the task, which runs later: the arrival is stamped as early as can be.
-            loop.remove_reader(self._descriptor)
-            self._drain()
-            end()
-
-        def end() -> None:
-            if not over.done():
-                over.set_result(None)
-
-        timer = loop.call_later(timeout_s, end)
-        loop.add_reader(self._descriptor, read)
+        if self._listening is not loop:
+            self._listen_no_more()
+            loop.add_reader(self._descriptor, self._arrived)
+            self._listening = loop
+        self._over = loop.create_future()
+        timer = loop.call_later(timeout_s, self._end)
         try:
-            await over
+            await self._over
         finally:
             timer.cancel()
-            loop.remove_reader(self._descriptor)
+            self._over = None
+
+    def _arrived(self) -> None:
+        if self._over is None or self._over.done():
+            # Nobody waits for it, and it is not read before: it stays in the kernel, and the loop is not told again.
+            self._listen_no_more()
+            return
+        # Here rather than in the task, which runs later: the arrival is stamped as early as can be.
+        self._drain()
+        self._end()
+
+    def _end(self) -> None:
+        if self._over is not None and not self._over.done():
+            self._over.set_result(None)
+
+    def _listen_no_more(self) -> None:
+        if self._listening is not None and not self._listening.is_closed():
+            self._listening.remove_reader(self._descriptor)
+        self._listening = None
 
     def _drain(self) -> None:
         parts: list[bytes] = []
@@ -151,6 +167,8 @@ class SerialPort:
                 lost = self._lost("hung up")
                 break
             parts.append(part)
+            if len(part) < SHORT_READ_BYTES:
+                break
         # What came before a hang-up is given first; the next read meets the hang-up again.
         self._read = Received(b"".join(parts), time.monotonic_ns()) if parts else lost
 

@@ -109,6 +109,22 @@ async def test_silence_is_no_loss_and_a_cancelled_read_loses_nothing() -> None:
         assert rest.data == b"kept"
 
 
+async def test_while_nobody_reads_the_loop_is_told_once_and_nothing_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = []
+    arrived = SerialPort._arrived
+    monkeypatch.setattr(SerialPort, "_arrived", lambda port: (told.append(port), arrived(port)))
+    with Peer() as peer, SerialPort(peer.path) as port:
+        await peer.write(b"first")
+        assert await read_exactly(port, 5) == b"first"
+        told.clear()
+        await peer.write(b"and the rest")
+        # Events come before tasks: after so many turns of the loop it would have been told again and again.
+        for _ in range(50):
+            await asyncio.sleep(0)
+        assert len(told) <= 1
+        assert await read_exactly(port, 12) == b"and the rest"
+
+
 async def test_what_came_before_the_port_went_is_read_and_then_the_loss_is_told() -> None:
     with Peer() as peer, SerialPort(peer.path) as port:
         reading = asyncio.create_task(port.read(DEADLINE_S))

@@ -26,7 +26,7 @@ _LEAST_MARGIN_K_CM = 0.05
 
 
 # A tool whose diameter is further off than this share is another one.
-_LARGEST_TOOL_SHARE = 0.15
+LARGEST_TOOL_SHARE = 0.15
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,7 +171,7 @@ class Tracker:
         """
         own_mm = self.calibration.tool_mm
         self._other_tool: tuple[str, ...] = ()
-        if tool is not None and abs(tool.value - own_mm) > _LARGEST_TOOL_SHARE * own_mm + tool.half_width:
+        if tool is not None and abs(tool.value - own_mm) > LARGEST_TOOL_SHARE * own_mm + tool.half_width:
             self._other_tool = (
                 f"the tool is of {tool.value:.3g} mm and the calibration of one of {own_mm:g} mm, and its torque does "
                 "not carry over; calibrate on this tool",

@@ -4,12 +4,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bank.estimators import Measured
+from bank.estimators.calibrated import LARGEST_TOOL_SHARE
 from daemon.errors import UserError
 from daemon.recording.reader import Recording
 from daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM
 
-# A diameter that is further off than this share, and than its measurement may be, is another tool's.
-_ANOTHER_TOOL = 0.15
 # A grip that met something on its way, or was taken anew, is no other tool: so much of the time may be of one.
 _MOMENTARY = 0.05
 
@@ -68,4 +67,4 @@ def _felt_mm(recording: Recording, t_ns: NDArray[np.int64]) -> list[Measured]:
 
 
 def _is_another(diameter_mm: float, tool: Measured) -> bool:
-    return abs(diameter_mm - tool.value) > _ANOTHER_TOOL * tool.value + tool.half_width
+    return abs(diameter_mm - tool.value) > LARGEST_TOOL_SHARE * tool.value + tool.half_width

@@ -19,8 +19,8 @@
 enum {
     MOST_BUFFERS = 10 + 3 * MOST_LEVELS,
     LEAST_CANDIDATES = 1 << 14,
-    /* Of so few lags, products with the basis cost less than transforms. */
-    FEW_LAGS = 48
+    /* Of so few lags, products with the basis cost less than transforms by numpy, when these come cold. */
+    FEW_LAGS = 128
 };
 
 typedef struct {

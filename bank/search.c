@@ -44,6 +44,17 @@ static float product(const float *a, const float *b, ptrdiff_t n)
     return (even[0] + even[2]) + (even[1] + even[3]) + rest;
 }
 
+/* The same for channels: with four sums at once, for a sum waits for the one before. */
+static float over_channels(const float *a, const float *b)
+{
+    Four sums[4] = {{0}};
+    for (int i = 0; i < CHANNELS; i += 16)
+        for (int j = 0; j < 4; j++)
+            sums[j] += four(a + i + 4 * j) * four(b + i + 4 * j);
+    Four sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
+    return (sum[0] + sum[2]) + (sum[1] + sum[3]);
+}
+
 static double score_of(const Hunt *hunt, int32_t cell, int32_t lag)
 {
     const Bank *bank = hunt->bank;
@@ -99,7 +110,7 @@ static void complete_column(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float
 static void project(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
 {
     for (ptrdiff_t i = 0; i < rank; i++)
-        column[i] = product(hunt->bank->basis + i * CHANNELS, hunt->single + CHANNELS + lag, CHANNELS);
+        column[i] = over_channels(hunt->bank->basis + i * CHANNELS, hunt->single + CHANNELS + lag);
     complete_column(hunt, lag, rank, column);
 }
 

@@ -19,7 +19,8 @@ ZERO_SAMPLES = 22
 # So many conversions a reading is of, the last of them its own: an HX711 settles within four (data sheet, "Output
 # settling time": 400 ms at 10 a second, 50 ms at 80).
 SETTLING_PERIODS = 4
-# A zero takes two seconds; what keeps it for longer than this does not go away by waiting.
+# A zero takes two seconds; what keeps it for longer than this does not go away by waiting. Of a board that is slower it
+# takes longer: then it is twice the time that the readings need.
 ZERO_DEADLINE_S = 15.0
 
 
@@ -30,6 +31,7 @@ class LoadCellTask:
         self, board: LoadCell, publisher: Publisher, clock: Clock, hear: Callable[[Torque], None], rate_hz: float
     ) -> None:
         self.source = Source(name=LOAD_CELL, period_s=1.0 / rate_hz)
+        self._zero_within_s = max(ZERO_DEADLINE_S, 2.0 * (ZERO_SAMPLES + SETTLING_PERIODS) / rate_hz)
         self._board = board
         self._publisher = publisher
         self._clock = clock
@@ -59,17 +61,17 @@ class LoadCellTask:
         now_ns = self._clock.now_ns()
         # The middle of the first reading that knows of nothing before.
         self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self.source.period_s * 1e9)
-        self._zero_until_ns = now_ns + round(ZERO_DEADLINE_S * 1e9)
+        self._zero_until_ns = now_ns + round(self._zero_within_s * 1e9)
 
     async def zero(self) -> str:
         """Take the mean of the next samples for zero; return why it could not be done, or an empty text."""
         self.tare()
         try:
             # Who waits for a zero that was asked for before waits for this one, which is later still.
-            return await self._waiting.wait(ZERO_DEADLINE_S)
+            return await self._waiting.wait(self._zero_within_s)
         except TimeoutError:
             why = self._why or "nothing came"
-            return f"the load cell's zero could not be taken within {ZERO_DEADLINE_S:g} s: {why}"
+            return f"the load cell's zero could not be taken within {self._zero_within_s:g} s: {why}"
         finally:
             if not self._waiting:
                 # A zero that nobody waits for any longer would be taken at whatever load comes.
@@ -88,8 +90,8 @@ class LoadCellTask:
         if sample.t_arrival_ns > self._zero_until_ns:
             self._zeroing = None
             self._untaken = (
-                f"a zero that was asked for was not taken within {ZERO_DEADLINE_S:g} s, and is not taken any more; see "
-                "what the load cell says, and tare again"
+                f"a zero that was asked for was not taken within {self._zero_within_s:g} s, and is not taken any more; "
+                "see what the load cell says, and tare again"
             )
             structlog.get_logger().warning(self._untaken)
             return

@@ -55,9 +55,11 @@ class Published:
 
 
 @asynccontextmanager
-async def reading(published: Published | None = None) -> AsyncIterator[tuple[LoadCellTask, Board]]:
+async def reading(
+    published: Published | None = None, rate_hz: float = 10.9
+) -> AsyncIterator[tuple[LoadCellTask, Board]]:
     board = Board()
-    task = LoadCellTask(board, published or Published(), Clock(), lambda _: None, 10.9)  # type: ignore[arg-type]
+    task = LoadCellTask(board, published or Published(), Clock(), lambda _: None, rate_hz)  # type: ignore[arg-type]
     read = asyncio.create_task(task.read())
     try:
         yield task, board
@@ -83,9 +85,9 @@ async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile() 
         assert board.tares == [7.0], "a zero is of the samples after it was asked for"
 
 
-async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daemon.load_cell_task.ZERO_DEADLINE_S", 0.05)
+async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason() -> None:
     async with reading() as (task, board):
+        task._zero_within_s = 0.05
         zero = await asked(task)
         await board.send(8388607.0, saturated=True)
         why = await zero
@@ -99,6 +101,17 @@ async def test_the_operators_tare_is_taken_from_the_next_samples() -> None:
         task.tare()
         await board.send(3.0)
         assert board.tares == [3.0]
+
+
+async def test_a_slow_board_has_the_time_that_its_readings_take() -> None:
+    async with reading(rate_hz=1.0) as (task, board):
+        task.tare()
+        now_ns = Clock().now_ns()
+        for number in range(1, 30):
+            board.sent.put_nowait(LoadSample(3.0, 0.1, now_ns + number * 10**9, now_ns + number * 10**9, number))
+        await board.sent.join()
+        assert board.tares == [3.0]
+        assert task.facts()["trouble"] == ""
 
 
 async def test_readings_that_know_of_the_load_before_are_not_of_the_zero() -> None:

@@ -18,6 +18,7 @@ from drivers.robotiq.messages import (
     GripperCommand,
     GripperState,
     Halt,
+    ObjectStatus,
     Readout,
     Request,
     SentCommand,
@@ -27,6 +28,8 @@ from drivers.robotiq.width import COUNTS_MAX, WidthCalibration
 from drivers.serial_port import LinkEvent, ReconnectPolicy
 
 POLL_S = 0.1
+# Of so many polls of a gripper that stands one asks for everything, so that what someone else has asked of it is seen.
+ASKED_WHOLE_EVERY = 5
 
 
 class RobotiqGripper:
@@ -57,6 +60,9 @@ class RobotiqGripper:
         self._seq = 0
         self._last_request: GoTo | None = None
         self._openings = 0
+        # The latest readout of a gripper that stands and of which nothing was asked since.
+        self._standing: Readout | None = None
+        self._polls = 0
         self._loss: DriverError | None = None
         self.connected = False
         self.last_error = ""
@@ -89,6 +95,15 @@ class RobotiqGripper:
         """Return the gripper's state, asked for now."""
         readout, t_ns = await self._read()
         self.latest = self._state(readout, t_ns)
+        return self.latest
+
+    async def _poll(self) -> GripperState:
+        """Return the gripper's state, asked for now as far as it can change by itself, and as a whole now and then."""
+        self._polls += 1
+        readout, t_ns = await self._read(again=self._polls % ASKED_WHOLE_EVERY != 0)
+        self.latest = self._state(readout, t_ns)
+        if self.latest.object is not ObjectStatus.MOVING:
+            self._standing = readout
         return self.latest
 
     async def activate(self, *, operator_confirmed: bool = False) -> GripperState:
@@ -169,7 +184,7 @@ class RobotiqGripper:
 
     async def _next_state(self) -> GripperState:
         if self.connected:
-            return await self.read()
+            return await self._poll()
         if self._loss is not None:
             raise self._loss
         state = await self.connect()
@@ -208,10 +223,13 @@ class RobotiqGripper:
             clipped=tuple(clipped),
         )
 
-    async def _read(self) -> tuple[Readout, int]:
+    async def _read(self, *, again: bool = False) -> tuple[Readout, int]:
         async with self._exchange:
             t_ns = self._clock_ns()
+            standing, self._standing = self._standing, None
             try:
+                if again and standing is not None:
+                    return await self._client.read_again(standing), t_ns
                 return await self._client.read(), t_ns
             except DriverError as error:
                 self._note_loss(error)
@@ -219,6 +237,7 @@ class RobotiqGripper:
 
     async def _write(self, request: Request) -> None:
         async with self._exchange:
+            self._standing = None
             try:
                 await self._client.write(request)
             except DriverError as error:

@@ -93,6 +93,12 @@ class GripperClient(Protocol):
     async def read(self) -> Readout:
         """Return the status registers."""
 
+    async def read_again(self, before: Readout) -> Readout:
+        """Return the status of a gripper that stood at `before`, and of which nothing was asked since.
+
+        What only a request changes may be that of before, unless something else has changed.
+        """
+
     async def write(self, request: Request) -> None:
         """Send a request and wait until it is acknowledged; what becomes of it shows in the status."""
 

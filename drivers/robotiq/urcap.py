@@ -22,6 +22,8 @@ _ACK = b"ack"
 MAX_REPLY_BYTES = 32
 # PRE before OBJ, and OBJ before POS: what OBJ says is then never older than the target, nor the position than the stop.
 READ_ORDER = ("ACT", "STA", "GTO", "PRE", "OBJ", "POS", "FLT", "COU")
+# What tells whether a gripper that stands still does, and what it takes for it; the others change by a request alone.
+STANDING_ORDER = ("OBJ", "POS", "FLT", "COU")
 # Older URCaps have no motor current.
 _OPTIONAL = ("COU",)
 

@@ -7,7 +7,7 @@ the driver is given the same clock.
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +18,15 @@ from drivers.emulators.robotiq.urcap_face import UrcapServer
 from drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
 from drivers.robotiq.faults import GripperFaultError, GripperRefusedError
 from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import ActivationStatus, GripperClient, GripperCommand, ObjectStatus
+from drivers.robotiq.messages import (
+    ActivationStatus,
+    GoTo,
+    GripperClient,
+    GripperCommand,
+    ObjectStatus,
+    Readout,
+    Request,
+)
 from drivers.robotiq.modbus_client import ModbusClient
 from drivers.robotiq.socket_client import SocketClient
 from drivers.robotiq.width import WidthCalibration
@@ -363,3 +371,51 @@ async def test_what_is_clipped_is_said_and_what_is_sent_is_returned() -> None:
     assert (sent.speed_mm_s, sent.force_n) == (30.0, 125.0)
     assert sent.width_mm == pytest.approx(CALIBRATION.width_mm(0))
     assert [sentence.split()[1] for sentence in sent.clipped] == ["width", "speed", "force"]
+
+
+class Counted:
+    """A gripper that stands at its target, and how it was asked."""
+
+    name = "here"
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.readout = Readout(True, True, ActivationStatus.ACTIVE, ObjectStatus.AT_TARGET, 0, 100, 100, 0)
+
+    async def connect(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+    async def read(self) -> Readout:
+        self.asked.append("whole")
+        return self.readout
+
+    async def read_again(self, before: Readout) -> Readout:
+        assert before == self.readout
+        self.asked.append("again")
+        return self.readout
+
+    async def write(self, request: Request) -> None:
+        self.asked.append("write")
+        if isinstance(request, GoTo):
+            self.readout = replace(self.readout, pre=request.position, obj=ObjectStatus.MOVING)
+
+
+async def test_a_gripper_that_stands_is_asked_as_a_whole_every_fifth_time_and_after_each_request() -> None:
+    client = Counted()
+    gripper = RobotiqGripper(client, CALIBRATION, poll_s=0.0)
+    async with contextlib.aclosing(gripper.states()) as states:
+        for _ in range(12):
+            await anext(states)
+        assert "".join(one[0] for one in client.asked) == "wwaaawaaaawa"
+        client.asked.clear()
+        await gripper.move(GripperCommand(50.0))
+        for _ in range(3):
+            await anext(states)
+        assert client.asked == ["whole", "write", "whole", "whole", "whole"], "it moves"
+        client.readout = replace(client.readout, obj=ObjectStatus.AT_TARGET)
+        client.asked.clear()
+        await anext(states)
+        await gripper.halt()
+        await anext(states)
+        assert client.asked == ["whole", "write", "whole"]

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from typing import cast
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from drivers.errors import DeviceLostError, ProtocolError
 from drivers.robotiq.messages import GoTo, Reset
 from drivers.robotiq.socket_client import SocketClient, _Connection
-from drivers.robotiq.urcap import READ_ORDER
+from drivers.robotiq.urcap import READ_ORDER, STANDING_ORDER
 
 VALUES = {"ACT": 1, "STA": 3, "GTO": 1, "PRE": 100, "OBJ": 3, "POS": 100, "FLT": 0, "COU": 7}
 
@@ -70,6 +71,30 @@ async def test_what_is_asked_is_answered_in_order() -> None:
         assert (await client.read()).current == 7
     asked = [f"GET {variable}" for variable in READ_ORDER]
     assert peer.lines == [*asked, "SET ACT 0", "SET ATR 0", "SET POS 10 SPE 20 FOR 30 GTO 1", *asked]
+
+
+async def test_of_a_gripper_that_stands_as_before_no_more_is_asked_than_tells_that() -> None:
+    values = {"COU": 7}
+
+    def answer(line: str) -> bytes:
+        variable = line.split()[1]
+        return f"{variable} {values.get(variable, 1)}\n".encode()
+
+    peer = Peer(answer)
+    whole, some = ([f"GET {variable}" for variable in order] for order in (READ_ORDER, STANDING_ORDER))
+    async with connected(peer) as client:
+        before = await client.read()
+        values["COU"] = 9
+        assert await client.read_again(before) == replace(before, current=9)
+        assert peer.lines == [*whole, *some]
+        for changed, now in (("POS", 50), ("OBJ", 2), ("FLT", 9)):
+            peer.lines.clear()
+            values.update({changed: now, "PRE": now})
+            after = await client.read_again(before)
+            assert peer.lines == [*some, *whole]
+            assert after.pre == now
+            assert after != before
+            del values[changed]
 
 
 @pytest.mark.parametrize(

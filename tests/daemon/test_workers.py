@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[2]
 STARTED_S = 90
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Start a scheduler and two workers, all processes of their own, and return the address."""
     from distributed import Client
@@ -114,7 +114,7 @@ def test_a_worker_killed_in_the_middle_costs_only_its_tasks(scheduler: str, tmp_
     assert len(runs) < 2 * 12 - 3
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def banks(scheduler: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Return a bank built here, and the same one built on the cluster; before any test is watched (tqdm's thread)."""
     folder = tmp_path_factory.mktemp("banks")
@@ -132,7 +132,7 @@ def test_a_bank_has_the_same_bytes_from_a_cluster(banks: tuple[Path, Path]) -> N
     assert banks[0].read_bytes() == banks[1].read_bytes()
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def varied(banks: tuple[Path, Path], scheduler: str) -> tuple[Path, Path]:
     """Return folders of banks over tilt and amplitude, built here and on the cluster."""
     folder = banks[0].parent

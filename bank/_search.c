@@ -91,9 +91,9 @@ static Outcome find_at_all_lags(Hunt *hunt, const float *parts, int first, int e
                                 long most_scores, Found *known, Found *best, Found *other)
 {
     const Bank *bank = hunt->bank;
-    double least = known[with_runner_up].score;
+    double left_out_below = known[with_runner_up].score;
     take_lags(hunt, parts, first, end);
-    int lag = likeliest_lag(hunt, least);
+    int lag = likeliest_lag(hunt, left_out_below);
     if (lag < 0)
         return UNDECIDED;
     /* The higher the scores that are known to be reached, the less is left to look at. */
@@ -104,8 +104,9 @@ static Outcome find_at_all_lags(Hunt *hunt, const float *parts, int first, int e
     n++;
     if (with_runner_up && find_at_lag(hunt, lag, best->cell, most_scores, &known[n]) == FOUND)
         n++;
-    least = with_runner_up ? highest_apart(bank, known, n, best->cell) : best->score;
-    if (least < 0 || !collect(hunt, least) || settle(hunt, -1, best->score, most_scores, best) != FOUND)
+    double least = with_runner_up ? highest_apart(bank, known, n, best->cell) : best->score;
+    /* Where both cells that lag 0 told of are in the best one's peak, a lag that is left out may have the runner-up. */
+    if (least < left_out_below || !collect(hunt, least) || settle(hunt, -1, best->score, most_scores, best) != FOUND)
         return UNDECIDED;
     if (!with_runner_up)
         return FOUND;

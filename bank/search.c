@@ -258,12 +258,18 @@ static void keep_what_may_reach(Hunt *hunt)
     }
 }
 
+/* Of cells that tie the first, and of its lags the one of the highest score. */
+static int is_before(const Candidate *one, const Found *found)
+{
+    return found->cell < 0 || one->cell < found->cell || (one->cell == found->cell && one->score > found->score);
+}
+
 Outcome settle(Hunt *hunt, int32_t apart_from, double reached, long most_scores, Found *found)
 {
     const Bank *bank = hunt->bank;
     reaches(hunt, reached);
     hunt->scores_left = most_scores;
-    found->cell = -1;
+    *found = (Found){-1, 0};
     for (ptrdiff_t i = 0; i < hunt->n_candidates; i++) {
         Candidate *each = &bank->candidates[i];
         if (!may_reach(hunt, each->bound) || in_peak_of(bank, each->cell, apart_from))
@@ -283,11 +289,11 @@ Outcome settle(Hunt *hunt, int32_t apart_from, double reached, long most_scores,
             continue;
         if (fabs(behind - bank->tie) < bank->tie_rounding)
             return UNDECIDED;
-        if (behind <= bank->tie && (found->cell < 0 || each->cell < found->cell)) {
-            found->cell = each->cell;
-            found->score = each->score < 1 ? each->score : 1;
-        }
+        if (behind <= bank->tie && is_before(each, found))
+            *found = (Found){each->cell, each->score};
     }
+    if (found->score > 1)
+        found->score = 1;
     return found->cell < 0 ? NONE : FOUND;
 }
 

@@ -490,3 +490,42 @@ def test_where_all_known_scores_are_in_the_peak_the_compiled_search_leaves_the_r
     if compiled.IS_COMPILED:
         assert fast._found(frame, True, 1000) is None
     assert_same(fast.match(frame), slow.match(frame))
+
+
+def bank_of_five_alone() -> tuple[tuple[np.ndarray, np.ndarray], dict[str, tuple[int, int]]]:
+    """Return a bank of five cells that have nothing in common with each other nor with the rest, and where they are."""
+    random = np.random.default_rng(0)
+    signals = np.zeros((20, 20, N_CHANNELS), dtype=np.float32)
+    signals[..., 860:] = random.random((20, 20, 2)) @ random.random((2, 36))
+    alone = {"left": (10, 5), "right": (10, 11), "between": (10, 8), "below": (2, 2), "above": (18, 18)}
+    for cell in alone.values():
+        signals[cell] = 0.0
+        signals[cell][random.choice(700, 40, replace=False)] = 1.0
+    return (signals, np.ones((20, 20), dtype=np.bool_)), alone
+
+
+@pytest.mark.parametrize("kind", [KINDS[0], COMPILED[0]])
+def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_from_lag_0(kind) -> None:
+    """Both that are high at lag 0 are in the peak of the best cell, and so is nothing at its own lag that is as high."""
+    bank, alone = bank_of_five_alone()
+    slow, fast = pair(*kind, bank)
+    frame = np.zeros(N_CHANNELS)
+    for name, size, lag in (("left", 5, 0), ("right", 4.8, 0), ("between", 6, 7), ("below", 2, 7), ("above", 3.5, 30)):
+        frame[lag:] += size * bank[0][alone[name]][: N_CHANNELS - lag]
+    expected = slow.match(frame)
+    assert (expected.cell, expected.runner_up_cell) == (alone["between"], alone["above"])
+    assert_same(fast.match(frame), expected)
+    assert_same(fast.match_quickly(frame), expected)
+
+
+@is_compiled
+def test_of_a_cells_lags_that_tie_the_highest_score_is_told() -> None:
+    """The frame, of two channels, is a cell's signal at lag 0, and nearly so at lag 100."""
+    signals, valid = bank_of_noise(n_live=40)
+    signals[3, 3] = 0.0
+    signals[3, 3, [200, 700]] = 1.0
+    slow, fast = pair(*COMPILED[0], (signals, valid))
+    for at_0, at_100 in ((1.0, 1.0 - 7e-13), (1.0 - 7e-13, 1.0)):
+        frame = np.zeros(N_CHANNELS)
+        frame[[200, 700]], frame[[300, 800]] = at_0, at_100
+        assert_same(fast._found(frame, False, 1000), without_runner_up(slow.match(frame)))

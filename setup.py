@@ -1,12 +1,28 @@
 """The compiled parts, which are left out where there is no C compiler; pyproject.toml has everything else."""
 
+from pathlib import Path
+from zlib import crc32
+
 from setuptools import Extension, setup
 
-HOW = {"extra_compile_args": ["-O3", "-std=c11", "-Wall", "-Wextra"], "optional": True, "py_limited_api": True}
+
+def compiled(name: str, sources: list[str], headers: list[str]) -> Extension:
+    """Return an extension that knows its sources: where others lie beside it, it is not used (`compiled.py`)."""
+    content = b"".join(Path(file).read_bytes() for file in [*sources, *headers])
+    return Extension(
+        name,
+        sources,
+        depends=headers,
+        define_macros=[("SOURCES", f"{crc32(content)}L")],
+        extra_compile_args=["-O3", "-std=c11", "-Wall", "-Wextra"],
+        optional=True,
+        py_limited_api=True,
+    )
+
 
 setup(
     ext_modules=[
-        Extension("bank._search", ["bank/_search.c", "bank/search.c"], depends=["bank/search.h"], **HOW),
-        Extension("drivers._cells", ["drivers/_cells.c"], **HOW),
+        compiled("bank._search", ["bank/_search.c", "bank/search.c"], ["bank/search.h"]),
+        compiled("drivers._cells", ["drivers/_cells.c"], []),
     ]
 )

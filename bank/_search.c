@@ -13,8 +13,10 @@
 #include <math.h>
 #include <string.h>
 
-/* How the capsules begin in which scipy hands out its BLAS with integers of 32 bits. */
-#define SGEMM "void (char *, char *, int *, int *, int *, "
+/* How the capsule is called in which scipy hands out sgemm: how it begins where its integers have 32 bits, and the type of
+   its numbers. */
+#define SGEMM_BEGINS "void (char *, char *, int *, int *, int *, "
+#define SGEMM_NUMBER "cython_blas_s *"
 
 enum {
     MOST_BUFFERS = 10 + 3 * MOST_LEVELS,
@@ -27,8 +29,18 @@ typedef struct {
     PyObject_HEAD
     Py_buffer held[MOST_BUFFERS];
     int n_held;
+    int is_whole; /* all arrays are held, and fit together */
     Bank bank;
 } Search;
+
+/* The bank of a search; NULL with an error for one that was never made, or refused. */
+static const Bank *bank_of(PyObject *self)
+{
+    if (((Search *)self)->is_whole)
+        return &((Search *)self)->bank;
+    PyErr_SetString(PyExc_ValueError, "this search has no bank");
+    return NULL;
+}
 
 static PyObject *as_tuple(const Found *best, const Found *other)
 {
@@ -37,13 +49,13 @@ static PyObject *as_tuple(const Found *best, const Found *other)
 
 static PyObject *match(PyObject *self, PyObject *args)
 {
-    const Bank *bank = &((Search *)self)->bank;
+    const Bank *bank = bank_of(self);
     Hunt hunt;
     Py_buffer difference;
     int with_runner_up;
     long most_scores;
     Found best = {-1, 0}, other = {-1, 0};
-    if (!PyArg_ParseTuple(args, "y*pl", &difference, &with_runner_up, &most_scores))
+    if (!bank || !PyArg_ParseTuple(args, "y*pl", &difference, &with_runner_up, &most_scores))
         return NULL;
     int sound = difference.len == CHANNELS * sizeof(double) && take_frame(&hunt, bank, difference.buf);
     PyBuffer_Release(&difference);
@@ -117,14 +129,14 @@ static Outcome find_at_all_lags(Hunt *hunt, const float *parts, int first, int e
 
 static PyObject *match_at_all_lags(PyObject *self, PyObject *args)
 {
-    const Bank *bank = &((Search *)self)->bank;
+    const Bank *bank = bank_of(self);
     Hunt hunt;
     Py_buffer difference, parts;
     PyObject *correlate;
     int with_runner_up, first, end;
     long most_scores;
     Found known[4], best, other = {-1, 0};
-    if (!PyArg_ParseTuple(args, "y*Opl", &difference, &correlate, &with_runner_up, &most_scores))
+    if (!bank || !PyArg_ParseTuple(args, "y*Opl", &difference, &correlate, &with_runner_up, &most_scores))
         return NULL;
     int sound = difference.len == CHANNELS * sizeof(double) && take_frame(&hunt, bank, difference.buf);
     PyBuffer_Release(&difference);
@@ -227,15 +239,15 @@ static int hold_levels(Search *s, PyObject *levels)
     for (Py_ssize_t i = 0; i < n; i++) {
         PyObject *rows, *starts, *parts;
         Level *level = &s->bank.levels[i];
-        if (!PyArg_ParseTuple(PyTuple_GetItem(levels, i), "nOOO", &level->n, &rows, &starts, &parts))
+        if (!PyArg_ParseTuple(PyTuple_GetItem(levels, i), "OOO", &rows, &starts, &parts)
+            || !(level->starts = hold(s, starts, -1, sizeof(int32_t))))
             return -1;
-        if (i > 0 && level->n != n_parts) {
+        level->n = s->held[s->n_held - 1].len / (Py_ssize_t)sizeof(int32_t) - 1;
+        if (level->n < 1 || (i > 0 && level->n != n_parts)) {
             PyErr_SetString(PyExc_ValueError, "the groups of a level are not the parts of the level before");
             return -1;
         }
-        level->rows = hold(s, rows, level->n * (s->bank.coarse_rank + 2), sizeof(float));
-        level->starts = level->rows ? hold(s, starts, level->n + 1, sizeof(int32_t)) : NULL;
-        if (!level->starts)
+        if (!(level->rows = hold(s, rows, level->n * (s->bank.coarse_rank + 2), sizeof(float))))
             return -1;
         n_parts = level->starts[level->n];
         if (!are_starts(level->starts, level->n) || !(level->parts = hold(s, parts, n_parts, sizeof(int32_t)))
@@ -260,8 +272,8 @@ static int hold_bank(Search *s, PyObject *const *arrays, PyObject *levels)
     if (!(bank->norms = hold(s, arrays[5], -1, sizeof(double))))
         return -1;
     bank->n_cells = s->held[0].len / (Py_ssize_t)sizeof(double);
-    if (!bank->n_cells) {
-        PyErr_SetString(PyExc_ValueError, "a bank without cells");
+    if (!bank->n_cells || bank->n_cells > INT32_MAX) {
+        PyErr_SetString(PyExc_ValueError, "a bank without cells, or of more than can be numbered");
         return -1;
     }
     if (!(bank->basis = hold(s, arrays[0], -1, sizeof(float)))
@@ -291,6 +303,22 @@ static int hold_bank(Search *s, PyObject *const *arrays, PyObject *levels)
     return hold_levels(s, levels);
 }
 
+static int names_sgemm(PyObject *capsule)
+{
+    const char *name = PyCapsule_CheckExact(capsule) ? PyCapsule_GetName(capsule) : NULL;
+    return name && strncmp(name, SGEMM_BEGINS, strlen(SGEMM_BEGINS)) == 0 && strstr(name, SGEMM_NUMBER);
+}
+
+static PyObject *is_sgemm(PyObject *module, PyObject *capsule)
+{
+    (void)module;
+    return PyBool_FromLong(names_sgemm(capsule));
+}
+
+PyDoc_STRVAR(is_sgemm_doc,
+"is_sgemm(capsule) -> bool\n\n"
+"Whether a capsule holds BLAS's sgemm as a search calls it: there are such with integers of 64 bits too.");
+
 static int search_init(PyObject *self, PyObject *args, PyObject *named)
 {
     Search *s = (Search *)self;
@@ -304,13 +332,11 @@ static int search_init(PyObject *self, PyObject *args, PyObject *named)
                           &arrays[5], &arrays[6], &arrays[7], &arrays[8], &PyTuple_Type, &levels, &multiply, &bank->rounding,
                           &bank->square_rounding, &bank->tie, &bank->tie_rounding, &bank->radius))
         return -1;
-    const char *signature = PyCapsule_GetName(multiply);
-    if (!signature || strncmp(signature, SGEMM, strlen(SGEMM)) != 0) {
-        if (!PyErr_Occurred())
-            PyErr_SetString(PyExc_TypeError, "this is no sgemm of scipy's");
+    if (!names_sgemm(multiply)) {
+        PyErr_SetString(PyExc_TypeError, "this is no sgemm of scipy's");
         return -1;
     }
-    if (!(bank->multiply = (Multiply *)PyCapsule_GetPointer(multiply, signature)))
+    if (!(bank->multiply = (Multiply *)PyCapsule_GetPointer(multiply, PyCapsule_GetName(multiply))))
         return -1;
     if (hold_bank(s, arrays, levels) < 0)
         return -1;
@@ -324,6 +350,7 @@ static int search_init(PyObject *self, PyObject *args, PyObject *named)
         PyErr_NoMemory();
         return -1;
     }
+    s->is_whole = 1;
     return 0;
 }
 
@@ -366,6 +393,7 @@ static PyType_Spec search_spec = {
 
 static PyMethodDef module_functions[] = {
     {"energy", energy, METH_VARARGS, energy_doc},
+    {"is_sgemm", is_sgemm, METH_O, is_sgemm_doc},
     {NULL, NULL, 0, NULL},
 };
 
@@ -381,7 +409,8 @@ PyMODINIT_FUNC PyInit__search(void)
 {
     PyObject *found = PyModule_Create(&module);
     PyObject *type = found ? PyType_FromSpec(&search_spec) : NULL;
-    if (!type || PyModule_AddObjectRef(found, "Search", type) < 0) {
+    if (!type || PyModule_AddObjectRef(found, "Search", type) < 0
+        || PyModule_AddIntConstant(found, "SOURCES", SOURCES) < 0) {
         Py_XDECREF(found);
         found = NULL;
     }

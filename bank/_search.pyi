@@ -3,6 +3,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+SOURCES: int
+
 class Search:
     def __init__(
         self,
@@ -15,7 +17,7 @@ class Search:
         k_of: NDArray[np.int32],
         sigma_of: NDArray[np.int32],
         overlaps: NDArray[np.float64],
-        levels: tuple[tuple[int, NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]], ...],
+        levels: tuple[tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]], ...],
         multiply: object,
         rounding: float,
         square_rounding: float,
@@ -37,3 +39,4 @@ class Search:
     ) -> tuple[int, float, int, float] | None: ...
 
 def energy(difference: NDArray[np.float64], noise: NDArray[np.float64], /) -> float: ...
+def is_sgemm(capsule: object, /) -> bool: ...

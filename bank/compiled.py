@@ -4,6 +4,10 @@ The compiled code is `search.c`; numpy does the same without, and the tests comp
 time from a frame to its estimate.
 """
 
+from pathlib import Path
+from types import ModuleType
+from zlib import crc32
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cython_blas
@@ -16,9 +20,22 @@ except ImportError:
     # No compiler, or none that could build it; docs/speed.md tells what that costs.
     _search = None  # type: ignore[assignment]
 
+
+def is_stale(module: ModuleType, *names: str) -> bool:
+    """Return whether a module is compiled from other sources than lie beside it, for they have changed since.
+
+    Where none lie there, as after an installation from a wheel, they have not.
+    """
+    sources = [Path(__file__).with_name(name) for name in names]
+    there = all(source.exists() for source in sources)
+    return there and crc32(b"".join(source.read_bytes() for source in sources)) != getattr(module, "SOURCES", None)
+
+
 # BLAS as scipy hands it to compiled code.
 _SGEMM = getattr(cython_blas, "__pyx_capi__", {}).get("sgemm")
-IS_COMPILED = _search is not None and _SGEMM is not None
+IS_COMPILED = (
+    _search is not None and not is_stale(_search, "_search.c", "search.c", "search.h") and _search.is_sgemm(_SGEMM)
+)
 
 
 def search_of(
@@ -32,18 +49,18 @@ def search_of(
     tie_rounding: float,
     radius: int,
 ) -> "_search.Search | None":
-    """Return what finds the best cell of a compressed bank, None where nothing is compiled.
+    """Return what finds the best cell of a compressed bank; None where nothing is compiled, or not for such signals.
 
     signals (m, 896) hold cell i of n in row places[i], with the norm norms[i]; `grid` are the rows and columns (n,) of
     the cells. Scores that differ by less than `tie` are the same, and a difference within `tie_rounding` of that is
     left undecided; a runner-up is more than `radius` rows or columns away.
     """
-    if not IS_COMPILED:
+    flags = signals.flags
+    if not (IS_COMPILED and signals.dtype == np.float32 and flags.c_contiguous and flags.aligned):
         return None
     parts_of = [*(level.part_of for level in bank.levels[1:]), bank.group_of]
     levels = tuple(
-        (len(level.rows), level.rows, *_by_group(part_of, len(level.rows)))
-        for level, part_of in zip(bank.levels, parts_of, strict=True)
+        (level.rows, *_by_group(part_of, len(level.rows))) for level, part_of in zip(bank.levels, parts_of, strict=True)
     )
     return _search.Search(
         *(bank.basis, bank.coarse, bank.fine, signals, places, norms, *grid, bank.overlaps, levels, _SGEMM),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, correlated, spectra_of
+from bank.channels import N_CHANNELS
 from bank.compiled import search_of
 from bank.compression import ROUNDING, Indices, compress
 from bank.errors import MatchingError
@@ -122,7 +123,10 @@ class _PruningMatcher(Matcher):
 
     def _found(self, difference: ArrayLike, runner_up: bool, most_scores: int) -> Match | None:
         """Return the match, or None: nothing is compiled, or numpy has to decide, or to say what is wrong."""
-        found = self._compiled_search(np.ascontiguousarray(difference, dtype=np.float64), runner_up, most_scores)
+        values = np.asarray(difference, dtype=np.float64)
+        if values.shape != (N_CHANNELS,):
+            return None
+        found = self._compiled_search(np.ascontiguousarray(values), runner_up, most_scores)
         if found is None:
             return None
         cell, score, other, other_score = found

@@ -103,5 +103,8 @@ static struct PyModuleDef module = {
 
 PyMODINIT_FUNC PyInit__cells(void)
 {
-    return PyModule_Create(&module);
+    PyObject *found = PyModule_Create(&module);
+    if (found && PyModule_AddIntConstant(found, "SOURCES", SOURCES) < 0)
+        Py_CLEAR(found);
+    return found;
 }

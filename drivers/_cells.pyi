@@ -1,6 +1,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
+SOURCES: int
+
 def read(line: bytes, zero_slots: NDArray[np.bool_], most: float, values: NDArray[np.float64], /) -> bool: ...
 def look(
     channels: NDArray[np.float64],

@@ -106,7 +106,8 @@ def compiled_finding() -> Finding:
         return good("compiled parts", "reading a frame and matching it are compiled")
     return note(
         "compiled parts",
-        "reading a frame and matching it are not compiled: there was no C compiler when this was installed",
+        "reading a frame and matching it are not compiled: there was no C compiler when this was installed, or their "
+        "sources have changed since",
         "the same estimates come about half a millisecond later",
         "`sudo apt install gcc python3-dev`, then install shearloop again",
     )

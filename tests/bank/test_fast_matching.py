@@ -2,7 +2,10 @@
 
 import dataclasses
 import datetime
+import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
+from scipy.linalg import cython_blas
 
 from bank import bounds, compiled, fast_matching
 from bank.channels import N_CHANNELS, channels_of_line
@@ -384,6 +388,20 @@ def test_the_outermost_lags_are_searched(first) -> None:
     assert_same(fast._found(frame, False, 1000), without_runner_up(slow.match(frame)))
 
 
+def arguments_of_search() -> list:
+    _, fast = PAIRS[1]
+    handed = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(compiled._search, "Search", lambda *arguments: handed.append(arguments))
+        compiled.search_of(
+            *(fast._bank, fast._signals, fast._cells, fast._norms, (fast._row, fast._column)),
+            tie=1e-12,
+            tie_rounding=1e-14,
+            radius=5,
+        )
+    return list(handed[0])
+
+
 @is_compiled
 @pytest.mark.parametrize(
     ("argument", "broken"),
@@ -398,29 +416,65 @@ def test_the_outermost_lags_are_searched(first) -> None:
         (9, lambda levels: levels[:-1]),
         (9, lambda levels: levels[:0]),
         (9, lambda levels: levels * 4),
-        (9, lambda levels: ((*levels[0][:3], levels[0][3] + 1), *levels[1:])),
-        (9, lambda levels: ((*levels[0][:2], levels[0][2][::-1].copy(), levels[0][3]), *levels[1:])),
+        (9, lambda levels: ((*levels[0][:2], levels[0][2] + 1), *levels[1:])),
+        (9, lambda levels: ((levels[0][0], levels[0][1][::-1].copy(), levels[0][2]), *levels[1:])),
+        (9, lambda levels: ((levels[0][0], levels[0][1][:0], levels[0][2]), *levels[1:])),
         (10, lambda _: None),
         (10, lambda _: datetime.datetime_CAPI),
+        (10, lambda _: cython_blas.__pyx_capi__["dgemm"]),
     ],
 )
-def test_arrays_that_do_not_fit_are_refused_and_not_searched(monkeypatch, argument, broken) -> None:
+def test_arrays_that_do_not_fit_are_refused_and_not_searched(argument, broken) -> None:
     """What a compiled search is handed decides where it reads."""
-    _, fast = PAIRS[1]
-    handed = []
-    monkeypatch.setattr(compiled._search, "Search", lambda *arguments: handed.append(arguments))
-    compiled.search_of(
-        *(fast._bank, fast._signals, fast._cells, fast._norms, (fast._row, fast._column)),
-        tie=1e-12,
-        tie_rounding=1e-14,
-        radius=5,
-    )
-    monkeypatch.undo()
-    arguments = list(handed[0])
+    arguments = arguments_of_search()
     assert compiled._search.Search(*arguments).match(np.ones(N_CHANNELS), True, 1000) is not None
     arguments[argument] = broken(arguments[argument])
     with pytest.raises((ValueError, BufferError, TypeError)):
         compiled._search.Search(*arguments)
+    refused = compiled._search.Search.__new__(compiled._search.Search)
+    with suppress(ValueError, BufferError, TypeError):
+        refused.__init__(*arguments)
+    with pytest.raises(ValueError, match="has no bank"):
+        refused.match(np.ones(N_CHANNELS), True, 1000)
+    with pytest.raises(ValueError, match="has no bank"):
+        refused.match_at_all_lags(np.ones(N_CHANNELS), lambda *_: None, True, 1000)
+
+
+@is_compiled
+def test_a_search_is_made_once() -> None:
+    arguments = arguments_of_search()
+    with pytest.raises(TypeError, match="made once"):
+        compiled._search.Search(*arguments).__init__(*arguments)
+
+
+@pytest.mark.parametrize("kind", COMPILED)
+def test_signals_in_another_order_or_of_another_type_are_matched_the_same(kind) -> None:
+    """By numpy, for a compiled search reads float32, one after the other."""
+    spread = np.zeros((*SHAPE, 2 * N_CHANNELS), np.float32)
+    spread[..., ::2] = BANK[0]
+    frame = BANK[0][6, 6] + BANK[0][16, 5]
+    for signals in (spread[..., ::2], BANK[0].astype(np.float64), BANK[0].astype(">f4")):
+        slow, fast = pair(*kind, (signals, BANK[1]))
+        assert fast._found(frame, True, 1000) is None
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+def test_several_threads_find_with_one_matcher_what_one_finds(slow, fast) -> None:
+    """All of them work in the memory of the same compiled search, and transforms let others go on meanwhile."""
+    frames = [two_contacts(seed) for seed in range(12)]
+    expected = [fast.match(frame) for frame in frames]
+    for one, frame in zip(expected, frames, strict=True):
+        assert_same(one, slow.match(frame))
+    # As often as the interpreter can, one goes on while another is under way.
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = [pool.submit(fast.match, frame) for _ in range(8) for frame in frames]
+            assert [each.result() for each in found] == expected * 8
+    finally:
+        sys.setswitchinterval(interval)
 
 
 @is_compiled
@@ -442,7 +496,12 @@ def test_a_frame_that_leaves_many_bounds_is_not_matched_quickly(monkeypatch) -> 
 
 @both
 def test_what_cannot_be_matched_is_refused_alike(slow, fast) -> None:
-    for frame, says in ((np.zeros(N_CHANNELS), "zero in all channels"), (np.full(N_CHANNELS, np.nan), "not finite")):
+    for frame, says in (
+        (np.zeros(N_CHANNELS), "zero in all channels"),
+        (np.full(N_CHANNELS, np.nan), "not finite"),
+        (np.ones((1, N_CHANNELS)), "has shape"),
+        (np.ones((N_CHANNELS, 1)), "has shape"),
+    ):
         for matcher in (slow, fast):
             with pytest.raises(MatchingError, match=says):
                 matcher.match(frame)
@@ -506,7 +565,7 @@ def bank_of_five_alone() -> tuple[tuple[np.ndarray, np.ndarray], dict[str, tuple
 
 @pytest.mark.parametrize("kind", [KINDS[0], COMPILED[0]])
 def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_from_lag_0(kind) -> None:
-    """Both that are high at lag 0 are in the peak of the best cell, and so is nothing at its own lag that is as high."""
+    """Both that are high at lag 0 are in the peak of the best cell, and nothing at its own lag is as high."""
     bank, alone = bank_of_five_alone()
     slow, fast = pair(*kind, bank)
     frame = np.zeros(N_CHANNELS)

@@ -55,6 +55,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
+    from structlog import get_logger
+
     from daemon.app import run_daemon
     from daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from daemon.cli.demonstration import Deaths, Happenings, Truth
@@ -91,6 +93,10 @@ def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
             _emulators(config.emulators, args.config.parent, args.recording, truth) as processes,
         ):
             happenings = Happenings(config.emulators, processes)
+            if processes:
+                # Before the daemon says what it does not find: it does not know that they are played.
+                devices = [emulator.device for emulator in config.emulators]
+                get_logger().info("emulated devices are starting; they are missed for a second", devices=devices)
             summary = RunSummary(
                 lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: happenings.happened
             )

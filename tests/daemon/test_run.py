@@ -86,6 +86,8 @@ async def test_the_daemon_and_its_emulators_stop_cleanly_on_a_signal(
         frames = subscriber(f"ipc://{tmp_path}/publish", "eit.frame")
         content = await asyncio.to_thread(next_message, frames)
         assert content["channels"].shape == (896,)
+        assert daemon.stderr is not None
+        assert b"emulated devices are starting" in await daemon.stderr.readline(), "before what is missed of them"
         await stop_and_time(daemon, number)
         assert not link.is_symlink(), "the emulator has taken its port away"
 

@@ -45,6 +45,7 @@ class Publisher:
         # The loop that tells of subscribers, and whether there may be news of them; without a loop, always.
         self._loop: asyncio.AbstractEventLoop | None = None
         self._told = False
+        self._watched = False
         # To subscribers an XPUB is a PUB; to us it tells their subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
@@ -80,13 +81,12 @@ class Publisher:
     def told(self) -> Iterator[None]:
         """Have the running event loop tell of subscribers, so that they are not looked for at every message."""
         self._loop, self._told = asyncio.get_running_loop(), True
-        descriptor = self._descriptor
-        self._loop.add_reader(descriptor, self._there_is_news)
+        descriptor = int(self._socket.getsockopt(zmq.FD))
         try:
             yield
         finally:
             self._loop.remove_reader(descriptor)
-            self._loop = None
+            self._loop, self._watched = None, False
 
     def wanted(self, topic: str) -> bool:
         """Return whether any subscriber asks for this topic: what is dear to compute waits for that."""
@@ -111,15 +111,19 @@ class Publisher:
         """Close the socket; what is not yet sent is dropped."""
         self._socket.close()
 
-    @property
-    def _descriptor(self) -> int:
-        return int(self._socket.getsockopt(zmq.FD))
+    def _watch(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Have the loop tell of what comes from now on, once: the descriptor stays readable until it is heard."""
+        self._told = False
+        if self._watched:
+            return
+        descriptor = int(self._socket.getsockopt(zmq.FD))
 
-    def _there_is_news(self) -> None:
-        if self._loop is not None:
-            # It stays readable until the news is heard, which the next message does.
-            self._loop.remove_reader(self._descriptor)
-            self._told = True
+        def there_is_news() -> None:
+            loop.remove_reader(descriptor)
+            self._watched, self._told = False, True
+
+        loop.add_reader(descriptor, there_is_news)
+        self._watched = True
 
     def _hear_subscribers(self) -> None:
         if self._loop is not None and not self._told:
@@ -128,8 +132,7 @@ class Publisher:
             # A poller would have to be made for each look.
             if not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 if self._loop is not None:
-                    self._told = False
-                    self._loop.add_reader(self._descriptor, self._there_is_news)
+                    self._watch(self._loop)
                 return
             self._wanted.clear()
             message = self._socket.recv(zmq.NOBLOCK)

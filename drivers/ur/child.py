@@ -47,7 +47,7 @@ EXIT_DONE, EXIT_FAILED = 0, 3
 COMMANDS = Command.__args__
 # Motion that the daemon leaves behind is braked in this time; the robot's watchdog ends what is not.
 FAREWELL_S = 1.0
-# A reading so old is as good as a new one: so late may ur-rtde see what the controller has sent.
+# A reading so old is as good as a new one: the controller's samples come four times as far apart.
 FRESH_S = 0.002
 # States that a slow daemon does not fetch are dropped, as the latest counts; replies wait, within this bound.
 MOST_UNSENT = 1 << 16

@@ -588,3 +588,16 @@ def test_of_a_cells_lags_that_tie_the_highest_score_is_told() -> None:
         frame = np.zeros(N_CHANNELS)
         frame[[200, 700]], frame[[300, 800]] = at_0, at_100
         assert_same(fast._found(frame, False, 1000), without_runner_up(slow.match(frame)))
+
+
+@is_compiled
+@pytest.mark.parametrize("kind", COMPILED)
+def test_no_score_is_bounded_below_itself_where_next_to_nothing_is_left_out_of_the_basis(kind) -> None:
+    """Of cells that float32 hardly tells apart: there the bounds have nothing to spare for their own rounding."""
+    random = np.random.default_rng(3)
+    signals = 1 + 1e-3 * (random.random((*SHAPE, 3)) @ random.random((3, N_CHANNELS)))
+    slow, fast = pair(*kind, (signals.astype(np.float32), np.ones(SHAPE, dtype=np.bool_)))
+    for frame in signals.reshape(-1, N_CHANNELS)[::22]:
+        found = fast._found(frame, True, 10_000)
+        assert found is not None
+        assert_same(found, slow.match(frame))

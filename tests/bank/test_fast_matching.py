@@ -601,3 +601,41 @@ def test_no_score_is_bounded_below_itself_where_next_to_nothing_is_left_out_of_t
         found = fast._found(frame, True, 10_000)
         assert found is not None
         assert_same(found, slow.match(frame))
+
+
+@pytest.mark.parametrize("kind", [*KINDS, *COMPILED])
+def test_of_cells_that_tie_but_for_rounding_the_first_is_found(kind) -> None:
+    """Two cells of two channels each; the frame has both, the first of them a little smaller."""
+    signals, valid = bank_of_noise(n_live=40)
+    signals[3, 3] = signals[9, 9] = 0.0
+    signals[3, 3, [200, 300]] = signals[9, 9, [600, 750]] = 1.0
+    slow, fast = pair(*kind, (signals, valid))
+    for smaller, cell in ((0.0, (3, 3)), (4e-13, (3, 3)), (4e-12, (9, 9))):
+        frame = np.zeros(N_CHANNELS)
+        frame[[200, 300]], frame[[600, 750]] = 1.0 - smaller, 1.0
+        assert slow.match(frame).cell == cell
+        assert_same(fast.match(frame), slow.match(frame))
+        if compiled.IS_COMPILED and kind is COMPILED[1]:
+            assert fast._found(frame, False, 1000) is not None
+
+
+@is_compiled
+def test_where_there_is_too_much_to_look_at_the_compiled_search_leaves_it() -> None:
+    """Signals and frames of noise, which nearly any cell fits at nearly any lag."""
+    slow, fast = pair(*COMPILED[0], bank_of_noise())
+    for frame in np.random.default_rng(12).random((4, N_CHANNELS)) ** 8:
+        assert fast._found(frame, False, 1_000_000) is None
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@is_compiled
+def test_a_lag_at_which_a_cell_is_hardly_better_is_looked_at() -> None:
+    bank, alone = bank_of_five_alone()
+    slow, fast = pair(*COMPILED[0], bank)
+    frame = np.zeros(N_CHANNELS)
+    for name, size, lag in (("left", 5, 0), ("between", 5.01, 7)):
+        frame[lag:] += size * bank[0][alone[name]][: N_CHANNELS - lag]
+    assert slow.match(frame).cell == alone["between"]
+    found = fast._found(frame, False, 1000)
+    assert found is not None
+    assert_same(found, without_runner_up(slow.match(frame)))

@@ -122,6 +122,10 @@ class LoopTask:
         try:
             if state is not None:
                 self._sense(state)
+                if self._robot.overtaken:
+                    # Where this process was away they come at once. Decided upon one by one, all but the first would be
+                    # in time, and a loop that is late again and again would not be late for more than a moment.
+                    return
             if passed_s >= SHORTEST_REST_S or state is None or not self._at_rest():
                 # From one decision to the next: what a decision itself takes is late as well.
                 self._brain.senses.late_s = max(0.0, passed_s - self._longest_s)

@@ -11,7 +11,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -54,6 +54,8 @@ class UrRobot:
         self._on_link = on_link or (lambda _event: None)
         # Hears of each state where it is read, before those who wait for one: no task has to be woken for it.
         self.on_state: Callable[[RobotState], None] = unheard
+        # Whether a newer state than the one that is told has been read along with it.
+        self.overtaken = False
         self._state: RobotState | None = None
         self._stdin: asyncio.StreamWriter | None = None
         self._waiting: dict[int, Callable[[Reply], None]] = {}
@@ -221,6 +223,14 @@ class UrRobot:
             except Exception as error:  # noqa: BLE001 - the others are told all the same, and the process is ended
                 said = {"message": "who waited for a reply of the robot's process died of its end", "exception": error}
                 asyncio.get_running_loop().call_exception_handler(said)
+
+    def take_all(self, messages: Sequence[tuple[int, Message]]) -> None:
+        """Act on what was read of the process at once, in order; of several states only the last is not `overtaken`."""
+        left = sum(isinstance(message, RobotState) for _, message in messages)
+        for number, message in messages:
+            left -= isinstance(message, RobotState)
+            self.overtaken = left > 0
+            self.take(number, message)
 
     def take(self, number: int, message: Message) -> None:
         """Act on a message of the process."""

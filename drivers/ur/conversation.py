@@ -90,8 +90,7 @@ class Conversation:
         try:
             data = os.read(self._stdout, 1 << 16)
             self._heard_s = time.monotonic()
-            for number, message in self._decoder.feed(data):
-                self._take(number, message)
+            self._take(list(self._decoder.feed(data)))
         except BlockingIOError:
             return
         except ProtocolError as error:
@@ -103,13 +102,14 @@ class Conversation:
             if not data:
                 self._end_with(None)
 
-    def _take(self, number: int, message: Message) -> None:
-        if isinstance(message, RobotState):
-            self._doing = "controlling"
-            self._robot.connected(self._stdin)
-        elif isinstance(message, Phase):
-            self._doing = message.doing
-        self._robot.take(number, message)
+    def _take(self, messages: list[tuple[int, Message]]) -> None:
+        for _, message in messages:
+            if isinstance(message, RobotState):
+                self._doing = "controlling"
+                self._robot.connected(self._stdin)
+            elif isinstance(message, Phase):
+                self._doing = message.doing
+        self._robot.take_all(messages)
 
     def _turn_away(self) -> None:
         asyncio.get_running_loop().remove_reader(self._stdout)

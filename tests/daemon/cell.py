@@ -18,7 +18,7 @@ from daemon.loop.watch import WatchSettings
 from daemon.loop.wrist import Wrist, WristSettings
 from daemon.loop_task import WRENCH, LoopTask, wrench_source
 from drivers.ur.client import UrRobot
-from drivers.ur.messages import Command, MoveLinear, Reply, RobotState, WristSpeed
+from drivers.ur.messages import Command, Message, MoveLinear, Reply, RobotState, WristSpeed
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
 
 SPEED_M_PER_S = 0.1
@@ -37,6 +37,7 @@ class Robot(UrRobot):
         self.brakes_for = 0
         self.flight.fly(5)
         self._held: list[Callable[[], None]] = []
+        self._unread: list[tuple[int, Message]] = []
         # Of how many cycles the daemon needs one.
         self.of_cycles = 1
 
@@ -63,8 +64,8 @@ class Robot(UrRobot):
         else:
             answered(reply)
 
-    def cycle(self) -> None:
-        """Let 8 ms pass, and tell who waits for the next state."""
+    def cycle(self, *, read: bool = True) -> None:
+        """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""
         arm = self.flight.arm
         # A real arm's move is under way until its end is told, though its joints rest.
         arm.stops_moves = not self.brakes_for
@@ -79,11 +80,15 @@ class Robot(UrRobot):
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
         arm.be(t_mono_ns=self.flight.now_ns)
         self.flight.fly(1)
+        if self.flight.cycle % self.of_cycles == 0:
+            self._unread.append((0, self.flight.state))
+        if not read:
+            return
         for answer in self._held:
             answer()
         self._held.clear()
-        if self.flight.cycle % self.of_cycles == 0:
-            self.take(0, self.flight.state)
+        self.take_all(self._unread)
+        self._unread.clear()
 
     @property
     def end_m(self) -> float:

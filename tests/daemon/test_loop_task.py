@@ -132,6 +132,36 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
         assert Event.LOOP_LATE in [trouble.event for trouble in cell.brain.standing.verdict.troubles]
 
 
+async def test_a_loop_that_is_late_again_and_again_is_stopped_though_it_then_reads_many_states_at_once() -> None:
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        for _ in range(40):
+            for _ in range(24):
+                cell.robot.cycle(read=False)
+            await cell.cycles(1)
+            if cell.phase is not Phase.RUNNING:
+                break
+        assert "loop was woken" in cell.why
+
+
+async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        decided: list[int] = []
+        decide = cell.brain.tick
+
+        def tick(t_ns: int) -> Any:
+            assert cell.brain.senses.arm is not None
+            decided.append(cell.brain.senses.arm.t_ns)
+            return decide(t_ns)
+
+        monkeypatch.setattr(cell.brain, "tick", tick)
+        for _ in range(5):
+            cell.robot.cycle(read=False)
+        await cell.cycles(1)
+        assert decided == [cell.state.t_mono_ns]
+
+
 async def test_who_waits_for_an_experiments_end_is_told_of_that_one() -> None:
     async with driven() as cell:
         await cell.start({"do": "wait", "wait_s": 60})

@@ -629,6 +629,15 @@ def test_where_there_is_too_much_to_look_at_the_compiled_search_leaves_it() -> N
 
 
 @is_compiled
+@by_compiled
+def test_no_score_is_above_1(slow, fast) -> None:
+    """Of a cell's own signal, which rounding may carry past it."""
+    del slow
+    found = [fast._found(signal.astype(np.float64), False, 1000) for signal in BANK[0][BANK[1]][::5]]
+    assert max(match.score for match in found if match is not None) == 1.0
+
+
+@is_compiled
 def test_a_lag_at_which_a_cell_is_hardly_better_is_looked_at() -> None:
     bank, alone = bank_of_five_alone()
     slow, fast = pair(*COMPILED[0], bank)

@@ -79,7 +79,8 @@ class LineParser:
         self.last_refusal: Refusal | None = None
         self.first_partials = 0
         self.unfinished = 0
-        self._zero_slots = zero_slots
+        # As compiled code takes it.
+        self._zero_slots = np.ascontiguousarray(zero_slots)
         self._slots = np.flatnonzero(~zero_slots)
         self._transfer_ns = transfer_ns
         self._full_scale_v = full_scale_v

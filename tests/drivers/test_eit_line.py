@@ -160,6 +160,11 @@ def test_one_byte_at_a_time_gives_the_same_frames() -> None:
     assert [frame.line + b"\n" for frame in frames] == LINES[:2]
 
 
+def test_a_mask_of_any_layout_serves() -> None:
+    (frame,) = LineParser(np.repeat(ZERO_SLOTS, 2)[::2]).feed(GOOD, 0)
+    assert frame.line + b"\n" == GOOD
+
+
 def test_carriage_returns_are_taken_as_part_of_the_line_end() -> None:
     frames = LineParser(ZERO_SLOTS).feed(GOOD.replace(b"\n", b"\r\n") * 2, 0)
     assert [frame.line + b"\n" for frame in frames] == [GOOD, GOOD]

@@ -69,8 +69,10 @@ class Publisher:
         """Send a message's map as it is, stamped and numbered already."""
         # Most topics are listened to by nobody most of the time, and what goes nowhere needs no bytes.
         if self._goes_out(topic):
+            # Before anything of it is sent: begun and not ended, it would be the beginning of the next message.
+            payload = encode(content)
             self._socket.send(topic.encode(), zmq.NOBLOCK | zmq.SNDMORE)
-            self._socket.send(encode(content), zmq.NOBLOCK)
+            self._socket.send(payload, zmq.NOBLOCK)
             # Whoever sends may have been told of subscribers by the way.
             self._told = True
             self._hear_subscribers()

@@ -1,8 +1,10 @@
 import asyncio
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
+import pytest
 import zmq
 
 from daemon.clock import Clock
@@ -36,6 +38,24 @@ def test_the_publisher_knows_which_topics_are_subscribed_to(tmp_path: Path) -> N
             assert publisher.wanted("eit.heatmap")
         until(lambda: not publisher.wanted("eit.heatmap"))
         publisher.close()
+
+
+def test_what_cannot_be_sent_spoils_no_other_message(tmp_path: Path) -> None:
+    address = f"ipc://{tmp_path}/publish"
+    with (
+        zmq.Context() as context,
+        closing(Publisher(context, address, Clock())) as publisher,
+        context.socket(zmq.SUB) as subscriber,
+    ):
+        subscriber.setsockopt(zmq.RCVTIMEO, 10_000)
+        subscriber.subscribe("health")
+        subscriber.connect(address)
+        until(lambda: publisher.wanted("health"))
+        with pytest.raises(TypeError):
+            publisher.forward("health", {"what": object()})
+        publisher.forward("health", {"number": 1})
+        topic, *payload = subscriber.recv_multipart()
+        assert (topic, list(map(decode, payload))) == (b"health", [{"number": 1}])
 
 
 def test_subscriptions_to_what_there_is_not_are_not_kept(tmp_path: Path) -> None:

@@ -1,17 +1,21 @@
 """The daemon's end of the robot where there is no controller: what is said of a process that ends."""
 
 import asyncio
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from drivers.errors import DriverError
 from drivers.ur.client import UrRobot
-from drivers.ur.conversation import LAST_WORDS_BYTES
+from drivers.ur.conversation import LAST_WORDS_BYTES, Conversation, output
 from drivers.ur.messages import Reply, Stop
+from drivers.ur.wire import encode
+from tests.drivers.ur.flight import SETTINGS, Flight
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
 
@@ -130,3 +134,19 @@ async def test_process_after_one_that_was_connected_may_stop_what_that_left_runn
     async with running(settings_for("127.0.0.254"), link):
         await link.down(2)
     assert told.read_text().split()[:2] == ["False", "True"]
+
+
+async def test_of_states_that_are_read_at_once_all_but_the_last_are_overtaken() -> None:
+    robot = UrRobot(SETTINGS)
+    overtaken: list[bool] = []
+    robot.on_state = lambda _: overtaken.append(robot.overtaken)
+    flight = Flight()
+    flight.fly(1)
+    with output() as (stdout, its_stdout):
+        process = Mock(spec=asyncio.subprocess.Process, stdin=Mock(), stderr=Mock())
+        conversation = Conversation(robot, process, stdout)
+        os.write(its_stdout.number, 3 * encode(flight.state) + encode(Reply(), 1))
+        conversation._hear()
+        os.write(its_stdout.number, encode(flight.state))
+        conversation._hear()
+    assert overtaken == [True, True, False, False]

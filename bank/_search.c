@@ -237,9 +237,9 @@ static int hold_levels(Search *s, PyObject *levels)
         return -1;
     }
     for (Py_ssize_t i = 0; i < n; i++) {
-        PyObject *rows, *starts, *parts;
+        PyObject *rows, *starts;
         Level *level = &s->bank.levels[i];
-        if (!PyArg_ParseTuple(PyTuple_GetItem(levels, i), "OOO", &rows, &starts, &parts)
+        if (!PyArg_ParseTuple(PyTuple_GetItem(levels, i), "OO", &rows, &starts)
             || !(level->starts = hold(s, starts, -1, sizeof(int32_t))))
             return -1;
         level->n = s->held[s->n_held - 1].len / (Py_ssize_t)sizeof(int32_t) - 1;
@@ -250,10 +250,8 @@ static int hold_levels(Search *s, PyObject *levels)
         if (!(level->rows = hold(s, rows, level->n * (s->bank.coarse_rank + 2), sizeof(float))))
             return -1;
         n_parts = level->starts[level->n];
-        if (!are_starts(level->starts, level->n) || !(level->parts = hold(s, parts, n_parts, sizeof(int32_t)))
-            || !all_within(level->parts, n_parts, n_parts)) {
-            if (!PyErr_Occurred())
-                PyErr_SetString(PyExc_ValueError, "the parts of a level's groups are not sound");
+        if (!are_starts(level->starts, level->n)) {
+            PyErr_SetString(PyExc_ValueError, "the parts of a level's groups are not sound");
             return -1;
         }
     }
@@ -291,6 +289,7 @@ static int hold_bank(Search *s, PyObject *const *arrays, PyObject *levels)
         || !(bank->k_of = hold(s, arrays[6], bank->n_cells, sizeof(int32_t)))
         || !(bank->sigma_of = hold(s, arrays[7], bank->n_cells, sizeof(int32_t)))
         || !(bank->overlaps = hold(s, arrays[8], 2 * CHANNELS, sizeof(double)))
+        || !(bank->cells = hold(s, arrays[9], bank->n_cells, sizeof(int32_t)))
         || !(bank->signals = hold(s, arrays[3], -1, sizeof(float))))
         return -1;
     Py_ssize_t n_signals = s->held[s->n_held - 1].len / (CHANNELS * (Py_ssize_t)sizeof(float));
@@ -299,6 +298,10 @@ static int hold_bank(Search *s, PyObject *const *arrays, PyObject *levels)
             PyErr_SetString(PyExc_ValueError, "a cell's place is not in the signals");
             return -1;
         }
+    }
+    if (!all_within(bank->cells, bank->n_cells, bank->n_cells)) {
+        PyErr_SetString(PyExc_ValueError, "the cells of the groups are not the bank's");
+        return -1;
     }
     return hold_levels(s, levels);
 }
@@ -323,13 +326,13 @@ static int search_init(PyObject *self, PyObject *args, PyObject *named)
 {
     Search *s = (Search *)self;
     Bank *bank = &s->bank;
-    PyObject *arrays[9], *levels, *multiply;
+    PyObject *arrays[10], *levels, *multiply;
     if (s->n_held || (named && PyDict_Size(named))) {
         PyErr_SetString(PyExc_TypeError, "a search is made once, and its arguments have no names");
         return -1;
     }
-    if (!PyArg_ParseTuple(args, "OOOOOOOOOO!Oddddl", &arrays[0], &arrays[1], &arrays[2], &arrays[3], &arrays[4],
-                          &arrays[5], &arrays[6], &arrays[7], &arrays[8], &PyTuple_Type, &levels, &multiply, &bank->rounding,
+    if (!PyArg_ParseTuple(args, "OOOOOOOOOOO!Oddddl", &arrays[0], &arrays[1], &arrays[2], &arrays[3], &arrays[4],
+                          &arrays[5], &arrays[6], &arrays[7], &arrays[8], &arrays[9], &PyTuple_Type, &levels, &multiply, &bank->rounding,
                           &bank->square_rounding, &bank->tie, &bank->tie_rounding, &bank->radius))
         return -1;
     if (!names_sgemm(multiply)) {

@@ -31,6 +31,7 @@ def is_stale(module: ModuleType, *names: str) -> bool:
     return there and crc32(b"".join(source.read_bytes() for source in sources)) != getattr(module, "SOURCES", None)
 
 
+Starts = NDArray[np.int32]
 # BLAS as scipy hands it to compiled code.
 _SGEMM = getattr(cython_blas, "__pyx_capi__", {}).get("sgemm")
 IS_COMPILED = (
@@ -58,13 +59,10 @@ def search_of(
     flags = signals.flags
     if not (IS_COMPILED and signals.dtype == np.float32 and flags.c_contiguous and flags.aligned):
         return None
-    parts_of = [*(level.part_of for level in bank.levels[1:]), bank.group_of]
-    levels = tuple(
-        (level.rows, *_by_group(part_of, len(level.rows))) for level, part_of in zip(bank.levels, parts_of, strict=True)
-    )
+    levels, cells = _in_order(bank)
     return _search.Search(
-        *(bank.basis, bank.coarse, bank.fine, signals, places, norms, *grid, bank.overlaps, levels, _SGEMM),
-        *(ROUNDING, SQUARE_ROUNDING, tie, tie_rounding, radius),
+        *(bank.basis, bank.coarse[cells], bank.fine, signals, places, norms, *grid, bank.overlaps, cells, levels),
+        *(_SGEMM, ROUNDING, SQUARE_ROUNDING, tie, tie_rounding, radius),
     )
 
 
@@ -79,8 +77,19 @@ def energy(difference: FloatArray, noise: FloatArray) -> float | None:
     return None if found < 0 else found
 
 
-def _by_group(group_of: Indices, n_groups: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return where the parts of each group begin, (n + 1,), and all parts, one group after the other."""
-    parts = np.argsort(group_of, kind="stable")
-    starts = np.searchsorted(group_of[parts], np.arange(n_groups + 1))
-    return starts.astype(np.int32), parts.astype(np.int32)
+def _in_order(bank: CompressedBank) -> tuple[tuple[tuple[Single, Starts], ...], Starts]:
+    """Return each level's groups so that the parts of each lie one after the other, and the cells (n,) likewise.
+
+    A level is its rows, (m, r + 2), and where the parts of each group begin in what comes next, (m + 1,).
+    """
+    levels = []
+    order = np.arange(len(bank.levels[0].rows))
+    for level, group_of in zip(bank.levels, [*(each.part_of for each in bank.levels[1:]), bank.group_of], strict=True):
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        placed = place[group_of]
+        parts = np.argsort(placed, kind="stable")
+        starts = np.searchsorted(placed[parts], np.arange(len(order) + 1))
+        levels.append((level.rows[order], starts.astype(np.int32)))
+        order = parts
+    return tuple(levels), order.astype(np.int32)

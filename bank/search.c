@@ -14,7 +14,7 @@
 enum {
     LANES = 8,
     /* With fewer candidates, scoring them costs less than to bound them anew. */
-    FEW_CANDIDATES = 16,
+    FEW_CANDIDATES = 64,
     /* More bounds than this at all lags take longer than numpy, whose products are quicker where much is left. */
     MOST_LOOKS = 1 << 16
 };
@@ -150,12 +150,10 @@ int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
     return 1;
 }
 
-static void look_at_cell(Hunt *hunt, const float *column, int32_t lag, int32_t cell)
+static void look_at_cell(Hunt *hunt, float bound, int32_t lag, int32_t cell)
 {
     const Bank *bank = hunt->bank;
-    float bound = product(bank->coarse + cell * (bank->coarse_rank + 2), column, bank->coarse_rank + 2);
-    hunt->looks_left--;
-    if (!may_reach(hunt, bound) || in_peak_of(bank, cell, hunt->apart_from))
+    if (in_peak_of(bank, cell, hunt->apart_from))
         return;
     if (hunt->n_candidates == bank->most_candidates) {
         hunt->looks_left = -1;
@@ -174,15 +172,17 @@ static void look_into(Hunt *hunt, const float *column, int32_t lag, int level, i
 {
     const Bank *bank = hunt->bank;
     const Level *here = &bank->levels[level];
-    for (int32_t i = here->starts[group]; i < here->starts[group + 1] && hunt->looks_left >= 0; i++) {
-        int32_t part = here->parts[i];
-        if (level + 1 == bank->n_levels) {
-            look_at_cell(hunt, column, lag, part);
-            continue;
-        }
-        const float *row = bank->levels[level + 1].rows + part * (bank->coarse_rank + 2);
+    int of_cells = level + 1 == bank->n_levels;
+    ptrdiff_t size = bank->coarse_rank + 2;
+    const float *rows = of_cells ? bank->coarse : bank->levels[level + 1].rows;
+    for (int32_t part = here->starts[group]; part < here->starts[group + 1] && hunt->looks_left >= 0; part++) {
+        float bound = product(rows + part * size, column, size);
         hunt->looks_left--;
-        if (may_reach(hunt, product(row, column, bank->coarse_rank + 2)))
+        if (!may_reach(hunt, bound))
+            continue;
+        if (of_cells)
+            look_at_cell(hunt, bound, lag, bank->cells[part]);
+        else
             look_into(hunt, column, lag, level + 1, part);
     }
 }
@@ -254,8 +254,9 @@ static void keep_what_may_reach(Hunt *hunt)
     if (hunt->n_candidates > FEW_CANDIDATES) {
         bound_anew(hunt);
         hunt->n_candidates = those_that_may_reach(hunt);
-        qsort(hunt->bank->candidates, (size_t)hunt->n_candidates, sizeof(Candidate), by_bound);
     }
+    /* The highest first: what is scored then leaves out others. */
+    qsort(hunt->bank->candidates, (size_t)hunt->n_candidates, sizeof(Candidate), by_bound);
 }
 
 /* Of cells that tie the first, and of its lags the one of the highest score. */

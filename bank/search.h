@@ -19,8 +19,7 @@ typedef void Multiply(const char *transpose_a, const char *transpose_b, const in
 
 typedef struct {
     const float *rows;     /* (n, coarse_rank + 2): bounds of the groups */
-    const int32_t *starts; /* (n + 1,): where the parts of each group begin in `parts` */
-    const int32_t *parts;  /* groups of the next level; after the last one, cells */
+    const int32_t *starts; /* (n + 1,): where each one's parts begin among the next level's groups, or the cells */
     ptrdiff_t n;
 } Level;
 
@@ -46,7 +45,8 @@ typedef struct {
 typedef struct {
     ptrdiff_t coarse_rank, fine_rank, n_cells;
     const float *basis;             /* (fine_rank, 896) */
-    const float *coarse;            /* (n_cells, coarse_rank + 2) */
+    const float *coarse;            /* (n_cells, coarse_rank + 2), as the cells lie in the groups: what is looked at */
+    const int32_t *cells;           /* together lies together. (n_cells,): the numbers of these cells */
     const float *fine;              /* (n_cells, fine_rank + 2) */
     const float *signals;           /* (any, 896) */
     const int64_t *places;          /* (n_cells,): the row of each cell in `signals` */

@@ -133,7 +133,10 @@ class Receiver:
                 newest = self._parser.feed(data) or newest
             except BlockingIOError:
                 break
-            except (ConnectionError, ProtocolError):
+            except (OSError, ProtocolError) as error:
+                if isinstance(error, TimeoutError) and self._connection.gettimeout():
+                    # The first one is waited for; afterwards it is the network that has given up.
+                    raise
                 data = b""
             self.connected, more = bool(data), len(data) == _READ_BYTES
         return newest

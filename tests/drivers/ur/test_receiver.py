@@ -1,9 +1,11 @@
 """Samples of the controller, from bytes as UR's RTDE guide has them, and on a connection."""
 
+import errno
 import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
+from unittest import mock
 
 import pytest
 from hypothesis import given
@@ -147,6 +149,21 @@ def test_connection_that_ends_or_carries_something_else_is_no_connection(
         receiver.latest()
     assert receiver.latest().timestamp_s in (1.0, 2.0)
     receiver.close()
+
+
+@pytest.mark.parametrize("number", [errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ECONNRESET])
+def test_connection_that_the_network_gives_up_is_lost_and_nothing_else(
+    play: Callable[..., Controller], number: int
+) -> None:
+    play()
+    receiver = Receiver("127.0.0.1", 125.0, 5.0)
+    receiver.close()
+    receiver.connected = True
+    with mock.patch.object(receiver, "_connection") as connection:
+        connection.recv.side_effect = OSError(number, "given up")
+        connection.gettimeout.return_value = 0.0
+        assert receiver.latest().timestamp_s == 1.0
+    assert not receiver.connected
 
 
 @pytest.mark.parametrize(

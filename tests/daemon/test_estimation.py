@@ -52,7 +52,7 @@ def frame(seq: int, arrives_ns: int) -> Frame:
     """Return a frame that was acquired in one period, sent, and arrived."""
     transfer_ns = 80 * MS
     mid_ns = arrives_ns - transfer_ns - PERIOD_NS // 2
-    return Frame(np.full(896, 0.1), np.zeros(1024), b"", mid_ns, arrives_ns, seq, NOTHING, NOTHING, False)
+    return Frame(np.full(896, 0.1), np.zeros(1024), b"", mid_ns, arrives_ns, seq, NOTHING, NOTHING, 0, False)
 
 
 class Unheard:

@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# What is compiled when it is installed, where there is a C compiler; everything works without, half a millisecond later.
+# What is compiled when it is installed, where there is a C compiler; everything works without, up to a millisecond later.
 COMPILED := setup.py bank/_search.c bank/search.c bank/search.h drivers/_cells.c
 # Many small solves: one BLAS thread each, on every machine.
 export OPENBLAS_NUM_THREADS := 1

@@ -332,8 +332,8 @@ static int search_init(PyObject *self, PyObject *args, PyObject *named)
         return -1;
     }
     if (!PyArg_ParseTuple(args, "OOOOOOOOOOO!Oddddl", &arrays[0], &arrays[1], &arrays[2], &arrays[3], &arrays[4],
-                          &arrays[5], &arrays[6], &arrays[7], &arrays[8], &arrays[9], &PyTuple_Type, &levels, &multiply, &bank->rounding,
-                          &bank->square_rounding, &bank->tie, &bank->tie_rounding, &bank->radius))
+                          &arrays[5], &arrays[6], &arrays[7], &arrays[8], &arrays[9], &PyTuple_Type, &levels,
+                          &multiply, &bank->rounding, &bank->square_rounding, &bank->tie, &bank->tie_rounding, &bank->radius))
         return -1;
     if (!names_sgemm(multiply)) {
         PyErr_SetString(PyExc_TypeError, "this is no sgemm of scipy's");

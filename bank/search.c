@@ -120,8 +120,7 @@ int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
     double largest = 0, sum = 0;
     for (int i = 0; i < CHANNELS; i++) {
         frame[i] = fabs(difference[i]);
-        /* Not fmax, which would pass over what is not a number. */
-        if (!(frame[i] <= largest))
+        if (frame[i] > largest)
             largest = frame[i];
     }
     if (!(largest > 0 && largest < INFINITY))
@@ -132,6 +131,7 @@ int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
         sum += frame[i] * frame[i];
     }
     double norm = sqrt(sum);
+    /* What is not a number shows here. */
     if (!(norm > 0 && norm < INFINITY))
         return 0;
     memset(hunt->padded, 0, CHANNELS * sizeof(double));

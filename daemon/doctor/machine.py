@@ -108,6 +108,6 @@ def compiled_finding() -> Finding:
         "compiled parts",
         "reading a frame and matching it are not compiled: there was no C compiler when this was installed, or their "
         "sources have changed since",
-        "the same estimates come about half a millisecond later",
+        "the same estimates come half a millisecond to a millisecond later",
         "`sudo apt install gcc python3-dev`, then install shearloop again",
     )

@@ -27,8 +27,8 @@ from daemon.experiment.steps import ExperimentFile
 from daemon.experiment.wishes import Action, TakeZero
 from daemon.loop.senses import Arm, Source, Torque
 from daemon.rig import make_brain
-from daemon.skin_estimator import SkinEstimator
-from daemon.skin_task import SKIN, skin_torque
+from daemon.skin.estimator import SkinEstimator
+from daemon.skin.task import SKIN, skin_torque
 from daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
 from drivers.emulators.skin.daq import NOISE_V
 from drivers.shear_skin.judge import SkinSample

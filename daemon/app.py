@@ -35,8 +35,8 @@ from daemon.recording.identity import Attached, identity_of, notes_of
 from daemon.recording.recorder import Recorder
 from daemon.rig import Rig, make_load_cell
 from daemon.rig_check import checked_experiment
-from daemon.skin_setup import make_skin
-from daemon.skin_task import SKIN, SKIN_SOURCE, SkinTask
+from daemon.skin.setup import make_skin
+from daemon.skin.task import SKIN, SKIN_SOURCE, SkinTask
 from daemon.supervisor import Supervisor
 from daemon.tool_diameter import FingertipDiameters
 from daemon.torque_sources import torque_sources

@@ -11,7 +11,7 @@ from daemon.experiment.steps import ExperimentFile, Grip, Release, beyond_limits
 from daemon.load_cell_task import LOAD_CELL
 from daemon.loop.senses import Source
 from daemon.loop_task import WRENCH
-from daemon.skin_task import SKIN
+from daemon.skin.task import SKIN
 
 
 def read_experiment(path: Path) -> ExperimentFile:

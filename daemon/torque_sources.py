@@ -6,7 +6,7 @@ from daemon.both import BOTH
 from daemon.config import DaemonConfig
 from daemon.loop.senses import Source
 from daemon.opening import AnyEstimator
-from daemon.skin_setup import skin_source
+from daemon.skin.setup import skin_source
 from daemon.tracking import TrackedEstimator
 
 

@@ -92,8 +92,8 @@ def _skin(config: "SkinConfig") -> str:
     import math
 
     from bank.skin.calibration_file import load_calibration
-    from daemon.skin_setup import check_circuit
-    from daemon.skin_zero import MOST_CHANGE
+    from daemon.skin.setup import check_circuit
+    from daemon.skin.zero import MOST_CHANGE
 
     calibration = load_calibration(config.calibration)
     check_circuit(config, calibration)

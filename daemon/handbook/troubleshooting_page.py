@@ -40,10 +40,10 @@ SECTIONS = (
             "daemon/estimator.py",
             "bank/estimators/guard.py",
             "bank/estimators/familiar.py",
-            "daemon/skin_estimator.py",
-            "daemon/skin_zero.py",
+            "daemon/skin/estimator.py",
+            "daemon/skin/zero.py",
             "drivers/shear_skin/judge.py",
-            "daemon/skin_task.py",
+            "daemon/skin/task.py",
         ),
     ),
     Section(

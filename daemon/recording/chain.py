@@ -15,8 +15,8 @@ from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.publisher import Publisher
 from daemon.recording.recorded_run import Asides
 from daemon.rig import load_cell_calibration
-from daemon.skin_setup import RecordedSkin
-from daemon.skin_task import SKIN
+from daemon.skin.setup import RecordedSkin
+from daemon.skin.task import SKIN
 from drivers.eit_line import Frame, LineParser
 from drivers.hx711 import LoadParser
 from drivers.raw_input import RawInput

@@ -11,7 +11,7 @@ import pytest
 from daemon.cli import main
 from daemon.recording.export import topics_of
 from tests.daemon.recording.test_replay import measured, replayed
-from tests.daemon.test_skin_run import played
+from tests.daemon.skin.test_skin_run import played
 
 
 async def recorded(folder: Path, *, socket: bool) -> list[tuple[str, dict[str, Any]]]:

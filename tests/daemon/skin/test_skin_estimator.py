@@ -11,7 +11,7 @@ from bank.skin.calibration import SkinCalibration
 from bank.skin.calibration_file import load_calibration
 from bank.skin.calibration_fit import fit_calibration
 from bank.skin.membrane import Direction
-from daemon.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
+from daemon.skin.estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
 from daemon.synthetic_skin import REST_OHM, SyntheticSkin, SyntheticSkinSettings, calibration_table
 from drivers.shear_skin.judge import Fault, SkinSample
 
@@ -21,7 +21,7 @@ PERIOD_NS = 100_000_000
 
 @pytest.fixture(scope="module")
 def calibration() -> SkinCalibration:
-    return load_calibration(Path(__file__).parents[2] / "config" / "calibrations" / "skin_demo.yaml")
+    return load_calibration(Path(__file__).parents[3] / "config" / "calibrations" / "skin_demo.yaml")
 
 
 class Bench:

@@ -7,7 +7,7 @@ from daemon.clock import Clock
 from daemon.loop.senses import Torque
 from daemon.messages import Scalar, SkinShear
 from daemon.publisher import Publisher
-from daemon.skin_estimator import SkinEstimator, SkinReading
+from daemon.skin.estimator import SkinEstimator, SkinReading
 from daemon.waiting import Waiting
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.shear_skin.judge import SkinSample

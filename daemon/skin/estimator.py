@@ -10,7 +10,7 @@ from bank.gaussian import TWO_SIDED_95
 from bank.skin.calibration import SkinCalibration
 from bank.skin.membrane import Direction, ShearInterval
 from bank.skin.tracking import DirectionFinder, ForceFollower
-from daemon.skin_zero import RefusedZero, Zero, ZeroTaker
+from daemon.skin.zero import RefusedZero, Zero, ZeroTaker
 from drivers.shear_skin.judge import SkinSample
 
 # The gauge on the slack side is never stretched, and compressed by at most so much of the other's stretch (the 2-D

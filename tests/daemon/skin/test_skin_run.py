@@ -20,7 +20,7 @@ from drivers.emulators.skin.instruments import SkinInstruments
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.test_run import collector, running
 
-CALIBRATION = Path(__file__).parents[2] / "config" / "calibrations" / "skin_demo.yaml"
+CALIBRATION = Path(__file__).parents[3] / "config" / "calibrations" / "skin_demo.yaml"
 RATE_HZ = 200.0
 
 
@@ -190,7 +190,7 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path)
 
 
 async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daemon.skin_task.ZERO_DEADLINE_S", 0.3)
+    monkeypatch.setattr("daemon.skin.task.ZERO_DEADLINE_S", 0.3)
     async with played(tmp_path) as bench:
         await bench.valid()
         bench.instruments.command("open 2")
@@ -210,8 +210,8 @@ async def test_one_daemon_carries_a_fingertip_and_a_skin(config: Callable[..., P
 SCANNER = {"scanner": {"socket": {"host": "127.0.0.1", "port": 5025}}}
 SOCKET = {"socket": {"host": "127.0.0.1", "port": 5025}}
 SOURCE = {"serial": {"path": "skin-source"}}
-HOLDS = str(Path(__file__).parents[2] / "config" / "experiments" / "skin_hold_shear.yaml")
-ROBOT = str(Path(__file__).parents[2] / "config" / "demo_ur.yaml")
+HOLDS = str(Path(__file__).parents[3] / "config" / "experiments" / "skin_hold_shear.yaml")
+ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ from bench.daemon_parts import (
     subscription,
     tree,
 )
-from daemon.request import request
+from daemon.wire.request import request
 from drivers.eit_format import FRAME_PERIOD_S
 
 REPEATS = 5

@@ -33,9 +33,9 @@ from numpy.typing import NDArray
 
 from bench.rig_configuration import write_configuration
 from daemon.messages import decode
-from daemon.request import request
 from daemon.service.priority import first_in_line
 from daemon.topics import TOPICS
+from daemon.wire.request import request
 from drivers.ur.client import UrRobot
 from drivers.ur.settings import UrSettings, read_settings
 

@@ -26,7 +26,7 @@ import zmq
 from daemon.clock import Clock
 from daemon.errors import UserError
 from daemon.messages import EitEstimate, EitHeatmap, Health, LoadTorque, LoopState, Message, RobotStateMessage
-from daemon.publisher import Publisher
+from daemon.wire.publisher import Publisher
 
 CHROMIUM_ARGUMENTS = (
     *("--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking"),

@@ -15,22 +15,18 @@ import zmq.asyncio
 
 from bank.channels import ZERO_SLOTS
 from daemon import sd_notify
-from daemon.addresses import open_stop_address
 from daemon.both import BOTH, BothTask
 from daemon.clock import Clock
-from daemon.command_server import CommandServer
 from daemon.commands import Commands, needed
 from daemon.config import DaemonConfig, Fingertip
 from daemon.configured_experiment import ConfiguredExperiment
 from daemon.estimation import Estimation
 from daemon.fingertip import FingertipTask
 from daemon.health import HealthReporter, TaskFacts
-from daemon.keys import Gatekeeper, load_server_keys
 from daemon.links import log_link
 from daemon.load_cell_task import LOAD_CELL
 from daemon.loop.senses import Source
 from daemon.opening import AnyEstimator, open_both, open_estimator
-from daemon.publisher import Listener, Publisher
 from daemon.recording.identity import Attached, identity_of, notes_of
 from daemon.recording.recorder import Recorder
 from daemon.rig import Rig, make_load_cell
@@ -41,6 +37,10 @@ from daemon.supervisor import Supervisor
 from daemon.tool_diameter import FingertipDiameters
 from daemon.torque_sources import torque_sources
 from daemon.tracking import TrackedEstimator
+from daemon.wire.addresses import open_stop_address
+from daemon.wire.command_server import CommandServer
+from daemon.wire.keys import Gatekeeper, load_server_keys
+from daemon.wire.publisher import Listener, Publisher
 from drivers.eit_kit import EitKit
 from drivers.raw_input import Tap, no_tap
 from drivers.serial_port import LinkEvent

@@ -7,8 +7,8 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, model_validator
 
-from daemon.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, open_to_the_network, stays_on_this_machine
 from daemon.config_file import ConfigModel, load_yaml_model
+from daemon.wire.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, open_to_the_network, stays_on_this_machine
 
 
 def _known_transport(address: str) -> str:

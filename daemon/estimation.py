@@ -9,9 +9,9 @@ from daemon.estimator import Reading
 from daemon.loop.senses import Torque
 from daemon.messages import EitEstimate
 from daemon.opening import AnyEstimator
-from daemon.publisher import Publisher
 from daemon.tool_diameter import HearDiameter, as_text, unheard, unknown
 from daemon.waiting import Waiting
+from daemon.wire.publisher import Publisher
 from drivers.eit_kit import Frame
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 

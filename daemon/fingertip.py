@@ -10,7 +10,7 @@ import numpy as np
 from daemon.estimation import Estimation
 from daemon.estimator import Reading
 from daemon.messages import EitFrame, EitHeatmap, Scalar
-from daemon.publisher import Publisher
+from daemon.wire.publisher import Publisher
 from drivers.eit_kit import EitKit, Frame
 
 # Frames that may wait for the estimator. When they are this many the port is read no further: the board's own

@@ -10,8 +10,8 @@ from daemon.experiment.wishes import GripTo
 from daemon.loop.senses import Hand
 from daemon.loop.watch import HAND_STALE_S
 from daemon.messages import GripperStateMessage, Scalar
-from daemon.publisher import Publisher
 from daemon.tool_diameter import unknown
+from daemon.wire.publisher import Publisher
 from drivers.errors import DriverError
 from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus

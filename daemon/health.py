@@ -11,8 +11,8 @@ from pathlib import Path
 from daemon import sd_notify
 from daemon.clock import Clock
 from daemon.messages import Health, Scalar
-from daemon.publisher import Publisher
 from daemon.supervisor import Supervisor
+from daemon.wire.publisher import Publisher
 
 HEALTH_PERIOD_S = 1.0
 TaskFacts = Mapping[str, Scalar | Mapping[str, int]]

@@ -8,8 +8,8 @@ import structlog
 from daemon.clock import Clock
 from daemon.loop.senses import Source, Torque
 from daemon.messages import LoadTorque, Scalar
-from daemon.publisher import Publisher
 from daemon.waiting import Waiting
+from daemon.wire.publisher import Publisher
 from drivers.hx711 import LoadSample
 from drivers.load_cell import LoadCell
 

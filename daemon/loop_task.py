@@ -15,9 +15,9 @@ from daemon.loop.watch import ARM_STALE_S
 from daemon.loop_actions import DeviceActions
 from daemon.loop_messages import loop_state, robot_state
 from daemon.messages import Scalar
-from daemon.publisher import Publisher
 from daemon.silence import Silence
 from daemon.supervisor import LONGEST_ERROR
+from daemon.wire.publisher import Publisher
 from drivers.ur.client import UrRobot, unheard
 from drivers.ur.messages import Enable, Reply, RobotState, Stop, Unlock, WristSpeed
 

@@ -20,8 +20,8 @@ from daemon.loop.tune import TuneSettings, tuned
 from daemon.loop.watch import WatchSettings
 from daemon.loop.wrist import Wrist, WristSettings
 from daemon.loop_task import WRENCH, LoopTask, wrench_source
-from daemon.publisher import Publisher
 from daemon.rig_check import read_experiment
+from daemon.wire.publisher import Publisher
 from drivers.calibration_file import load_calibration
 from drivers.hx711 import LoadCalibration
 from drivers.load_cell import LoadCell

@@ -81,7 +81,7 @@ def _rig(config: "DaemonConfig") -> dict[str, str]:
 
 
 def _clients(curve: "CurveConfig") -> str:
-    from daemon.keys import admitted_clients, load_server_keys
+    from daemon.wire.keys import admitted_clients, load_server_keys
 
     load_server_keys(curve.server_key)
     return ", ".join(sorted(admitted_clients(curve.clients).values()))

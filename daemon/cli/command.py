@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from daemon.addresses import COMMAND_ADDRESS, needs_keys, stop_address
 from daemon.cli.connection import add_connection, client_keys
-from daemon.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
+from daemon.wire.addresses import COMMAND_ADDRESS, needs_keys, stop_address
+from daemon.wire.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
 
 COMMANDS = {
     "tare": "take the zero of the torque sensors anew: nothing gripped, no experiment running",
@@ -65,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
     import json
     import sys
 
-    from daemon.request import request
-    from daemon.subscriber import checked_timeout_s
+    from daemon.wire.request import request
+    from daemon.wire.subscriber import checked_timeout_s
 
     arguments = {} if args.source is None else {"source": args.source}
     if args.heatmap is not None:

@@ -5,10 +5,10 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.addresses import needs_keys
+from daemon.wire.addresses import needs_keys
 
 if TYPE_CHECKING:
-    from daemon.keys import ClientKeys
+    from daemon.wire.keys import ClientKeys
 
 
 def own_key_folder() -> Path:
@@ -33,7 +33,7 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
     given = (args.key, args.server_key)
     if given == (None, None) and not needs_keys(args.connect):
         return None
-    from daemon.keys import ClientKeys, load_key_pair, load_public_key
+    from daemon.wire.keys import ClientKeys, load_key_pair, load_public_key
 
     folder = own_key_folder()
     key = args.key or folder / "client.key_secret"

@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _server(args: argparse.Namespace) -> None:
-    from daemon.keys import cannot_write, make_key_pair
+    from daemon.wire.keys import cannot_write, make_key_pair
 
     public, secret = make_key_pair(args.dir, "server")
     clients = args.dir / "clients"
@@ -56,7 +56,7 @@ def _server(args: argparse.Namespace) -> None:
 
 
 def _client(args: argparse.Namespace) -> None:
-    from daemon.keys import make_key_pair
+    from daemon.wire.keys import make_key_pair
 
     public, secret = make_key_pair(args.dir, "client")
     sentences = [
@@ -69,7 +69,7 @@ def _client(args: argparse.Namespace) -> None:
 
 def _allow(args: argparse.Namespace) -> None:
     from daemon.errors import UserError
-    from daemon.keys import allowed_clients, cannot_write, load_public_key, write_public_key
+    from daemon.wire.keys import allowed_clients, cannot_write, load_public_key, write_public_key
 
     public = load_public_key(args.key)
     name, clients = args.name or args.key.stem, args.dir / "clients"
@@ -90,7 +90,7 @@ def _allow(args: argparse.Namespace) -> None:
 
 def _revoke(args: argparse.Namespace) -> None:
     from daemon.errors import UserError
-    from daemon.keys import allowed_clients, cannot_write
+    from daemon.wire.keys import allowed_clients, cannot_write
 
     clients = args.dir / "clients"
     _check_name(args.name)
@@ -106,7 +106,7 @@ def _revoke(args: argparse.Namespace) -> None:
 
 
 def _list(args: argparse.Namespace) -> None:
-    from daemon.keys import allowed_clients, load_public_key
+    from daemon.wire.keys import allowed_clients, load_public_key
 
     server = load_public_key(args.dir / "server.key").decode()
     clients = {name: key.decode() for key, name in allowed_clients(args.dir / "clients").items()}

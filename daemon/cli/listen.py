@@ -2,8 +2,8 @@
 
 import argparse
 
-from daemon.addresses import PUBLISH_ADDRESS
 from daemon.cli.connection import add_connection, client_keys
+from daemon.wire.addresses import PUBLISH_ADDRESS
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -21,8 +21,8 @@ def run(args: argparse.Namespace) -> int:
     """Print messages until interrupted, or until enough have come."""
     from daemon.errors import UserError
     from daemon.readable import as_json, as_line
-    from daemon.subscriber import checked_timeout_s, messages
     from daemon.topics import TOPICS
+    from daemon.wire.subscriber import checked_timeout_s, messages
 
     for topic in args.topics:
         if not any(known.startswith(topic) for known in TOPICS):

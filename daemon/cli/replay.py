@@ -8,8 +8,8 @@ from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.addresses import PUBLISH_ADDRESS
 from daemon.cli.result import add_json, tell
+from daemon.wire.addresses import PUBLISH_ADDRESS
 
 if TYPE_CHECKING:
     from daemon.config import DaemonConfig
@@ -77,9 +77,9 @@ async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, ar
 
     from daemon.cli.progress import progress_bar
     from daemon.cli.run import Show
-    from daemon.publisher import Publisher
     from daemon.recording.chain import Chain
     from daemon.recording.replay import Replay, ReplayClock
+    from daemon.wire.publisher import Publisher
 
     clock = ReplayClock()
     with ExitStack() as opened:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from daemon.cli.demonstration import Truth
     from daemon.config import Emulator
     from daemon.outlet import Outlet
-    from daemon.publisher import Listener
+    from daemon.wire.publisher import Listener
 
 # Long enough for an emulator to remove its port's link, short enough for a clean stop within a second.
 EMULATOR_STOP_S = 0.5

@@ -4,8 +4,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys, stop_address
 from daemon.cli.connection import add_connection, client_keys
+from daemon.wire.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys, stop_address
 
 if TYPE_CHECKING:
     from bank.fingertip import Fingertip

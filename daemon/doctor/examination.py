@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.addresses import stop_address
 from daemon.config import DaemonConfig, load_daemon_config
 from daemon.doctor.devices import examine_devices
 from daemon.doctor.files import examine_files
@@ -14,6 +13,7 @@ from daemon.doctor.live import examine_daemon, listen, tasks_of_daemon
 from daemon.doctor.machine import disk_finding, examine_machine
 from daemon.errors import UserError
 from daemon.ports import ports_there
+from daemon.wire.addresses import stop_address
 
 
 def examine(config_path: Path | None, seconds: float, geometry: Path | None = None) -> Iterator[Finding]:

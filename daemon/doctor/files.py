@@ -91,7 +91,7 @@ def both_finding(both: Both, fingertips: dict[str, Fingertip]) -> Finding:
 
 def keys_finding(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
     """Say who may connect from the network, and whether a secret key is one."""
-    from daemon.keys import admitted_clients, load_server_keys, server_key_file
+    from daemon.wire.keys import admitted_clients, load_server_keys, server_key_file
 
     if curve is None:
         return good("keys", "none are needed: every address is of this machine alone")

@@ -11,7 +11,7 @@ from daemon.doctor.devices import channels_finding, rate_finding
 from daemon.doctor.finding import Finding, good, note, trouble
 from daemon.errors import UserError
 from daemon.messages import decode
-from daemon.request import request
+from daemon.wire.request import request
 
 ANSWER_TIMEOUT_S = 1.0
 

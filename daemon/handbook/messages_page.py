@@ -8,11 +8,11 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from daemon.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
 from daemon.cli.command import COMMANDS
 from daemon.handbook.markdown import table
 from daemon.messages import Message
 from daemon.topics import STALE_AFTER_PERIODS, TOPICS
+from daemon.wire.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
 
 EXAMPLES = Path("docs/examples")
 _ENVELOPE = ("source", "t_mono_ns")

@@ -55,7 +55,7 @@ SECTIONS = (
             "daemon/loop/wrist.py",
             "daemon/loop/tune.py",
             "daemon/experiment/machine.py",
-            "daemon/command_server.py",
+            "daemon/wire/command_server.py",
         ),
     ),
     Section(
@@ -96,10 +96,10 @@ SECTIONS = (
         raised=(
             "daemon/config_file.py",
             "daemon/config.py",
-            "daemon/publisher.py",
-            "daemon/keys.py",
-            "daemon/request.py",
-            "daemon/subscriber.py",
+            "daemon/wire/publisher.py",
+            "daemon/wire/keys.py",
+            "daemon/wire/request.py",
+            "daemon/wire/subscriber.py",
             "daemon/service",
             "daemon/cli/run.py",
             "daemon/cli/connection.py",
@@ -107,7 +107,7 @@ SECTIONS = (
             "daemon/cli/emulate.py",
             "daemon/cli/listen.py",
         ),
-        told=("daemon/addresses.py",),
+        told=("daemon/wire/addresses.py",),
     ),
     Section(
         "Bank files",

@@ -12,11 +12,11 @@ from daemon.fingertip import frame_message
 from daemon.load_cell_task import LOAD_CELL, load_message
 from daemon.messages import EitEstimate, EitFrame, LoadTorque, SkinShear
 from daemon.opening import AnyEstimator, open_both, open_estimator
-from daemon.publisher import Publisher
 from daemon.recording.recorded_run import Asides
 from daemon.rig import load_cell_calibration
 from daemon.skin.setup import RecordedSkin
 from daemon.skin.task import SKIN
+from daemon.wire.publisher import Publisher
 from drivers.eit_line import Frame, LineParser
 from drivers.hx711 import LoadParser
 from drivers.raw_input import RawInput

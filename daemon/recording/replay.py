@@ -16,11 +16,11 @@ import numpy as np
 
 from daemon.clock import Clock
 from daemon.messages import EitHeatmap
-from daemon.publisher import Publisher
 from daemon.recording.chain import MADE_ANEW, Chain
 from daemon.recording.content import message_json
 from daemon.recording.recorded_run import Happened, RecordedRun
 from daemon.recording.schema import CLOCK_TOPIC, recorded_topic
+from daemon.wire.publisher import Publisher
 
 # These two say when a message was made and by which reading of the clocks, and not what was measured.
 NOT_COMPARED = ("latency_s", "timestamp")

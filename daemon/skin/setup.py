@@ -12,9 +12,9 @@ from daemon.errors import UserError
 from daemon.links import log_link
 from daemon.loop.senses import Source, Torque
 from daemon.messages import SkinShear
-from daemon.publisher import Publisher
 from daemon.skin.estimator import SkinEstimator
 from daemon.skin.task import SKIN, SKIN_DAQ, SKIN_SOURCE, SkinTask, shear_message
+from daemon.wire.publisher import Publisher
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.serial_port import DEFAULT_BAUD, Link, LinkEvent, SerialLink
 from drivers.shear_skin.adc_board import AdcBoard, PairParser

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from daemon.clock import Clock
 from daemon.loop.senses import Torque
 from daemon.messages import Scalar, SkinShear
-from daemon.publisher import Publisher
 from daemon.skin.estimator import SkinEstimator, SkinReading
 from daemon.waiting import Waiting
+from daemon.wire.publisher import Publisher
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.shear_skin.judge import SkinSample
 from drivers.shear_skin.skin import ShearSkin

@@ -14,8 +14,8 @@ from concurrent.futures import Future
 from typing import Any
 
 from daemon.errors import UserError
-from daemon.keys import ClientKeys
-from daemon.request import request
+from daemon.wire.keys import ClientKeys
+from daemon.wire.request import request
 
 # So much later than its own end a request counts as hanging.
 GRACE_S = 2.0

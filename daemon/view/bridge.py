@@ -11,13 +11,13 @@ import zmq
 import zmq.asyncio
 
 from daemon.errors import UserError
-from daemon.keys import ClientKeys
 from daemon.messages import EitFrame, EitHeatmap, decode
-from daemon.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
-from daemon.subscriber import connect
 from daemon.topics import TOPICS
 from daemon.view.asked import Requests
 from daemon.view.latest import Latest
+from daemon.wire.keys import ClientKeys
+from daemon.wire.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
+from daemon.wire.subscriber import connect
 
 # The largest message is a heatmap of 200 × 200 float32.
 LARGEST_MESSAGE_BYTES = 1 << 20

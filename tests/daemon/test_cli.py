@@ -245,7 +245,7 @@ def test_unlocking_is_waited_for_and_an_absent_daemon_is_told_at_once(
         asked.append((content["command"], timeout_s))
         return {"ok": True}
 
-    monkeypatch.setattr("daemon.request.request", answers)
+    monkeypatch.setattr("daemon.wire.request.request", answers)
     assert main(["command", "unlock"]) == 0
     assert main(["command", "unlock", "--timeout", "5"]) == 0
     assert main(["command", "stop"]) == 0

@@ -17,10 +17,10 @@ from bank.bank_file import Bank
 from bank.calibration import Calibration
 from daemon.app import Daemon
 from daemon.config import load_daemon_config
-from daemon.request import request
 from daemon.view.bridge import Bridge, Place
 from daemon.view.latest import Latest
 from daemon.view.server import make_app
+from daemon.wire.request import request
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 

@@ -18,16 +18,16 @@ from hypothesis import strategies as st
 
 from daemon.app import Daemon
 from daemon.clock import Clock
-from daemon.command_server import CommandRefusedError, CommandServer
 from daemon.commands import Commands
 from daemon.config import load_daemon_config
 from daemon.errors import UserError
 from daemon.messages import decode, encode
-from daemon.publisher import Publisher
-from daemon.rate_limit import RateLimit
-from daemon.request import request
 from daemon.rig import Rig
-from daemon.subscriber import messages
+from daemon.wire.command_server import CommandRefusedError, CommandServer
+from daemon.wire.publisher import Publisher
+from daemon.wire.rate_limit import RateLimit
+from daemon.wire.request import request
+from daemon.wire.subscriber import messages
 
 
 def handlers() -> Mapping[str, Any]:

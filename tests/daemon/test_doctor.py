@@ -17,9 +17,9 @@ from daemon.doctor.examination import examine, ports_finding
 from daemon.doctor.files import bank_finding, keys_finding
 from daemon.doctor.finding import Finding, from_sentence
 from daemon.doctor.live import task_finding
-from daemon.keys import make_key_pair
 from daemon.ports import PortThere
-from daemon.subscriber import messages
+from daemon.wire.keys import make_key_pair
+from daemon.wire.subscriber import messages
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 

@@ -9,7 +9,7 @@ from daemon.clock import Clock
 from daemon.estimation import Estimation
 from daemon.estimator import Reading
 from daemon.messages import Message
-from daemon.publisher import Publisher
+from daemon.wire.publisher import Publisher
 from drivers.eit_line import Frame
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 

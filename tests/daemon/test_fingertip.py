@@ -14,7 +14,7 @@ from daemon.estimation import Estimation
 from daemon.estimator import Reading
 from daemon.fingertip import FingertipTask
 from daemon.messages import Message
-from daemon.publisher import Publisher
+from daemon.wire.publisher import Publisher
 from drivers.eit_format import FRAME_PERIOD_S
 from drivers.eit_kit import EitKit, Frame
 

@@ -14,11 +14,11 @@ import zmq
 import zmq.asyncio
 
 from daemon.app import Daemon
-from daemon.command_server import MOST_AT_ONCE
 from daemon.config import load_daemon_config
 from daemon.health import resident_memory_mb
 from daemon.messages import decode, encode
-from daemon.rate_limit import ALL_BURST, ALL_PER_S, PER_CLIENT_BURST, PER_CLIENT_PER_S, RateLimit
+from daemon.wire.command_server import MOST_AT_ONCE
+from daemon.wire.rate_limit import ALL_BURST, ALL_PER_S, PER_CLIENT_BURST, PER_CLIENT_PER_S, RateLimit
 from drivers.ur.client import UrRobot
 from drivers.ur.messages import Reply
 

@@ -16,8 +16,8 @@ import zmq
 
 from daemon.clock import Clock
 from daemon.messages import Message
-from daemon.publisher import Publisher
 from daemon.topics import TOPICS
+from daemon.wire.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.view.fake_daemon import MESSAGES, made
 

@@ -20,7 +20,7 @@ from bank.channels import LINE_SLOTS, line_of_channels
 from daemon.app import Daemon
 from daemon.config import load_daemon_config
 from daemon.messages import decode
-from daemon.request import request
+from daemon.wire.request import request
 from drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address

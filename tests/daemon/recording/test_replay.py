@@ -16,12 +16,12 @@ import zmq.asyncio
 from daemon.app import Daemon
 from daemon.cli import main
 from daemon.config import DaemonConfig, load_daemon_config
-from daemon.publisher import Publisher
 from daemon.recording.chain import Chain
 from daemon.recording.importing import import_mat
 from daemon.recording.recorded_run import RecordedRun
 from daemon.recording.replay import Comparison, Replay, ReplayClock
-from daemon.request import request
+from daemon.wire.publisher import Publisher
+from daemon.wire.request import request
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.test_run import recording
 

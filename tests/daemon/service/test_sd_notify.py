@@ -12,10 +12,10 @@ import zmq
 from daemon import health
 from daemon.clock import Clock
 from daemon.errors import UserError
-from daemon.publisher import Publisher
 from daemon.sd_notify import notify
 from daemon.service.locked_memory import lock_memory
 from daemon.supervisor import Supervisor, TaskRecord
+from daemon.wire.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 

@@ -14,8 +14,8 @@ import zmq.asyncio
 from daemon.app import Daemon
 from daemon.cli import main
 from daemon.config import load_daemon_config
-from daemon.request import request
 from daemon.synthetic_skin import SyntheticSkin
+from daemon.wire.request import request
 from drivers.emulators.skin.instruments import SkinInstruments
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.test_run import collector, running

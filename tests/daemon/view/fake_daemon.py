@@ -19,7 +19,6 @@ import zmq
 import zmq.asyncio
 
 from daemon.clock import Clock
-from daemon.command_server import CommandRefusedError, CommandServer
 from daemon.messages import (
     EitEstimate,
     EitHeatmap,
@@ -31,7 +30,8 @@ from daemon.messages import (
     RobotStateMessage,
     SkinShear,
 )
-from daemon.publisher import Publisher
+from daemon.wire.command_server import CommandRefusedError, CommandServer
+from daemon.wire.publisher import Publisher
 
 # Estimates and heatmaps come twice a second, all else ten times.
 PUMP_S, SLOW_TURNS = 0.1, 5

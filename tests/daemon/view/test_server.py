@@ -16,18 +16,18 @@ import pytest
 import zmq.asyncio
 from aiohttp import web
 
-from daemon.addresses import PUBLISH_ADDRESS
 from daemon.clock import Clock
-from daemon.command_server import CommandRefusedError, CommandServer
 from daemon.errors import UserError
 from daemon.messages import EitHeatmap, LoadTorque
-from daemon.publisher import Publisher
 from daemon.view import bridge as bridge_module
 from daemon.view import server as server_module
 from daemon.view.bridge import Bridge, Place
 from daemon.view.latest import Latest
 from daemon.view.serve import serve
 from daemon.view.server import HEADERS, NEEDS_TOKEN, make_app
+from daemon.wire.addresses import PUBLISH_ADDRESS
+from daemon.wire.command_server import CommandRefusedError, CommandServer
+from daemon.wire.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 TOKEN = "the token of this test, long enough for anybody"  # noqa: S105 - opens nothing but this test's page

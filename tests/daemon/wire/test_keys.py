@@ -10,13 +10,13 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from daemon.addresses import needs_keys, open_stop_address, stays_on_this_machine
 from daemon.app import Daemon
 from daemon.cli import main
 from daemon.config import load_daemon_config
 from daemon.errors import UserError
-from daemon.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
 from daemon.messages import decode, encode
+from daemon.wire.addresses import needs_keys, open_stop_address, stays_on_this_machine
+from daemon.wire.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
 
 Write = Callable[..., Path]
 NETWORK = "tcp://0.0.0.0:*"

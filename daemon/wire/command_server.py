@@ -14,10 +14,10 @@ import structlog
 import zmq
 import zmq.asyncio
 
-from daemon.keys import KeyPair
 from daemon.messages import decode, encode
-from daemon.publisher import bind
-from daemon.rate_limit import PER_CLIENT_PER_S, RateLimit
+from daemon.wire.keys import KeyPair
+from daemon.wire.publisher import bind
+from daemon.wire.rate_limit import PER_CLIENT_PER_S, RateLimit
 
 LARGEST_REQUEST_BYTES = 64 * 1024
 MOST_AT_ONCE = 16

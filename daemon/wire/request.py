@@ -6,9 +6,9 @@ from typing import Any
 import zmq
 
 from daemon.errors import UserError
-from daemon.keys import ClientKeys
 from daemon.messages import decode, encode
-from daemon.subscriber import connect, keys_hint
+from daemon.wire.keys import ClientKeys
+from daemon.wire.subscriber import connect, keys_hint
 
 
 def request(

@@ -11,12 +11,12 @@ from typing import Any, TypeAlias
 
 import zmq
 
-from daemon.addresses import open_to_the_network, stays_on_this_machine
 from daemon.clock import Clock
 from daemon.errors import UserError
-from daemon.keys import KeyPair
 from daemon.messages import Message, encode, wire_map
 from daemon.topics import TOPICS
+from daemon.wire.addresses import open_to_the_network, stays_on_this_machine
+from daemon.wire.keys import KeyPair
 
 # Messages kept for a subscriber that reads too slowly; older ones are dropped for it, never delayed for others.
 HIGH_WATER_MARK = 1000

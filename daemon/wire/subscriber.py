@@ -5,10 +5,10 @@ from typing import Any
 
 import zmq
 
-from daemon.addresses import needs_keys
 from daemon.errors import UserError
-from daemon.keys import ClientKeys
 from daemon.messages import decode
+from daemon.wire.addresses import needs_keys
+from daemon.wire.keys import ClientKeys
 
 # A day; what a poll takes at most is some weeks.
 LONGEST_TIMEOUT_S = 86_400

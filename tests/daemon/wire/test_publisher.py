@@ -9,7 +9,7 @@ import zmq
 
 from daemon.clock import Clock
 from daemon.messages import LoadTorque, decode
-from daemon.publisher import Publisher
+from daemon.wire.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
 
 

@@ -29,7 +29,7 @@ from daemon.config import load_daemon_config
 from daemon.config_file import load_yaml_model
 from daemon.experiment.programme import expected_s
 from daemon.experiment.steps import ExperimentFile
-from daemon.slices import SliceRecorder
+from daemon.matlab.slices import SliceRecorder
 from drivers.eit_format import FRAME_PERIOD_S
 
 EXPERIMENTS = Path("config/experiments")

@@ -62,9 +62,9 @@ def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
     from daemon.cli.demonstration import Deaths, Happenings, Truth
     from daemon.config import RecordingConfig, load_daemon_config
     from daemon.errors import UserError
+    from daemon.matlab.slices import SliceRecorder
     from daemon.run_summary import RunSummary
     from daemon.service.priority import first_in_line
-    from daemon.slices import SliceRecorder
 
     config = load_daemon_config(args.config)
     if args.recording is not None and not any(emulator.device == "eit-kit" for emulator in config.emulators):
@@ -77,7 +77,7 @@ def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
         lock_memory()
     checked_emulators(config.emulators, args.config)
     if args.recording is not None:
-        from daemon.recordings import read_stream
+        from daemon.matlab.recordings import read_stream
 
         for emulator in config.emulators:
             if emulator.device == "eit-kit":

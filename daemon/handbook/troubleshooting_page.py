@@ -135,7 +135,7 @@ SECTIONS = (
     Section(
         "Recordings",
         "Copy or import the recording again.",
-        raised=("daemon/recordings.py", "daemon/matfile.py", "daemon/recording", "daemon/reproduce"),
+        raised=("daemon/matlab/recordings.py", "daemon/matlab/matfile.py", "daemon/recording", "daemon/reproduce"),
     ),
 )
 # What to do about sentences that do not say it themselves, by words of theirs.

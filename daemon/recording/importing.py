@@ -11,9 +11,9 @@ from scipy.ndimage import minimum_filter1d
 
 from bank.estimators.values import LARGEST_TORQUE_NM
 from daemon.errors import UserError
+from daemon.matlab.recordings import LoadStream, Stream, contents, read_load_stream, read_stream
 from daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 from daemon.recording.writer import RecordingWriter
-from daemon.recordings import LoadStream, Stream, contents, read_load_stream, read_stream
 from drivers.frame_clock import slope_below
 
 FloatArray = NDArray[np.float64]

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from bank.channels import channels_of_line
 from bank.estimators.values import FrameSeries
 from daemon.errors import UserError
+from daemon.matlab.recordings import read_diameter_slices, read_torque_slices
 from daemon.recording.reader import Recording, read_recording
 from daemon.recording.schema import SIDES
 from daemon.recording.tools import tool_of
-from daemon.recordings import read_diameter_slices, read_torque_slices
 
 FloatArray = NDArray[np.float64]
 

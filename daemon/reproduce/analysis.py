@@ -27,7 +27,7 @@ from bank.model_scores import (
 )
 from bank.models import MODELS
 from bank.polynomial import Polynomial
-from daemon.recordings import DiameterSlices, TorqueSlices
+from daemon.matlab.recordings import DiameterSlices, TorqueSlices
 
 FloatArray = NDArray[np.float64]
 # Called with how many slices have been matched since the last call.

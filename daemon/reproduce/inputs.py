@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bank.channels import channels_of_line
 from daemon.errors import UserError
-from daemon.recordings import DiameterSlices, TorqueSlices, read_diameter_slices, read_line, read_torque_slices
+from daemon.matlab.recordings import DiameterSlices, TorqueSlices, read_diameter_slices, read_line, read_torque_slices
 from daemon.reproduce.analysis import FEWEST_SLICES
 
 TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"

@@ -146,7 +146,7 @@ def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared) 
     from bank.forward import ForwardModel
     from bank.mesh import load_mesh
     from bank.models import conductivity
-    from daemon.recordings import read_torque_slices
+    from daemon.matlab.recordings import read_torque_slices
 
     mesh = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     forward = ForwardModel(mesh)

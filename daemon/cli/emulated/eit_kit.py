@@ -109,7 +109,7 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
         if args.once:
             raise UserError("--once is for a recording; synthetic frames have no end")
         return _synthetic(args, period_s)
-    from daemon.recordings import read_stream
+    from daemon.matlab.recordings import read_stream
 
     lines = read_stream(args.recording, args.side).lines
     return iter(lines) if args.once else cycle(lines)

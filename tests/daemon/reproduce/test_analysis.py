@@ -10,7 +10,7 @@ from bank.channels import smoothed_along_channels
 from bank.grouping import group_means
 from bank.matching import ReferenceMatcher, best_match
 from bank.mesh import Mesh, load_mesh
-from daemon.recordings import DiameterSlices, TorqueSlices, read_torque_slices
+from daemon.matlab.recordings import DiameterSlices, TorqueSlices, read_torque_slices
 from daemon.reproduce.analysis import (
     TorqueResult,
     analyse_diameter,

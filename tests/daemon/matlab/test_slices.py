@@ -9,8 +9,8 @@ import pytest
 
 from bank.channels import channels_of_line
 from daemon.errors import UserError
-from daemon.recordings import read_diameter_slices, read_line, read_torque_slices
-from daemon.slices import SliceRecorder
+from daemon.matlab.recordings import read_diameter_slices, read_line, read_torque_slices
+from daemon.matlab.slices import SliceRecorder
 
 S = 1_000_000_000
 PERIOD_S = 0.5
@@ -268,7 +268,7 @@ def test_no_message_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.Monke
         threads.add(threading.current_thread())
         assert let_go.wait(60)
 
-    monkeypatch.setattr("daemon.slices.savemat", slow)
+    monkeypatch.setattr("daemon.matlab.slices.savemat", slow)
     sweep = Sweep(tmp_path)
     sweep.hold(1, 0.1)
     sweep.hold(2, 0.1)

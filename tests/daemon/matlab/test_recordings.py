@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from daemon.errors import UserError
-from daemon.recordings import (
+from daemon.matlab.recordings import (
     read_diameter_slices,
     read_line,
     read_load_stream,

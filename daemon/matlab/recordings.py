@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bank.channels import N_CHANNELS, N_LINE_VALUES
 from daemon.errors import UserError
-from daemon.matfile import MatFileError, NotAMatrix, Variable, read_variables
+from daemon.matlab.matfile import MatFileError, NotAMatrix, Variable, read_variables
 
 FloatArray = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print messages until interrupted, or until enough have come."""
+    from daemon.cli.readable import as_json, as_line
     from daemon.errors import UserError
-    from daemon.readable import as_json, as_line
     from daemon.topics import TOPICS
     from daemon.wire.subscriber import checked_timeout_s, messages
 

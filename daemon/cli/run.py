@@ -146,7 +146,7 @@ class Show:
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
         """Print one message."""
         if topic in ("eit.estimate", "skin.shear"):
-            from daemon.readable import as_line
+            from daemon.cli.readable import as_line
 
             self._out.write(as_line(topic, content) + "\n")
             self._out.flush()

@@ -14,8 +14,8 @@ import yaml
 from bank.bank_file import Bank
 from bank.calibration import Calibration
 from daemon.cli import COMMANDS, main
+from daemon.cli.readable import as_json, as_line
 from daemon.messages import decode, encode
-from daemon.readable import as_json, as_line
 
 Write = Callable[..., Path]
 

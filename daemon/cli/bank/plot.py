@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     if args.path is None and args.config is None:
         raise UserError("give a bank's PATH, or --config FILE, or both")
     try:
-        from daemon.bank_figures import SignalGrid, models_figure, save_figure, signal_figure, solved_grid, spread
+        from daemon.cli.bank.figures import SignalGrid, models_figure, save_figure, signal_figure, solved_grid, spread
     except ModuleNotFoundError as error:
         raise UserError(f"drawing needs {error.name}: install shearloop with the extra `plot`") from error
     from bank.bank_file import Bank

@@ -1,1 +1,1 @@
-"""The closed loop: what is sensed, what is wrong, what the wrist does about it. No I/O: `daemon/loop_task.py` has it."""
+"""The closed loop: what is sensed, what is wrong, what the wrist does about it. Its I/O is in `daemon/loop_task.py`."""

@@ -110,12 +110,16 @@ static Outcome find_at_all_lags(Hunt *hunt, const float *parts, int first, int e
         return UNDECIDED;
     /* The higher the scores that are known to be reached, the less is left to look at. */
     int n = 1 + with_runner_up;
-    if (find_at_lag(hunt, lag, -1, most_scores, &known[n]) != FOUND)
-        return UNDECIDED;
-    *best = known[n].score > known[0].score ? known[n] : known[0];
-    n++;
-    if (with_runner_up && find_at_lag(hunt, lag, best->cell, most_scores, &known[n]) == FOUND)
+    *best = known[0];
+    if (first + lag != 0) { /* lag 0 has been looked at */
+        if (find_at_lag(hunt, lag, -1, most_scores, &known[n]) != FOUND)
+            return UNDECIDED;
+        if (known[n].score > best->score)
+            *best = known[n];
         n++;
+        if (with_runner_up && find_at_lag(hunt, lag, best->cell, most_scores, &known[n]) == FOUND)
+            n++;
+    }
     double least = with_runner_up ? highest_apart(bank, known, n, best->cell) : best->score;
     /* Where both cells that lag 0 told of are in the best one's peak, a lag that is left out may have the runner-up. */
     if (least < left_out_below || !collect(hunt, least) || settle(hunt, -1, best->score, most_scores, best) != FOUND)

@@ -352,7 +352,7 @@ static int search_init(PyObject *self, PyObject *args, PyObject *named)
     bank->roots = PyMem_Malloc((size_t)bank->levels[0].n * sizeof(Root));
     bank->bounds = PyMem_Malloc((size_t)bank->levels[0].n * 2 * CHANNELS * sizeof(float));
     bank->columns = PyMem_Malloc(2 * CHANNELS * (size_t)(bank->coarse_rank + 2) * sizeof(float));
-    bank->lags = PyMem_Malloc(2 * CHANNELS * sizeof(Lag));
+    bank->lags = PyMem_Malloc(2 * CHANNELS * sizeof(int));
     if (!bank->candidates || !bank->roots || !bank->bounds || !bank->columns || !bank->lags) {
         PyErr_NoMemory();
         return -1;

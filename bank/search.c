@@ -19,43 +19,53 @@ enum {
     MOST_LOOKS = 1 << 16
 };
 
-/* Four numbers side by side, as the processors that we know of have them in a register. */
-typedef float Four __attribute__((vector_size(16)));
+/* Compiled twice, also for wider registers where the processor has them: the same sums in the same order, bit for bit. */
+#if defined(__GLIBC__) && defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
+#define ALSO_WIDE __attribute__((target_clones("avx2", "default")))
+#else
+#define ALSO_WIDE
+#endif
 
-static inline Four four(const float *from)
+/* Eight numbers side by side. */
+typedef float Eight __attribute__((vector_size(32)));
+
+#define INLINE static inline __attribute__((always_inline))
+
+INLINE void eight(Eight *to, const float *from)
 {
-    Four found;
-    memcpy(&found, from, sizeof found);
-    return found;
+    memcpy(to, from, sizeof *to);
 }
 
-static float product(const float *a, const float *b, ptrdiff_t n)
+INLINE float product(const float *a, const float *b, ptrdiff_t n)
 {
-    Four even = {0}, odd = {0};
+    Eight sum = {0}, x, y;
     float rest = 0;
     ptrdiff_t whole = n - n % 8;
     for (ptrdiff_t i = 0; i < whole; i += 8) {
-        even += four(a + i) * four(b + i);
-        odd += four(a + i + 4) * four(b + i + 4);
+        eight(&x, a + i);
+        eight(&y, b + i);
+        sum += x * y;
     }
     for (ptrdiff_t i = whole; i < n; i++)
         rest += a[i] * b[i];
-    even += odd;
-    return (even[0] + even[2]) + (even[1] + even[3]) + rest;
+    return ((sum[0] + sum[4]) + (sum[1] + sum[5])) + ((sum[2] + sum[6]) + (sum[3] + sum[7])) + rest;
 }
 
-/* The same for channels: with four sums at once, for a sum waits for the one before. */
-static float over_channels(const float *a, const float *b)
+/* The same for channels: with four sums at once, for each waits for the one before. */
+INLINE float over_channels(const float *a, const float *b)
 {
-    Four sums[4] = {{0}};
-    for (int i = 0; i < CHANNELS; i += 16)
-        for (int j = 0; j < 4; j++)
-            sums[j] += four(a + i + 4 * j) * four(b + i + 4 * j);
-    Four sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
-    return (sum[0] + sum[2]) + (sum[1] + sum[3]);
+    Eight sums[4] = {{0}}, x, y;
+    for (int i = 0; i < CHANNELS; i += 32)
+        for (int j = 0; j < 4; j++) {
+            eight(&x, a + i + 8 * j);
+            eight(&y, b + i + 8 * j);
+            sums[j] += x * y;
+        }
+    Eight sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
+    return ((sum[0] + sum[4]) + (sum[1] + sum[5])) + ((sum[2] + sum[6]) + (sum[3] + sum[7]));
 }
 
-static double score_of(const Hunt *hunt, int32_t cell, int32_t lag)
+ALSO_WIDE static double score_of(const Hunt *hunt, int32_t cell, int32_t lag)
 {
     const Bank *bank = hunt->bank;
     const float *signal = bank->signals + bank->places[cell] * CHANNELS;
@@ -107,7 +117,7 @@ static void complete_column(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float
     column[rank + 1] = (float)sqrt((left > 0 ? left : 0) + hunt->bank->square_rounding);
 }
 
-static void project(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
+ALSO_WIDE static void project(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
 {
     for (ptrdiff_t i = 0; i < rank; i++)
         column[i] = over_channels(hunt->bank->basis + i * CHANNELS, hunt->single + CHANNELS + lag);
@@ -150,7 +160,7 @@ int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
     return 1;
 }
 
-static void look_at_cell(Hunt *hunt, float bound, int32_t lag, int32_t cell)
+static void look_at_cell(Hunt *hunt, float estimate, float bound, int32_t lag, int32_t cell)
 {
     const Bank *bank = hunt->bank;
     if (in_peak_of(bank, cell, hunt->apart_from))
@@ -161,27 +171,28 @@ static void look_at_cell(Hunt *hunt, float bound, int32_t lag, int32_t cell)
     }
     Candidate *found = &bank->candidates[hunt->n_candidates++];
     *found = (Candidate){bound, cell, lag, -1.0};
-    if (bound > hunt->highest) {
-        /* The higher the score that is known, the more can be left out. */
-        hunt->highest = bound;
-        look_up(hunt, found);
+    if (estimate > hunt->highest) {
+        hunt->highest = estimate;
+        hunt->likeliest = found;
     }
 }
 
-static void look_into(Hunt *hunt, const float *column, int32_t lag, int level, int32_t group)
+ALSO_WIDE static void look_into(Hunt *hunt, const float *column, int32_t lag, int level, int32_t group)
 {
     const Bank *bank = hunt->bank;
     const Level *here = &bank->levels[level];
     int of_cells = level + 1 == bank->n_levels;
-    ptrdiff_t size = bank->coarse_rank + 2;
+    ptrdiff_t rank = bank->coarse_rank, size = rank + 2;
     const float *rows = of_cells ? bank->coarse : bank->levels[level + 1].rows;
     for (int32_t part = here->starts[group]; part < here->starts[group + 1] && hunt->looks_left >= 0; part++) {
-        float bound = product(rows + part * size, column, size);
+        const float *row = rows + part * size;
+        float estimate = product(row, column, rank);
+        float bound = estimate + row[rank] * column[rank] + row[rank + 1] * column[rank + 1];
         hunt->looks_left--;
         if (!may_reach(hunt, bound))
             continue;
         if (of_cells)
-            look_at_cell(hunt, bound, lag, bank->cells[part]);
+            look_at_cell(hunt, estimate, bound, lag, bank->cells[part]);
         else
             look_into(hunt, column, lag, level + 1, part);
     }
@@ -205,7 +216,7 @@ static int by_lag(const void *one, const void *other)
     return (a > b) - (a < b);
 }
 
-static void bound_roots(const Hunt *hunt, const float *column)
+ALSO_WIDE static void bound_roots(const Hunt *hunt, const float *column)
 {
     const Bank *bank = hunt->bank;
     ptrdiff_t rank = bank->coarse_rank;
@@ -230,7 +241,7 @@ static ptrdiff_t those_that_may_reach(const Hunt *hunt)
 }
 
 /* Bound the candidates anew at each lag that has many: the frame's numbers there cost as much as some scores. */
-static void bound_anew(const Hunt *hunt)
+ALSO_WIDE static void bound_anew(const Hunt *hunt)
 {
     const Bank *bank = hunt->bank;
     Candidate *all = bank->candidates;
@@ -298,24 +309,30 @@ Outcome settle(Hunt *hunt, int32_t apart_from, double reached, long most_scores,
     return found->cell < 0 ? NONE : FOUND;
 }
 
-static void begin(Hunt *hunt, int32_t apart_from, double reached, float highest, long most_looks)
+static void begin(Hunt *hunt, int32_t apart_from, double reached, long most_looks)
 {
     hunt->apart_from = apart_from;
     reaches(hunt, reached);
-    hunt->highest = highest;
+    hunt->highest = -1;
     hunt->looks_left = most_looks;
     hunt->scores_left = 0;
     hunt->n_candidates = 0;
+    hunt->likeliest = NULL;
 }
 
 static Outcome find_at(Hunt *hunt, const float *column, int32_t lag, int32_t apart_from, long most_scores, Found *found)
 {
     const Bank *bank = hunt->bank;
     bound_roots(hunt, column);
-    begin(hunt, apart_from, 0, -1, LONG_MAX);
-    for (ptrdiff_t i = 0; i < bank->levels[0].n; i++)
-        if (may_reach(hunt, bank->roots[i].bound))
-            look_into(hunt, column, lag, 0, bank->roots[i].group);
+    begin(hunt, apart_from, 0, LONG_MAX);
+    for (ptrdiff_t i = 0; i < bank->levels[0].n; i++) {
+        if (!may_reach(hunt, bank->roots[i].bound))
+            continue;
+        look_into(hunt, column, lag, 0, bank->roots[i].group);
+        /* The higher the score that is known, the more can be left out. */
+        if (hunt->likeliest && hunt->likeliest->score < 0)
+            look_up(hunt, hunt->likeliest);
+    }
     keep_what_may_reach(hunt);
     return settle(hunt, apart_from, hunt->reached, most_scores, found);
 }
@@ -346,17 +363,29 @@ static void take_parts(const Hunt *hunt, int32_t lag, const float *parts, ptrdif
     complete_column(hunt, lag, hunt->bank->coarse_rank, column);
 }
 
+/* One direction at all lags after the other: it stays in the cache meanwhile. */
+ALSO_WIDE static void project_at_lags(const Hunt *hunt)
+{
+    const Bank *bank = hunt->bank;
+    for (ptrdiff_t i = 0; i < bank->coarse_rank; i++)
+        for (int j = 0; j < hunt->n_lags; j++)
+            bank->columns[j * (bank->coarse_rank + 2) + i] =
+                over_channels(bank->basis + i * CHANNELS, hunt->single + CHANNELS + hunt->first + j);
+}
+
 void take_lags(Hunt *hunt, const float *parts, int first, int end)
 {
     const Bank *bank = hunt->bank;
     hunt->first = first;
     hunt->n_lags = end - first;
+    if (!parts)
+        project_at_lags(hunt);
     for (int j = 0; j < hunt->n_lags; j++) {
         float *column = bank->columns + j * (bank->coarse_rank + 2);
         if (parts)
             take_parts(hunt, first + j, parts + j, hunt->n_lags, column);
         else
-            project(hunt, first + j, bank->coarse_rank, column);
+            complete_column(hunt, first + j, bank->coarse_rank, column);
     }
     /* bounds = rows columns; BLAS takes a matrix by columns, and so all of them for transposed. */
     int size = (int)bank->coarse_rank + 2, n_groups = (int)bank->levels[0].n;
@@ -365,26 +394,35 @@ void take_lags(Hunt *hunt, const float *parts, int first, int end)
                    &none, bank->bounds, &hunt->n_lags);
 }
 
+/* The highest bound of each lag that is looked at. */
+ALSO_WIDE static void highest_bounds(const Hunt *hunt, float *highest)
+{
+    int n = hunt->n_lags;
+    const float *bounds = hunt->bank->bounds;
+    memcpy(highest, bounds, (size_t)n * sizeof(float));
+    for (ptrdiff_t group = 1; group < hunt->bank->levels[0].n; group++) {
+        const float *others = bounds + group * n;
+        for (int j = 0; j < n; j++)
+            highest[j] = others[j] > highest[j] ? others[j] : highest[j];
+    }
+}
+
 int likeliest_lag(Hunt *hunt, double score)
 {
     const Bank *bank = hunt->bank;
+    float highest[2 * CHANNELS];
     int n = hunt->n_lags, kept = 0, likeliest = 0;
-    for (int j = 0; j < n; j++)
-        bank->lags[j] = (Lag){j, -INFINITY};
-    for (ptrdiff_t group = 0; group < bank->levels[0].n; group++)
-        for (int j = 0; j < n; j++)
-            if (bank->bounds[group * n + j] > bank->lags[j].highest)
-                bank->lags[j].highest = bank->bounds[group * n + j];
+    highest_bounds(hunt, highest);
     for (int j = 0; j < n; j++) {
-        if ((double)bank->lags[j].highest < score - bank->rounding)
+        if ((double)highest[j] < score - bank->rounding)
             continue;
-        bank->lags[kept] = bank->lags[j];
-        if (bank->lags[kept].highest > bank->lags[likeliest].highest)
+        bank->lags[kept] = j;
+        if (highest[j] > highest[bank->lags[likeliest]])
             likeliest = kept;
         kept++;
     }
     hunt->n_left = kept;
-    return kept ? bank->lags[likeliest].number : -1;
+    return kept ? bank->lags[likeliest] : -1;
 }
 
 Outcome find_at_lag(Hunt *hunt, int number, int32_t apart_from, long most_scores, Found *found)
@@ -397,10 +435,10 @@ int collect(Hunt *hunt, double score)
 {
     const Bank *bank = hunt->bank;
     /* No score is looked up meanwhile: the runner-up's must not be raised by the best cell's. */
-    begin(hunt, -1, score, INFINITY, MOST_LOOKS);
+    begin(hunt, -1, score, MOST_LOOKS);
     for (ptrdiff_t group = 0; group < bank->levels[0].n && hunt->looks_left >= 0; group++)
         for (int i = 0; i < hunt->n_left; i++) {
-            int number = bank->lags[i].number;
+            int number = bank->lags[i];
             if (may_reach(hunt, bank->bounds[group * hunt->n_lags + number]))
                 look_into(hunt, bank->columns + number * (bank->coarse_rank + 2), hunt->first + number, 0,
                           (int32_t)group);

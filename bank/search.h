@@ -36,11 +36,6 @@ typedef struct {
     int32_t group;
 } Root;
 
-typedef struct {
-    int32_t number; /* from the first lag that is looked at */
-    float highest;  /* no score at this lag is above */
-} Lag;
-
 /* A compressed bank (bank/compression.py), and room to work in; bank/compiled.py says what the arrays are. */
 typedef struct {
     ptrdiff_t coarse_rank, fine_rank, n_cells;
@@ -63,7 +58,7 @@ typedef struct {
     Root *roots;    /* (levels[0].n,) */
     float *bounds;  /* (levels[0].n, lags that are looked at) */
     float *columns; /* (2 * CHANNELS, coarse_rank + 2): the frame at each lag that is looked at */
-    Lag *lags;      /* (2 * CHANNELS,): those at which something may be found */
+    int *lags;      /* (2 * CHANNELS,): those at which something may be found, counted from the first looked at */
 } Bank;
 
 /* A frame that is searched for, and what has been found of it. */
@@ -77,7 +72,8 @@ typedef struct {
     /* Of the search that is under way. */
     double reached;       /* a score that some cell has */
     float least;          /* what is bounded below this cannot have it */
-    float highest;        /* the highest bound whose score has been looked up meanwhile */
+    float highest;        /* the highest estimate of a score */
+    Candidate *likeliest; /* whose it is; NULL as long as there is none */
     int32_t apart_from;   /* only cells outside the peak of this one count; -1: all */
     long scores_left;     /* so many may still be computed */
     long looks_left;      /* so many bounds too */

@@ -35,7 +35,7 @@ FORMAT_VERSION = 1
 # shape to compare with: its normalised correlation is 0/0.
 MIN_SIGNAL_NORM = 1e-3
 
-_MAGIC = b"\x8eSHLBANK"
+BANK_MAGIC = b"\x8eSHLBANK"
 _PREAMBLE = struct.Struct("<8sQ32s")
 _ALIGNMENT = 64
 _PAGE = 4096
@@ -206,7 +206,7 @@ def write_bank(
     }
     stored = {name: np.ascontiguousarray(arrays[name], dtype=kind) for name, kind in _TYPES.items()}
     header, offsets = _layout(definition, stored)
-    preamble = _PREAMBLE.pack(_MAGIC, FORMAT_VERSION, hashlib.sha256(header).digest())
+    preamble = _PREAMBLE.pack(BANK_MAGIC, FORMAT_VERSION, hashlib.sha256(header).digest())
     try:
         with replaced(path) as file:
             file.write(preamble + header)
@@ -244,8 +244,12 @@ def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tupl
 
 def _read_header(path: Path, file: BinaryIO) -> dict[str, Any]:
     page = file.read(_PAGE)
-    if not page.startswith(_MAGIC):
-        raise _unusable(path, "this is not a bank: expected a file that starts with shearloop's mark of one")
+    if not page.startswith(BANK_MAGIC):
+        # Whatever it is, it is not to be written over.
+        raise BankFileError(
+            f"{path}: this is not a bank: expected a file that starts with shearloop's mark of one; name a bank, or "
+            "make one with `shearloop bank build --config FILE --out NAME.bank`"
+        )
     if len(page) < _PAGE:
         raise _unusable(path, f"the file is truncated: expected a header of {_PAGE} bytes, found {len(page)}")
     _, version, checksum = _PREAMBLE.unpack_from(page)

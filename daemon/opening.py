@@ -40,9 +40,13 @@ def open_estimator(config: Fingertip, name: str) -> AnyEstimator:
             )
         return _tracked(fitted, config)
     if config.estimator not in (None, "paper"):
+        if config.calibration is None:
+            there = "none is configured"
+        else:
+            there = f"{config.calibration} {'is another kind' if config.calibration.exists() else 'does not exist'}"
         raise UserError(
             f"the estimator {config.estimator} of {name} needs a calibration that was fitted to recordings, and "
-            f"{config.calibration or 'none'} is configured; make one with `shearloop calibrate REC… --estimator "
+            f"{there}; make one with `shearloop calibrate REC… --estimator "
             f"{config.estimator} --out CAL`"
         )
     if config.bank is None:

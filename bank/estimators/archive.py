@@ -22,6 +22,8 @@ from bank.stored import check_made_with, check_version, replaced
 
 FORMAT_VERSION = 3
 _KIND = "shearloop estimator calibration"
+# How a zip begins that has something in it.
+ARCHIVE_MAGIC = b"PK\x03\x04"
 _HEADER = "calibration.yaml"
 _DATE = (1980, 1, 1, 0, 0, 0)
 

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from daemon.cli.cluster import add_cluster
 
+_FIGURES = (".png", ".svg", ".pdf")
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -38,6 +40,8 @@ def run(args: argparse.Namespace) -> int:
     from daemon.recording.series import part_of, read_series
     from daemon.workers import in_order, workers
 
+    if args.out is not None and args.out.suffix not in _FIGURES:
+        raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
     start, stop = parsed_part(args.part)

@@ -17,8 +17,12 @@ def run(args: argparse.Namespace) -> int:
     """Import and say what came in."""
     import json
 
+    from mcap.writer import MCAP0_MAGIC
+
+    from daemon.cli.writing_over import check_writes_over
     from daemon.recording.importing import import_mat
 
+    check_writes_over(args.out, "a recording", MCAP0_MAGIC)
     imported = import_mat(args.sources, args.out)
     if args.json:
         counted = {"path": str(args.out), "frames": imported.frames, "torques": imported.torques}

@@ -1,6 +1,7 @@
 """`shearloop listen`: print what a daemon publishes."""
 
 import argparse
+import sys
 
 from daemon.cli.connection import add_connection, client_keys
 from daemon.wire.addresses import PUBLISH_ADDRESS
@@ -22,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     from daemon.cli.readable import as_json, as_line
     from daemon.errors import UserError
     from daemon.topics import TOPICS
-    from daemon.wire.subscriber import checked_timeout_s, messages
+    from daemon.wire.subscriber import QUIET_S, checked_timeout_s, messages
 
     for topic in args.topics:
         if not any(known.startswith(topic) for known in TOPICS):
@@ -32,7 +33,16 @@ def run(args: argparse.Namespace) -> int:
     if args.timeout is not None:
         checked_timeout_s(args.timeout)
     write = as_json if args.json else as_line
-    heard = messages(args.connect, args.topics, args.timeout, client_keys(args))
+
+    def tell_quiet() -> None:
+        print(
+            f"shearloop listen: nothing has come from {args.connect} in {QUIET_S:g} s; waiting. Is a daemon running "
+            f"there (`shearloop run CONFIG`), and does it publish {' or '.join(args.topics) or 'anything'}?",
+            file=sys.stderr,
+            flush=True,
+        )
+
+    heard = messages(args.connect, args.topics, args.timeout, client_keys(args), tell_quiet)
     for number, (topic, content) in enumerate(heard, start=1):
         print(write(topic, content), flush=True)
         if number == args.count:

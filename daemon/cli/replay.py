@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("recording", type=Path, metavar="REC", help="made by `shearloop run --record` or imported")
+    # Of a folder with two recordings, `recordings/first/*.mcap` names both.
+    parser.add_argument("more", nargs="*", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--speed", default="1", metavar="N", help="times as fast as it happened, or max; default 1")
     parser.add_argument("--publish", default=PUBLISH_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
     parser.add_argument("--config", type=Path, help="instead of the configuration in the recording")
@@ -37,10 +39,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Replay to the end, and say whether it came to the same."""
     from daemon.config import load_daemon_config
+    from daemon.errors import UserError
     from daemon.recording.identity import code_digest
     from daemon.recording.recorded_run import RecordedRun
 
     speed = parsed_speed(args.speed)
+    if args.more:
+        raise UserError(
+            f"one recording is replayed at a time, and {1 + len(args.more)} were named; name one, as {args.recording}"
+        )
     run = RecordedRun(args.recording)
     with nullcontext(load_daemon_config(args.config)) if args.config else run.configuration() as config:
         comparison = asyncio.run(_replayed(run, config, speed, args))

@@ -79,10 +79,12 @@ def _calibrate(args: argparse.Namespace) -> int:
     from bank.errors import CalibrationError
     from bank.skin.calibration_file import read_table, save_calibration
     from bank.skin.calibration_fit import fit_calibration
+    from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
 
     if args.friction is not None and not 0 <= args.friction <= 1:
         raise UserError(f"--friction is {args.friction}; a coefficient of friction lies between 0 and 1.")
+    check_writes_over(args.out, "a calibration file")
     table = read_table(args.table)
     try:
         calibration = fit_calibration(table, friction=args.friction)

@@ -130,12 +130,27 @@ SECTIONS = (
     Section(
         "Calibrations",
         "Restore the file from a copy, or calibrate again with a longer recording.",
-        raised=("bank/calibration.py", "bank/estimators", "bank/grouping.py", "bank/polynomial.py", "bank/skin"),
+        raised=(
+            "bank/calibration.py",
+            "bank/estimators",
+            "bank/grouping.py",
+            "bank/polynomial.py",
+            "bank/skin",
+            "daemon/opening.py",
+        ),
     ),
     Section(
         "Recordings",
         "Copy or import the recording again.",
-        raised=("daemon/matlab/recordings.py", "daemon/matlab/matfile.py", "daemon/recording", "daemon/reproduce"),
+        raised=(
+            "daemon/matlab/recordings.py",
+            "daemon/matlab/matfile.py",
+            "daemon/recording",
+            "daemon/reproduce",
+            "daemon/cli/evaluate.py",
+            "daemon/cli/replay.py",
+            "daemon/cli/writing_over.py",
+        ),
     ),
 )
 # What to do about sentences that do not say it themselves, by words of theirs.

@@ -90,7 +90,7 @@ def opened(path: Path) -> Iterator[OpenRecording]:
     """Give a recording that was closed; raises UserError, as whatever is read of it within does."""
     with damaged(path), path.open("rb") as file:
         if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-            raise UserError(f"{path}: this is not an MCAP file, so there is nothing in it to read")
+            raise UserError(f"{path}: this is not an MCAP file, or is empty, so there is nothing in it to read")
         yield OpenRecording(file)
 
 

@@ -61,7 +61,7 @@ def records(path: Path, condition: Condition, progress: Progress = lambda _: Non
     try:
         with path.open("rb") as file:
             if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                raise UserError(f"{path}: this is not an MCAP file, so there is nothing in it to read")
+                raise UserError(f"{path}: this is not an MCAP file, or is empty, so there is nothing in it to read")
             file.seek(0)
             yield from _sound_records(file, condition, progress)
     except OSError as error:

@@ -1,6 +1,6 @@
 """Receives messages over ZeroMQ, as any program on the network side would."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import zmq
@@ -10,23 +10,32 @@ from daemon.messages import decode
 from daemon.wire.addresses import needs_keys
 from daemon.wire.keys import ClientKeys
 
+# The slowest topic of a daemon that runs, health, comes once a second.
+QUIET_S = 3.0
 # A day; what a poll takes at most is some weeks.
 LONGEST_TIMEOUT_S = 86_400
 _ENVELOPE = frozenset({"timestamp", "t_mono_ns", "seq", "source"})
 
 
 def messages(
-    address: str, topics: Iterable[str], timeout_s: float | None = None, keys: ClientKeys | None = None
+    address: str,
+    topics: Iterable[str],
+    timeout_s: float | None = None,
+    keys: ClientKeys | None = None,
+    on_quiet: Callable[[], None] = lambda: None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield (topic, content) of every message whose topic starts with one of `topics` (all, when there is none).
 
-    Raises UserError for a malformed address, and when nothing has come for `timeout_s`.
+    Without `timeout_s` it waits for ever; `on_quiet` is called when nothing has come in the first `QUIET_S`. Raises
+    UserError for a malformed address, and when nothing has come for `timeout_s`.
     """
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         connect(socket, address, keys)
         for topic in tuple(topics) or ("",):
             socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
+        if timeout_s is None and not socket.poll(int(QUIET_S * 1000)):
+            on_quiet()
         while True:
             if timeout_s is not None and not socket.poll(int(timeout_s * 1000)):
                 raise UserError(

@@ -146,7 +146,8 @@ def test_solve_writes_the_absolute_voltages(folder, tmp_path):
 
 def test_solve_leaves_what_was_there_whole_until_the_voltages_are_written(folder, tmp_path, monkeypatch, capsys):
     out, link = tmp_path / "v.npy", tmp_path / "link.npy"
-    out.write_text("an earlier result")
+    np.save(out, np.zeros(3))
+    earlier = out.read_bytes()
     link.symlink_to(out)
     solve = [*("bank", "solve", "--mesh", f"{folder}/tip.yaml", "--model", "gaussian_derivative", "--k", "1.5")]
     solve += ["--sigma", "1.1", "--out", f"{link}"]
@@ -159,7 +160,7 @@ def test_solve_leaves_what_was_there_whole_until_the_voltages_are_written(folder
         disk.setattr(np, "save", full)
         assert main(solve) == 2
     assert "No space left on device" in capsys.readouterr().err
-    assert out.read_text() == "an earlier result"
+    assert out.read_bytes() == earlier
     assert sorted(path.name for path in tmp_path.iterdir()) == ["link.npy", "v.npy"]
     assert main(solve) == 0
     assert np.load(out).shape == (896,)
@@ -236,6 +237,7 @@ def test_mistakes_of_build_are_one_sentence(folder, tmp_path, capsys, options, p
     ("arguments", "part"),
     [
         (["info", "{folder}/tip.yaml"], "tip.yaml: this is not a bank"),
+        (["info", "{folder}/tip.yaml"], "or make one with `shearloop bank build --config FILE --out NAME.bank`"),
         (["info", "{folder}/none"], "none: the bank cannot be read"),
         (["plot", "--out", "{folder}/f"], "give a bank's PATH, or --config FILE, or both"),
         (["plot", "{folder}/a.bank", "--out", "{folder}/tip.yaml"], "the pictures cannot be written: File exists"),

@@ -158,6 +158,8 @@ def test_the_calibration_says_which_estimator_it_is(files: dict[str, Path]) -> N
         (lambda f: open_estimator(fingertip(calibration=f["both"]), "right"), "a calibration of both under `both`"),
         (lambda f: open_estimator(fingertip(calibration=f["right"], estimator="bank"), "right"), "the estimator fused"),
         (lambda _: open_estimator(fingertip(estimator="fused"), "right"), "needs a calibration that was fitted"),
+        (lambda _: open_estimator(fingertip(estimator="fused", calibration="no.cal"), "right"), "no.cal does not"),
+        (lambda _: open_estimator(fingertip(estimator="fused", calibration=__file__), "right"), "is another kind;"),
         (lambda _: open_estimator(fingertip(), "right"), "needs its bank; add `bank:`"),
         (lambda f: open_both(Both(calibration=f["both"]), {"right": fingertip()}), "of both, and name"),
     ],

@@ -55,8 +55,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _build(args: argparse.Namespace) -> int:
+    from bank.bank_file import BANK_MAGIC
     from bank.build import build_bank, solve_row
     from daemon.bank_config import load_bank_plans
+    from daemon.cli.writing_over import check_writes_over
     from daemon.workers import workers
 
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
@@ -65,6 +67,9 @@ def _build(args: argparse.Namespace) -> int:
     model, k, sigma = overrides(args)
     plans = load_bank_plans(args.config, model=model, k=k, sigma=sigma)
     paths = _paths(args.out, list(plans))
+    # In a folder the names are the banks' own, and what cannot be used of an earlier build is built anew.
+    if paths == [args.out]:
+        check_writes_over(args.out, "a bank", BANK_MAGIC)
     with workers(args.cluster, jobs) as pool:
 
         def on_cluster(

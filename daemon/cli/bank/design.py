@@ -17,9 +17,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Design, and print or write what `bank build --config` takes."""
+    from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
     from daemon.scene import design_yaml, designed_for
 
+    if args.out is not None:
+        check_writes_over(args.out, "a configuration")
     fingertip, design = designed_for(args.recording, args.fingertip, args.side)
     text = design_yaml(design, fingertip, args.recording)
     if args.out is None:

@@ -27,8 +27,10 @@ def run(args: argparse.Namespace) -> int:
     from bank.models import conductivity
     from bank.stored import replaced
     from daemon.bank_config import load_geometry
+    from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
 
+    check_writes_over(args.out, "an array of NumPy", np.lib.format.MAGIC_PREFIX)
     mesh = load_geometry(args.mesh)
     try:
         voltages = ForwardModel(mesh).voltages(conductivity(mesh, args.model, args.k, args.sigma))

@@ -42,6 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Grip each object, and write the calibration."""
+    from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
     from drivers.calibration_file import save_calibration
     from drivers.robotiq.gripper import RobotiqGripper
@@ -54,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")
     if not args.out.parent.is_dir():
         raise UserError(f"--out {args.out} cannot be written: the folder {args.out.parent} does not exist")
+    check_writes_over(args.out, "a calibration file")
     client: GripperClient
     if args.host is not None:
         client = SocketClient(args.host, args.socket_port)

@@ -49,6 +49,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Ask for each load, measure it, and write the calibration."""
+    from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
     from drivers.calibration_file import save_calibration
     from drivers.hx711 import BAUD_RATE
@@ -59,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--lever-arm-mm {args.lever_arm_mm:g} is no lever arm; give millimetres above 0")
     if not args.out.parent.is_dir():
         raise UserError(f"--out {args.out} cannot be written: the folder {args.out.parent} does not exist")
+    check_writes_over(args.out, "a calibration file")
     calibrator = LoadCalibrator(args.mass_g, args.lever_arm_mm * 1e-3, -1 if args.reverse else 1)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:
         asyncio.run(_measure(port, calibrator, Operator(stdout_is_for_json=args.json)))

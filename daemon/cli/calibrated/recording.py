@@ -45,8 +45,10 @@ def run(args: argparse.Namespace) -> int:
     from bank.bank_file import Bank
     from bank.estimators import Physics, fit
     from bank.estimators.alignment import alignment, doubt
+    from bank.estimators.archive import ARCHIVE_MAGIC
     from bank.mesh import load_mesh
     from daemon.cli.recorded import parsed_part, parsed_sides
+    from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
     from daemon.recording.schema import LARGEST_DIAMETER_MM
     from daemon.recording.series import part_of, read_series
@@ -59,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
         raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
     sides = parsed_sides(args.sides)
+    check_writes_over(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     series = [(path.name, one) for path in args.recordings for one in read_series(path, sides, tool_mm)]
     parts = [part_of(one, start, stop) for _, one in series]
     if late_s:
@@ -95,7 +98,10 @@ def run(args: argparse.Namespace) -> int:
     if calibration.kind == "raw":
         known_mm = None if isnan(calibration.tool_mm) else calibration.tool_mm
         told["tool_mm"] = known_mm
-        unknown = "Its tool is not known to be one, and on another the torque would be wrong: name it with --tool-mm."
+        unknown = (
+            "The recordings do not name one tool's diameter, and on another tool the torque would be wrong: name it "
+            "with --tool-mm."
+        )
         sentences.append(unknown if known_mm is None else f"Its tool is of {known_mm:.3g} mm.")
     tell(told, sentences, as_json=args.json)
     return 0

@@ -74,6 +74,7 @@ def test_reasons_say_what_is_the_matter_and_not_with_whom_alone():
         ),
         (["calibrate", "nowhere.mcap", "--out", "x"], "nowhere.mcap: the recording cannot be read"),
         (["evaluate", "nowhere.cal", "{slices}"], "nowhere.cal: the calibration cannot be read"),
+        (["evaluate", "nowhere.cal", "{slices}", "--out", "x.mcap"], "x.mcap is not the name of a figure"),
     ],
 )
 def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, capsys):

@@ -172,6 +172,7 @@ def test_a_real_recording_gives_the_estimates_that_it_gave(shared: Path, config:
     [
         (["nowhere.mcap"], "nowhere.mcap: the recording cannot be read: No such file"),
         (["{imported}"], "has no configuration; give one with --config"),
+        (["{imported}", "{imported}", "a.mcap"], "one recording is replayed at a time, and 3 were named; name one"),
         (["{imported}", "--speed", "0"], "--speed must be a number above 0, or max, not '0'"),
         (["{imported}", "--speed", "fast"], "--speed must be a number above 0, or max, not 'fast'"),
     ],

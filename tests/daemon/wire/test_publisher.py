@@ -8,8 +8,9 @@ import pytest
 import zmq
 
 from daemon.clock import Clock
-from daemon.messages import LoadTorque, decode
+from daemon.messages import LoadTorque, decode, encode
 from daemon.wire.publisher import Publisher
+from daemon.wire.subscriber import messages
 from tests.daemon.conftest import DEADLINE_S
 
 
@@ -130,3 +131,24 @@ async def test_more_subscriptions_than_are_taken_in_at_a_time_are_taken_in_by_an
             stranger.send(b"\x01health")
             await until_told(lambda: publisher.wanted("health"))
         publisher.close()
+
+
+def test_who_listens_where_nobody_speaks_is_told_so_once_and_hears_who_comes_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("daemon.wire.subscriber.QUIET_S", 0.02)
+    address, told = f"ipc://{tmp_path}/publish", []
+    content = {"timestamp": 1.0, "t_mono_ns": 2, "source": "daemon"}
+    with zmq.Context() as context, context.socket(zmq.XPUB) as late:
+        late.setsockopt(zmq.RCVTIMEO, 10_000)
+
+        def comes() -> None:
+            told.append("quiet")
+            late.bind(address)
+            assert late.recv() == b"\x01health"
+            for seq in range(2):
+                late.send_multipart([b"health", encode({**content, "seq": seq})])
+
+        with closing(messages(address, ["health"], on_quiet=comes)) as heard:
+            assert [next(heard)[1]["seq"] for _ in range(2)] == [0, 1]
+    assert told == ["quiet"]

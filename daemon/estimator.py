@@ -4,6 +4,7 @@ This is the paper's way (Trehan et al. 2025, section 2): the difference to the h
 the bank, and the best cell's sigma and k become torque and diameter through the calibration.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, TypeAlias
@@ -78,6 +79,7 @@ class Baseline:
         self.taken = 0
         self._sum = np.zeros(0)
         self._sum_of_squares = np.zeros(0)
+        self._noise_of: dict[int, FloatArray] = {}
 
     @property
     def complete(self) -> bool:
@@ -98,6 +100,7 @@ class Baseline:
         # Asked for with every frame from now on.
         self.__dict__.pop("homogeneous", None)
         self.__dict__.pop("noise", None)
+        self._noise_of.clear()
 
     @cached_property
     def homogeneous(self) -> FloatArray:
@@ -116,6 +119,13 @@ class Baseline:
         own = (self._sum_of_squares - self.taken * mean**2) / freedom
         variance = (freedom * own + POOLED_FREEDOM * own.mean()) / (freedom + POOLED_FREEDOM)
         return np.asarray(np.sqrt(np.maximum(variance, LEAST_NOISE_V**2)))
+
+    def noise_of_difference(self, frames: int) -> FloatArray:
+        """Return the standard deviation of the mean of so many frames to the homogeneous one, (896,) in volts."""
+        noise = self._noise_of.get(frames)
+        if noise is None:
+            noise = self._noise_of[frames] = self.noise * math.sqrt(1.0 / frames + 1.0 / self.taken)
+        return noise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,8 +208,7 @@ class Estimator:
         latest = (*before, frame)[-self._average_frames :]
         mean = frame.channels if len(latest) == 1 else np.mean([each.channels for each in latest], axis=0)
         difference = mean - self._baseline.homogeneous
-        noise = self._baseline.noise * np.sqrt(1.0 / len(latest) + 1.0 / self._baseline.taken)
-        silent = signal_above_noise(difference, noise)
+        silent = signal_above_noise(difference, self._baseline.noise_of_difference(len(latest)))
         if silent is not None:
             self._latest = latest
             return Reading(why=(silent.why,))

@@ -1,10 +1,13 @@
-"""The task of two fingertips on one tool: their frames are paired as they come, and each pair gives an estimate."""
+"""The task of two fingertips on one tool: their frames are paired as they come, and each pair gives an estimate.
+
+It is what drives the loop, so it comes before that of the fingertip whose frame completed the pair.
+"""
 
 import asyncio
 from collections.abc import Mapping
 
 from bank.estimators.pairing import Pairing
-from daemon.estimation import Estimation
+from daemon.estimation import Estimation, Taken
 from daemon.messages import Scalar
 from drivers.eit_kit import Frame
 
@@ -22,19 +25,26 @@ class BothTask:
         self.sides = sides
         self._period_s = period_s
         self._pairing: Pairing[Frame] = Pairing(sides, round(period_s * 1e9))
-        self._backlog: asyncio.Queue[tuple[Frame, ...]] = asyncio.Queue()
+        self._backlog: asyncio.Queue[Taken] = asyncio.Queue()
+        # Whether the estimating task has nothing to do: then a pair may be estimated before it goes there.
+        self._idle = False
         self._room = asyncio.Event()
         self._room.set()
 
     def take(self, side: str, frame: Frame) -> None:
-        """Take in a frame that one of the fingertips has sent, when it comes.
+        """Take in a frame that one of the fingertips has sent, when it comes, and estimate from the pair it completes.
 
         Not later: which frames make a pair follows from the order in which they came, whatever was waited for since.
-        So a replay finds the same pairs.
+        So a replay finds the same pairs. An estimate that takes long, or has others before it, is left to `estimate`.
         """
         pair = self._pairing.take(side, frame.t_mid_ns, frame)
-        if pair is not None:
-            self._backlog.put_nowait(pair[1])
+        if pair is None:
+            return
+        taken = Taken(pair[1])
+        if self._idle and self._backlog.empty():
+            self.estimation.try_at_once(taken)
+        if taken.reading is None:
+            self._backlog.put_nowait(taken)
             if self._backlog.qsize() >= LARGEST_BACKLOG:
                 self._room.clear()
 
@@ -43,12 +53,16 @@ class BothTask:
         await self._room.wait()
 
     async def estimate(self) -> None:
-        """Estimate from every pair, in order, until cancelled."""
+        """Estimate from every pair that was not at once, in order, until cancelled."""
         while True:
-            pair = await self._backlog.get()
+            self._idle = True
+            try:
+                taken = await self._backlog.get()
+            finally:
+                self._idle = False
             if self._backlog.qsize() < LARGEST_BACKLOG:
                 self._room.set()
-            await self.estimation.of(*pair)
+            await self.estimation.finish(taken)
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the estimates."""

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from bank.estimators import Measured
 from daemon.clock import Clock
@@ -14,6 +15,16 @@ from daemon.waiting import Waiting
 from daemon.wire.publisher import Publisher
 from drivers.eit_kit import Frame
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
+
+
+@dataclass(slots=True)
+class Taken:
+    """The frames of one moment on their way to an estimating task, and what came of estimating them at once."""
+
+    frames: tuple[Frame, ...]
+    reading: Reading | None = None
+    takes_long: bool = False
+    error: Exception | None = None
 
 
 class Estimation:
@@ -58,6 +69,22 @@ class Estimation:
         """Take a new homogeneous frame and wait until it is complete; the text is empty, for nothing can go wrong."""
         self.tare()
         return await self._waiting.wait(None)
+
+    def try_at_once(self, taken: Taken) -> None:
+        """Estimate where the frames were read; what that dies of is raised by `finish`, in the estimating task."""
+        try:
+            taken.reading = self.at_once(*taken.frames)
+        except Exception as error:  # noqa: BLE001 - the estimating task dies of it, and not the one that reads a board
+            taken.error = error
+        taken.takes_long = taken.reading is None
+
+    async def finish(self, taken: Taken) -> Reading:
+        """Return what the frames say, estimating whatever has not been yet."""
+        if taken.error is not None:
+            raise taken.error
+        if taken.reading is not None:
+            return taken.reading
+        return await (self.slowly(*taken.frames) if taken.takes_long else self.of(*taken.frames))
 
     async def of(self, *frames: Frame) -> Reading:
         """Estimate from the frames of one moment, one a side, publish it, and return what they said."""

@@ -3,11 +3,10 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from daemon.estimation import Estimation
+from daemon.estimation import Estimation, Taken
 from daemon.estimator import Reading
 from daemon.messages import EitFrame, EitHeatmap, Scalar
 from daemon.wire.publisher import Publisher
@@ -22,16 +21,6 @@ FRAME_LATER_S, LONG_PERIOD_S = 0.001, 0.02
 
 async def _at_once() -> None:
     """Wait for nothing."""
-
-
-@dataclass(slots=True)
-class _Taken:
-    """A frame on its way to the estimating task, and what came of estimating it at once."""
-
-    frame: Frame
-    reading: Reading | None = None
-    takes_long: bool = False
-    error: Exception | None = None
 
 
 class FingertipTask:
@@ -52,7 +41,7 @@ class FingertipTask:
         self._publisher = publisher
         self._room = room
         self.always_heatmap = always_heatmap
-        self._backlog: asyncio.Queue[_Taken] = asyncio.Queue(LARGEST_BACKLOG)
+        self._backlog: asyncio.Queue[Taken] = asyncio.Queue(LARGEST_BACKLOG)
         # Whether the estimating task has nothing to do: then a frame may be estimated before it goes there.
         self._idle = False
 
@@ -63,9 +52,9 @@ class FingertipTask:
         """
         async with contextlib.aclosing(self._board.frames()) as frames:
             async for frame in frames:
-                taken = _Taken(frame)
+                taken = Taken((frame,))
                 if self._idle and self._backlog.empty():
-                    self._estimate_at_once(taken)
+                    self.estimation.try_at_once(taken)
                 try:
                     if taken.reading is not None and self._board.period_s > LONG_PERIOD_S:
                         # The socket's own thread, which sends the estimate, may want the core that we are on.
@@ -83,19 +72,7 @@ class FingertipTask:
                 taken = await self._backlog.get()
             finally:
                 self._idle = False
-            frame, reading = taken.frame, taken.reading
-            if taken.error is not None:
-                raise taken.error
-            if reading is None:
-                reading = await (self.estimation.slowly(frame) if taken.takes_long else self.estimation.of(frame))
-            await self._publish_heatmap(frame, reading)
-
-    def _estimate_at_once(self, taken: "_Taken") -> None:
-        try:
-            taken.reading = self.estimation.at_once(taken.frame)
-        except Exception as error:  # noqa: BLE001 - the estimating task dies of it, and not the one that reads the board
-            taken.error = error
-        taken.takes_long = taken.reading is None
+            await self._publish_heatmap(taken.frames[0], await self.estimation.finish(taken))
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board and the estimates."""

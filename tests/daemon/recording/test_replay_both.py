@@ -19,6 +19,7 @@ from bank.estimators import FrameSeries, Measured, fit
 from daemon.app import Daemon
 from daemon.both import LARGEST_BACKLOG, BothTask
 from daemon.config import load_daemon_config
+from daemon.estimation import Taken
 from drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import measured, replayed
@@ -71,13 +72,13 @@ async def test_pairs_follow_from_the_order_of_arrival_and_boards_wait_while_too_
     """What the estimator has not caught up with changes no pair: so a replay, which never waits, finds the same."""
     go_on, all_estimated, estimated, number = asyncio.Event(), asyncio.Event(), [], 0
 
-    async def estimate(*frames: SimpleNamespace) -> None:
+    async def finish(taken: Taken) -> None:
         await go_on.wait()
-        estimated.append(tuple(frame.t_mid_ns for frame in frames))
+        estimated.append(tuple(frame.t_mid_ns for frame in taken.frames))
         if len(estimated) == number:
             all_estimated.set()
 
-    both = BothTask(SimpleNamespace(of=estimate, count=0), ("right", "left"), 1.0)
+    both = BothTask(SimpleNamespace(finish=finish, count=0), ("right", "left"), 1.0)
     estimating = asyncio.create_task(both.estimate())
     while both._room.is_set():
         both.take("right", SimpleNamespace(t_mid_ns=number * 10**9))

@@ -248,10 +248,11 @@ def spectra_of(bank: CompressedBank) -> Spectra:
 
 
 def correlated(spectra: Spectra, frame: bytes, first: int, end: int) -> Single:
-    """Return the (r, end − first) products of the basis's first directions and a frame, at lags from `first` on.
+    """Return the (r, end − first) products of the basis's first directions and a frame, at lags from `first` ≤ 0 on.
 
     frame are the bytes of its (896,) float32.
     """
     length = next(n for n in spectra if n >= N_CHANNELS + max(-first, end - 1))
     parts = fft.irfft(fft.rfft(np.frombuffer(frame, np.float32), length) * spectra[length], length)
-    return np.asarray(parts.take(range(first, end), axis=1, mode="wrap"))
+    # A transform is a circle: lags below 0 lie at its end.
+    return np.concatenate([parts[:, length + first :], parts[:, :end]], axis=1)

@@ -42,6 +42,8 @@ N_FRAMES = 40
 N_CHECKED = 10
 # Frames of a batch: some twenty seconds at all lags, against which the start of two processes is little.
 BATCH = 20_000
+# Written between two frames that are to be matched cold: more than what a processor's core has of its own.
+OTHERS_BYTES = 64 << 20
 MATCHERS: dict[str, type[FastMatcher | FastZeroLagMatcher]] = {"all lags": FastMatcher, "zero lag": FastZeroLagMatcher}
 
 
@@ -218,6 +220,32 @@ def take_turns(methods: Mapping[str, tuple[Run, int]], turns: int) -> dict[str, 
     return found
 
 
+def cold_seconds(bank: Bank, frames: Floats, turns: int) -> dict[str, list[float]]:
+    """Return the median seconds of a match with runner-up in every turn, each after others have had the caches.
+
+    So frames come in a daemon, half a second apart.
+    """
+    kinds = {
+        "zero lag": FastZeroLagMatcher,
+        "zero lag, not compiled": _ZeroLagByNumpy,
+        "all lags": FastMatcher,
+        "all lags, not compiled": _AllLagsByNumpy,
+    }
+    matchers = {name: kind.from_bank(bank) for name, kind in kinds.items()}
+    others = np.zeros(OTHERS_BYTES // 8)
+    found: dict[str, list[float]] = {name: [] for name in matchers}
+    for _ in range(turns):
+        for name, matcher in matchers.items():
+            taken = []
+            for frame in frames:
+                others += 1.0
+                begun = time.perf_counter()
+                matcher.match(frame)
+                taken.append(time.perf_counter() - begun)
+            found[name].append(statistics.median(taken))
+    return found
+
+
 def ratios(seconds: Mapping[str, list[float]], own: str, peers: Iterable[str]) -> dict[str, Any]:
     """Return how many times as long each peer takes as our own method, turn by turn."""
     return {
@@ -261,6 +289,9 @@ def main() -> None:
         "cited": {
             "EIDORS, seconds per cell": EIDORS_CELL_S,
             f"EIDORS / {own}": EIDORS_CELL_S / statistics.median(seconds[own]),
+        },
+        "seconds_of_a_cold_match": {
+            name: spread(each) for name, each in cold_seconds(bank, frames, args.turns).items()
         },
         "batches_a_minute": batches_a_minute(args.bank, frames, args.turns),
         "error_against_direct": error,

@@ -70,3 +70,23 @@ def test_fewer_than_five_turns_are_refused(monkeypatch, capsys) -> None:
     with pytest.raises(SystemExit):
         peers.main()
     assert "--turns must be 5 or more" in capsys.readouterr().err
+
+
+def test_before_each_cold_match_others_have_had_the_caches(bank, monkeypatch) -> None:
+    happened: list[str] = []
+
+    class Others:
+        def __iadd__(self, _: float) -> "Others":
+            happened.append("others")
+            return self
+
+    class Matcher:
+        def match(self, _: object) -> None:
+            happened.append("match")
+
+    for kind in (peers.FastMatcher, peers.FastZeroLagMatcher):
+        monkeypatch.setattr(kind, "from_bank", lambda _: Matcher())
+    monkeypatch.setattr(peers.np, "zeros", lambda _: Others())
+    found = peers.cold_seconds(bank, np.ones((3, 896)), turns=2)
+    assert [len(each) for each in found.values()] == [2] * 4
+    assert happened == ["others", "match"] * (4 * 2 * 3)

@@ -50,13 +50,17 @@ def splits(recordings: Path, scratch: Path) -> Iterator[Split]:
     for share in SLICE_SHARES:
         yield Split(f"torque slices, first {share:.0%}", part_of(torque, 0, share), part_of(torque, share, 1))
     (cylinders,) = read_series(recordings / "diameter_slices")
-    yield Split("cylinders", part_of(cylinders, 0, CYLINDER_SHARE), part_of(cylinders, CYLINDER_SHARE, 1))
+    yield Split(
+        f"cylinders, first {CYLINDER_SHARE:.0%}",
+        part_of(cylinders, 0, CYLINDER_SHARE),
+        part_of(cylinders, CYLINDER_SHARE, 1),
+    )
     recording = scratch / "twists.mcap"
     import_mat([recordings / "streams" / "2024-12-03_16-09"], recording)
     for sides in (("right",), ("left",), ("right", "left")):
         twists = series_of(read_recording(recording), sides)
         yield Split(
-            f"stream, {' and '.join(sides)}",
+            f"stream, {' and '.join(sides)}, first {TWIST_SHARE:.0%}",
             part_of(twists, 0, TWIST_SHARE),
             part_of(twists, TWIST_SHARE - _WARM_UP, 1),
         )
@@ -94,7 +98,7 @@ def main() -> None:
     if args.mesh:
         names.append("reconstruction")
     found: dict[str, dict[str, Figures]] = {}
-    tracks = []
+    tracks: dict[str, Track] = {}
     print("| later than | estimator | r | RMSE | bias | coverage | valid | frames |")
     print("|---|---|---|---|---|---|---|---|")
     for split in splits(args.recordings, args.out):
@@ -106,7 +110,7 @@ def main() -> None:
             found.setdefault(split.title, {})[name] = figures
             print(row(split.title, name, figures), flush=True)
             if name == DEFAULT:
-                tracks.append(track)
+                tracks[split.title] = track
     (torque,) = read_series(args.recordings / "torque_slices")
     ranking = over_channels(torque)
     print("\n| best channels | r on later slices |\n|---|---|")
@@ -114,7 +118,8 @@ def main() -> None:
         print(f"| {count} | {r:.3f} |")
     (args.out / "channels.json").write_text(json.dumps(ranking, indent=1) + "\n")
     (args.out / "estimators.json").write_text(json.dumps(found, indent=1) + "\n")
-    draw(tracks, f"{DEFAULT}, on what came later than its fit", args.out / "estimators.png")
+    title = f"{DEFAULT}, on what came later than its fit"
+    draw(list(tracks.values()), [f"fitted to {name}" for name in tracks], title, args.out / "estimators.png")
 
 
 def over_channels(torque: FrameSeries) -> dict[int, float]:

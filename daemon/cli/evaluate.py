@@ -62,9 +62,10 @@ def run(args: argparse.Namespace) -> int:
         except ModuleNotFoundError as error:
             raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
         try:
-            draw(tracks, f"{calibration.estimator}, fitted to {calibration.source}", out)
+            titles = [f"{path.name}, {' and '.join(part.sides)}" for (path, _), part in zip(named, parts, strict=True)]
+            draw(tracks, titles, f"{calibration.estimator}, fitted to {calibration.source}", out)
         except OSError as error:
-            raise UserError(f"{out}: the figure cannot be written: {error.strerror}") from error
+            raise UserError(f"{out}: the figure cannot be written: {error.strerror}; choose another --out") from error
         print(f"The figure is in {out}.", file=sys.stderr)
     if args.json:
         print(json.dumps(figures))

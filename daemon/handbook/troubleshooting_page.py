@@ -155,6 +155,7 @@ SECTIONS = (
 )
 # What to do about sentences that do not say it themselves, by words of theirs.
 CURES = (
+    ("was made from slices;", "Calibrate on a recording, `shearloop run --record` or `shearloop import mat`."),
     ("taking the homogeneous frame", "Leave the fingertip untouched until it is taken, some five seconds."),
     ("taking the zero, ", "Leave the skin untouched until it is taken, two seconds."),
     ("sigma have no torque", "Calibrate, and name the file as `calibration`: docs/first-calibration.md."),

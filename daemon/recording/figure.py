@@ -6,15 +6,17 @@ from pathlib import Path
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from daemon.recording.evaluation import Track
 
 
-def draw(tracks: Sequence[Track], title: str, path: Path) -> None:
-    """Write a figure, one row per series: truth, estimates with their intervals, and where none is valid."""
+def draw(tracks: Sequence[Track], names: Sequence[str], title: str, path: Path) -> None:
+    """Write a figure, one named row per series: truth, estimates with their intervals, and where none is valid."""
     figure = Figure(figsize=(11, 3.2 * len(tracks)), layout="constrained")
     FigureCanvasAgg(figure)
-    for axes, track in zip(np.ravel(figure.subplots(len(tracks), 1, squeeze=False)), tracks, strict=True):
+    rows = np.ravel(figure.subplots(len(tracks), 1, squeeze=False))
+    for axes, track, row_name in zip(rows, tracks, names, strict=True):
         truth, name = track.series.torque_at_frames(), "torque_nm"
         label, bounds = "torque in N·m", ("torque_low_nm", "torque_high_nm")
         if np.isfinite(track.series.diameter_mm).any():
@@ -37,8 +39,11 @@ def draw(tracks: Sequence[Track], title: str, path: Path) -> None:
                 t_s, 0, 1, where=np.isnan(value), transform=axes.get_xaxis_transform(), color="0.92", linewidth=0,
                 label="no valid estimate",
             )  # fmt: skip
+        if slices:
+            axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+        axes.set_title(row_name, loc="left", fontsize="medium")
         axes.set_xlabel("slice" if slices else "time in s")
         axes.set_ylabel(label)
-        axes.legend(loc="upper left", fontsize="small")
+        axes.legend(loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0, ncols=3, frameon=False, fontsize="small")
     figure.suptitle(title)
     figure.savefig(path, dpi=110)

@@ -27,6 +27,9 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert figures["diameter_rmse_mm"] < 3
     assert figures["frames"] == 20 + 6
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["evaluate", str(first), str(slices_folder), "--out", str(tmp_path / "named.svg")]) == 0
+    capsys.readouterr()
+    assert (tmp_path / "named.svg").read_text().count(f"<!-- {slices_folder.name}, right -->") == 2
     assert main(["evaluate", str(first), str(slices_folder / "torque_slices")]) == 0
     text = capsys.readouterr().out
     assert "rmse_nm" in text

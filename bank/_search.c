@@ -121,14 +121,19 @@ static Outcome find_at_all_lags(Hunt *hunt, const float *parts, int first, int e
             n++;
     }
     double least = with_runner_up ? highest_apart(bank, known, n, best->cell) : best->score;
-    /* Where both cells that lag 0 told of are in the best one's peak, a lag that is left out may have the runner-up. */
-    if (least < left_out_below || !collect(hunt, least) || settle(hunt, -1, best->score, most_scores, best) != FOUND)
-        return UNDECIDED;
-    if (!with_runner_up)
-        return FOUND;
-    /* All that reaches `least` was collected; outside the peak of the best cell no such score may be known any more. */
-    double reached = highest_apart(bank, known, n, best->cell);
-    return reached < least ? UNDECIDED : settle(hunt, best->cell, reached, most_scores, other);
+    for (;;) {
+        /* Where both cells that lag 0 told of are in the best one's peak, a lag that is left out may have the runner-up. */
+        if (least < left_out_below || !collect(hunt, least)
+            || settle(hunt, -1, best->score, most_scores, best) != FOUND)
+            return UNDECIDED;
+        if (!with_runner_up)
+            return FOUND;
+        double reached = highest_apart(bank, known, n, best->cell);
+        if (reached >= least)
+            return settle(hunt, best->cell, reached, most_scores, other);
+        /* It is another one than was known, with the known runner-up in its peak: once more, from further down. */
+        least = reached;
+    }
 }
 
 static PyObject *match_at_all_lags(PyObject *self, PyObject *args)

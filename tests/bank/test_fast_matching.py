@@ -543,13 +543,18 @@ def two_contacts(seed: int) -> np.ndarray:
     return frame
 
 
-@pytest.mark.parametrize("seed", [1327, 1859, 2887, 3213])
-def test_where_all_known_scores_are_in_the_peak_the_compiled_search_leaves_the_runner_up(seed) -> None:
-    """Of ten thousand such frames, one in eight hundred: the peak is at another cell than each lag alone suggests."""
+@pytest.mark.parametrize(("seed", "leaves_it"), [(1327, False), (1859, True), (2887, True), (3213, False)])
+def test_where_all_known_scores_are_in_the_peak_the_compiled_search_looks_again_or_leaves_the_runner_up(
+    seed, leaves_it
+) -> None:
+    """Of ten thousand such frames, one in eight hundred: the peak is at another cell than each lag alone suggests.
+
+    Of recorded frames it is one in twenty, half of which are settled by looking again from further down.
+    """
     slow, fast = COMPILED_PAIRS[0]
     frame = two_contacts(seed)
     if compiled.IS_COMPILED:
-        assert fast._found(frame, True, 1000) is None
+        assert (fast._found(frame, True, 1000) is None) == leaves_it
     assert_same(fast.match(frame), slow.match(frame))
 
 

@@ -10,6 +10,15 @@ from pydantic import AfterValidator, Field, model_validator
 from daemon.config_file import ConfigModel, load_yaml_model
 from daemon.wire.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, open_to_the_network, stays_on_this_machine
 
+# What else a daemon has a task of, publishes as, drives by or records under. A fingertip of such a name would be taken
+# for it: its torque for the load cell's that supervises it, its zero for the other's.
+TAKEN_NAMES = frozenset(
+    (
+        *("load_cell", "wrench", "skin", "both", "robot", "gripper", "loop", "experiment", "recording", "slices"),
+        *("commands", "open_stop", "keys", "health", "log", "shown", "daemon", "clock"),
+    )
+)
+
 
 def _known_transport(address: str) -> str:
     if not address.startswith(("ipc://", "tcp://")):
@@ -255,7 +264,11 @@ class DaemonConfig(ConfigModel):
     def _loop_is_whole(self) -> "DaemonConfig":
         if not self.fingertips and self.skin is None:
             raise ValueError("nothing is measured: give `fingertips`, a `skin`, or both")
-        if self.both is not None and (len(self.fingertips) < 2 or "both" in self.fingertips):
+        if taken := sorted(TAKEN_NAMES & self.fingertips.keys()):
+            raise ValueError(
+                f"a fingertip cannot be named {taken[0]!r}, as another part of the daemon is: try right or left"
+            )
+        if self.both is not None and len(self.fingertips) < 2:
             raise ValueError("`both` needs two `fingertips`, named as the sides of its calibration: right and left")
         for key, address in self.network_addresses.items():
             if self.curve is None:

@@ -10,12 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+import zmq.asyncio
 
 from bank.bank_file import Bank
 from bank.calibration import Calibration
+from daemon.app import Daemon
+from daemon.both import BOTH
 from daemon.cli import COMMANDS, main
 from daemon.cli.readable import as_json, as_line
+from daemon.config import TAKEN_NAMES, load_daemon_config
+from daemon.loop_task import WRENCH
 from daemon.messages import decode, encode
+from daemon.skin.task import SKIN
 
 Write = Callable[..., Path]
 
@@ -59,6 +65,7 @@ def test_a_calibration_of_diameters_alone_is_no_torque_to_drive_by(
         ({"publish": "tcp://0.0.0.0:7761"}, ["publish", "loopback"]),
         ({"publish": "tcp://lab-pc:7761"}, ["publish", "loopback"]),
         ({"fingertips": {"Right Hand": {}}}, ["fingertips"]),
+        ({"fingertips": {"load_cell": {"device": {"path": "eit"}}}}, ["cannot be named 'load_cell', as another part"]),
     ],
 )
 def test_a_mistake_in_a_configuration_names_file_key_and_cure(
@@ -68,6 +75,28 @@ def test_a_mistake_in_a_configuration_names_file_key_and_cure(
     said = mistake(capsys, command, str(path))
     for part in (str(path), *parts):
         assert part in said
+
+
+async def test_no_fingertip_bears_the_name_of_another_part(config: Write, tmp_path: Path) -> None:
+    shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
+    (tmp_path / "wait.yaml").write_text("{name: one, drive: right, steps: [{do: wait, wait_s: 1}]}")
+    whole = config(
+        robot="ur.yaml",
+        gripper={"socket": {"host": "127.0.0.1"}},
+        load_cell={"device": {"path": "load"}},
+        experiment="wait.yaml",
+        recording={"folder": "recordings"},
+    )
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(whole), context)
+        names = set(daemon.health.tasks())
+        for name, task in daemon._tasks():
+            names.add(name)
+            task.close()
+        daemon.stop()
+        await daemon.run()
+    assert {"right", "right.estimator", "robot", "gripper", "loop", "load_cell", "recording", "health"} <= names
+    assert (names | {BOTH, SKIN, WRENCH}) - TAKEN_NAMES == {"right", "right.estimator"}
 
 
 def fingertip(**changes: Any) -> dict[str, Any]:

@@ -24,7 +24,6 @@ R = TypeVar("R")
 # What `--cluster` alone means: a cluster of this machine's own.
 LOCAL = "local"
 CONNECT_S = 20
-HELP = "Dask scheduler to run on, such as tcp://host:8786; alone: a cluster of this machine's own"
 
 
 class Workers(Protocol):

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from bank.skin.calibration_file import load_calibration
 from bench.charts.picture import figure, look, save
-from bench.skin_loop import (
+from bench.held_shear import (
     AGES_S,
     CALIBRATION,
     GAINS,

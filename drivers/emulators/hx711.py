@@ -13,7 +13,6 @@ PERIOD_S = 1 / 10.9
 COUNTS_MAX, COUNTS_MIN = 8388607, -8388608
 # A line of the paper's board that lost its beginning, "0.0000", on the way: 38 µN·m became 38 MN·m.
 CORRUPTED = 38399996
-N_STUCK = 40
 # Lateness of this process that it makes up for, so that a fast pace is kept on the average.
 CATCH_UP_S = 0.05
 

@@ -8,9 +8,9 @@ import pytest
 
 from bank.skin.calibration import SkinCalibration
 from bank.skin.calibration_file import load_calibration
-from bench import skin_loop
+from bench import held_shear
 from bench.charts import limit_cycle
-from bench.skin_loop import CALIBRATION, Case, SkinLoop, judge
+from bench.held_shear import CALIBRATION, Case, SkinLoop, judge
 from daemon.config import load_daemon_config
 from daemon.config_file import load_yaml_model
 from daemon.experiment.machine import Phase
@@ -73,7 +73,7 @@ def test_the_stability_chart_shows_the_limit_cycle(tmp_path: Path, monkeypatch: 
     case = Case(name="told the band", hold_s=4.0)
     monkeypatch.setattr(limit_cycle, "over_gains", lambda: [case])
     monkeypatch.setattr(limit_cycle, "over_delays", lambda: [replace(case, name="not told", band=False)])
-    monkeypatch.setattr(skin_loop, "SEEDS", 1)
+    monkeypatch.setattr(held_shear, "SEEDS", 1)
     heard: list[str] = []
     paths = limit_cycle.chart(tmp_path, InTurn(), "stability-skin", lambda held: heard.append(held.case.name))
     assert heard == ["told the band", "not told"]

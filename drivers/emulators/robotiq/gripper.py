@@ -87,7 +87,6 @@ class Gripper:
         self._position = float(COUNTS_MAX // 2)
         self._activation = _Activation.RESET
         self._fault = 0
-        self._requested_fault = 0
         self._taken = Command()
         self._obj = 0
         self._current = 0

@@ -6,17 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from drivers.emulators.skin.circuit import COMMANDS, Circuit, Gauges, befall
-from drivers.emulators.skin.daq import BOARD_COMMANDS, PERIOD_S, AdcBoard, Scanner
+from drivers.emulators.skin.circuit import Circuit, Gauges, befall
+from drivers.emulators.skin.daq import PERIOD_S, AdcBoard, Scanner
 from drivers.emulators.skin.keithley import Keithley6430
-from drivers.emulators.skin.servers import COMMANDS as LINK_COMMANDS
 from drivers.emulators.skin.servers import Outages, ScpiSerial, ScpiSocket
 
 # What asking takes: two conversions of one period of the mains each, and the reply's way.
 ANSWER_S = 0.04
 # Where an instrument is to be found: a name for its pseudo-terminal, or host and port of its socket.
 Place = Path | tuple[str, int]
-ALL_COMMANDS = f"{COMMANDS}; source {LINK_COMMANDS}; daq {LINK_COMMANDS} or, of the board, {BOARD_COMMANDS}; normal"
 
 
 class Played(Protocol):

@@ -46,6 +46,13 @@ def test_scalars_come_back_as_they_were_sent(content: dict[str, object]) -> None
     assert decode(encode(content)) == content
 
 
+def test_a_message_that_cannot_be_encoded_leaves_nothing_in_the_next() -> None:
+    with pytest.raises(TypeError):
+        encode({"source": "left", "k": object()})
+    assert decode(encode({"source": "right"})) == {"source": "right"}
+
+
+
 @given(st.binary(max_size=300))
 def test_what_is_not_a_message_is_refused_with_a_value_error(payload: bytes) -> None:
     try:

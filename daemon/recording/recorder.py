@@ -9,6 +9,7 @@ import re
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -245,10 +246,16 @@ class Recorder:
     def _begin(self) -> None:
         now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
         file = self._opened(datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ"))
-        file.metadata(METADATA, self._identity.metadata)
-        for one in self._identity.attached:
-            file.attach(one.name, one.media_type, one.data, now_ns + offset_ns)
-        file.flush()
+        try:
+            file.metadata(METADATA, self._identity.metadata)
+            for one in self._identity.attached:
+                file.attach(one.name, one.media_type, one.data, now_ns + offset_ns)
+            file.flush()
+        except OSError:
+            # What says nothing of a run is in the way of those who look for one, and is tried again soon.
+            with suppress(OSError):
+                file.discard()
+            raise
         self._file, self._began_ns = file, now_ns
         self._offset_ns: int | None = None
         self._experiment = ""

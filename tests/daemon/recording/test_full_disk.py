@@ -1,0 +1,215 @@
+"""A disk that is full or slow: what is on it stays whole, what waits has a bound, what is lost is told."""
+
+import asyncio
+import errno
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from daemon.clock import Clock
+from daemon.errors import UserError
+from daemon.recording import recorder as recorder_module
+from daemon.recording.mcap_file import McapFile
+from daemon.recording.recorder import Recorder
+from daemon.recording.salvage import repair
+from daemon.recording.summary import summarise
+from tests.daemon.conftest import deadline
+from tests.daemon.recording.test_recorder import IDENTITY, frame, topics, torque
+
+
+class SmallDisk:
+    """A file on a disk that has room for so many bytes, and takes what it can, as a file system does."""
+
+    def __init__(self, path: Path, room: int) -> None:
+        self.file = path.open("xb", buffering=0)
+        self.room = room
+
+    def write(self, data: memoryview, /) -> int:
+        room = self.room - self.file.tell()
+        if room <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return self.file.write(data[:room])
+
+    def seek(self, offset: int, /) -> int:
+        return self.file.seek(offset)
+
+    def truncate(self, size: int, /) -> int:
+        return self.file.truncate(size)
+
+    def fileno(self) -> int:
+        return self.file.fileno()
+
+    def close(self) -> None:
+        self.file.close()
+
+
+def test_wherever_the_disk_is_full_all_that_was_flushed_is_kept(tmp_path: Path) -> None:
+    clock = Clock()
+    for n, room in enumerate(np.random.default_rng(3).integers(2_000, 40_000, 50)):
+        disks = []
+
+        def opener(path: Path, room: int = int(room), disks: list[SmallDisk] = disks) -> McapFile:
+            disks.append(SmallDisk(path.with_name(path.name + ".partial"), room))
+            return McapFile(path, disks[0])
+
+        recorder = Recorder(tmp_path / str(n), IDENTITY, clock, opener=opener)
+        safe = -1
+        for number in range(12):
+            recorder.record("eit.frame", frame(clock, number))
+            recorder.write()
+            if not recorder.failure:
+                safe = number
+        recorder.close()
+        assert "No space left on device" in recorder.failure
+        (partial,) = (tmp_path / str(n)).iterdir()
+        if safe < 0:
+            continue
+        repaired = repair(partial)
+        assert repaired.condition.torn_bytes == 0, "the file ends with its last whole chunk"
+        numbers = [one["frame"] for one in topics(repaired.path)["eit.frame.right"]]
+        assert numbers == list(range(safe + 1))
+
+
+def test_when_there_is_room_again_nothing_is_missing(tmp_path: Path) -> None:
+    clock = Clock()
+    disks: list[SmallDisk] = []
+
+    def opener(path: Path) -> McapFile:
+        disks.append(SmallDisk(path.with_name(path.name + ".partial"), 20_000))
+        return McapFile(path, disks[-1])
+
+    told: list[str] = []
+    recorder = Recorder(tmp_path, IDENTITY, clock, opener=opener, on_failure=told.append)
+    for number in range(20):
+        recorder.record("eit.frame", frame(clock, number))
+        recorder.write()
+    assert "No space left on device" in recorder.failure
+    facts = recorder.facts()
+    assert facts["trouble"] == recorder.failure
+    assert facts["waiting_bytes"] > 0
+    recorder.experiment("another")
+    recorder.write()
+    assert len(disks) == 1, "no other file is begun on a full disk"
+    disks[0].room = 10_000_000
+    recorder.write()
+    assert recorder.failure == ""
+    recorder.close()
+    (path,) = recorder.finished
+    assert [one["frame"] for one in topics(path)["eit.frame.right"]] == list(range(20))
+
+
+def test_a_file_that_cannot_be_begun_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = Clock()
+    rooms = [0, 100_000, 0, 0, 0, 100_000]
+
+    def opener(path: Path) -> McapFile:
+        disk = SmallDisk(path.with_name(path.name + ".partial"), 0)
+        disk.room = rooms.pop(0)
+        return McapFile(path, disk)
+
+    with pytest.raises(UserError, match="nothing can be recorded there: No space left on device"):
+        Recorder(tmp_path, IDENTITY, clock, opener=opener)
+    assert list(tmp_path.iterdir()) == []
+    recorder = Recorder(tmp_path, IDENTITY, clock, opener=opener)
+    # Each item asks for another file, as all do after an hour; the disk has room for one at last.
+    monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
+    for number in range(3):
+        recorder.record("load.torque", torque(clock, number))
+    recorder.write()
+    assert "No space left on device" in recorder.failure
+    assert list(tmp_path.iterdir()) == [recorder.path]
+    recorder.record("load.torque", torque(clock, 3))
+    recorder.write()
+    assert recorder.failure == ""
+    recorder.close()
+    assert [[one["seq"] for one in topics(path)["load.torque"]] for path in recorder.finished] == [[0, 1, 2], [3]]
+
+
+def test_what_waits_has_a_bound_and_what_is_dropped_is_counted(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock, most_waiting_bytes=100_000)
+    for number in range(20):
+        recorder.record("eit.frame", frame(clock, number))
+    dropped = recorder.facts()["errors"]["dropped"]
+    assert 0 < dropped < 20
+    recorder.close()
+    (path,) = recorder.finished
+    assert [one["frame"] for one in topics(path)["eit.frame.right"]] == list(range(20 - dropped))
+    assert summarise(path).dropped == dropped
+
+
+def test_what_was_dropped_is_told_by_the_file_that_lacks_it_and_no_later_one(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock, most_waiting_bytes=100_000)
+    for number in range(20):
+        recorder.record("eit.frame", frame(clock, number))
+    dropped = recorder.facts()["errors"]["dropped"]
+    recorder.write()
+    recorder.experiment("one")
+    recorder.record("load.torque", torque(clock, 0))
+    recorder.write()
+    recorder.experiment("two")
+    for number in range(20):
+        recorder.record("eit.frame", frame(clock, number))
+    later = recorder.facts()["errors"]["dropped"] - dropped
+    recorder.write()
+    recorder.experiment("three")
+    recorder.close()
+    assert dropped > 0 < later
+    assert [summarise(path).dropped for path in recorder.finished] == [dropped, later, 0]
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], check=False, capture_output=True
+    )
+    if mounted.returncode:
+        pytest.skip("a small file system can be mounted by root alone, and not in every container")
+    yield folder
+    subprocess.run(["umount", folder], check=True)
+
+
+async def test_on_a_real_full_disk_the_failure_is_told_and_what_was_written_is_saved(
+    small_disk: Path, tmp_path: Path
+) -> None:
+    clock = Clock()
+    why: list[str] = []
+    flushed = asyncio.Event()
+
+    def on_failure(failure: str) -> None:
+        if failure:
+            why.append(failure)
+        flushed.set()
+
+    recorder = Recorder(small_disk, IDENTITY, clock, on_failure=on_failure)
+    task = asyncio.create_task(recorder.run())
+    number = 0
+    async with deadline("the recorder did not tell of the full disk"):
+        while not why:
+            assert number < 1000, "a disk of 64 kB took a thousand frames, and is not full"
+            for _ in range(5):
+                recorder.record("eit.frame", frame(clock, number))
+                number += 1
+            flushed.clear()
+            await flushed.wait()
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+    await asyncio.to_thread(recorder.close)
+    assert "No space left on device" in why[0]
+    repaired = repair(recorder.path, tmp_path / "saved.mcap")
+    kept = [one["frame"] for one in topics(repaired.path)["eit.frame.right"]]
+    assert kept == list(range(len(kept)))
+    assert len(kept) > 1
+
+
+def test_a_folder_where_nothing_can_be_written_is_a_mistake(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="nothing can be recorded there"):
+        Recorder(tmp_path / "file", IDENTITY, Clock())

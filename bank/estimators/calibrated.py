@@ -117,22 +117,22 @@ class Seen:
 
 
 def features_of(
-    calibration: Calibration, locator: Locator | None, difference: FloatArray, recent: FloatArray | None, t_s: float
+    calibration: Calibration, locator: Locator | None, difference: FloatArray, places: FloatArray | None, t_s: float
 ) -> Seen:
-    """Return the features of (m, 896) differences at t_s, or of the motion in the recent frames where motion is read.
+    """Return the features of (m, 896) differences at t_s, or of the last frames' places where motion is read.
 
     A slice is followed by its time: how it is read drifts with it.
     """
     if calibration.motion is not None:
-        if recent is None:
-            raise ValueError("features of motion need the recent frames")
-        return Seen(calibration.motion.features(recent, difference))
+        if places is None:
+            raise ValueError("features of motion need the last frames' places")
+        return Seen(calibration.motion.features(places, difference))
     if locator is not None:
-        places = [locator.locate(layer) for layer in difference]
+        cells = [locator.locate(layer) for layer in difference]
         if calibration.estimator == "paper":
             # The paper considers one fingertip, and reads torque from sigma and diameter from k.
-            return Seen(np.array([places[0].k, places[0].sigma, places[0].sigma ** 2]), places[0])
-        return Seen(np.concatenate([place.features for place in places]), places[0])
+            return Seen(np.array([cells[0].k, cells[0].sigma, cells[0].sigma ** 2]), cells[0])
+        return Seen(np.concatenate([cell.features for cell in cells]), cells[0])
     if calibration.image is not None:
         return Seen((difference @ calibration.image.T).ravel())
     features = (difference / calibration.scale).ravel()
@@ -223,9 +223,9 @@ class Tracker:
         if moment.why:
             return Estimate(valid=False, why=moment.why)
         self._difference = moment.difference
-        return self._read(moment.difference, self._memory.recent, moment.usable, frame.t_s)
+        return self._read(moment.difference, self._memory.places, moment.usable, frame.t_s)
 
-    def _read(self, difference: FloatArray, recent: FloatArray | None, usable: BoolArray, t_s: float) -> Estimate:
+    def _read(self, difference: FloatArray, places: FloatArray | None, usable: BoolArray, t_s: float) -> Estimate:
         calibration = self.calibration
         refused: list[str] = []
         tasks = {"torque": (calibration.torque, "N·m"), "diameter": (calibration.diameter, "mm")}
@@ -247,12 +247,13 @@ class Tracker:
         if not wanted:
             return Estimate(valid=False, why=tuple(refused))
         guard = next((task.guard for task in wanted.values() if task.guard is not None), None)
-        if guard is not None and not usable.all():
+        usable_share = np.count_nonzero(usable) / usable.size
+        if guard is not None and usable_share < 1.0:
             # A curve does without dead channels; all else has to be told what they would have said.
             curve = calibration.estimator == "fused"
             said = np.full(N_CHANNELS, np.nan) if curve else guard.filled(difference[0], usable[0])
             difference = np.where(usable, difference, said)
-        seen = features_of(calibration, self._locator, difference, recent, t_s)
+        seen = features_of(calibration, self._locator, difference, places, t_s)
         if seen.place is not None and seen.place.ambiguous:
             return _with_place(
                 Estimate(valid=False, why=("two places of the bank far apart fit the frame equally well",)), seen.place
@@ -261,7 +262,7 @@ class Tracker:
         for name, task in wanted.items():
             features = read_from(calibration, name, seen.features, difference)
             widening = 1.0 if task.guard is None else task.guard.widening(difference[0], usable[0])
-            read = task.reader.read(features, float(usable.mean()), widening)
+            read = task.reader.read(features, usable_share, widening)
             why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])
             refused += [reason for reason in why if reason not in refused]
             if not why:

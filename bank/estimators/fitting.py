@@ -330,7 +330,7 @@ def _replayed(
     ):
         moment = memory.see(TactileFrame.of(float(t_s), channels))
         if not moment.why and np.isfinite(torque) and i % every == 0:
-            features = features_of(calibration, locator, moment.difference, memory.recent, float(t_s)).features
+            features = features_of(calibration, locator, moment.difference, memory.places, float(t_s)).features
             since_s = float(t_s - series.t_s[0])
             rows.append(_Row(recording, since_s, features, moment.difference, float(torque), float(diameter)))
     return rows

@@ -56,7 +56,7 @@ class Intervals:
 
     def half_width(self, predicted: float) -> float:
         """Return half of the 95 % interval's width at this prediction."""
-        return float(self.half_widths[int(np.searchsorted(self.edges, predicted))])
+        return float(self.half_widths[self.edges.searchsorted(predicted)])
 
 
 def _quantile(absolute: FloatArray) -> float:

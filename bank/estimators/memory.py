@@ -15,14 +15,9 @@ import numpy as np
 
 from bank.channels import N_CHANNELS
 from bank.estimators.grip import Grip
-from bank.estimators.guard import (
-    LARGEST_JUMPING_SHARE,
-    LARGEST_UNUSABLE_SHARE,
-    STEP_FRAMES,
-    SideGuard,
-    at_rail,
-)
-from bank.estimators.values import BoolArray, FloatArray, TactileFrame
+from bank.estimators.guard import LARGEST_JUMPING_SHARE, STEP_FRAMES, SideGuard, at_rail
+from bank.estimators.guards import Guards
+from bank.estimators.values import BoolArray, FloatArray, TactileFrame, everywhere
 
 # Frames that an idle baseline is averaged over at the most recent end.
 _BASELINE_FRAMES = 10
@@ -49,11 +44,6 @@ class Moment:
     difference: FloatArray
     why: tuple[str, ...]
     usable: BoolArray
-
-    @property
-    def usable_share(self) -> float:
-        """The share of all channels that are usable."""
-        return float(self.usable.mean())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,12 +84,11 @@ class Motion:
     def _shapes(self, layer: int, noise: FloatArray) -> FloatArray:
         return np.asarray(self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2)
 
-    def features(self, recent: FloatArray, difference: FloatArray) -> FloatArray:
-        """Return the features of the (n_lags + 1, m, 896) last frames and the newest's (m, 896) difference from idle.
+    def features(self, places: FloatArray, difference: FloatArray) -> FloatArray:
+        """Return the features of the (n_lags + 1, m·p) last places and of the newest (m, 896) difference from idle.
 
         n_lags · m·p of motion, the nearest lag first, and m·p of place after them where `placed` is true.
         """
-        places = self.places(recent)
         motion = (places[-1] - places[-2::-1]).ravel()
         return np.concatenate([motion, self.places(difference)]) if self.placed else np.asarray(motion)
 
@@ -114,16 +103,18 @@ class Memory:
     """The state of one session; every frame goes through `see` in order."""
 
     def __init__(self, guards: tuple[SideGuard, ...], motion: Motion | None, period_s: float = np.inf) -> None:
-        self._guards = guards
+        self._guards = Guards(guards)
         # The board's, where it is known beforehand: of one that leaves out half of its frames it cannot be learned.
         self._period_s = period_s
         self._motion = motion
         n_lags = motion.n_lags if motion is not None else 0
+        # Where the last frames were along the directions, and the last of these frames.
         self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
+        self._newest: FloatArray = np.zeros(0)
         self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
         self._idle: list[deque[FloatArray]] = [deque(maxlen=_BASELINE_FRAMES) for _ in guards]
         # The calibration's, until the session has its own.
-        self._baselines: FloatArray = np.array([guard.idle for guard in guards])
+        self._baselines = self._guards.idle.copy()
         # (m, 1) of each fingertip's idle frame of this session against the calibration's.
         self._gains: FloatArray = np.ones((len(guards), 1))
         self._begun = False
@@ -156,49 +147,41 @@ class Memory:
         return all(self._idle)
 
     @property
-    def recent(self) -> FloatArray | None:
-        """The (n_lags + 1, m, 896) last frames at the calibration's gain, the newest last; None while incomplete."""
-        return np.array(self._recent) / self._gains if len(self._recent) == self._recent.maxlen else None
+    def places(self) -> FloatArray | None:
+        """The (n_lags + 1, m·p) places of the last frames at the calibration's gain, the newest last.
+
+        None while incomplete.
+        """
+        return np.array(self._recent) if len(self._recent) == self._recent.maxlen else None
 
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
         self._pass_time(frame.t_s)
-        told = TactileFrame(
-            frame.t_s,
-            frame.channels,
-            frame.usable & ~np.array(list(map(at_rail, frame.channels, frame.usable))),
-        )
-        channels = self._filled(told)
-        seen = [guard.seen(*one) for guard, *one in zip(self._guards, channels, told.usable, strict=True)]
-        why = [
-            reason
-            for layer, guard in enumerate(self._guards)
-            if (reason := _too_few(guard, told.usable[layer]) or seen[layer][0])
-        ]
+        usable = frame.usable & ~at_rail(frame.channels, frame.usable)
+        channels = self._filled(frame.channels, usable)
+        foreign, lost = self._guards.seen(channels, usable)
+        why = [few or other for few, other in zip(self._guards.too_few(usable), foreign, strict=True) if few or other]
         # Channels that are lost for longer are left out; while they are being lost they count as jumping.
-        lost = np.array([one for _, one in seen])
-        disturbed = self._disturbed(channels, told.usable & ~(lost & self._lost))
+        disturbed = self._disturbed(channels, usable & ~(lost & self._lost))
         self._lost = lost
-        frame = TactileFrame(frame.t_s, frame.channels, told.usable & ~lost)
-        if lost.any():
-            why = why or [text for i, guard in enumerate(self._guards) if (text := _too_few(guard, frame.usable[i]))]
-            channels = self._filled(frame)
+        if np.count_nonzero(lost):
+            usable = usable & ~lost
+            why = why or [few for few in self._guards.too_few(usable) if few]
+            channels = self._filled(frame.channels, usable)
         if why:
             self._forget()
-            return Moment(channels, np.zeros_like(channels), tuple(why), frame.usable)
+            return Moment(channels, np.zeros_like(channels), tuple(why), usable)
         if disturbed:
-            return self._bridge(channels, disturbed, frame.usable)
+            return self._bridge(channels, disturbed, usable)
         if self._idle_wanted:
-            return self._taken_for_idle(channels, frame.usable)
+            return self._taken_for_idle(channels, usable)
         if self._before is None:
             self._before = channels
-            return Moment(
-                channels, np.zeros_like(channels), ("there is no frame before to compare with",), frame.usable
-            )
+            return Moment(channels, np.zeros_like(channels), ("there is no frame before to compare with",), usable)
         self._refused, self._before = None, channels
         self._learn_baseline(channels)
         self._notice_release(channels)
-        return self._judged(channels, frame.usable)
+        return self._judged(channels, usable)
 
     def _pass_time(self, t_s: float) -> None:
         step_s, self._t_s, self._missing = t_s - self._t_s, t_s, False
@@ -206,17 +189,22 @@ class Memory:
             # A frame from before the last one says nothing of how the gel has moved since that.
             self._forget()
             return
-        learned_s = float(np.median(self._steps_s)) if len(self._steps_s) == _STEPS else np.inf
+        learned_s = sorted(self._steps_s)[_STEPS // 2] if len(self._steps_s) == _STEPS else np.inf
         self._missing = step_s > _MISSING_SHARE * min(learned_s, self._period_s)
         self._steps_s.append(step_s)
 
     def _remember(self, channels: FloatArray, *, bridged: bool) -> None:
         """Add a frame to the last ones; where one is missing before it, that one lies halfway."""
         if self._missing and self._recent:
-            self._recent.append(0.5 * (self._recent[-1] + channels))
+            self._recent.append(self._placed(0.5 * (self._newest + channels)))
             self._bridged.append(True)
-        self._recent.append(channels)
+        self._recent.append(self._placed(channels))
+        self._newest = channels
         self._bridged.append(bridged)
+
+    def _placed(self, channels: FloatArray) -> FloatArray:
+        """Return the (m·p,) places of a frame at the calibration's gain, which does not change while it is gripped."""
+        return self._motion.places(channels / self._gains) if self._motion is not None else np.zeros(0)
 
     def _taken_for_idle(self, channels: FloatArray, usable: BoolArray) -> Moment:
         self._refused, self._before = None, channels
@@ -235,15 +223,15 @@ class Memory:
     def _difference(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the (m, 896) difference to the idle frame; what is not usable goes by what is."""
         difference = channels - self._baselines
-        if self._motion is not None and not usable.all():
-            for layer, guard in enumerate(self._guards):
+        if self._motion is not None and not everywhere(usable):
+            for layer, guard in enumerate(self._guards.sides):
                 said = self._motion.gripped_step(layer, difference[layer], usable[layer], guard)
                 difference[layer] = np.where(usable[layer], difference[layer], said)
         return difference
 
     def _judged(self, channels: FloatArray, usable: BoolArray) -> Moment:
-        held = [self._holds(layer, channels[layer]) for layer in range(len(self._guards))]
-        loose = [guard.side for layer, guard in enumerate(self._guards) if self._let_go[layer] or not held[layer]]
+        held = [self._holds(layer, score) for layer, score in enumerate(self._guards.grips(channels, self._baselines))]
+        loose = [one.side for layer, one in enumerate(self._guards.sides) if self._let_go[layer] or not held[layer]]
         difference = self._difference(channels, usable) / self._gains
         if loose:
             self._recent.clear()
@@ -257,10 +245,9 @@ class Memory:
             return Moment(channels, difference, ("too many of the last frames were disturbed, or are missing",), usable)
         return Moment(channels, difference, (), usable)
 
-    def _holds(self, layer: int, channels: FloatArray) -> bool:
+    def _holds(self, layer: int, score: float) -> bool:
         """Return whether a fingertip is gripped; with a baseline of a few frames only an outright grip is one."""
-        guard, grip = self._guards[layer], self._grips[layer]
-        score = guard.grip(channels, self._baselines[layer])
+        guard, grip = self._guards.sides[layer], self._grips[layer]
         learning = 0 < len(self._idle[layer]) < _LEAST_IDLE and not grip.held
         return grip.see(score) if not learning or score > max(_OUTRIGHT, guard.grip_threshold) else False
 
@@ -268,17 +255,17 @@ class Memory:
         self._passed.append(channels)
         if len(self._passed) <= STEP_FRAMES:
             return
-        for layer, guard in enumerate(self._guards):
+        for layer in self._guards.stepping:
             now, then, idle = (one[layer] / self._gains[layer] for one in (channels, self._passed[0], self._baselines))
-            released = guard.released(now, then, idle)
+            released = self._guards.sides[layer].released(now, then, idle)
             if released is not None:
                 self._let_go[layer] = released
 
     def _bridge(self, channels: FloatArray, disturbed: str, usable: BoolArray) -> Moment:
         """Leave a disturbed frame out; when the next one agrees with it, the change is real and the past is not."""
         if self._refused is not None and all(
-            guard.jumping_share(channels[i], self._refused[i], np.isfinite(guard.noise)) <= LARGEST_JUMPING_SHARE
-            for i, guard in enumerate(self._guards)
+            share <= LARGEST_JUMPING_SHARE
+            for share in self._guards.jumping_shares(channels, self._refused, self._guards.alive)
         ):
             self._recent.clear()
             self._bridged.clear()
@@ -286,14 +273,14 @@ class Memory:
         else:
             self._refused = channels
             if self._recent:
-                self._remember(self._recent[-1], bridged=True)
+                self._remember(self._newest, bridged=True)
         return Moment(channels, np.zeros_like(channels), (disturbed,), usable)
 
     def _disturbed(self, channels: FloatArray, usable: BoolArray) -> str | None:
         if self._before is None:
             return None
-        for layer, guard in enumerate(self._guards):
-            share = guard.jumping_share(channels[layer], self._before[layer], usable[layer])
+        shares = self._guards.jumping_shares(channels, self._before, usable)
+        for guard, share in zip(self._guards.sides, shares, strict=True):
             if share > LARGEST_JUMPING_SHARE:
                 return (
                     f"{guard.side} fingertip: {100 * share:.0f} % of the channels jumped since the frame before; "
@@ -301,34 +288,38 @@ class Memory:
                 )
         return None
 
-    def _filled(self, frame: TactileFrame) -> FloatArray:
+    def _filled(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
         """Return the channels with unusable ones moved on from where they were as the usable ones say."""
+        if everywhere(usable):
+            return channels
         if self._before is None:
-            return np.where(frame.usable, frame.channels, np.array([guard.gripped for guard in self._guards]))
+            return np.where(usable, channels, self._guards.gripped)
         assumed = self._before.copy()
-        if self._motion is not None and not frame.usable.all():
-            for layer, guard in enumerate(self._guards):
-                moved = frame.channels[layer] - self._before[layer]
-                assumed[layer] += self._motion.step(layer, moved, frame.usable[layer], guard.noise)
-        return np.where(frame.usable, frame.channels, assumed)
+        if self._motion is not None:
+            for layer, guard in enumerate(self._guards.sides):
+                moved = channels[layer] - self._before[layer]
+                assumed[layer] += self._motion.step(layer, moved, usable[layer], guard.noise)
+        return np.where(usable, channels, assumed)
 
     def _learn_baseline(self, channels: FloatArray) -> None:
         """Follow the idle frame while nothing is gripped; a session that begins gripped has the calibration's."""
         first, self._begun = not self._begun, True
-        for layer, guard in enumerate(self._guards):
+        if self._recent:
+            return
+        for layer, guard in enumerate(self._guards.sides):
             idle = self._idle[layer]
             begun = first and guard.idle_like(channels[layer])
             # One frame is a poor baseline: the first few are taken unless they look gripped outright.
             limit = 0.5 * guard.grip_threshold if len(idle) >= _LEAST_IDLE else max(_OUTRIGHT, guard.grip_threshold)
             following = bool(idle) and guard.grip(channels[layer], self._baselines[layer]) < limit
-            if (begun or following) and not self._recent:
+            if begun or following:
                 idle.append(channels[layer])
                 self._baselines[layer] = np.mean(idle, axis=0)
                 self._take_gains()
 
     def _take_gains(self) -> None:
         if self.own_baseline:
-            gains = [guard.gain(idle) for guard, idle in zip(self._guards, self._baselines, strict=True)]
+            gains = [guard.gain(idle) for guard, idle in zip(self._guards.sides, self._baselines, strict=True)]
             self._gains = np.array(gains)[:, None]
 
     def _forget(self) -> None:
@@ -336,13 +327,3 @@ class Memory:
         self._bridged.clear()
         self._before = self._refused = None
         self._passed.clear()
-
-
-def _too_few(guard: SideGuard, usable: BoolArray) -> str | None:
-    unusable = 1.0 - float(usable.mean())
-    if unusable <= LARGEST_UNUSABLE_SHARE:
-        return None
-    return (
-        f"{guard.side} fingertip: {100 * unusable:.0f} % of the channels are dead or saturated; look at the ribbon "
-        "cable and the gel's contact with the electrodes"
-    )

@@ -1,5 +1,6 @@
 """A reader turns the features of a frame into one value with its interval."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -70,7 +71,7 @@ class Reader:
         frames say: nothing that was read then denies it.
         """
         raw = float(self.head.predict(features[None])[0])
-        widening /= float(np.sqrt(max(usable_share, 0.1)))
+        widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
         value, beyond = _shown(self.head, raw), _UNSEEN * (self.high - self.low)
         below, above = half, half

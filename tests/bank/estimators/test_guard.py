@@ -5,9 +5,10 @@ from hypothesis import strategies as st
 
 from bank.errors import CalibrationError
 from bank.estimators.gripped import gripped_part
-from bank.estimators.guard import LEAST_NOISE_V, SideGuard, _median, channel_noise
+from bank.estimators.guard import LEAST_NOISE_V, Known, SideGuard, channel_noise
+from bank.estimators.guards import JUMP_NOISES, JUMP_V, Guards
 
-ALL = np.ones(896, dtype=bool)
+ALL = np.ones((1, 896), dtype=bool)
 
 
 def guard_of(series, layer=0):
@@ -35,9 +36,49 @@ def test_noise_is_what_is_fast(twisting):
 
 @pytest.mark.parametrize("gain", [0.85, 1.0, 1.2])
 def test_a_fingertip_is_known_under_any_gain(recorded, gain):
-    guard = guard_of(recorded)
-    assert all(guard.seen(gain * frame, ALL)[0] is None for frame in recorded.channels[::20, 0])
-    assert all(guard.seen(gain * frame, ALL)[0] for frame in recorded.channels[::20, 1])
+    guards = Guards((guard_of(recorded),))
+    assert all(guards.seen(gain * frame[None], ALL)[0] == [""] for frame in recorded.channels[::20, 0])
+    assert all(guards.seen(gain * frame[None], ALL)[0] != [""] for frame in recorded.channels[::20, 1])
+
+
+def lost_channels(side, frame, usable):
+    """Return the channels that are off by more than six tenths from the idle and from the gripped frame."""
+    off = usable.copy()
+    for known in (side.idle, side.gripped):
+        judged = usable & (known > 0.03)
+        expected = np.median(frame[judged] / known[judged]) * known
+        off &= judged & (np.abs(frame - expected) > 0.6 * expected)
+    return off
+
+
+def test_each_side_is_compared_with_its_own_fingertip_whatever_the_other_says(recorded):
+    """Side by side they are what each is by itself: why, which channels are lost, jumps and grips."""
+    random = np.random.default_rng(3)
+    sides = [guard_of(recorded, layer) for layer in (0, 1)]
+    both, alone = Guards(tuple(sides)), [Guards((side,)) for side in sides]
+    before, idle = recorded.channels[100], np.array([side.idle for side in sides])
+    said = set()
+    for number, frame in enumerate(recorded.channels[::10].copy()):
+        usable = random.random((2, 896)) > (0.0, 0.02, 0.1)[number % 3]
+        frame[0, 100:128] *= 0.1
+        frame[1] = frame[1, ::-1] if number % 4 == 0 else frame[1]
+        frame[:, :40] += 0.05 * random.random()
+        why, lost = both.seen(frame, usable)
+        jumps, grips = both.jumping_shares(frame, before, usable), both.grips(frame, idle)
+        for layer, (one, side) in enumerate(zip(alone, sides, strict=True)):
+            own = slice(layer, layer + 1)
+            own_why, own_lost = one.seen(frame[own], usable[own])
+            assert own_why == why[own]
+            np.testing.assert_array_equal(own_lost, lost[own])
+            np.testing.assert_array_equal(lost[layer], lost_channels(side, frame[layer], usable[layer]))
+            assert one.jumping_shares(frame[own], before[own], usable[own]) == jumps[own]
+            assert side.grip(frame[layer], side.idle) == grips[layer]
+            moved = np.abs(frame[layer] - before[layer])[usable[layer]]
+            limit = np.maximum(JUMP_NOISES * np.sqrt(2.0) * side.noise, JUMP_V)[usable[layer]]
+            assert jumps[layer] == np.mean(moved > limit)
+            said.add((layer, bool(why[layer]), bool(own_lost.any())))
+        before = frame
+    assert said >= {(0, False, True), (1, False, False), (1, True, True)}, "all of it was seen"
 
 
 def test_grip_is_about_one_gripped_and_zero_idle(recorded):
@@ -73,6 +114,19 @@ def test_too_little_is_said_to_be(recorded):
         gripped_part(silent)
 
 
-@given(st.lists(st.floats(-1e3, 1e3), max_size=40))
-def test_the_quick_median_is_the_median_to_the_bit(values: list[float]) -> None:
-    assert _median(np.array(values)) == (np.median(values) if values else 0.0)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.4, 0.75, 0.76, 1.0]))
+def test_gain_and_deviation_are_medians_of_the_channels_that_are_compared(seed: int, left_out: float) -> None:
+    random = np.random.default_rng(seed)
+    known, usable = random.uniform(0.0, 0.3, (2, 896)), random.random(896) >= left_out
+    frame = random.uniform(0.5, 2.0) * known[0] + random.normal(0, 0.02, 896)
+    compared = Known(known, usable)
+    gains = compared.gains(frame)
+    for one, gain, deviation in zip(known, gains[:, 0], compared.deviations(frame, gains), strict=True):
+        judged = usable & (one > 0.03)
+        if not judged.any():
+            assert np.isnan(gain)
+            assert deviation == np.inf
+            continue
+        assert gain == np.median(frame[judged] / one[judged]), "to the bit"
+        off = np.median(np.abs(frame[judged] / gain - one[judged]) / one[judged])
+        assert deviation == (off if np.count_nonzero(judged) >= 224 else np.inf)

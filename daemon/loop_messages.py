@@ -6,6 +6,9 @@ from daemon.loop.brain import Brain
 from daemon.messages import LoopState, RobotStateMessage
 from drivers.ur.messages import RobotState
 
+# Looked up once: from its text it would be at each state.
+_FLOAT32 = np.dtype("<f4")
+
 
 def loop_state(brain: Brain, sent_rad_per_s: float, now_ns: int) -> LoopState:
     """Return where the closed loop stands at now_ns, while so much was sent to the wrist."""
@@ -47,7 +50,7 @@ def loop_state(brain: Brain, sent_rad_per_s: float, now_ns: int) -> LoopState:
 
 def robot_state(state: RobotState) -> RobotStateMessage:
     """Return a state of the robot's process as it is published."""
-    joints_rad, tcp_pose, wrench = np.array((state.q_rad, state.tcp_pose, state.wrench), "<f4")
+    joints_rad, tcp_pose, wrench = np.array((*state.q_rad, *state.tcp_pose, *state.wrench), _FLOAT32).reshape(3, 6)
     return RobotStateMessage(
         source="robot",
         t_mono_ns=state.t_mono_ns,

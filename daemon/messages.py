@@ -7,17 +7,20 @@ has `timestamp` (Unix seconds), `t_mono_ns`, `seq` (per topic and source, withou
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Any, ClassVar, TypeAlias
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.values import value
+
 Scalar: TypeAlias = float | int | str | bool | None
 FloatArray: TypeAlias = NDArray[np.floating]
 
 
+_WIRE = np.dtype("<f4")
 _NAMES: dict[type, tuple[str, ...]] = {}
 # Kept, for one takes a quarter of a megabyte; it packs one message after the other, whatever became of the last.
 _PACKER = msgpack.Packer(use_bin_type=True)
@@ -28,7 +31,7 @@ def column(unit: str, meaning: str) -> Any:
     return field(metadata={"unit": unit, "meaning": meaning})
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class Message:
     """What all messages carry: who says it, and the time that it speaks of."""
 
@@ -40,7 +43,7 @@ class Message:
     t_mono_ns: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class EitFrame(Message):
     """One frame of a fingertip as it was received; its time is the middle of the acquisition."""
 
@@ -56,7 +59,7 @@ class EitFrame(Message):
     repeated: bool = column("", "the line equals the one before it to the last digit")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class EitEstimate(Message):
     """What one frame says of the tool; torque and diameter are nil unless `valid` is true."""
 
@@ -79,7 +82,7 @@ class EitEstimate(Message):
     latency_s: float = column("s", "from the arrival of the frame's last byte to this message")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class EitHeatmap(Message):
     """The scores of all cells for one frame, NaN at cells that are not valid; sent only while somebody subscribes."""
 
@@ -95,7 +98,7 @@ class EitHeatmap(Message):
     frame: int = column("", "number of the frame that it was made from")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class LoadTorque(Message):
     """One reading of the load cell on the lever; what is not `valid` is no torque, whatever the number."""
 
@@ -110,7 +113,7 @@ class LoadTorque(Message):
     why: str = column("", "what speaks against it, in a sentence; empty when it is valid")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class SkinShear(Message):
     """What one reading of the shear skin says; the force and its interval are nil unless `valid` is true."""
 
@@ -135,7 +138,7 @@ class SkinShear(Message):
     latency_s: float = column("s", "from the reading's arrival to this message")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class RobotStateMessage(Message):
     """What the robot's controller says of itself."""
 
@@ -157,7 +160,7 @@ class RobotStateMessage(Message):
     age_s: float = column("s", "since the controller's own timestamp last changed")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class GripperStateMessage(Message):
     """What the gripper says of itself; the width at which it stops on an object is a diameter measurement."""
 
@@ -175,7 +178,7 @@ class GripperStateMessage(Message):
     fault_text: str = column("", "the fault in a sentence; empty for none")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class LoopState(Message):
     """Where the closed loop stands: what is wanted, what is sent, and every reason for holding."""
 
@@ -207,7 +210,7 @@ class LoopState(Message):
     reasons: str = column("", "every reason for holding or stopping, in sentences")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class Health(Message):
     """How the process and each of its tasks are."""
 
@@ -228,7 +231,7 @@ def wire_map(message: Message, timestamp: float, seq: int) -> dict[str, Any]:
     for name in _names(type(message)):
         value = getattr(message, name)
         if isinstance(value, np.ndarray):
-            content[name] = np.ascontiguousarray(value, "<f4").tobytes()
+            content[name] = value.astype(_WIRE, copy=False).tobytes()
             content[f"{name}_shape"] = list(value.shape)
         else:
             content[name] = value

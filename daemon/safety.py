@@ -8,6 +8,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
+from drivers.values import value
+
 
 class Response(IntEnum):
     """What is done, from the mildest to the strongest; the strongest of all active rows is carried out."""
@@ -180,7 +182,7 @@ class Trouble:
         return f"{self.rule.sentence.format(detail=self.detail.removesuffix('.'))} {self.rule.cure}"
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Verdict:
     """The response to all that is wrong now, and every reason for it."""
 

@@ -18,6 +18,7 @@ from typing import Literal, Self
 from drivers.calibration_file import CalibrationModel, Finite, Positive
 from drivers.lines import LineCutter, transfer_ns
 from drivers.raw_input import InputKind, RawInput
+from drivers.values import value
 
 BAUD_RATE = 115200
 # Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second, nominally.
@@ -83,7 +84,7 @@ class LoadLimits:
     settle_samples: int = 3
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class LoadSample:
     """One line of the board. Every decimal becomes one, flagged where it is not to be believed.
 

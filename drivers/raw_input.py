@@ -1,9 +1,10 @@
 """What a parser was told, so that it can be recorded and told again."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
+
+from drivers.values import value
 
 
 class InputKind(Enum):
@@ -17,7 +18,7 @@ class InputKind(Enum):
     TOOL = "tool"  # another tool is held, or none
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class RawInput:
     """One thing that a parser was told at t_ns (monotonic clock); `data` are the bytes, or what belongs to its kind."""
 

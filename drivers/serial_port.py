@@ -18,6 +18,7 @@ import serial
 from serial.tools import list_ports
 
 from drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError, DriverError
+from drivers.values import value
 
 DEFAULT_BAUD = 115_200
 # One read takes what the kernel keeps for a port (4 kB for a pseudo-terminal, 64 kB at most for a USB port); after
@@ -60,7 +61,7 @@ def _ports_there_are() -> str:
     return f"there are {', '.join(ports)}" if ports else "no USB serial port is plugged in"
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Received:
     """Bytes, and when (monotonic, ns) all of them had arrived."""
 

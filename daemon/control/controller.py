@@ -24,12 +24,12 @@ still while less was sent than was wanted.
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from enum import StrEnum
 
 from daemon.control.history import AngleHistory
 from daemon.control.settings import ControllerSettings
 from daemon.errors import UserError
+from drivers.values import value
 
 # A ramp does not catch up on a loop that was late for longer than this.
 _LONGEST_STEP_NS = 50_000_000
@@ -72,7 +72,7 @@ class Refusal(StrEnum):
 _CLIPPED = frozenset({Reason.TRAVEL, Reason.SPEED})
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class WristCommand:
     """The wrist speed that is wanted now, and every reason why it is not the one that the torque asks for."""
 
@@ -85,7 +85,7 @@ class WristCommand:
         return any(reason not in _CLIPPED for reason in self.reasons)
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class ControllerState:
     """What the controller believes; torques in N·m. None before the start."""
 

@@ -4,13 +4,15 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
+from drivers.values import value
 
-@dataclass(frozen=True, slots=True)
+
+@value(frozen=True, slots=True)
 class Still:
     """The wrist stands."""
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class GoTo:
     """The wrist turns to an angle, measured from where the tool was gripped, no faster than this."""
 
@@ -18,14 +20,14 @@ class GoTo:
     speed_rad_per_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Turn:
     """The wrist turns on at a speed, counterclockwise positive."""
 
     speed_rad_per_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Track:
     """The wrist follows a torque set point in closed loop."""
 
@@ -79,7 +81,7 @@ class ActionState(Enum):
     FAILED = "failed"
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class View:
     """What the experiment sees: the wrist from where the tool was gripped, the driving torque, its own action.
 
@@ -94,7 +96,7 @@ class View:
     failure: str = ""
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Wish:
     """What the experiment wants now.
 

@@ -4,7 +4,7 @@ A plain object without I/O or clock. Senses go in, `Orders` come out; what the o
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 from daemon.control.controller import TwistController
@@ -27,12 +27,13 @@ from daemon.loop.senses import Senses, Source, Torque
 from daemon.loop.watch import Watched, WatchSettings, compared_for_s, troubles
 from daemon.loop.wrist import Wrist, WristTurn
 from daemon.safety import Event, Response, SafetyGate, Trouble, Verdict
+from drivers.values import value
 
 # Of no experiment; made once, for it is asked for at every tick.
 NO_LIMITS = Limits()
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Orders:
     """What is to be told to the devices now; `begin` and `release` are for this tick alone.
 
@@ -46,7 +47,7 @@ class Orders:
     release: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Standing:
     """Where the loop stands, for `loop.state`."""
 

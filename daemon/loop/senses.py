@@ -5,8 +5,10 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from drivers.values import value
 
-@dataclass(frozen=True, slots=True)
+
+@value(frozen=True, slots=True)
 class Torque:
     """One torque of one source: None where it is not valid; when it was measured and when it became known.
 
@@ -33,7 +35,7 @@ class Torque:
         return min(max(expected_nm, self.low_nm), self.high_nm)
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Arm:
     """What the loop needs of the robot's state."""
 
@@ -46,7 +48,7 @@ class Arm:
     moving_linearly: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Hand:
     """What the loop needs of the gripper's state."""
 

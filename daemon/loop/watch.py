@@ -7,6 +7,7 @@ from daemon.experiment.steps import Limits
 from daemon.loop.senses import Senses, Source
 from daemon.safety import Event, Trouble
 from daemon.topics import STALE_AFTER_PERIODS, stale_after_s
+from drivers.values import value
 
 # 2.5 periods of their topics. The arm stands still by itself when it hears nothing for 0.3 s.
 ARM_STALE_S = stale_after_s("robot.state")
@@ -25,7 +26,7 @@ class WatchSettings:
     freshness_s: float = 0.1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value(frozen=True, slots=True, kw_only=True)
 class Watched:
     """What is watched at present: the sources, the limits, and what the experiment relies on."""
 

@@ -12,6 +12,7 @@ from daemon.control.settings import ControllerSettings
 from daemon.control.tuning import RequiredMargins, refusal
 from daemon.experiment.wishes import GoTo, MeasureTool, Still, Track, Turn, WristWish
 from daemon.loop.senses import Source, Torque
+from drivers.values import value
 
 # Torques that wait for an angle: while the wrist stands they may be many, and the latest say what has become of it.
 MOST_HEARD = 64
@@ -32,7 +33,7 @@ class WristSettings:
     required: RequiredMargins = field(default_factory=RequiredMargins)
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class WristTurn:
     """The speed that is wanted now, and why it is not another."""
 

@@ -5,6 +5,7 @@ from enum import IntEnum
 from typing import Protocol
 
 from drivers.robotiq.faults import Fault
+from drivers.values import value
 
 # Instruction manual of the 2F-140, specifications; the counts between are taken as evenly spaced.
 SPEED_MIN_MM_S, SPEED_MAX_MM_S = 30.0, 250.0
@@ -36,7 +37,7 @@ class ActivationStatus(IntEnum):
     ACTIVE = 3
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Readout:
     """The gripper's status registers, all from one exchange; `current` is None where the way in has none."""
 
@@ -123,7 +124,7 @@ class SentCommand:
     clipped: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class GripperState:
     """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were asked for). It is never repeated as a new one.
 

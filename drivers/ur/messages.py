@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Final, Literal
 
 from drivers.ur.settings import Six, UrSettings
+from drivers.values import value
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal["not-installed", "unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
@@ -13,7 +14,7 @@ _FINITE: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan"
 _STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "ser_json_inf_nan": "constants"}
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class WristSpeed:
     """Turn the tool about its axis; holds for `command_timeout_s`, then has to be commanded again."""
 
@@ -74,7 +75,7 @@ class Disconnect:
 Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | Disconnect
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Reply:
     """The one answer to a command: what is sent to the robot after clipping, or why nothing is."""
 
@@ -90,7 +91,7 @@ class Reply:
         return not self.refused
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Reading:
     """One reading of the controller: SI units, base frame, joints from base to wrist 3."""
 
@@ -132,7 +133,7 @@ class Reading:
         return self.q_rad[5]
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class RobotState(Reading):
     """A reading and what the driver makes of it; published as `robot.state`."""
 

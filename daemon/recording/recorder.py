@@ -1,6 +1,6 @@
 """Records a running daemon: every message and every raw input, without ever making the loop wait for a disk.
 
-What is recorded waits in a queue with a bound; three times a second a thread turns it into JSON and writes it as one
+What is recorded waits in a queue with a bound; twice a second a thread turns it into JSON and writes it as one
 chunk. A file begins with the daemon and with every further experiment, and in any case after an hour without one.
 """
 
@@ -31,9 +31,10 @@ from daemon.recording.schema import (
     recorded_topic,
 )
 from drivers.raw_input import InputKind, RawInput, Tap
+from drivers.values import value
 
 # A kill costs what came since the last flush: below a second, and so even where the machine is busy.
-FLUSH_S = 0.3
+FLUSH_S = 0.5
 # What may wait for a disk that is slow or full: minutes at rated speed. Beyond it things are dropped, and counted.
 MOST_WAITING_BYTES = 32 << 20
 LONGEST_IDLE_FILE_S = 3600.0
@@ -43,7 +44,7 @@ _OVERHEAD_BYTES = 1000
 _MOST_ALIKE = 100
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class _Message:
     topic: str
     content: Mapping[str, Any]
@@ -51,7 +52,7 @@ class _Message:
     now_ns: int
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class _Input:
     source: str
     told: RawInput

@@ -78,3 +78,15 @@ def test_every_message_is_what_its_schema_says_with_and_without_values(topic: st
 def test_raw_inputs_are_what_their_schema_says() -> None:
     written = json.loads(input_json(RawInput(InputKind.DATA, 7, bytes(range(256)))))
     Draft202012Validator(schemas()[INPUT]).validate(written)
+
+
+@pytest.mark.parametrize("lost", [[], [float("nan")], [float("inf"), float("-inf")]])
+def test_few_numbers_are_written_as_they_are_among_many(lost: list[float]) -> None:
+    random = np.random.default_rng(0)
+    many = np.concatenate([random.normal(size=57), random.normal(size=4) * 1e6, [1e30], lost]).astype("<f4")
+    message = {"t_mono_ns": 0, "source": "right"}
+    written = json.loads(message_json("robot.state", {**message, "q": many.tobytes()}, 0))["q"]
+    assert any(one is None for one in written) == bool(lost)
+    for start in range(0, len(many), 6):
+        few = json.loads(message_json("robot.state", {**message, "q": many[start : start + 6].tobytes()}, 0))["q"]
+        assert few == written[start : start + 6]

@@ -13,7 +13,6 @@ import signal
 import sys
 import time
 import traceback
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, NoReturn
 
 from drivers.ur import sentences
@@ -60,7 +59,7 @@ class Pipe:
         """Take over both descriptors."""
         self._in, self._out = stdin, stdout
         self._decoder = Decoder()
-        self._unsent, self._held = bytearray(), bytearray()
+        self._unsent = self._held = b""
         self.open = True
         os.set_blocking(stdin, False)
         os.set_blocking(stdout, False)
@@ -69,20 +68,19 @@ class Pipe:
         """Wait for input, and return whether there is any."""
         return bool(select.select([self._in], [], [], timeout_s)[0])
 
-    def receive(self) -> Iterator[tuple[int, Message]]:
-        """Yield the messages that have arrived; `open` is False once the daemon is gone."""
+    def receive(self) -> list[tuple[int, Message]]:
+        """Return the messages that have arrived; `open` is False once the daemon is gone."""
         try:
             data = os.read(self._in, 1 << 16)
         except BlockingIOError:
-            return
+            return []
         self.open = self.open and bool(data)
-        yield from self._decoder.feed(data)
+        return self._decoder.feed(data)
 
     def send(self, message: Message, number: int = 0) -> None:
         """Send a message that must arrive, and what was held back for the next one."""
         self.hold(message, number)
-        self._unsent += self._held
-        self._held.clear()
+        self._unsent, self._held = self._unsent + self._held, b""
         self._flush()
 
     def hold(self, message: Message, number: int) -> None:
@@ -93,18 +91,19 @@ class Pipe:
 
     def send_latest(self, message: Message) -> None:
         """Send a message unless others are still waiting."""
-        self._flush()
+        if self._unsent:
+            self._flush()
         if not self._unsent:
             self.send(message)
 
     def _flush(self) -> None:
         try:
             while self._unsent:
-                del self._unsent[: os.write(self._out, self._unsent)]
+                self._unsent = self._unsent[os.write(self._out, self._unsent) :]
         except BlockingIOError:
             return
         except BrokenPipeError:
-            self._unsent.clear()
+            self._unsent = b""
             self.open = False
 
 
@@ -249,6 +248,9 @@ def _newest(pipe: Pipe, pilot: Pilot, pace: Pace) -> list[tuple[int, Command]]:
             commands.append((number, message))
         elif not isinstance(message, Heartbeat | Ease):
             raise TypeError(f"the daemon sent a {type(message).__name__}, which is no command")
+    if len(commands) < 2:
+        # In every cycle of a wrist that turns.
+        return commands
     motions = [n for n, (_, command) in enumerate(commands) if isinstance(command, WristSpeed | MoveLinear | Stop)]
     # A stop is never overtaken: what comes after it finds the arm stopping.
     overtaken = [n for n in motions[:-1] if not isinstance(commands[n][1], Stop)]

@@ -7,11 +7,11 @@ UR's RTDE guide, protocol 2: setting up outputs, start, and the data package.
 
 import socket
 import struct
-from dataclasses import dataclass
 
 from drivers.errors import ProtocolError
 from drivers.ur.probe import HEADER, RTDE_PORT, agree_on_protocol, explained, request
 from drivers.ur.settings import Six
+from drivers.values import value
 
 _OUTPUTS, _START, _DATA = ord("O"), ord("S"), ord("U")
 # The outputs, with their types, in the order of a sample's fields.
@@ -34,7 +34,7 @@ _RATE = struct.Struct(">d")
 _READ_BYTES = 1 << 15
 
 
-@dataclass(frozen=True, slots=True)
+@value(frozen=True, slots=True)
 class Sample:
     """One sample of the controller: SI units, base frame, joints from base to wrist 3."""
 
@@ -54,7 +54,7 @@ class SampleParser:
 
     def __init__(self) -> None:
         """Start with nothing received."""
-        self._buffer = bytearray()
+        self._begun = b""
 
     def feed(self, data: bytes) -> Sample | None:
         """Return the newest sample that is complete by now, and was not before; None where there is none.
@@ -62,21 +62,20 @@ class SampleParser:
         Raises:
             ProtocolError: a package that cannot be one; where the next one begins is not known then.
         """
-        buffer = self._buffer
-        buffer += data
-        start, newest = 0, -1
-        while len(buffer) - start >= HEADER.size:
-            size, kind = HEADER.unpack_from(buffer, start)
+        # Nearly always nothing had begun, and nothing is copied.
+        data = self._begun + data
+        start, newest, received = 0, -1, len(data)
+        while received - start >= HEADER.size:
+            size, kind = HEADER.unpack_from(data, start)
             if size < HEADER.size or (kind == _DATA and size != _PACKAGE_BYTES):
                 raise ProtocolError(f"The controller sent a package of kind {kind} with {size} bytes.")
-            if len(buffer) - start < size:
+            if received - start < size:
                 break
             if kind == _DATA:
                 newest = start
             start += size
-        sample = _sample(buffer, newest + HEADER.size + 1) if newest >= 0 else None
-        del buffer[:start]
-        return sample
+        self._begun = data[start:]
+        return _sample(data, newest + HEADER.size + 1) if newest >= 0 else None
 
 
 class Receiver:
@@ -142,11 +141,6 @@ class Receiver:
         return newest
 
 
-def _sample(buffer: bytearray, start: int) -> Sample:
-    timestamp_s, *v, robot_mode, safety_mode, runtime_state, speed_scaling = _VALUES.unpack_from(buffer, start)
-    return Sample(
-        timestamp_s,
-        (v[0], v[1], v[2], v[3], v[4], v[5]), (v[6], v[7], v[8], v[9], v[10], v[11]),
-        (v[12], v[13], v[14], v[15], v[16], v[17]), (v[18], v[19], v[20], v[21], v[22], v[23]),
-        robot_mode, safety_mode, runtime_state, speed_scaling,
-    )  # fmt: skip
+def _sample(data: bytes, start: int) -> Sample:
+    values = _VALUES.unpack_from(data, start)
+    return Sample(values[0], values[1:7], values[7:13], values[13:19], values[19:25], *values[25:])

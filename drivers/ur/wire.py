@@ -81,7 +81,7 @@ class Decoder:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._buffer = bytearray()
+        self._begun = b""
 
     def feed(self, data: bytes) -> list[tuple[int, Message]]:
         """Return the (number, message) pairs that are complete now.
@@ -89,17 +89,20 @@ class Decoder:
         Raises:
             ProtocolError: the stream is not one of ours, or a message does not have its type's fields and values.
         """
-        self._buffer += data
-        messages = []
-        while len(self._buffer) >= _HEADER.size:
-            length, number, code = _HEADER.unpack_from(self._buffer)
+        # Nearly always nothing had begun, and nothing is copied.
+        data = self._begun + data
+        messages: list[tuple[int, Message]] = []
+        start, ready = 0, _HEADER.size
+        while len(data) >= ready:
+            length, number, code = _HEADER.unpack_from(data, start)
             if length > LARGEST_BODY or code >= len(_KINDS):
                 raise ProtocolError(f"The robot's pipe carries no message of ours: kind {code}, {length} bytes.")
-            end = _HEADER.size + length
-            if len(self._buffer) < end:
+            body, end = ready, ready + length
+            if len(data) < end:
                 break
-            messages.append((number, _decode(code, bytes(self._buffer[_HEADER.size : end]))))
-            del self._buffer[:end]
+            messages.append((number, _decode(code, data[body:end])))
+            start, ready = end, end + _HEADER.size
+        self._begun = data[start:]
         return messages
 
 
@@ -109,7 +112,7 @@ def _decode(code: int, body: bytes) -> Message:
         if kind is RobotState:
             return _state(body)
         if kind is Reply:
-            sent = _sent(*_SENT.unpack_from(body))
+            sent = _sent(body[: _SENT.size])
             refused, clipped = _words_of_reply(body[_SENT.size :])
             return Reply(refused, sent, clipped)
         if kind is WristSpeed:
@@ -151,8 +154,11 @@ def _sent_body(sent: WristSpeed | MoveLinear | Stop | None) -> bytes:
     return _SENT.pack(0, *_NO_NUMBERS)
 
 
-def _sent(kind: int, *numbers: float) -> WristSpeed | MoveLinear | Stop | None:
-    a, b, c, d, e, f, speed, acceleration = _finite(numbers)
+# A reply and the state after it carry the same one, and at rest it does not change at all.
+@lru_cache(maxsize=4)
+def _sent(packed: bytes) -> WristSpeed | MoveLinear | Stop | None:
+    kind, *numbers = _SENT.unpack(packed)
+    a, b, c, d, e, f, speed, acceleration = _finite(tuple(numbers))
     match kind:
         case 0:
             return None
@@ -196,18 +202,19 @@ def _words_of_reply(body: bytes) -> tuple[str, tuple[str, ...]]:
 
 
 def _state(body: bytes) -> RobotState:
+    numbers = _NUMBERS.unpack_from(body)
+    t_mono_ns, timestamp_s, age_ns = numbers[:3]
     (
-        t_mono_ns, timestamp_s, age_ns, *v, robot_mode, safety_mode, runtime_state, speed_scaling, wrist_torque_nm,
-        motion_id, cycle, motion, connected, moving_linearly, protective_stop, emergency_stop, recovering,
-    ) = _NUMBERS.unpack_from(body)  # fmt: skip
+        robot_mode, safety_mode, runtime_state, speed_scaling, wrist_torque_nm, motion_id, cycle, motion,
+        connected, moving_linearly, protective_stop, emergency_stop, recovering,
+    ) = numbers[27:]  # fmt: skip
     if motion >= len(_MOTIONS):
         raise ValueError(f"there is no motion {motion}")
-    sent = _sent(*_SENT.unpack_from(body, _NUMBERS.size))
+    sent = _sent(body[_NUMBERS.size : _NUMBERS.size + _SENT.size])
     blocked, ended, clipped = _words_of_state(body[_NUMBERS.size + _SENT.size :])
     return RobotState(
         t_mono_ns, timestamp_s, age_ns, connected,
-        (v[0], v[1], v[2], v[3], v[4], v[5]), (v[6], v[7], v[8], v[9], v[10], v[11]),
-        (v[12], v[13], v[14], v[15], v[16], v[17]), (v[18], v[19], v[20], v[21], v[22], v[23]),
+        numbers[3:9], numbers[9:15], numbers[15:21], numbers[21:27],
         robot_mode, safety_mode, runtime_state, speed_scaling, moving_linearly,
         wrist_torque_nm, protective_stop, emergency_stop, blocked, recovering,
         _MOTIONS[motion], motion_id, ended, sent, clipped, cycle,

@@ -58,6 +58,8 @@ class UrRobot:
         self.overtaken = False
         self._state: RobotState | None = None
         self._stdin: asyncio.StreamWriter | None = None
+        # When the process was told anything last: whatever it hears is a sign of life.
+        self.told_s = -math.inf
         self._waiting: dict[int, Callable[[Reply], None]] = {}
         self._number = 0
         self._lost_s = -math.inf
@@ -99,12 +101,12 @@ class UrRobot:
         """Have a state only every so many cycles, as long as nothing moves, until `hurry` or the next command."""
         if cycles > 1 and self._stdin is not None and not self.at_ease:
             self._hurried.clear()
-            self._stdin.write(encode(Ease(cycles)))
+            self._write(self._stdin, encode(Ease(cycles)))
 
     def hurry(self) -> None:
         """Have a state in every cycle again, the next one in the present one."""
         if self._end_ease() and self._stdin is not None:
-            self._stdin.write(HEARTBEAT)
+            self._write(self._stdin, HEARTBEAT)
 
     async def hurried(self) -> None:
         """Wait until a state is needed in every cycle, and signs of life with them."""
@@ -151,7 +153,11 @@ class UrRobot:
         self._number += 1
         self._waiting[self._number] = answered
         self._end_ease()
-        self._stdin.write(encode(command, self._number))
+        self._write(self._stdin, encode(command, self._number))
+
+    def _write(self, stdin: asyncio.StreamWriter, data: bytes) -> None:
+        self.told_s = time.monotonic()
+        stdin.write(data)
 
     async def run(self) -> None:
         """Keep the robot connected until cancelled; then stop it and let it go.
@@ -226,10 +232,11 @@ class UrRobot:
 
     def take_all(self, messages: Sequence[tuple[int, Message]]) -> None:
         """Act on what was read of the process at once, in order; of several states only the last is not `overtaken`."""
-        left = sum(isinstance(message, RobotState) for _, message in messages)
-        for number, message in messages:
-            left -= isinstance(message, RobotState)
-            self.overtaken = left > 0
+        newest = len(messages) - 1
+        while newest > 0 and not isinstance(messages[newest][1], RobotState):
+            newest -= 1
+        for index, (number, message) in enumerate(messages):
+            self.overtaken = index < newest
             self.take(number, message)
 
     def take(self, number: int, message: Message) -> None:

@@ -124,15 +124,21 @@ class Conversation:
             self._over.set_exception(error)
 
     async def keep_alive(self) -> None:
-        """Give signs of life four times in the time after which motion would be stopped; at ease nothing moves."""
+        """Give signs of life four times in the time after which motion would be stopped; at ease nothing moves.
+
+        A command is one too, and as long as they come there is no need of others: each wakes the process once more.
+        """
+        longest_s = self._settings.silence_timeout_s / 4
         while True:
             await self._robot.hurried()
-            await asyncio.sleep(self._settings.silence_timeout_s / 4)
+            left_s = longest_s - (time.monotonic() - self._robot.told_s)
+            if left_s <= 0:
+                self._robot.told_s, left_s = time.monotonic(), longest_s
+                self._stdin.write(HEARTBEAT)
+            await asyncio.sleep(left_s)
             if self._stdin.transport.get_write_buffer_size() > MOST_UNSENT:
                 self._kill()
                 raise LostError("hung", self._hung(self._settings.silence_timeout_s))
-            if not self._robot.at_ease:
-                self._stdin.write(HEARTBEAT)
 
     async def collect_stderr(self) -> None:
         """Keep the end of what the process printed: after a crash it is all there is."""

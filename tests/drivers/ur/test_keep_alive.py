@@ -1,0 +1,69 @@
+"""Signs of life to the robot's process: as often as it needs them, and none where commands are some."""
+
+import asyncio
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from drivers.ur import conversation
+from drivers.ur.conversation import HEARTBEAT, Conversation
+from tests.drivers.ur.flight import SETTINGS
+
+LONGEST_S = SETTINGS.silence_timeout_s / 4
+
+
+class Played:
+    """A robot that is told a command each 8 ms until `commands_until_s`, and a clock that only sleeping moves on."""
+
+    def __init__(self, commands_until_s: float, ends_s: float) -> None:
+        self.settings, self.takes_over, self.told_s = SETTINGS, False, 0.0
+        self.now_s = 0.0
+        self.signs_s: list[float] = []
+        self._commands_until_s, self._ends_s = commands_until_s, ends_s
+        self.transport = SimpleNamespace(get_write_buffer_size=lambda: 0)
+
+    async def hurried(self) -> None:
+        """Signs of life are needed."""
+
+    def write(self, data: bytes) -> None:
+        """Take what the process is told."""
+        if data == HEARTBEAT:
+            self.signs_s.append(self.now_s)
+
+    async def sleep(self, seconds: float) -> None:
+        """Let so much time pass."""
+        assert seconds > 0
+        # No sleep is as short as what rounding leaves.
+        self.now_s += max(seconds, 1e-6)
+        if self.now_s < self._commands_until_s:
+            self.told_s = self.now_s - self.now_s % 0.008
+        if self.now_s >= self._ends_s:
+            raise asyncio.CancelledError
+
+
+async def signs_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends_s: float) -> list[float]:
+    """Return when signs of life were given."""
+    played: Any = Played(commands_until_s, ends_s)
+    monkeypatch.setattr(conversation, "time", SimpleNamespace(monotonic=lambda: played.now_s))
+    talk = Conversation(played, SimpleNamespace(stdin=played, stderr=object()), 0)  # type: ignore[arg-type]
+    with monkeypatch.context() as patched:
+        patched.setattr(asyncio, "sleep", played.sleep)
+        with pytest.raises(asyncio.CancelledError):
+            await talk.keep_alive()
+    return played.signs_s
+
+
+async def test_as_long_as_commands_come_no_other_sign_of_life_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert await signs_s(monkeypatch, commands_until_s=10.0, ends_s=9.0) == []
+
+
+async def test_after_the_last_command_the_process_is_never_without_one_for_longer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    signs = await signs_s(monkeypatch, commands_until_s=1.0, ends_s=3.0)
+    last_command_s = 1.0 - 0.008
+    assert len(signs) > 1.5 / LONGEST_S
+    assert signs[0] - last_command_s <= LONGEST_S + 0.008
+    assert all(later - one == pytest.approx(LONGEST_S, abs=1e-5) for one, later in pairwise(signs))

@@ -45,6 +45,8 @@ class Arm:
         kind = rtde_control.RTDEControlInterface
         with _woken_late(_POLL_SLACK_NS):
             self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
+        # Whether a straight move may be under way: one was begun, and the wrist has not been turned since.
+        self._may_move_linearly = False
         self._timestamp_s = -1.0
         self._changed_ns = time.monotonic_ns()
 
@@ -67,11 +69,13 @@ class Arm:
             sample.safety_mode,
             sample.runtime_state,
             sample.speed_scaling,
-            self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
+            # Two calls that wrap an object: not in each cycle in which the answer is known.
+            self._may_move_linearly and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
 
     def wrist(self, command: WristSpeed) -> bool:
-        """Turn wrist 3, the other joints held."""
+        """Turn wrist 3, the other joints held; of an arm that is on no straight move."""
+        self._may_move_linearly = False
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
         return bool(self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0))
 
@@ -81,6 +85,7 @@ class Arm:
 
     def move(self, command: MoveLinear) -> bool:
         """Begin a linear move; `Reading.moving_linearly` tells its end."""
+        self._may_move_linearly = True
         return bool(
             self._control.moveL(
                 [*command.pose], command.speed_m_per_s, command.acceleration_m_per_s2, asynchronous=True

@@ -8,7 +8,11 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
+from drivers.ur.messages import MoveLinear, WristSpeed
+from drivers.ur.receiver import Sample
 from tests.drivers.ur.flight import SETTINGS
+
+SIX = (0.0,) * 6
 
 
 class Client:
@@ -43,3 +47,37 @@ def test_kernel_that_does_not_let_threads_be_woken_late_does_not_prevent_connect
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
     assert arm.Arm(SETTINGS)._control.connected
     assert "woken more often than needed" in capsys.readouterr().err
+
+
+class Controlled(Client):
+    """Takes every command, and says that a straight move is under way; `asked` counts who asked."""
+
+    asked = 0
+
+    def isConnected(self) -> bool:  # noqa: N802 - ur-rtde's name
+        return True
+
+    def speedJ(self, *_: object) -> bool:  # noqa: N802
+        return True
+
+    def moveL(self, *_: object, **__: object) -> bool:  # noqa: N802
+        return True
+
+    def getAsyncOperationProgressEx(self) -> SimpleNamespace:  # noqa: N802
+        self.asked += 1
+        return SimpleNamespace(isAsyncOperationRunning=lambda: True)
+
+
+def test_a_straight_move_is_asked_after_from_its_beginning_until_the_wrist_is_turned(
+    arm: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
+    sample = Sample(1.0, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0)
+    monkeypatch.setattr(arm, "Receiver", lambda *_: SimpleNamespace(connected=True, latest=lambda: sample))
+    one = arm.Arm(SETTINGS)
+    assert not one.read().moving_linearly
+    one.move(MoveLinear(SIX, 0.1, 0.1))
+    assert [one.read().moving_linearly for _ in range(3)] == [True] * 3
+    one.wrist(WristSpeed(0.1, 1.0))
+    assert not one.read().moving_linearly
+    assert one._control.asked == 3

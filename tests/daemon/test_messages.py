@@ -52,7 +52,6 @@ def test_a_message_that_cannot_be_encoded_leaves_nothing_in_the_next() -> None:
     assert decode(encode({"source": "right"})) == {"source": "right"}
 
 
-
 @given(st.binary(max_size=300))
 def test_what_is_not_a_message_is_refused_with_a_value_error(payload: bytes) -> None:
     try:

@@ -103,9 +103,23 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
         return f"{subject}is missing{f' (allowed: {allowed})' if allowed else ''}"
     if details["type"] in ("value_error", "assertion_error"):
         return f"{subject}{details['msg'].split(', ', 1)[1]}"
+    if details["type"].startswith("union_tag"):
+        return f"{subject}{_tag(details)}"
     reason = details["msg"].replace("Input should", "should", 1).replace("Value should", "should", 1)
     allowed_text = f", allowed: {allowed}" if allowed else ""
     return f"{subject}{reason} (found {_shown(details['input'])}{allowed_text})"
+
+
+def _tag(details: ErrorDetails) -> str:
+    """Return what is wrong with the key by which the kinds of a section are told apart."""
+    context = details["ctx"]
+    key = context["discriminator"].strip("'")
+    if "tag" not in context:
+        return f"lacks `{key}`, which says what it is"
+    known = [tag.strip("'") for tag in context["expected_tags"].split(", ")]
+    near = get_close_matches(context["tag"], known, 1)
+    meant = f", did you mean {near[0]!r}?" if near else ""
+    return f"has the {key} {context['tag']!r}, which there is not{meant} (allowed: {', '.join(known)})"
 
 
 def _known_keys(wrong: str, schema: Mapping[str, Any]) -> str:

@@ -1,6 +1,7 @@
 """Configuration files: every mistake is reported, at once, by file, key and allowed range."""
 
 from contextlib import suppress
+from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
@@ -10,6 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from daemon.config_file import ConfigModel, load_yaml_model
 from daemon.errors import UserError
+from daemon.experiment.steps import ExperimentFile
 
 
 class Inner(ConfigModel):
@@ -113,3 +115,19 @@ def test_no_content_whatever_does_anything_but_load_or_be_refused(tmp_path_facto
     path.write_bytes(b"torque_limit_nm: 1\n" + content)
     with suppress(UserError):
         assert isinstance(load_yaml_model(path, Outer), Outer)
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        ("{do: gripp}", "`steps[0]` has the do 'gripp', which there is not, did you mean 'grip'? (allowed: approach, "),
+        ("{do: 7}", "`steps[0]` has the do '7', which there is not (allowed: approach, "),
+        ("{width_mm: 5}", "`steps[0]` lacks `do`, which says what it is"),
+    ],
+)
+def test_a_step_of_no_kind_is_told_in_a_sentence(step: str, said: str, tmp_path: Path) -> None:
+    path = tmp_path / "steps.yaml"
+    path.write_text(f"{{name: one, steps: [{step}]}}")
+    with pytest.raises(UserError) as caught:
+        load_yaml_model(path, ExperimentFile)
+    assert said in str(caught.value)

@@ -53,7 +53,11 @@ def test_all_mistakes_are_told_together(tmp_path: Path) -> None:
         ("margin_rad: 0.1", "margin_rad: 3.2", "no room"),
         ("{inner: 4.0, hard: 8.0}", "{inner: 4.0, hard: 50.0}", "more than ur-rtde takes, which is 40"),
         ("margin_m: 0.02", "margin_m: 0", "above 0"),
-        ("host: 192.168.1.10\n", "", "host: Field required"),
+        ("host: 192.168.1.10\n", "", "ur.yaml: host: it is missing"),
+        ("host: 192.168.1.10", "host: ' '", "ur.yaml: the file: host is empty; give the robot's address"),
+        ("host: 192.168.1.10", "host: 192.168.1.10\nhots: 1", "hots: this is not a known key"),
+        ("margin_rad: 0.1", "margin_rad: 0.1\n    margin_rad: 0.01", r"line \d+: the key `margin_rad` is given twice"),
+        ("margin_rad: 0.1", "margin_rad: -1", "limits.joints: the margin must be above 0, not -1"),
         ("limits:", "limits", "cannot be read"),
     ],
 )

@@ -39,6 +39,7 @@ SECTIONS = (
         told=(
             "daemon/estimator.py",
             "bank/estimators/guard.py",
+            "bank/estimators/guards.py",
             "bank/estimators/familiar.py",
             "daemon/skin/estimator.py",
             "daemon/skin/zero.py",

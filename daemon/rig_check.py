@@ -7,7 +7,7 @@ from daemon.both import BOTH
 from daemon.config import DaemonConfig
 from daemon.config_file import load_yaml_model
 from daemon.errors import UserError
-from daemon.experiment.steps import ExperimentFile, Grip, Release, beyond_limits
+from daemon.experiment.steps import ExperimentFile, Grip, HoldTorque, Identify, Release, Tare, beyond_limits
 from daemon.load_cell_task import LOAD_CELL
 from daemon.loop.senses import Source
 from daemon.loop_task import WRENCH
@@ -42,7 +42,29 @@ def checked_experiment(config: DaemonConfig, sources: Mapping[str, Source]) -> E
                     f"{path}: step {number} is `{step.do}`, and no gripper is configured; "
                     "add a `gripper` section to the configuration, or take the step out"
                 )
+    if number := _held_unknown(file):
+        raise UserError(
+            f"{path}: step {number} is `hold_torque`, and the tool is not known then; put an `identify` step before "
+            "it, after the last `tare`, `grip` or `release`"
+        )
     return file
+
+
+def _held_unknown(file: ExperimentFile) -> int | None:
+    """Return the number of the first step that closes the loop on a tool of which nothing was learnt, or None.
+
+    What was learnt is forgotten with another grip and another zero (`Wrist.forget`).
+    """
+    known = False
+    for number, step in enumerate(file.steps, 1):
+        match step:
+            case Identify():
+                known = True
+            case Tare() | Grip() | Release():
+                known = False
+            case HoldTorque() if not known:
+                return number
+    return None
 
 
 def _why_not(drive: str, config: DaemonConfig) -> str:

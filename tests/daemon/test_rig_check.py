@@ -96,6 +96,17 @@ def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(
     assert f"`steps[2]` ({step['do']}) {told}" in said
 
 
+@pytest.mark.parametrize("between", [[], [{"do": "tare"}], [{"do": "release"}], [{"do": "grip"}]])
+def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path: Path, between: list[dict[str, Any]]) -> None:
+    identify, hold = {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.1}
+    gripper = {"socket": {"host": "127.0.0.1"}}
+    first = [identify] if between else []
+    told = refusal(tmp_path, {"steps": [*first, *between, hold, identify, hold]}, gripper=gripper)
+    assert f"step {1 + len(first) + len(between)} is `hold_torque`, and the tool is not known then; put an" in told
+    steps = [*between, identify, {"do": "wait", "wait_s": 1}, hold, hold]
+    assert checked_experiment(config(tmp_path, {"steps": steps}, gripper=gripper), SOURCES) is not None
+
+
 def test_a_file_that_is_none_is_told_with_its_name(tmp_path: Path) -> None:
     daemon = config(tmp_path, {})
     (tmp_path / "experiment.yaml").unlink()

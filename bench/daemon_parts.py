@@ -77,12 +77,14 @@ def lines(bank: Bank, n: int, n_idle: int = 10, seed: int = 0) -> list[bytes]:
         if number >= n_idle:
             signal = scale * bank.signals[tuple(cells[random.integers(len(cells))])].astype(np.float64)
             signal *= min(1.0, 0.25 / np.abs(signal).max())
-        found.append(_line(np.clip(volts + signal + random.normal(0, 0.002, len(volts)), 0.002, 0.77)))
+        channels = np.clip(volts + signal + random.normal(0, 0.002, len(volts)), 0.002, 0.77)
+        found.append(line_text(line_of_channels(channels)))
     return found
 
 
-def _line(channels: NDArray[np.float64]) -> bytes:
-    return b"".join(b"%.4f, " % value for value in line_of_channels(channels).tolist()) + b"\n"
+def line_text(values: NDArray[np.float64]) -> bytes:
+    """Return the bytes that a board sends of the 1024 values of a line, in volts."""
+    return b"".join(b"%.4f, " % value for value in values.tolist()) + b"\n"
 
 
 def configuration(folder: Path, bank: Path, names: Sequence[str], **fingertip: Any) -> Path:

@@ -1,6 +1,7 @@
 """How lean the daemon is: latency, losses, processor time, memory, and the time until it is ready.
 
     python -m bench.daemon_speed --bank run/paper.bank --out run/daemon_speed.json [--rig-bank run/demo.bank]
+        [--rig run]
 
 Each figure is measured on a daemon in a process of its own, through a pseudo-terminal and a subscriber's socket.
 """
@@ -34,6 +35,7 @@ from bench.daemon_parts import (
     subscription,
     tree,
 )
+from bench.fused_latency import fused_latency
 from daemon.wire.request import request
 from drivers.eit_format import FRAME_PERIOD_S
 
@@ -259,6 +261,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--bank", type=Path, required=True, help="the bank of the fingertips, of 100 × 100 cells")
     parser.add_argument("--rig-bank", type=Path, help="what the emulated rig plays (default: the same)")
+    parser.add_argument("--rig", type=Path, help="where bench.rig_twists left rig-25mm.mcap and rig*.cal, for `fused`")
     parser.add_argument("--frames", type=int, default=300, help="frames whose latency is measured")
     parser.add_argument("--rated-s", type=float, default=30.0, help="seconds at rated speeds")
     parser.add_argument("--only", nargs="+", choices=("help", "latency", "flood", "rated", "shared"))
@@ -277,6 +280,16 @@ def main() -> None:
             }
             for each in ("zero_lag", "all_lags")
         }
+        if args.rig is None:
+            print("latency of `fused`: left out, for no --rig was given", file=sys.stderr)
+        else:
+            found["latency"]["fused"] = {
+                name: {
+                    "in_packets": fused_latency(args.rig, sides, args.frames, PAUSE_S),
+                    "in_packets_at_the_boards_rate": fused_latency(args.rig, sides, args.frames // 3, FRAME_PERIOD_S),
+                }
+                for name, sides in (("one", ("right",)), ("two", ("right", "left")))
+            }
     if "flood" in wanted:
         found["flood"] = flood(args.bank, 10 * args.frames)
     if "rated" in wanted:

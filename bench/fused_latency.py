@@ -1,0 +1,93 @@
+"""From the last byte of a frame to an estimate by `fused` at a subscriber, for `bench.daemon_speed`.
+
+What is played was recorded of the emulated rig by `python -m bench.rig_twists`, with its calibrations.
+"""
+
+import contextlib
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import yaml
+import zmq
+
+from bench.daemon_parts import Board, daemon, line_text, received, subscription
+from daemon.both import BOTH
+from daemon.recording.reader import read_recording
+
+RECORDING = "rig-25mm.mcap"
+BOTH_CALIBRATION = "rig.cal"
+# Of the recording's idle frames some are left out: it is gripped from the 27th on, and estimates are from the 40th.
+_FIRST = 12
+# An estimate that has not come after this long will not: the two frames came too far apart to make a pair.
+_LOST_MS = 1000
+
+
+def fused_latency(rig: Path, sides: tuple[str, ...], n_frames: int, pause_s: float) -> dict[str, dict[str, float]]:
+    """Return by source the milliseconds from a frame's last byte to its estimate, of n_frames that are valid at most.
+
+    Of two sides both are told, and `both`, from the last byte of the later one. Lines come in packets.
+    """
+    recorded = read_recording(rig / RECORDING).sides
+    lines = {side: [line_text(one) for one in recorded[side].lines[_FIRST : _FIRST + n_frames]] for side in sides}
+    taken: dict[str, list[tuple[float, float]]] = {
+        source: [] for source in ((*sides, BOTH) if len(sides) > 1 else sides)
+    }
+    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
+        folder = Path(name)
+        boards = {side: Board(folder / side) for side in sides}
+        for board in boards.values():
+            opened.callback(board.close)
+        config = _configuration(folder, rig.resolve(), sides, pause_s)
+        opened.enter_context(daemon(config, folder))
+        estimates = opened.enter_context(subscription(folder, "eit.estimate"))
+        estimates.setsockopt(zmq.RCVTIMEO, _LOST_MS)
+        for board in boards.values():
+            board.wait_for_start()
+        for number in range(min(map(len, lines.values()))):
+            time.sleep(0.5 * pause_s)
+            for side, board in boards.items():
+                # Two boards do not keep step: a frame comes when the daemon is idle again.
+                time.sleep(0.5 * pause_s / len(sides))
+                sent_ns = board.send_in_packets(lines[side][number])
+                awaited = {side, BOTH} if side == sides[-1] and len(sides) > 1 else {side}
+                while awaited:
+                    try:
+                        arrived_ns, content = received(estimates)
+                    except zmq.Again:
+                        break
+                    if content["frame"] == number and content["source"] in awaited:
+                        awaited.remove(content["source"])
+                        if content["valid"]:
+                            took_ms = (arrived_ns - sent_ns) / 1e6, content["latency_s"] * 1e3
+                            taken[content["source"]].append(took_ms)
+    return {source: _figures(np.array(found)) for source, found in taken.items()}
+
+
+def _figures(taken: np.ndarray) -> dict[str, float]:
+    if not len(taken):
+        raise RuntimeError("no estimate was valid; make the recording and its calibrations anew: bench.rig_twists")
+    p50, p99 = np.percentile(taken[:, 0], [50, 99])
+    return {"p50_ms": p50, "p99_ms": p99, "own_p50_ms": float(np.median(taken[:, 1])), "n": len(taken)}
+
+
+def _configuration(folder: Path, rig: Path, sides: tuple[str, ...], period_s: float) -> Path:
+    fingertips = {
+        side: {
+            "device": {"path": str(folder / side)},
+            "frame_period_s": period_s,
+            "calibration": str(rig / f"rig-{side}.cal"),
+            "estimator": "fused",
+        }
+        for side in sides
+    }
+    content = {
+        "publish": f"ipc://{folder}/publish",
+        "commands": f"ipc://{folder}/commands",
+        "fingertips": fingertips,
+        **({BOTH: {"calibration": str(rig / BOTH_CALIBRATION)}} if len(sides) > 1 else {}),
+    }
+    path = folder / "daemon.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path

@@ -108,7 +108,7 @@ class SideGuard:
     def idle_like(self, frame: FloatArray) -> bool:
         """Return whether a session's first frame is idle: not clearly nearer to the calibration's gripped frame."""
         known = Known(np.array([self.idle, self.gripped]), np.isfinite(self.noise))
-        from_idle, from_gripped = known.deviations(frame, known.gains(frame))
+        from_idle, from_gripped = known.deviations(known.off(frame))
         even = frame / self.gain(frame)
         if min(from_idle, from_gripped) < _SAME_HOUR and self.grip(even, self.idle) > _GRIPPED_SCORE:
             return False
@@ -144,12 +144,19 @@ class Known:
         found = [gain if gain > 0 else math.nan for gain in self._medians(frame / self.frames)]
         return np.array(found).reshape(*self.frames.shape[:-1], 1)
 
-    def deviations(self, frame: FloatArray, gains: FloatArray) -> list[float]:
-        """Return a frame's median relative deviation from each known one after these gains, as a flat list.
+    def off(self, frame: FloatArray) -> FloatArray:
+        """Return by which shares (…, 896) of the known ones a frame is off from them after the gain in common.
 
-        It is infinite where too few channels are compared, or there is no gain.
+        NaN at channels that are not compared, and where there is no gain.
         """
-        found = self._medians(np.abs(frame / gains - self.frames) / self.frames)
+        return np.asarray(np.abs(frame / self.gains(frame) - self.frames) / self.frames)
+
+    def deviations(self, off: FloatArray) -> list[float]:
+        """Return a flat list of the medians of what is `off`, which is put in order: a frame's from each known one.
+
+        They are infinite where too few channels are compared, or there is no gain.
+        """
+        found = self._medians(off)
         return [
             one if n >= N_CHANNELS // 4 and not math.isnan(one) else math.inf
             for one, n in zip(found, self._counts, strict=True)
@@ -168,13 +175,14 @@ def relative_to(frame: FloatArray, idle: FloatArray) -> FloatArray:
     return np.asarray((frame - idle) / (idle + _SMALL_V))
 
 
-def at_rail(channels: FloatArray, usable: BoolArray) -> BoolArray:
-    """Return which usable (…, 896) channels share the largest value with too many others to be chance: saturated."""
+def unsaturated(channels: FloatArray, usable: BoolArray) -> BoolArray:
+    """Return which (m, 896) channels are usable still: too many that share a side's largest value are at the rail."""
     heights = channels if everywhere(usable) else np.where(usable, channels, -np.inf)
-    top = usable & (heights >= heights.max(axis=-1, keepdims=True))
-    if np.count_nonzero(top) < _FEWEST_AT_RAIL:
-        return np.zeros_like(top)
-    return np.asarray(top & (top.sum(axis=-1, keepdims=True) >= _FEWEST_AT_RAIL))
+    ordered = np.sort(heights, axis=-1)
+    if not any(one.item(-_FEWEST_AT_RAIL) == one.item(-1) for one in ordered):
+        return usable
+    at_rail = (heights == ordered[:, -1:]) & (ordered[:, -_FEWEST_AT_RAIL] == ordered[:, -1])[:, None]
+    return np.asarray(usable & ~at_rail)
 
 
 def _discriminant(parts: list[FloatArray]) -> FloatArray:

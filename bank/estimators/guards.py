@@ -41,16 +41,19 @@ class Guards:
         return [_too_few(guard.side, one) for guard, one in zip(self.sides, usable, strict=True)]
 
     def seen(self, frame: FloatArray, usable: BoolArray) -> tuple[list[str], BoolArray]:
-        """Return for each side why it is another fingertip, or an empty text, and which (m, 896) channels are lost.
+        """Return for each side why it says nothing, or an empty text, and which (m, 896) channels are lost.
 
-        Lost ones read what neither grip nor twist explains: a lost electrode, a crossed wire.
+        It has too few usable channels, or is another fingertip. Lost ones read what neither grip nor twist explains: a
+        lost electrode, a crossed wire.
         """
-        known = self._known if everywhere(usable) else Known(self._frames, usable[:, None])
-        frame = frame[:, None]
-        gains = known.gains(frame)
-        lost = np.abs(frame - gains * known.frames) > _LOST_SHARE * gains * known.frames
-        deviations = known.deviations(frame, gains)
+        complete = everywhere(usable)
+        known = self._known if complete else Known(self._frames, usable[:, None])
+        off = known.off(frame[:, None])
+        lost = off > _LOST_SHARE
+        deviations = known.deviations(off)
         why = [_foreign(guard.side, *deviations[2 * i : 2 * i + 2]) for i, guard in enumerate(self.sides)]
+        if not complete:
+            why = [few or other for few, other in zip(self.too_few(usable), why, strict=True)]
         return why, lost[:, 0] & lost[:, 1]
 
     def jumping_shares(self, frame: FloatArray, before: FloatArray, usable: BoolArray) -> list[float]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from bank.channels import N_CHANNELS
 from bank.estimators.grip import Grip
-from bank.estimators.guard import LARGEST_JUMPING_SHARE, STEP_FRAMES, SideGuard, at_rail
+from bank.estimators.guard import LARGEST_JUMPING_SHARE, STEP_FRAMES, SideGuard, unsaturated
 from bank.estimators.guards import Guards
 from bank.estimators.values import BoolArray, FloatArray, TactileFrame, everywhere
 
@@ -157,20 +157,19 @@ class Memory:
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
         self._pass_time(frame.t_s)
-        usable = frame.usable & ~at_rail(frame.channels, frame.usable)
+        usable = unsaturated(frame.channels, frame.usable)
         channels = self._filled(frame.channels, usable)
-        foreign, lost = self._guards.seen(channels, usable)
-        why = [few or other for few, other in zip(self._guards.too_few(usable), foreign, strict=True) if few or other]
+        why, lost = self._guards.seen(channels, usable)
         # Channels that are lost for longer are left out; while they are being lost they count as jumping.
         disturbed = self._disturbed(channels, usable & ~(lost & self._lost))
         self._lost = lost
         if np.count_nonzero(lost):
             usable = usable & ~lost
-            why = why or [few for few in self._guards.too_few(usable) if few]
+            why = why if any(why) else self._guards.too_few(usable)
             channels = self._filled(frame.channels, usable)
-        if why:
+        if any(why):
             self._forget()
-            return Moment(channels, np.zeros_like(channels), tuple(why), usable)
+            return Moment(channels, np.zeros_like(channels), tuple(filter(None, why)), usable)
         if disturbed:
             return self._bridge(channels, disturbed, usable)
         if self._idle_wanted:

@@ -94,7 +94,7 @@ class Reader:
                 f"the {name} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to "
                 f"{self.high:.3g} {unit}",
             )
-        if len(self.reach) and (np.abs(features - self.mean_feature) > _LARGEST_REACH * self.reach).any():
+        if len(self.reach) and np.count_nonzero(np.abs(features - self.mean_feature) > _LARGEST_REACH * self.reach):
             return ("the frame moves further or faster than any at calibration",)
         return ()
 

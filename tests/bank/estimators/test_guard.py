@@ -120,8 +120,8 @@ def test_gain_and_deviation_are_medians_of_the_channels_that_are_compared(seed: 
     known, usable = random.uniform(0.0, 0.3, (2, 896)), random.random(896) >= left_out
     frame = random.uniform(0.5, 2.0) * known[0] + random.normal(0, 0.02, 896)
     compared = Known(known, usable)
-    gains = compared.gains(frame)
-    for one, gain, deviation in zip(known, gains[:, 0], compared.deviations(frame, gains), strict=True):
+    deviations = compared.deviations(compared.off(frame))
+    for one, gain, deviation in zip(known, compared.gains(frame)[:, 0], deviations, strict=True):
         judged = usable & (one > 0.03)
         if not judged.any():
             assert np.isnan(gain)

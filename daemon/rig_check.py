@@ -42,9 +42,9 @@ def checked_experiment(config: DaemonConfig, sources: Mapping[str, Source]) -> E
                     f"{path}: step {number} is `{step.do}`, and no gripper is configured; "
                     "add a `gripper` section to the configuration, or take the step out"
                 )
-    if number := _held_unknown(file):
+    if (unknown := _held_unknown(file)) is not None:
         raise UserError(
-            f"{path}: step {number} is `hold_torque`, and the tool is not known then; put an `identify` step before "
+            f"{path}: step {unknown} is `hold_torque`, and the tool is not known then; put an `identify` step before "
             "it, after the last `tare`, `grip` or `release`"
         )
     return file

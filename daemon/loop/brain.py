@@ -79,6 +79,10 @@ class Brain:
         self._wrists = wrists
         self._watch = watch
         self._sources = supervisors
+        # Of each that may drive, the others, which supervise it.
+        self._others = {
+            drive: tuple(source for name, source in supervisors.items() if name != drive) for drive in supervisors
+        }
         self._required = required
         self._creep = creep
         self._wish = Wish()
@@ -307,7 +311,7 @@ class Brain:
         gripped = running and self._grips and not isinstance(wish.action, GripTo)
         watched = Watched(
             driving=self._sources[drive],
-            supervising=tuple(source for name, source in self._sources.items() if name != drive),
+            supervising=self._others[drive],
             limits=limits,
             torque_needed=gripped and moves and not paused,
             gripped=gripped,

@@ -39,6 +39,7 @@ class Event(Enum):
     DEVICE_LOST = "device lost"
     TASK_DIED = "task died"
     LOOP_LATE = "loop late"
+    HELD_TOO_LONG = "held too long"
     RECORDING_FAILED = "recording failed"
     COMMAND_REFUSED = "command refused"
     STEP_OVERDUE = "step overdue"
@@ -48,13 +49,15 @@ class Event(Enum):
 class Rule:
     """One row: the response, what the operator reads, and how long a hold may last before it becomes a stop.
 
-    A hold that comes back counts on: see `FORGETS`.
+    A hold that comes back counts on: see `FORGETS`. What is `told_afterwards` has been so since the judgement before,
+    and is over when it is told, as that the loop was away.
     """
 
     response: Response
     sentence: str
     cure: str
     hold_at_most_s: float | None = None
+    told_afterwards: bool = False
 
 
 # Of how long an event has held, so much is forgotten for each second in which it does not: what is wrong for more than
@@ -144,6 +147,12 @@ TABLE: Mapping[Event, Rule] = {
         "the daemon is too slow for its devices: {detail}.",
         "End other programs on this computer, or see the service's real-time options.",
         hold_at_most_s=5.0,
+        told_afterwards=True,
+    ),
+    Event.HELD_TOO_LONG: Rule(
+        _KEEP,
+        "the wrist was held for too long, now for one reason and now for another: {detail}.",
+        "Clear what held it longest first, then start the experiment again.",
     ),
     Event.RECORDING_FAILED: Rule(
         Response.REFUSE_START,
@@ -161,6 +170,10 @@ TABLE: Mapping[Event, Rule] = {
         "Look what kept it waiting; lengthen `timeout_s` of the step when it was too short.",
     ),
 }
+
+
+# Several causes that take turns hold the wrist no longer than one alone may.
+HELD_AT_MOST_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold_at_most_s is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,17 +212,27 @@ class SafetyGate:
     """Judges what is wrong, lets holds go when their cause has gone, and keeps a stop until it is acknowledged."""
 
     def __init__(self) -> None:
-        # For how long each event has held, less what is forgotten, and which of them did at the last judgement.
+        # For how long each event has held, and any of them the wrist, less what is forgotten; and which of them did at
+        # the last judgement, if there was one.
         self._held_ns: dict[Event, int] = {}
+        self._wrist_ns = 0
+        # What each has contributed to the wrist's, to be told.
+        self._of_each_ns: dict[Event, int] = {}
         self._holding: frozenset[Event] = frozenset()
-        self._judged_ns = 0
+        self._judged_ns: int | None = None
         self._stopped: Verdict | None = None
 
     def judge(self, troubles: Iterable[Trouble], t_ns: int) -> Verdict:
         """Return the response to the troubles of this moment (t_ns on the monotonic clock)."""
         active = tuple(troubles)
-        self._count(frozenset(each.event for each in active), t_ns)
+        # 125 times a second, and nearly always there is nothing to count.
+        if active or self._wrist_ns or self._holding:
+            self._count(active, t_ns)
+        self._judged_ns = t_ns
         response = max(map(self._response, active), default=Response.NOTE)
+        if response is Response.HOLD and self._wrist_ns > HELD_AT_MOST_S * 1e9:
+            active = (*active, Trouble(Event.HELD_TOO_LONG, self._told_of_holds()))
+            response = TABLE[Event.HELD_TOO_LONG].response
         verdict = Verdict(response, active)
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stopped is None or response > self._stopped.response):
             self._stopped = verdict
@@ -242,22 +265,41 @@ class SafetyGate:
         first = (trouble for trouble in stop.troubles if trouble.event not in events)
         return Verdict(stop.response, (*first, *active))
 
-    def _count(self, events: frozenset[Event], t_ns: int) -> None:
-        """Take in which events there are at t_ns: what held until now has held for longer, the rest is forgotten."""
-        passed_ns = t_ns - self._judged_ns
-        for event, held_ns in tuple(self._held_ns.items()):
-            change_ns = passed_ns if event in self._holding else -round(FORGETS * passed_ns)
-            self._held_ns[event] = max(0, held_ns + change_ns)
-        self._held_ns.update((event, 0) for event in events if event not in self._held_ns)
-        self._holding, self._judged_ns = events, t_ns
+    def _count(self, active: tuple[Trouble, ...], t_ns: int) -> None:
+        """Take in what there is at t_ns: what held until now has held for longer, the rest is forgotten."""
+        passed_ns = 0 if self._judged_ns is None else t_ns - self._judged_ns
+        holding = frozenset(trouble.event for trouble in active if trouble.rule.hold_at_most_s is not None)
+        held = self._holding.union(event for event in holding if TABLE[event].told_afterwards)
+        counted = {
+            event: _counted(self._held_ns.get(event, 0), passed_ns, held=event in held)
+            for event in (*self._held_ns, *holding)
+        }
+        self._held_ns = {event: held_ns for event, held_ns in counted.items() if held_ns or event in holding}
+        self._wrist_ns = _counted(self._wrist_ns, passed_ns, held=bool(held))
+        if not self._wrist_ns:
+            self._of_each_ns.clear()
+        for event in held:
+            self._of_each_ns[event] = self._of_each_ns.get(event, 0) + passed_ns
+        self._holding = holding
 
     def _forget(self) -> None:
         self._held_ns.clear()
-        self._holding = frozenset()
+        self._of_each_ns.clear()
+        self._wrist_ns, self._holding, self._judged_ns = 0, frozenset(), None
 
     def _response(self, trouble: Trouble) -> Response:
         rule = trouble.rule
-        held_s = self._held_ns[trouble.event] / 1e9
-        if rule.hold_at_most_s is not None and held_s > rule.hold_at_most_s:
+        longest_s = rule.hold_at_most_s
+        if longest_s is not None and self._held_ns[trouble.event] > longest_s * 1e9:
             return Response.STOP_AND_KEEP_GRIP
         return rule.response
+
+    def _told_of_holds(self) -> str:
+        """Return for how long each event has held, the longest first."""
+        longest_first = sorted(self._of_each_ns.items(), key=lambda held: -held[1])
+        return ", ".join(f"{event.value} for {held_ns / 1e9:.1f} s" for event, held_ns in longest_first)
+
+
+def _counted(held_ns: int, passed_ns: int, *, held: bool) -> int:
+    """Return for how long something has held, after so much more time in which it did or did not."""
+    return held_ns + passed_ns if held else max(0, held_ns - round(FORGETS * passed_ns))

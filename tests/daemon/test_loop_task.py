@@ -144,6 +144,18 @@ async def test_a_loop_that_is_late_again_and_again_is_stopped_though_it_then_rea
         assert "loop was woken" in cell.why
 
 
+async def test_a_loop_that_stalls_again_and_again_is_stopped_though_it_decides_in_time_between() -> None:
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        for _ in range(60):
+            for _ in range(18):
+                cell.robot.cycle(read=False)
+            await cell.cycles(2)
+            if cell.phase is not Phase.RUNNING:
+                break
+        assert "loop was woken" in cell.why
+
+
 async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkeypatch: pytest.MonkeyPatch) -> None:
     async with driven() as cell:
         await cell.start({"do": "wait", "wait_s": 60})

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.safety import TABLE, Event, Response, SafetyGate, Trouble
+from daemon.safety import HELD_AT_MOST_S, TABLE, Event, Response, SafetyGate, Trouble
 
 STOPS = (Response.STOP_AND_KEEP_GRIP, Response.STOP_AND_RELEASE)
 SECOND = 10**9
@@ -58,9 +58,10 @@ def flapping(event: Event, held: int, gone: int, for_s: float = 60.0) -> float |
 
 
 HOLDS = [(event, rule.hold_at_most_s) for event, rule in TABLE.items() if rule.hold_at_most_s is not None]
+OF_THE_MOMENT = [(event, longest_s) for event, longest_s in HOLDS if not TABLE[event].told_afterwards]
 
 
-@pytest.mark.parametrize(("event", "longest_s"), HOLDS)
+@pytest.mark.parametrize(("event", "longest_s"), OF_THE_MOMENT)
 @pytest.mark.parametrize(("held", "gone"), [(1, 1), (50, 50), (125, 125), (125, 12)])
 def test_a_hold_that_flaps_becomes_a_stop(event: Event, longest_s: float, held: int, gone: int) -> None:
     """Of each cycle's time so much is held and half of the rest forgotten, until it is as long as it may be."""
@@ -71,13 +72,102 @@ def test_a_hold_that_flaps_becomes_a_stop(event: Event, longest_s: float, held: 
     assert stopped_s == pytest.approx(cycle_s * cycles_before, abs=cycle_s + held * TICK_S + 4 * TICK_S)
 
 
-@pytest.mark.parametrize(("event", "longest_s"), HOLDS)
+@pytest.mark.parametrize(("event", "longest_s"), OF_THE_MOMENT)
 @pytest.mark.parametrize(("held", "gone"), [(1, 3), (12, 36), (125, 260)])
 def test_a_hold_that_is_gone_for_more_than_two_thirds_of_the_time_stays_one(
     event: Event, longest_s: float, held: int, gone: int
 ) -> None:
     assert held * TICK_S < longest_s
     assert flapping(event, held, gone) is None
+
+
+def taking_turns(*turns: tuple[Event, float], for_s: float = 60.0) -> tuple[float, SafetyGate] | None:
+    """Judge events that follow each other, each for so long; return when they became a stop, None where never."""
+    gate, cycle = SafetyGate(), [event for event, for_s in turns for _ in range(round(for_s / TICK_S))]
+    for tick in range(round(for_s / TICK_S)):
+        if gate.judge([trouble(cycle[tick % len(cycle)])], round(tick * TICK_S * SECOND)).response in STOPS:
+            return tick * TICK_S, gate
+    return None
+
+
+@pytest.mark.parametrize("each_s", [0.008, 0.1, 1.0])
+@pytest.mark.parametrize("count", [3, 4, 6])
+def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(count: int, each_s: float) -> None:
+    events = [event for event, _ in HOLDS][:count]
+    stopped = taking_turns(*((event, each_s) for event in events))
+    assert stopped is not None
+    stopped_s, gate = stopped
+    assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
+    told = gate.look([]).reasons[-1]
+    assert "held for too long" in told
+    assert all(f"{event.value} for " in told for event in events[:4])
+
+
+def test_one_cause_alone_is_told_alone() -> None:
+    stopped = taking_turns((Event.ESTIMATE_STALE, 1.0))
+    assert stopped is not None
+    assert [found.event for found in stopped[1].look([]).troubles] == [Event.ESTIMATE_STALE]
+
+
+def test_what_does_not_hold_is_not_counted_as_a_hold() -> None:
+    notes = [event for event, rule in TABLE.items() if rule.response < Response.HOLD]
+    assert taking_turns(*((event, 0.1) for event in notes)) is None
+
+
+LATE = [trouble(Event.LOOP_LATE)]
+
+
+@pytest.mark.parametrize(("stall_s", "decisions"), [(0.15, 1), (0.15, 10), (0.3, 60), (1.0, 1)])
+def test_a_loop_that_is_away_for_more_than_a_third_of_the_time_is_stopped(stall_s: float, decisions: int) -> None:
+    """It is found late when it is back, and in time at the next decision: what counts is the time between."""
+    gate, t_ns = SafetyGate(), SECOND
+    gate.judge([], t_ns)
+    while t_ns < 60 * SECOND:
+        t_ns += round(stall_s * SECOND)
+        if gate.judge(LATE, t_ns).response in STOPS:
+            break
+        for _ in range(decisions):
+            t_ns += round(TICK_S * SECOND)
+            assert gate.judge([], t_ns).response not in STOPS
+    held_s, gone_s = stall_s + TICK_S, (decisions - 1) * TICK_S
+    longest_s = TABLE[Event.LOOP_LATE].hold_at_most_s
+    assert longest_s is not None
+    cycles = (longest_s - held_s) / (held_s - 0.5 * gone_s)
+    assert t_ns / SECOND - 1.0 == pytest.approx(cycles * (held_s + gone_s), abs=2 * (held_s + gone_s))
+
+
+def test_a_loop_that_is_late_now_and_then_is_held_and_goes_on() -> None:
+    gate, t_ns = SafetyGate(), 0
+    for _ in range(100):
+        t_ns += 150_000_000
+        assert gate.judge(LATE, t_ns).response is Response.HOLD
+        for _ in range(60):
+            t_ns += round(TICK_S * SECOND)
+            assert gate.judge([], t_ns).response is Response.NOTE
+
+
+def test_what_was_before_the_first_judgement_does_not_count() -> None:
+    gate = SafetyGate()
+    assert gate.judge(LATE, 3600 * SECOND).response is Response.HOLD
+    gate.look([])
+    assert gate.judge(LATE, 7200 * SECOND).response is Response.HOLD
+
+
+CAUSES = st.lists(st.sampled_from([event for event, _ in HOLDS]), max_size=3)
+STRETCHES = st.tuples(CAUSES, st.integers(1, 3 * SECOND))
+
+
+@given(st.lists(STRETCHES, min_size=1, max_size=60))
+def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop(
+    story: list[tuple[list[Event], int]],
+) -> None:
+    gate, t_ns, held_ns = SafetyGate(), 0, 0.0
+    for events, lasts_ns in story:
+        if gate.judge([trouble(event) for event in events], t_ns).response in STOPS:
+            return
+        assert not events or held_ns <= HELD_AT_MOST_S * SECOND
+        t_ns += lasts_ns
+        held_ns = held_ns + lasts_ns if events else max(0.0, held_ns - 0.5 * lasts_ns)
 
 
 def test_a_hold_begins_anew_with_the_next_experiment_and_after_the_operators_word() -> None:

@@ -157,7 +157,7 @@ class RobotStateMessage(Message):
     protective_stop: bool = column("", "whether it is in a protective stop")
     emergency_stop: bool = column("", "whether an emergency stop is pressed")
     blocked: str = column("", "why motion is refused at present; empty when it is allowed")
-    age_s: float = column("s", "since the controller's own timestamp last changed")
+    age_s: float = column("s", "since the controller made the sample, by its own clock against ours")
 
 
 @value(frozen=True, slots=True, kw_only=True)

@@ -17,6 +17,7 @@ import rtde_control
 from drivers.errors import DriverError
 from drivers.ur.messages import MoveLinear, Reading, WristSpeed
 from drivers.ur.receiver import Receiver
+from drivers.ur.sample_age import SampleAge
 from drivers.ur.settings import UrSettings
 
 # A thread of the client asks its socket for data, sleeps for 0.1 ms, and asks again: 5 % of a core. Woken up to so much
@@ -47,19 +48,16 @@ class Arm:
             self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
         # Whether a straight move may be under way: one was begun, and the wrist has not been turned since.
         self._may_move_linearly = False
-        self._timestamp_s = -1.0
-        self._changed_ns = time.monotonic_ns()
+        self._age = SampleAge()
 
     def read(self) -> Reading:
         """Return the controller's latest sample and its age."""
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
-        if sample.timestamp_s != self._timestamp_s:
-            self._timestamp_s, self._changed_ns = sample.timestamp_s, now_ns
         return Reading(
             now_ns,
             sample.timestamp_s,
-            now_ns - self._changed_ns,
+            self._age.age_ns(sample.timestamp_s, now_ns),
             self._receiver.connected and self._control.isConnected(),
             sample.q_rad,
             sample.qd_rad_per_s,

@@ -99,7 +99,7 @@ class Reading:
 
     t_mono_ns: int
     timestamp_s: float
-    # How long ago the controller's timestamp last changed; a connection can be open and the data old.
+    # How long ago the controller made the sample, by its own clock: it can be new to us, and have waited.
     age_ns: int
     connected: bool
     q_rad: Six

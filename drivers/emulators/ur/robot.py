@@ -59,6 +59,8 @@ class Robot:
         self._pace = pace
         self.plant: WristPlant = plant or (lambda _angle_rad, _speed_rad_per_s, _dt_s: 0.0)
         self.time_s = 0.0
+        # For how long its time has stood still, which its clock did not.
+        self.stood_still_s = 0.0
         self.q_rad: Vector = np.array(self.make.start_rad)
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Motion | None = None
@@ -275,7 +277,7 @@ class Robot:
 
 
 _VARIABLES: dict[str, Callable[[Robot], Value]] = {
-    "timestamp": lambda r: r.time_s,
+    "timestamp": lambda r: r.time_s + r.stood_still_s,
     "actual_q": lambda r: [*r.q_rad],
     "target_q": lambda r: [*r.q_rad],
     "actual_qd": lambda r: [*r.qd_rad_per_s],

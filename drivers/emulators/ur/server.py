@@ -15,7 +15,7 @@ RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 SCRIPT_END = b"\nend\n"
 LARGEST_SCRIPT = 1 << 20
 # A controller is never late. When this process was, the robot's time stands still rather than leap: a leap would
-# let a watchdog expire on kicks that are waiting in the socket.
+# let a watchdog expire on kicks that are waiting in the socket. Its clock goes on: its samples are of now.
 MOST_CATCH_UP_S = 0.02
 
 log = logging.getLogger(__name__)
@@ -72,7 +72,9 @@ class Controller:
         while True:
             await asyncio.sleep(max(0.0, last_s + self._dt_s - time.monotonic()))
             now_s = time.monotonic()
-            last_s = max(last_s, now_s - MOST_CATCH_UP_S)
+            missed_s = max(0.0, now_s - MOST_CATCH_UP_S - last_s)
+            last_s += missed_s
+            self.robot.stood_still_s += missed_s
             while last_s + self._dt_s <= now_s:
                 last_s += self._dt_s
                 self.robot.step(self._dt_s)

@@ -1,12 +1,15 @@
 """RTDE bytes in and out of the emulated controller."""
 
+import asyncio
 import struct
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.emulators.ur import server
 from drivers.emulators.ur.make import Make
 from drivers.emulators.ur.registers import pack, unpack
 from drivers.emulators.ur.robot import Robot
@@ -122,3 +125,23 @@ def test_values_survive_the_wire(numbers: list[float], integer: int) -> None:
 def test_impossible_lengths_end_the_connection(size: int) -> None:
     with pytest.raises(NotRtdeError, match="bytes"):
         session().receive(struct.pack(">HB", size, ord("V")))
+
+
+async def test_clock_goes_on_where_the_emulator_was_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its samples are of now; its time, and with it the watchdog, has not gone through what it missed."""
+    robot, now_s, pauses_s = Robot(), 50.0, iter([0.002, 0.3, 0.002])
+
+    async def sleep(_seconds: float) -> None:
+        nonlocal now_s
+        try:
+            now_s += next(pauses_s)
+        except StopIteration:
+            raise asyncio.CancelledError from None
+
+    monkeypatch.setattr(server, "time", SimpleNamespace(monotonic=lambda: now_s))
+    controller = server.Controller(robot, rate_hz=500.0)
+    monkeypatch.setattr(server, "asyncio", SimpleNamespace(sleep=sleep))
+    with pytest.raises(asyncio.CancelledError):
+        await controller.run()
+    assert robot.variable("timestamp") == pytest.approx(0.304, abs=0.004)
+    assert robot.time_s == pytest.approx(0.024, abs=0.004)

@@ -41,6 +41,18 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     del sys.modules["drivers.ur.arm"]
 
 
+def test_sample_that_has_waited_in_the_socket_is_read_as_old(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader, now_ns = arm.Arm(SETTINGS), 10**12
+    monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
+    monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
+    six = (0.0,) * 6
+    for number, waited_ns in enumerate([0, 0, 200_000_000]):
+        sample = Sample(50.0 + 0.008 * number, six, six, six, six, 7, 1, 2, 1.0)
+        monkeypatch.setattr(reader, "_receiver", SimpleNamespace(latest=lambda it=sample: it, connected=True))
+        now_ns = 10**12 + 8_000_000 * number + waited_ns
+        assert reader.read().age_ns == pytest.approx(waited_ns, abs=300_000)
+
+
 def test_kernel_that_does_not_let_threads_be_woken_late_does_not_prevent_connecting(
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

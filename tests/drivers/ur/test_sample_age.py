@@ -1,0 +1,75 @@
+"""The age of a controller's samples, from timestamps and times of arrival."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.ur.sample_age import RISES, SampleAge
+
+PERIOD_NS = 8_000_000
+STARTED_NS = 7 * 10**12
+
+
+def ages_s(waits_s: list[float], *, drift: float = 0.0) -> list[float]:
+    """Return the ages of samples of which each waited for so long, by a clock that is `drift` slower than ours."""
+    age, ages = SampleAge(), []
+    for number, wait_s in enumerate(waits_s):
+        made_ns = number * PERIOD_NS
+        timestamp_s = 3600.0 + (1.0 - drift) * made_ns / 1e9
+        ages.append(age.age_ns(timestamp_s, STARTED_NS + made_ns + round(wait_s * 1e9)) / 1e9)
+    return ages
+
+
+def test_sample_that_waited_is_as_old_though_its_timestamp_is_new() -> None:
+    *_, waited_s = ages_s([0.001] * 100 + [0.2])
+    assert waited_s == pytest.approx(0.199, abs=1e-3)
+
+
+def test_stream_that_is_late_stays_so_and_is_new_again_once_it_has_caught_up() -> None:
+    ages = ages_s([0.001] * 100 + [0.2] * 125 + [0.001])
+    assert min(ages[100:225]) > 0.195
+    assert ages[225] == pytest.approx(0.0, abs=1e-5)
+
+
+def test_sample_that_does_not_change_grows_older() -> None:
+    age = SampleAge()
+    assert age.age_ns(5.0, STARTED_NS) == 0
+    assert age.age_ns(5.0, STARTED_NS + 300_000_000) == 300_000_000
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_timestamp_that_is_no_number_is_nothing_new(bad: float) -> None:
+    age = SampleAge()
+    age.age_ns(5.0, STARTED_NS)
+    assert age.age_ns(bad, STARTED_NS + 300_000_000) == 300_000_000
+    assert age.age_ns(5.3, STARTED_NS + 310_000_000) == pytest.approx(10_000_000, abs=400_000)
+
+
+def test_controller_that_was_started_again_has_another_clock() -> None:
+    age = SampleAge()
+    age.age_ns(5000.0, STARTED_NS)
+    assert age.age_ns(0.5, STARTED_NS + 10**9) == 0
+    assert age.age_ns(0.508, STARTED_NS + 10**9 + 28_000_000) == pytest.approx(20_000_000, abs=100_000)
+
+
+@pytest.mark.parametrize("drift", [-1e-4, 1e-4, 5e-4])
+def test_clocks_that_drift_apart_do_not_make_samples_old(drift: float) -> None:
+    assert max(ages_s([0.001] * 50_000, drift=drift)) < 1e-4
+
+
+def test_controller_whose_clock_stood_still_is_believed_again_in_time() -> None:
+    ages = ages_s([0.001] * 10 + [0.101] * round(1.01 * 0.1 / RISES / 0.008))
+    assert ages[10] > 0.09
+    assert ages[-1] == 0.0
+
+
+@given(st.lists(st.floats(0.0, 0.5), min_size=1, max_size=60))
+def test_age_is_the_wait_beyond_the_least_one_so_far_but_for_what_the_offset_may_rise(waits_s: list[float]) -> None:
+    # What was sent later comes later.
+    for number in range(1, len(waits_s)):
+        waits_s[number] = max(waits_s[number], waits_s[number - 1] - 0.008)
+    for number, age_s in enumerate(ages_s(waits_s)):
+        beyond_s = waits_s[number] - min(waits_s[: number + 1])
+        assert beyond_s - RISES * (number * 0.008 + 0.5) <= age_s <= beyond_s + 1e-6

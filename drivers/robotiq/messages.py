@@ -128,6 +128,9 @@ class SentCommand:
 class GripperState:
     """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were asked for). It is never repeated as a new one.
 
+    While it stands, of the registers by way of the controller only those of activation, object, position and fault are
+    as new as that; target and current are of the latest of every fifth poll.
+
     width_mm ± width_std_mm is between the fingertips. While the fingers stand on an object, closing, diameter_mm is
     that width: a measurement of the object. `object` is MOVING until the gripper has taken up the last command.
     """

@@ -94,8 +94,11 @@ class MotionWatch:
 def object_status(readout: Readout, last: GoTo | None) -> ObjectStatus:
     """Return what the fingers met, in the motion that was asked for last.
 
-    Until the gripper has taken up a target (GTO is 1 and the echo PRE equals it), OBJ speaks of the motion before.
+    Until the gripper has taken up a target (GTO is 1 and the echo PRE equals it), OBJ speaks of the motion before. One
+    that is not active holds nothing, whatever OBJ says.
     """
+    if readout.sta is not ActivationStatus.ACTIVE:
+        return ObjectStatus.UNKNOWN
     if last is not None and not (readout.gto and readout.pre == last.position):
         return ObjectStatus.MOVING
     return readout.obj if readout.gto else ObjectStatus.UNKNOWN

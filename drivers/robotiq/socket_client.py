@@ -3,7 +3,6 @@
 import asyncio
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 
 from drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
 from drivers.robotiq.messages import Readout, Request
@@ -70,9 +69,9 @@ class SocketClient:
         Each question wakes this process: half of them are half of what the gripper costs.
         """
         values = await self._values(STANDING_ORDER)
-        if (values["OBJ"], values["POS"], values["FLT"]) != (before.obj, before.pos, before.flt):
+        if tuple(values.values()) != (before.sta, before.obj, before.pos, before.flt):
             return await self.read()
-        return replace(before, current=values["COU"])
+        return before
 
     async def _values(self, variables: Sequence[str]) -> dict[str, int | None]:
         texts = await self._ask([(get_line(variable), variable) for variable in variables])

@@ -22,8 +22,9 @@ _ACK = b"ack"
 MAX_REPLY_BYTES = 32
 # PRE before OBJ, and OBJ before POS: what OBJ says is then never older than the target, nor the position than the stop.
 READ_ORDER = ("ACT", "STA", "GTO", "PRE", "OBJ", "POS", "FLT", "COU")
-# What tells whether a gripper that stands still does, and what it takes for it; the others change by a request alone.
-STANDING_ORDER = ("OBJ", "POS", "FLT", "COU")
+# What tells whether a gripper that stands still does, and still is active, which safety goes by. Of the others GTO, PRE
+# and ACT change by a request alone, and the current of a gripper that stands is of no use in between.
+STANDING_ORDER = ("STA", "OBJ", "POS", "FLT")
 # Older URCaps have no motor current.
 _OPTIONAL = ("COU",)
 

@@ -77,6 +77,15 @@ def test_what_the_fingers_met_is_believed_only_for_the_target_that_was_asked_for
     assert object_status(readout, None) is (obj if gto else ObjectStatus.UNKNOWN)
 
 
+@pytest.mark.parametrize("sta", [one for one in ActivationStatus if one is not ActivationStatus.ACTIVE])
+def test_a_gripper_that_is_not_active_holds_nothing(sta: ActivationStatus) -> None:
+    """As after its supply was away for a moment: the fingers stand where they stood, and press on nothing."""
+    held = replace(ACTIVE, obj=ObjectStatus.CONTACT_CLOSING, pre=GO.position, gto=True)
+    for last in (GO, None):
+        assert object_status(held, last) is ObjectStatus.CONTACT_CLOSING
+        assert object_status(replace(held, sta=sta), last) is ObjectStatus.UNKNOWN
+
+
 def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before() -> None:
     watch = MotionWatch(GO, 0)
     assert not watch.finished(ACTIVE, S)

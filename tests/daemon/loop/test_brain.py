@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from daemon.experiment.machine import Phase
@@ -44,6 +44,8 @@ class Rig:
         self.force_n, self.width_mm = 0.0, 140.0
         self.window: deque[float] = deque(maxlen=round(EIT.window_s / TICK_S))
         self.silent: set[str] = set()
+        # What the load cell says too much, and whether it says nothing of use.
+        self.offset_nm, self.void = 0.0, False
         self.arm = Arm(0.3, 0.0, 0)
         self.hand = Hand(0, 140.0, holding=False, moving=False)
         self.pending: list[tuple[int, Action]] = []
@@ -86,8 +88,8 @@ class Rig:
             value = float(np.mean(self.window) + self.random.normal(0.0, self.noise_nm))
             self.brain.hear(Torque("right", value, "", middle, now))
         if self.tick % 11 == 0 and "load_cell" not in self.silent:
-            value = torque_nm + float(self.random.normal(0.0, 0.0005))
-            self.brain.hear(Torque("load_cell", value, "", now - 1_000_000, now))
+            value = torque_nm + self.offset_nm + float(self.random.normal(0.0, 0.0005))
+            self.brain.hear(Torque("load_cell", None if self.void else value, "", now - 1_000_000, now))
 
     def _finish(self, action: Action) -> None:
         if isinstance(action, GripTo):
@@ -285,6 +287,57 @@ def test_no_fault_at_any_time_makes_the_wrist_faster_than_its_limit_or_move_afte
                 rig.twin.kick_nm = 0.1 - rig.twin.kick_nm
             case name:
                 rig.silent ^= {name}
+
+
+WRONG = st.sampled_from(["right", "load_cell", "arm", "hand", "void", "late", "apart"])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(st.lists(WRONG, max_size=2), st.integers(10, 250)), max_size=30), st.integers(0, 1000))
+@example([([name], 60) for name in ("void", "apart", "late", "arm") * 6], 0)
+def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
+    story: list[tuple[list[str], int]], seed: int
+) -> None:
+    """Held counts whole, free counts half against it: never more than 5 s, and nothing moves while it is held."""
+    rig = started(
+        Rig(brain(), seed), GRIP, {"do": "twist", "angles_rad": [0.3, -0.3], "speed_rad_per_s": 0.05}, drive="load_cell"
+    )
+    rig.run(2)
+    held_s = 0.0
+    for wrong, ticks in story:
+        rig.silent = {*wrong} & {"right", "load_cell", "arm", "hand"}
+        rig.offset_nm = 0.2 if "apart" in wrong else 0.0
+        rig.void = "void" in wrong
+        rig.brain.senses.late_s = 0.15 if "late" in wrong else 0.0
+        for _ in range(ticks):
+            rig.step()
+            if phase(rig) is not Phase.RUNNING:
+                assert rig.speed == 0.0
+                continue
+            held = rig.brain.standing.verdict.response is Response.HOLD
+            assert not (held and rig.speed)
+            assert not held or held_s <= 5.0 + 2 * TICK_S
+            held_s = held_s + TICK_S if held else max(0.0, held_s - 0.5 * TICK_S)
+
+
+def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothing() -> None:
+    """Of the slower sensor: what it says stands until it says something else."""
+    rig = started(Rig(brain(), noise_nm=0.0), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01})
+    rig.run(5)
+    while (spiked := rig.brain.senses.torques["right"]).t_ns != rig.t_ns:
+        rig.step()
+    assert spiked.torque_nm is not None
+    spike = replace(spiked, torque_nm=spiked.torque_nm + 0.07, t_mid_ns=spiked.t_mid_ns + 1)
+    rig.brain.hear(spike)
+    held = 0
+    for _ in range(300):
+        rig.step()
+        assert phase(rig) is Phase.RUNNING
+        if rig.brain.standing.verdict.response is Response.HOLD:
+            held += 1
+            assert rig.speed == 0.0
+    assert held * TICK_S == pytest.approx(EIT.period_s, abs=2 * TICK_S)
+    assert rig.speed > 0.0
 
 
 def test_a_wrist_angle_that_is_not_a_number_turns_nothing() -> None:

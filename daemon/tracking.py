@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bank.bank_file import Bank
+from bank.channels import N_CHANNELS
 from bank.estimators import Calibration, Estimate, Measured, TactileFrame, Tracker
 from bank.matching import Match
 from bank.polynomial import Interval
@@ -52,6 +53,7 @@ class TrackedEstimator:
         self._scoring = scoring
         self._baseline_frames = baseline_frames
         self._is_quick = calibration.estimator in QUICK
+        self._all_usable = np.ones((len(self.sides), N_CHANNELS), dtype=np.bool_)
         # Frames that the tracker has taken in, with what it made of them, while their match is left to a thread.
         self._unmatched: tuple[tuple[Frame, ...], Estimate, FloatArray | None] | None = None
 
@@ -114,13 +116,11 @@ class TrackedEstimator:
             self._unmatched = None
             if all(one is other for one, other in zip(seen, frames, strict=True)):
                 return estimate, first
-        estimate = self._tracker.estimate(
-            TactileFrame.of(
-                sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9,
-                np.array([frame.channels for frame in frames]),
-                np.array([~(frame.saturated | frame.dead) for frame in frames]),
-            )
-        )
+        usable = self._all_usable
+        if any(frame.unusable for frame in frames):
+            usable = np.array([~(frame.saturated | frame.dead) for frame in frames])
+        t_s = sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9
+        estimate = self._tracker.estimate(TactileFrame.of(t_s, np.array([frame.channels for frame in frames]), usable))
         difference = self._tracker.difference
         return estimate, None if difference is None else difference[0]
 

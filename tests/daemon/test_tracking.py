@@ -85,6 +85,9 @@ def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_says_nothing(
     dead = np.random.default_rng(0).uniform(size=896) < 0.1
     found = followed(TrackedEstimator(calibration, None, None, baseline_frames=10), played, dead=dead)
     assert np.count_nonzero([value is not None for value in found]) > 0.6 * len(found)
+    elsewhere = replace(played, channels=np.where(dead, 0.3, played.channels))
+    again = followed(TrackedEstimator(calibration, None, None, baseline_frames=10), elsewhere, dead=dead)
+    assert again == found, "whatever dead channels read"
     estimator = TrackedEstimator(calibration, None, None, baseline_frames=10)
     pair = [frame(0, channels, repeated=True) for channels in played.channels[0]]
     assert estimator.update(*pair).why == ("the board sent the same frame again",)

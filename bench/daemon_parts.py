@@ -43,10 +43,15 @@ class Board:
         os.read(self._master, 16)
 
     def send(self, line: bytes) -> int:
-        """Write a line, and return when its last byte was taken, on the monotonic clock."""
+        """Write a line, and return when its last byte was about to be taken, on the monotonic clock.
+
+        Not after that: the daemon may be woken on our processor and be done before we go on.
+        """
+        sent_ns = time.monotonic_ns()
         while line:
+            sent_ns = time.monotonic_ns()
             line = line[os.write(self._master, line) :]
-        return time.monotonic_ns()
+        return sent_ns
 
     def send_in_packets(self, line: bytes) -> int:
         """Do the same in the packets of a USB port of high speed, over the time that a Teensy 4 takes for a line."""

@@ -18,19 +18,19 @@ from daemon.recording.reader import read_recording
 
 RECORDING = "rig-25mm.mcap"
 BOTH_CALIBRATION = "rig.cal"
-# Of the recording's idle frames some are left out: it is gripped from the 27th on, and estimates are from the 40th.
-_FIRST = 12
+# Some idle frames are left out. Soon after them the tool is gripped, and the 40th frame gives the first valid estimate.
+_FIRST, _FIRST_VALID = 12, 39
 # An estimate that has not come after this long will not: the two frames came too far apart to make a pair.
 _LOST_MS = 1000
 
 
 def fused_latency(rig: Path, sides: tuple[str, ...], n_frames: int, pause_s: float) -> dict[str, dict[str, float]]:
-    """Return by source the milliseconds from a frame's last byte to its estimate, of n_frames that are valid at most.
+    """Return by source the milliseconds from a frame's last byte to its estimate, of n_frames with a valid one at most.
 
     Of two sides both are told, and `both`, from the last byte of the later one. Lines come in packets.
     """
     recorded = read_recording(rig / RECORDING).sides
-    lines = {side: [line_text(one) for one in recorded[side].lines[_FIRST : _FIRST + n_frames]] for side in sides}
+    lines = {side: [line_text(one) for one in recorded[side].lines[_FIRST : _FIRST_VALID + n_frames]] for side in sides}
     taken: dict[str, list[tuple[float, float]]] = {
         source: [] for source in ((*sides, BOTH) if len(sides) > 1 else sides)
     }

@@ -6,6 +6,7 @@ has `timestamp` (Unix seconds), `t_mono_ns`, `seq` (per topic and source, withou
 """
 
 import dataclasses
+import threading
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, ClassVar, TypeAlias
@@ -22,8 +23,19 @@ FloatArray: TypeAlias = NDArray[np.floating]
 
 _WIRE = np.dtype("<f4")
 _NAMES: dict[type, tuple[str, ...]] = {}
-# Kept, for one takes a quarter of a megabyte; it packs one message after the other, whatever became of the last.
-_PACKER = msgpack.Packer(use_bin_type=True)
+
+
+class _Packing(threading.local):
+    """A thread's own packer: where it is of plain Python, another thread may be let in in the middle of a message.
+
+    Kept, for one takes a quarter of a megabyte; it packs one message after the other, whatever became of the last.
+    """
+
+    def __init__(self) -> None:
+        self.packer = msgpack.Packer(use_bin_type=True)
+
+
+_PACKING = _Packing()
 
 
 def column(unit: str, meaning: str) -> Any:
@@ -250,7 +262,7 @@ def _names(kind: type[Message]) -> tuple[str, ...]:
 
 def encode(content: Mapping[str, Any]) -> bytes:
     """Return the second frame of a message."""
-    packed: bytes = _PACKER.pack(content)
+    packed: bytes = _PACKING.packer.pack(content)
     return packed
 
 

@@ -13,7 +13,7 @@ import yaml
 import zmq
 
 from bench.daemon_parts import Board, daemon, line_text, received, subscription
-from daemon.both import BOTH
+from daemon.eit.both import BOTH
 from daemon.recording.reader import read_recording
 
 RECORDING = "rig-25mm.mcap"

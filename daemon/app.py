@@ -15,18 +15,20 @@ import zmq.asyncio
 
 from bank.channels import ZERO_SLOTS
 from daemon import sd_notify
-from daemon.both import BOTH, BothTask
 from daemon.clock import Clock
 from daemon.commands import Commands, needed
 from daemon.config import DaemonConfig, Fingertip
 from daemon.configured_experiment import ConfiguredExperiment
-from daemon.estimation import Estimation
-from daemon.fingertip import FingertipTask
+from daemon.eit.both import BOTH, BothTask
+from daemon.eit.estimation import Estimation
+from daemon.eit.fingertip import FingertipTask
+from daemon.eit.opening import AnyEstimator, open_both, open_estimator
+from daemon.eit.tool_diameter import FingertipDiameters
+from daemon.eit.tracking import TrackedEstimator
 from daemon.health import HealthReporter, TaskFacts
 from daemon.links import log_link
 from daemon.load_cell_task import LOAD_CELL
 from daemon.loop.senses import Source
-from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.recording.identity import Attached, identity_of, notes_of
 from daemon.recording.recorder import Recorder
 from daemon.rig import Rig, make_load_cell
@@ -34,9 +36,7 @@ from daemon.rig_check import checked_experiment
 from daemon.skin.setup import make_skin
 from daemon.skin.task import SKIN, SKIN_SOURCE, SkinTask
 from daemon.supervisor import Supervisor
-from daemon.tool_diameter import FingertipDiameters
 from daemon.torque_sources import torque_sources
-from daemon.tracking import TrackedEstimator
 from daemon.wire.addresses import open_stop_address
 from daemon.wire.command_server import CommandServer
 from daemon.wire.keys import Gatekeeper, load_server_keys

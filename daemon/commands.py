@@ -5,8 +5,8 @@ from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from daemon.eit.fingertip import FingertipTask
 from daemon.errors import UserError
-from daemon.fingertip import FingertipTask
 from daemon.rig import Rig
 from daemon.wire.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 

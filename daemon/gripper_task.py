@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping
 
 from bank.estimators import Measured, fused
 from bank.gaussian import TWO_SIDED_95
+from daemon.eit.tool_diameter import unknown
 from daemon.experiment.wishes import GripTo
 from daemon.loop.senses import Hand
 from daemon.loop.watch import HAND_STALE_S
 from daemon.messages import GripperStateMessage, Scalar
-from daemon.tool_diameter import unknown
 from daemon.wire.publisher import Publisher
 from drivers.errors import DriverError
 from drivers.robotiq.gripper import RobotiqGripper

@@ -6,11 +6,11 @@ from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
-from daemon.both import BOTH
 from daemon.clock import Clock
 from daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, LoopConfig
 from daemon.control.creep import Creep
 from daemon.control.tuning import RequiredMargins
+from daemon.eit.both import BOTH
 from daemon.gripper_task import GripperTask
 from daemon.links import log_event, log_link
 from daemon.load_cell_task import LOAD_CELL, LoadCellTask

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from daemon.both import BOTH
 from daemon.config import DaemonConfig
 from daemon.config_file import load_yaml_model
+from daemon.eit.both import BOTH
 from daemon.errors import UserError
 from daemon.experiment.steps import ExperimentFile, Grip, HoldTorque, Identify, Release, Tare, beyond_limits
 from daemon.load_cell_task import LOAD_CELL

@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping
 
-from daemon.both import BOTH
 from daemon.config import DaemonConfig
+from daemon.eit.both import BOTH
+from daemon.eit.opening import AnyEstimator
+from daemon.eit.tracking import TrackedEstimator
 from daemon.loop.senses import Source
-from daemon.opening import AnyEstimator
 from daemon.skin.setup import skin_source
-from daemon.tracking import TrackedEstimator
 
 
 def torque_sources(

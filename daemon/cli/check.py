@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from daemon.config import CurveConfig, DaemonConfig, SkinConfig
-    from daemon.opening import AnyEstimator
+    from daemon.eit.opening import AnyEstimator
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
 
     from daemon.cli.run import checked_emulators
     from daemon.config import load_daemon_config
-    from daemon.opening import open_both, open_estimator
+    from daemon.eit.opening import open_both, open_estimator
     from daemon.rig_check import checked_experiment
     from daemon.torque_sources import torque_sources
 

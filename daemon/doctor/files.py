@@ -9,10 +9,10 @@ from bank.errors import BankError
 from daemon.config import Both, CurveConfig, DaemonConfig, Fingertip
 from daemon.config_file import load_yaml_model
 from daemon.doctor.finding import Finding, from_file, from_sentence, good, note, trouble
+from daemon.eit.opening import open_both, open_estimator
+from daemon.eit.tracking import TrackedEstimator
 from daemon.errors import UserError
 from daemon.experiment.steps import ExperimentFile
-from daemon.opening import open_both, open_estimator
-from daemon.tracking import TrackedEstimator
 from drivers.errors import DriverError
 from drivers.ur.settings import read_settings
 

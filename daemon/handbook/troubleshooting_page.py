@@ -37,7 +37,7 @@ SECTIONS = (
         "An estimate is not valid (`why` in `eit.estimate` and `skin.shear`)",
         "Wait for the next frames; when it stays, tare with nothing gripped, then see `shearloop doctor CONFIG`.",
         told=(
-            "daemon/estimator.py",
+            "daemon/eit/estimator.py",
             "bank/estimators/guard.py",
             "bank/estimators/guards.py",
             "bank/estimators/familiar.py",
@@ -137,7 +137,7 @@ SECTIONS = (
             "bank/grouping.py",
             "bank/polynomial.py",
             "bank/skin",
-            "daemon/opening.py",
+            "daemon/eit/opening.py",
         ),
     ),
     Section(

@@ -5,13 +5,13 @@ from dataclasses import replace
 
 from bank.channels import ZERO_SLOTS
 from bank.estimators.pairing import Pairing
-from daemon.both import BOTH
 from daemon.config import DaemonConfig
-from daemon.estimation import estimate_message
-from daemon.fingertip import frame_message
+from daemon.eit.both import BOTH
+from daemon.eit.estimation import estimate_message
+from daemon.eit.fingertip import frame_message
+from daemon.eit.opening import AnyEstimator, open_both, open_estimator
 from daemon.load_cell_task import LOAD_CELL, load_message
 from daemon.messages import EitEstimate, EitFrame, LoadTorque, SkinShear
-from daemon.opening import AnyEstimator, open_both, open_estimator
 from daemon.recording.recorded_run import Asides
 from daemon.rig import load_cell_calibration
 from daemon.skin.setup import RecordedSkin

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bank.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
 from bank.estimators import Measured
+from daemon.eit.tool_diameter import from_text
 from daemon.errors import UserError
 from daemon.recording.content import as_json, input_of
 from daemon.recording.opened import opened
@@ -25,7 +26,6 @@ from daemon.recording.schema import (
     METADATA,
     input_topic,
 )
-from daemon.tool_diameter import from_text
 from drivers.raw_input import InputKind
 
 # What every recording says of itself, beside the notes of this one.

@@ -15,6 +15,7 @@ from bank.channels import N_LINE_VALUES
 from bank.estimators import Measured
 from daemon.config import DaemonConfig
 from daemon.config_file import ConfigModel, mistakes
+from daemon.eit.tool_diameter import from_text
 from daemon.errors import UserError
 from daemon.messages import EitFrame
 from daemon.recording.content import input_of
@@ -29,7 +30,6 @@ from daemon.recording.schema import (
     input_topic,
     schema_of,
 )
-from daemon.tool_diameter import from_text
 from drivers.raw_input import InputKind, RawInput
 
 Model = TypeVar("Model", bound=ConfigModel)

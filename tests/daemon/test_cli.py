@@ -15,10 +15,10 @@ import zmq.asyncio
 from bank.bank_file import Bank
 from bank.calibration import Calibration
 from daemon.app import Daemon
-from daemon.both import BOTH
 from daemon.cli import COMMANDS, main
 from daemon.cli.readable import as_json, as_line
 from daemon.config import TAKEN_NAMES, load_daemon_config
+from daemon.eit.both import BOTH
 from daemon.loop_task import WRENCH
 from daemon.messages import decode, encode
 from daemon.skin.task import SKIN

@@ -220,7 +220,7 @@ async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_h
 async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
     config: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from daemon.estimator import Estimator
+    from daemon.eit.estimator import Estimator
 
     quickly = Estimator.quickly
     deaths = iter([True])

@@ -17,9 +17,9 @@ from scipy.io import savemat
 from bank.channels import channels_of_line, line_of_channels
 from bank.estimators import FrameSeries, Measured, fit
 from daemon.app import Daemon
-from daemon.both import LARGEST_BACKLOG, BothTask
 from daemon.config import load_daemon_config
-from daemon.estimation import Taken
+from daemon.eit.both import LARGEST_BACKLOG, BothTask
+from daemon.eit.estimation import Taken
 from drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import measured, replayed

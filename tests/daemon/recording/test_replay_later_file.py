@@ -12,7 +12,7 @@ import zmq.asyncio
 from bank.estimators import Measured
 from daemon.app import Daemon
 from daemon.config import load_daemon_config
-from daemon.estimator import Estimator
+from daemon.eit.estimator import Estimator
 from daemon.recording.recorded_run import RecordedRun
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import replayed

@@ -8,6 +8,7 @@ import pytest
 from bank.estimators import Measured
 from daemon.cli import main
 from daemon.clock import Clock
+from daemon.eit.tool_diameter import as_text
 from daemon.errors import UserError
 from daemon.experiment.steps import ExperimentFile, Wait
 from daemon.messages import EitFrame, wire_map
@@ -16,7 +17,6 @@ from daemon.recording.reader import read_recording
 from daemon.recording.recorder import Recorder
 from daemon.recording.series import read_series, series_of
 from daemon.recording.summary import summarise
-from daemon.tool_diameter import as_text
 from drivers.raw_input import InputKind, RawInput
 
 PERIOD_NS = 540_000_000

@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 
 from bank.estimators import Measured
 from bank.polynomial import Interval
-from daemon.tool_diameter import STALE_AFTER_NS, FingertipDiameters, as_text, from_text
+from daemon.eit.tool_diameter import STALE_AFTER_NS, FingertipDiameters, as_text, from_text
 
 
 def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> None:

@@ -7,7 +7,7 @@ import asyncio
 from collections.abc import Mapping
 
 from bank.estimators.pairing import Pairing
-from daemon.estimation import Estimation, Taken
+from daemon.eit.estimation import Estimation, Taken
 from daemon.messages import Scalar
 from drivers.eit_kit import Frame
 

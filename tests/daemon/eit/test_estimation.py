@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from daemon.clock import Clock
-from daemon.estimation import Estimation
-from daemon.estimator import Reading
+from daemon.eit.estimation import Estimation
+from daemon.eit.estimator import Reading
 from daemon.messages import Message
 from daemon.wire.publisher import Publisher
 from drivers.eit_line import Frame

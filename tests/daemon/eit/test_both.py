@@ -9,11 +9,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from daemon.both import BOTH, BothTask
 from daemon.clock import Clock
-from daemon.estimation import Estimation
-from daemon.estimator import Reading
-from daemon.fingertip import FingertipTask
+from daemon.eit.both import BOTH, BothTask
+from daemon.eit.estimation import Estimation
+from daemon.eit.estimator import Reading
+from daemon.eit.fingertip import FingertipTask
 from daemon.messages import Message
 from daemon.wire.publisher import Publisher
 from drivers.eit_kit import EitKit, Frame

@@ -10,9 +10,9 @@ from bank.bank_file import Bank
 from bank.estimators import Calibration, FrameSeries, fit
 from bank.fast_matching import FastZeroLagMatcher
 from daemon.config import Both, Fingertip
+from daemon.eit.opening import open_both, open_estimator
+from daemon.eit.tracking import Scoring, TrackedEstimator
 from daemon.errors import UserError
-from daemon.opening import open_both, open_estimator
-from daemon.tracking import Scoring, TrackedEstimator
 from drivers.eit_kit import Frame
 from tests.bank.estimators.conftest import IDLE_S, PERIOD_S, series
 

@@ -13,7 +13,7 @@ from bank.channels import N_CHANNELS
 from bank.estimators import Calibration, Estimate, Measured, TactileFrame, Tracker
 from bank.matching import Match
 from bank.polynomial import Interval
-from daemon.estimator import FloatArray, Matcher, Reading
+from daemon.eit.estimator import FloatArray, Matcher, Reading
 from drivers.eit_kit import Frame
 
 # These take a millisecond, always the same few products; the others search a bank or reconstruct.

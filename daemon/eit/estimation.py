@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from bank.estimators import Measured
 from daemon.clock import Clock
-from daemon.estimator import Reading
+from daemon.eit.estimator import Reading
+from daemon.eit.opening import AnyEstimator
+from daemon.eit.tool_diameter import HearDiameter, as_text, unheard, unknown
 from daemon.loop.senses import Torque
 from daemon.messages import EitEstimate
-from daemon.opening import AnyEstimator
-from daemon.tool_diameter import HearDiameter, as_text, unheard, unknown
 from daemon.waiting import Waiting
 from daemon.wire.publisher import Publisher
 from drivers.eit_kit import Frame

@@ -11,10 +11,10 @@ from bank.calibration import Calibration
 from bank.estimators import Calibration as FittedCalibration
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
 from daemon.config import Both, Fingertip
+from daemon.eit.estimator import LONGEST_GAP_NS, Estimator
+from daemon.eit.tracking import Scoring, TrackedEstimator
 from daemon.errors import UserError
-from daemon.estimator import LONGEST_GAP_NS, Estimator
 from daemon.topics import STALE_AFTER_PERIODS
-from daemon.tracking import Scoring, TrackedEstimator
 
 AnyEstimator: TypeAlias = Estimator | TrackedEstimator
 _MATCHERS: Mapping[str, type[FastMatcher | FastZeroLagMatcher]] = {

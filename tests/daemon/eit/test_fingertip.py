@@ -10,9 +10,9 @@ import pytest
 
 from daemon.clock import Clock
 from daemon.config import Fingertip
-from daemon.estimation import Estimation
-from daemon.estimator import Reading
-from daemon.fingertip import FingertipTask
+from daemon.eit.estimation import Estimation
+from daemon.eit.estimator import Reading
+from daemon.eit.fingertip import FingertipTask
 from daemon.messages import Message
 from daemon.wire.publisher import Publisher
 from drivers.eit_format import FRAME_PERIOD_S

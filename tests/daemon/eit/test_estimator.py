@@ -4,7 +4,7 @@ from numpy.typing import NDArray
 
 from bank.calibration import Calibration
 from bank.matching import Match, best_match
-from daemon.estimator import Baseline, Estimator
+from daemon.eit.estimator import Baseline, Estimator
 from drivers.eit_kit import Frame
 
 K_GRID, SIGMA_GRID = np.linspace(3.0, 4.0, 11), np.linspace(1.0, 2.0, 11)

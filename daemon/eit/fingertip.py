@@ -6,8 +6,8 @@ from collections.abc import Awaitable, Callable, Mapping
 
 import numpy as np
 
-from daemon.estimation import Estimation, Taken
-from daemon.estimator import Reading
+from daemon.eit.estimation import Estimation, Taken
+from daemon.eit.estimator import Reading
 from daemon.messages import EitFrame, EitHeatmap, Scalar
 from daemon.wire.publisher import Publisher
 from drivers.eit_kit import EitKit, Frame

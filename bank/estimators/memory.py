@@ -135,6 +135,8 @@ class Memory:
     def take_idle(self, frames: int) -> None:
         """Take the next so many usable frames for those of an untouched fingertip: the session's baseline."""
         self._idle_wanted, self._idle_taken = frames, []
+        # What was gripped before is further back than the frames after it would tell, and has another gain.
+        self._forget_grip()
 
     @property
     def taking_idle(self) -> bool:
@@ -233,8 +235,7 @@ class Memory:
         loose = [one.side for layer, one in enumerate(self._guards.sides) if self._let_go[layer] or not held[layer]]
         difference = self._difference(channels, usable) / self._gains
         if loose:
-            self._recent.clear()
-            self._bridged.clear()
+            self._forget_grip()
             return Moment(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
         self._remember(channels, bridged=False)
         missing = (self._recent.maxlen or 0) - len(self._recent)
@@ -266,8 +267,7 @@ class Memory:
             share <= LARGEST_JUMPING_SHARE
             for share in self._guards.jumping_shares(channels, self._refused, self._guards.alive)
         ):
-            self._recent.clear()
-            self._bridged.clear()
+            self._forget_grip()
             self._refused, self._before = None, channels
         else:
             self._refused = channels
@@ -321,8 +321,11 @@ class Memory:
             gains = [guard.gain(idle) for guard, idle in zip(self._guards.sides, self._baselines, strict=True)]
             self._gains = np.array(gains)[:, None]
 
-    def _forget(self) -> None:
+    def _forget_grip(self) -> None:
         self._recent.clear()
         self._bridged.clear()
+
+    def _forget(self) -> None:
+        self._forget_grip()
         self._before = self._refused = None
         self._passed.clear()

@@ -108,16 +108,19 @@ def _repair(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
+    from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
     from daemon.recording.export import export, topics_of
 
+    stem = args.recording.name.partition(".mcap")[0]
+    out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")
+    if args.format == "mat":
+        check_writes_over(out, "a MATLAB file", b"MATLAB")
     there = topics_of(args.recording)
     unknown = [topic for topic in args.topic or () if topic not in there]
     if unknown:
         raise UserError(f"{args.recording} has no topic {unknown[0]!r}; it has {', '.join(sorted(there))}")
     topics = args.topic or sorted(topic for topic, count in there.items() if count)
-    stem = args.recording.name.partition(".mcap")[0]
-    out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")
     with progress_bar(args.format, sum(there[topic] for topic in topics), "message") as progress:
         done = 0
 

@@ -33,6 +33,7 @@ def matlab() -> bytes:
         ("bank solve --mesh no --model step --k 1 --sigma 1 --out", "an array of NumPy"),
         ("bank design no.mcap --out", "a configuration"),
         ("import mat no.mat --out", "a recording"),
+        ("recording export no.mcap --format mat --out", "a MATLAB file"),
     ],
 )
 def test_no_command_writes_over_another_s_file(

@@ -248,7 +248,9 @@ class Pilot:
         return self._unfit(reading) or self._violation(reading) or self._held
 
     def _recover(self, recovery: Recovery, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
-        if not recovery.why and (not reading.connected or reading.age_ns > self._settings.state_timeout_s * 1e9):
+        silent = not reading.connected or reading.age_ns > self._settings.state_timeout_s * 1e9
+        # States may stay old for minutes, and not so old that the connection is given up: the operator is answered.
+        if silent and not recovery.ended(now_ns):
             return None
         outcome = recovery.advance(reading, now_ns)
         if outcome is Outcome.UNDER_WAY:

@@ -57,6 +57,10 @@ class Recovery:
         """Do nothing more, and say so when asked again."""
         self.why = why
 
+    def ended(self, now_ns: int) -> bool:
+        """Whether nothing more is done, whatever the robot says."""
+        return bool(self.why) or now_ns > self._deadline_ns
+
     def advance(self, reading: Reading, now_ns: int) -> Outcome:
         """Do what is due in this cycle."""
         if self.why:

@@ -3,7 +3,7 @@
 import pytest
 
 from drivers.ur.messages import Disconnect, Enable, MoveLinear, Stop, Unlock, WristSpeed
-from tests.drivers.ur.flight import POSE, Flight, flying, turning
+from tests.drivers.ur.flight import POSE, SETTINGS, Flight, flying, turning
 
 
 @pytest.mark.parametrize("command", [WristSpeed(0.1, 1.0), Stop(4.0)])
@@ -271,3 +271,18 @@ def test_starting_the_program_is_ended_by_disconnecting() -> None:
     assert flight.pilot.at_rest
     for command in (Enable(), Unlock(), WristSpeed(0.1, 1.0)):
         assert "disconnects" in flight.ask(command).refused
+
+
+def test_unlocking_a_controller_whose_states_stay_old_is_answered_in_time() -> None:
+    flight = turning()
+    flight.arm.protective_stop()
+    flight.fly(10)
+    # As of a network that has become slow for good: not so old that the connection counts as lost.
+    flight.arm.be(age_ns=400_000_000)
+    since_ns = flight.now_ns
+    assert "did not get ready" in flight.ask(Unlock()).refused
+    assert flight.now_ns - since_ns < (SETTINGS.recover_timeout_s + 1.0) * 1e9
+    flight.arm.be(age_ns=0)
+    flight.arm.calls.clear()
+    flight.fly(100)
+    assert flight.arm.calls == [], "nothing is unlocked so long after the operator's word"

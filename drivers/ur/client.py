@@ -18,7 +18,7 @@ from typing import Final, Literal
 from drivers.errors import DriverError
 from drivers.ur import sentences
 from drivers.ur.conversation import HEARTBEAT, Conversation, Descriptor, LossKind, LostError, output
-from drivers.ur.messages import Command, Ease, Failed, Message, Reply, RobotState
+from drivers.ur.messages import RUNTIME_STOPPED, Command, Ease, Failed, Message, Reply, RobotState
 from drivers.ur.settings import UrSettings
 from drivers.ur.wire import encode
 
@@ -63,6 +63,8 @@ class UrRobot:
         self._waiting: dict[int, Callable[[Reply], None]] = {}
         self._number = 0
         self._lost_s = -math.inf
+        # Whether what runs on the robot, or is paused there, was seen to be somebody else's.
+        self._foreign = False
         # How many states have come since the beginning.
         self.states = 0
         # Who waits for the next state; None is for those who wait no longer.
@@ -73,7 +75,7 @@ class UrRobot:
 
     @property
     def takes_over(self) -> bool:
-        """Whether the connection was lost just now, so that a program may have been left on the robot."""
+        """Whether the connection was lost just now, so that a program of ours may have been left on the robot."""
         return time.monotonic() - self._lost_s < TAKES_OVER_S
 
     @property
@@ -220,7 +222,8 @@ class UrRobot:
         # The next process begins with every cycle.
         self._end_ease()
         if self._state is not None:
-            self._lost_s = time.monotonic()
+            # A network that failed makes no program ours.
+            self._lost_s = -math.inf if self._foreign else time.monotonic()
         self._state = None
         waiting, self._waiting = self._waiting, {}
         for answered in waiting.values():
@@ -245,6 +248,7 @@ class UrRobot:
             case RobotState():
                 first = self._state is None
                 self._state = message
+                self._foreign = _is_foreign(message, before=self._foreign)
                 if first:
                     self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
                 self.states += 1
@@ -262,6 +266,13 @@ class UrRobot:
     def _tell(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
         self.link = LinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
         self._on_link(self.link)
+
+
+def _is_foreign(state: RobotState, *, before: bool) -> bool:
+    """Return whether somebody else's program is on the robot; of a state that does not tell, as it was before."""
+    if state.runtime_state == RUNTIME_STOPPED or state.blocked in ("", sentences.NOT_ENABLED):
+        return False
+    return before or state.blocked == sentences.NOT_OURS
 
 
 def unheard(_state: RobotState) -> None:

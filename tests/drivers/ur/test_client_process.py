@@ -136,6 +136,33 @@ async def test_process_after_one_that_was_connected_may_stop_what_that_left_runn
     assert told.read_text().split()[:2] == ["False", "True"]
 
 
+@pytest.mark.parametrize(
+    "before_the_loss",
+    [{}, {"age_ns": 400_000_000}, {"safety_mode": 3, "runtime_state": 4}],
+    ids=["playing", "silent", "paused"],
+)
+async def test_program_that_was_seen_to_be_somebody_elses_is_not_taken_for_one_left_behind(
+    before_the_loss: dict[str, int],
+) -> None:
+    robot, flight = UrRobot(SETTINGS), Flight()
+    flight.arm.be(runtime_state=2)
+    flight.fly(500)
+    robot.take(0, flight.state)
+    flight.arm.be(**before_the_loss)
+    flight.fly(1)
+    robot.take(0, flight.state)
+    robot._disconnected()
+    assert not robot.takes_over
+
+    # Once the operator has had ours started in its place, it is ours that a lost process leaves.
+    again = Flight()
+    for _ in range(30):
+        again.fly(1)
+        robot.take(0, again.state)
+    robot._disconnected()
+    assert robot.takes_over
+
+
 async def test_of_states_that_are_read_at_once_all_but_the_last_are_overtaken() -> None:
     robot = UrRobot(SETTINGS)
     overtaken: list[bool] = []

@@ -88,7 +88,11 @@ def unfit(reading: Reading, host: str, state_timeout_s: float) -> str:
     if not reading.connected:
         return f"The connection to the robot at {host} is lost."
     if reading.age_ns > state_timeout_s * 1e9:
-        return f"The controller at {host} has sent nothing new: its state is {reading.age_ns / 1e9:.2f} s old."
+        return (
+            f"The controller at {host} has sent nothing newer than a state that is {reading.age_ns / 1e9:.2f} s old: "
+            "look at its cable, what else uses the network, and with a simulator whether its clock is slower than "
+            "real time."
+        )
     if reading.safety_mode == SAFETY_PROTECTIVE_STOP:
         return "Protective stop: look for its cause, clear the workspace, then unlock (not in the first 5 s)."
     if reading.safety_mode in SAFETY_EMERGENCY_STOPS:

@@ -231,7 +231,7 @@ def test_old_data_is_not_believed() -> None:
     flight.arm.calls.clear()
     flight.fly(10)
     assert flight.arm.calls == [], "without a kick the robot's watchdog stops it"
-    assert "its state is 0.30 s old" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert "a state that is 0.30 s old" in flight.ask(WristSpeed(0.1, 1.0)).refused
     flight.arm.be(age_ns=0)
     flight.fly(40)
     assert flight.state.blocked, "what came back is not trusted by itself"

@@ -59,6 +59,12 @@ def test_clocks_that_drift_apart_do_not_make_samples_old(drift: float) -> None:
     assert max(ages_s([0.001] * 50_000, drift=drift)) < 1e-4
 
 
+def test_clock_that_is_slower_for_good_is_not_believed() -> None:
+    ages = ages_s([0.001] * 3600, drift=0.01)
+    old_s = next(number * PERIOD_NS / 1e9 for number, age_s in enumerate(ages) if age_s > 0.25)
+    assert old_s == pytest.approx(27.8, abs=0.1), "as docs/safety.md says: it cannot be told from a network's delay"
+
+
 def test_controller_whose_clock_stood_still_is_believed_again_in_time() -> None:
     ages = ages_s([0.001] * 10 + [0.101] * round(1.01 * 0.1 / RISES / 0.008))
     assert ages[10] > 0.09

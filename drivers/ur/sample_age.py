@@ -7,10 +7,11 @@ that of the sample that came soonest; what comes later than it has waited for so
 
 import math
 
-# The least difference may rise by so much of the time: clocks drift apart by less (quartzes by tens of ppm, one that
-# is being set by up to 500). A controller whose clock has stood still is believed again in time: a tenth of a second is
-# forgotten after 100 s.
-RISES = 1e-3
+# The least difference may rise by so much of the time. Clocks drift apart by less (quartzes by tens of ppm, one that
+# is being set by up to 500), but a simulator's may be slow by some thousandths on a busy computer. A controller whose
+# clock has stood still is believed again in time: a tenth of a second is forgotten after 10 s, when a delay as long has
+# held the wrist and stopped it.
+RISES = 1e-2
 
 
 class SampleAge:

@@ -24,12 +24,12 @@ def ages_s(waits_s: list[float], *, drift: float = 0.0) -> list[float]:
 
 def test_sample_that_waited_is_as_old_though_its_timestamp_is_new() -> None:
     *_, waited_s = ages_s([0.001] * 100 + [0.2])
-    assert waited_s == pytest.approx(0.199, abs=1e-3)
+    assert waited_s == pytest.approx(0.199, abs=3e-3)
 
 
 def test_stream_that_is_late_stays_so_and_is_new_again_once_it_has_caught_up() -> None:
     ages = ages_s([0.001] * 100 + [0.2] * 125 + [0.001])
-    assert min(ages[100:225]) > 0.195
+    assert min(ages[100:225]) > 0.185
     assert ages[225] == pytest.approx(0.0, abs=1e-5)
 
 
@@ -44,25 +44,25 @@ def test_timestamp_that_is_no_number_is_nothing_new(bad: float) -> None:
     age = SampleAge()
     age.age_ns(5.0, STARTED_NS)
     assert age.age_ns(bad, STARTED_NS + 300_000_000) == 300_000_000
-    assert age.age_ns(5.3, STARTED_NS + 310_000_000) == pytest.approx(10_000_000, abs=400_000)
+    assert age.age_ns(5.3, STARTED_NS + 310_000_000) == pytest.approx(10_000_000, abs=1.01 * RISES * 310_000_000)
 
 
 def test_controller_that_was_started_again_has_another_clock() -> None:
     age = SampleAge()
     age.age_ns(5000.0, STARTED_NS)
     assert age.age_ns(0.5, STARTED_NS + 10**9) == 0
-    assert age.age_ns(0.508, STARTED_NS + 10**9 + 28_000_000) == pytest.approx(20_000_000, abs=100_000)
+    assert age.age_ns(0.508, STARTED_NS + 10**9 + 28_000_000) == pytest.approx(20_000_000, abs=RISES * 29e6)
 
 
-@pytest.mark.parametrize("drift", [-1e-4, 1e-4, 5e-4])
+@pytest.mark.parametrize("drift", [-1e-4, 1e-4, 5e-4, 5e-3])
 def test_clocks_that_drift_apart_do_not_make_samples_old(drift: float) -> None:
     assert max(ages_s([0.001] * 50_000, drift=drift)) < 1e-4
 
 
 def test_clock_that_is_slower_for_good_is_not_believed() -> None:
-    ages = ages_s([0.001] * 3600, drift=0.01)
+    ages = ages_s([0.001] * 900, drift=0.05)
     old_s = next(number * PERIOD_NS / 1e9 for number, age_s in enumerate(ages) if age_s > 0.25)
-    assert old_s == pytest.approx(27.8, abs=0.1), "as docs/safety.md says: it cannot be told from a network's delay"
+    assert old_s == pytest.approx(6.25, abs=0.1), "as docs/safety.md says: it cannot be told from a network's delay"
 
 
 def test_controller_whose_clock_stood_still_is_believed_again_in_time() -> None:

@@ -7,7 +7,7 @@ import asyncio
 from collections.abc import Mapping
 
 from bank.estimators.pairing import Pairing
-from daemon.eit.estimation import Estimation, Taken
+from daemon.eit.estimation import Backlog, Estimation, Taken
 from daemon.messages import Scalar
 from drivers.eit_kit import Frame
 
@@ -25,9 +25,7 @@ class BothTask:
         self.sides = sides
         self._period_s = period_s
         self._pairing: Pairing[Frame] = Pairing(sides, round(period_s * 1e9))
-        self._backlog: asyncio.Queue[Taken] = asyncio.Queue()
-        # Whether the estimating task has nothing to do: then a pair may be estimated before it goes there.
-        self._idle = False
+        self._backlog = Backlog()
         self._room = asyncio.Event()
         self._room.set()
 
@@ -41,7 +39,7 @@ class BothTask:
         if pair is None:
             return
         taken = Taken(pair[1])
-        if self._idle and self._backlog.empty():
+        if self._backlog.idle:
             self.estimation.try_at_once(taken)
         if taken.reading is None:
             self._backlog.put_nowait(taken)
@@ -55,11 +53,7 @@ class BothTask:
     async def estimate(self) -> None:
         """Estimate from every pair that was not at once, in order, until cancelled."""
         while True:
-            self._idle = True
-            try:
-                taken = await self._backlog.get()
-            finally:
-                self._idle = False
+            taken = await self._backlog.get()
             if self._backlog.qsize() < LARGEST_BACKLOG:
                 self._room.set()
             await self.estimation.finish(taken)

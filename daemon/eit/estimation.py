@@ -27,6 +27,25 @@ class Taken:
     error: Exception | None = None
 
 
+class Backlog(asyncio.Queue[Taken]):
+    """Frames on their way to an estimating task."""
+
+    _awaited = False
+
+    @property
+    def idle(self) -> bool:
+        """Whether the estimating task has nothing to do: then frames may be estimated before they go there."""
+        return self._awaited and self.empty()
+
+    async def get(self) -> Taken:
+        """Return what has waited longest; whoever waits for it is idle meanwhile."""
+        self._awaited = True
+        try:
+            return await super().get()
+        finally:
+            self._awaited = False
+
+
 class Estimation:
     """Publishes what an estimator says of each frame, or of each pair."""
 

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping
 
 import numpy as np
 
-from daemon.eit.estimation import Estimation, Taken
+from daemon.eit.estimation import Backlog, Estimation, Taken
 from daemon.eit.estimator import Reading
 from daemon.messages import EitFrame, EitHeatmap, Scalar
 from daemon.wire.publisher import Publisher
@@ -41,9 +41,7 @@ class FingertipTask:
         self._publisher = publisher
         self._room = room
         self.always_heatmap = always_heatmap
-        self._backlog: asyncio.Queue[Taken] = asyncio.Queue(LARGEST_BACKLOG)
-        # Whether the estimating task has nothing to do: then a frame may be estimated before it goes there.
-        self._idle = False
+        self._backlog = Backlog(LARGEST_BACKLOG)
 
     async def read(self) -> None:
         """Estimate and publish every frame that arrives, until cancelled.
@@ -53,7 +51,7 @@ class FingertipTask:
         async with contextlib.aclosing(self._board.frames()) as frames:
             async for frame in frames:
                 taken = Taken((frame,))
-                if self._idle and self._backlog.empty():
+                if self._backlog.idle:
                     self.estimation.try_at_once(taken)
                 try:
                     if taken.reading is not None and self._board.period_s > LONG_PERIOD_S:
@@ -67,11 +65,7 @@ class FingertipTask:
     async def estimate(self) -> None:
         """Estimate from every frame that `read` has not, in order, and publish heatmaps, until cancelled."""
         while True:
-            self._idle = True
-            try:
-                taken = await self._backlog.get()
-            finally:
-                self._idle = False
+            taken = await self._backlog.get()
             await self._publish_heatmap(taken.frames[0], await self.estimation.finish(taken))
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:

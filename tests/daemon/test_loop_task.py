@@ -132,25 +132,15 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
         assert Event.LOOP_LATE in [trouble.event for trouble in cell.brain.standing.verdict.troubles]
 
 
-async def test_a_loop_that_is_late_again_and_again_is_stopped_though_it_then_reads_many_states_at_once() -> None:
-    async with driven() as cell:
-        await cell.start({"do": "wait", "wait_s": 60})
-        for _ in range(40):
-            for _ in range(24):
-                cell.robot.cycle(read=False)
-            await cell.cycles(1)
-            if cell.phase is not Phase.RUNNING:
-                break
-        assert "loop was woken" in cell.why
-
-
-async def test_a_loop_that_stalls_again_and_again_is_stopped_though_it_decides_in_time_between() -> None:
+@pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2)])
+async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read: int) -> None:
+    """Though it then reads many states at once, or decides in time before it is late again."""
     async with driven() as cell:
         await cell.start({"do": "wait", "wait_s": 60})
         for _ in range(60):
-            for _ in range(18):
+            for _ in range(missed):
                 cell.robot.cycle(read=False)
-            await cell.cycles(2)
+            await cell.cycles(read)
             if cell.phase is not Phase.RUNNING:
                 break
         assert "loop was woken" in cell.why

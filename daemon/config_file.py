@@ -1,15 +1,16 @@
 """Reading a YAML file into a pydantic model, with every mistake reported at once, by file, key and allowed range."""
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import ErrorDetails
 
 from daemon.errors import UserError
+from drivers.errors import DriverError
+from drivers.yaml_file import read_yaml
 
 _LONGEST_VALUE = 60
 
@@ -37,7 +38,10 @@ def load_yaml_model(path: str | Path, model: type[Model]) -> Model:
     values the model refuses; then the message names all of them.
     """
     path = Path(path)
-    content = _read(path)
+    try:
+        content = read_yaml(path)
+    except DriverError as error:
+        raise UserError(str(error)) from error
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected keys and values such as `{_example(model)}`, found {_shown(content)}")
     try:
@@ -50,44 +54,6 @@ def mistakes(error: ValidationError, model: type[BaseModel]) -> str:
     """Return all that a model found wrong, each with its key, what was found and the allowed range."""
     schema = model.model_json_schema()
     return "; ".join(dict.fromkeys(_sentence(details, schema) for details in error.errors(include_url=False)))
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """A SafeLoader that refuses a key given twice, where YAML would silently take the last."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
-        seen: set[Hashable] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if isinstance(key, Hashable) and key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key `{key}` is given twice", key_node.start_mark
-                )
-            if isinstance(key, Hashable):
-                seen.add(key)
-        return super().construct_mapping(node, deep)
-
-
-def _read(path: Path) -> Any:
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"{path}: the configuration cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise UserError(f"{path}: the configuration is not UTF-8 text (byte {error.start})") from error
-    try:
-        content = yaml.load(text, _UniqueKeyLoader)  # noqa: S506 - it is a SafeLoader
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = f"line {mark.line + 1}, column {mark.column + 1}: " if mark else ""
-        raise UserError(f"{path}: {where}{error.problem or error.context}") from error
-    except yaml.YAMLError as error:
-        raise UserError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
-    except RecursionError as error:
-        raise UserError(f"{path}: the configuration is nested too deeply") from error
-    if content is None:
-        raise UserError(f"{path}: the configuration is empty")
-    return content
 
 
 def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:

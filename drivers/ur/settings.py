@@ -7,12 +7,9 @@ commands are clipped to, so that the hard limit is never reached by a command. A
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 from drivers.errors import DriverError
-
-if TYPE_CHECKING:
-    from yaml import Node
 
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
@@ -166,16 +163,11 @@ def read_settings(path: Path) -> UrSettings:
     Raises:
         DriverError: the file cannot be read, or settings are wrong; all mistakes are named together.
     """
-    import yaml
     from pydantic import TypeAdapter, ValidationError
 
-    try:
-        text = path.read_text(encoding="utf-8")
-        content, twice = yaml.safe_load(text), _given_twice(yaml.compose(text, Loader=yaml.SafeLoader))
-    except (OSError, yaml.YAMLError) as error:
-        raise DriverError(f"The robot's settings cannot be read from {path}: {error}.") from error
-    if twice:
-        raise DriverError(f"{path}: {twice}.")
+    from drivers.yaml_file import read_yaml
+
+    content = read_yaml(path)
     try:
         return TypeAdapter(UrSettings).validate_python(content)
     except ValidationError as error:
@@ -190,20 +182,3 @@ def _told(kind: str, message: str) -> str:
     """Return what pydantic has found as an operator would say it."""
     said = {"missing": "it is missing", "unexpected_keyword_argument": "this is not a known key"}
     return said.get(kind, message.removeprefix("Value error, "))
-
-
-def _given_twice(node: "Node | None") -> str:
-    """Return which key of a YAML tree is given twice: the later one would count, and the earlier limit be forgotten."""
-    import yaml
-
-    inner: list[Node] = []
-    if isinstance(node, yaml.MappingNode):
-        seen: set[str] = set()
-        for key, value in node.value:
-            if key.value in seen:
-                return f"line {key.start_mark.line + 1}: the key `{key.value}` is given twice"
-            seen.add(key.value)
-            inner.append(value)
-    elif isinstance(node, yaml.SequenceNode):
-        inner = node.value
-    return next(filter(None, map(_given_twice, inner)), "")

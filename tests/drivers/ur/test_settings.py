@@ -56,9 +56,15 @@ def test_all_mistakes_are_told_together(tmp_path: Path) -> None:
         ("host: 192.168.1.10\n", "", "ur.yaml: host: it is missing"),
         ("host: 192.168.1.10", "host: ' '", "ur.yaml: the file: host is empty; give the robot's address"),
         ("host: 192.168.1.10", "host: 192.168.1.10\nhots: 1", "hots: this is not a known key"),
-        ("margin_rad: 0.1", "margin_rad: 0.1\n    margin_rad: 0.01", r"line \d+: the key `margin_rad` is given twice"),
+        (
+            "margin_rad: 0.1",
+            "margin_rad: 0.1\n    margin_rad: 0.01",
+            r"line 9, column 5: the key `margin_rad` is given twice",
+        ),
         ("margin_rad: 0.1", "margin_rad: -1", "limits.joints: the margin must be above 0, not -1"),
-        ("limits:", "limits", "cannot be read"),
+        ("limits:", "limits", "ur.yaml: line 5, column 9: could not find expected ':'"),
+        ("host: 192.168.1.10", "host: &itself [*itself]", "ur.yaml: host: Input should be a valid string"),
+        ("host: 192.168.1.10", "? [1, 2]\n: 3", "column 3: found unhashable key"),
     ],
 )
 def test_a_mistake_is_told(tmp_path: Path, old: str, new: str, said: str) -> None:

@@ -9,8 +9,8 @@ import math
 
 # The least difference may rise by so much of the time. Clocks drift apart by less (quartzes by tens of ppm, one that
 # is being set by up to 500), but a simulator's may be slow by some thousandths on a busy computer. A controller whose
-# clock has stood still is believed again in time: a tenth of a second is forgotten after 10 s, when a delay as long has
-# held the wrist and stopped it.
+# clock has stood still is believed again in time: a tenth of a second is forgotten after 10 s. A delay of two tenths is
+# stale for nearly as long, and stops the wrist.
 RISES = 1e-2
 
 

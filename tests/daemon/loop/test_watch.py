@@ -4,8 +4,9 @@ import pytest
 
 from daemon.experiment.steps import Limits
 from daemon.loop.senses import Arm, Senses, Source, Torque
-from daemon.loop.watch import Watched, WatchSettings, compared_for_s, troubles
-from daemon.safety import Event
+from daemon.loop.watch import ARM_STALE_S, Watched, WatchSettings, compared_for_s, troubles
+from daemon.safety import TABLE, Event
+from drivers.ur.sample_age import SampleAge
 
 EIT = Source(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = Source(name="load_cell", period_s=1 / 10.9)
@@ -109,3 +110,14 @@ def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_h
     (trouble,) = troubles(senses, watched(EIT, (quick,)), WatchSettings(), NOW_NS)
     assert trouble.event is Event.TORQUES_DISAGREE
     assert len(senses.recent[LOAD.name].torque_nm) <= 10 * rate_hz, "and the rest is forgotten"
+
+
+def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wrist() -> None:
+    """A fifth of a second late, until it is taken for the controller's clock."""
+    age, stale_s = SampleAge(), 0.0
+    for number in range(2000):
+        made_s = 0.008 * number
+        late_s = 0.2 if number >= 100 else 0.001
+        stale_s += 0.008 * (age.age_ns(made_s, round((made_s + late_s) * 1e9)) > ARM_STALE_S * 1e9)
+    assert stale_s == pytest.approx(9.7, abs=0.1)
+    assert stale_s > (TABLE[Event.STATE_STALE].hold_at_most_s or 0.0) + 1.0

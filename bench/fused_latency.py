@@ -27,13 +27,15 @@ _LOST_MS = 1000
 def fused_latency(rig: Path, sides: tuple[str, ...], n_frames: int, pause_s: float) -> dict[str, dict[str, float]]:
     """Return by source the milliseconds from a frame's last byte to its estimate, of n_frames with a valid one at most.
 
-    Of two sides both are told, and `both`, from the last byte of the later one. Lines come in packets.
+    Of two sides both are told, and `both`, from the last byte of the later one. Lines come in packets. Estimates that
+    were not valid, and those that did not come, are counted and not timed.
     """
     recorded = read_recording(rig / RECORDING).sides
     lines = {side: [line_text(one) for one in recorded[side].lines[_FIRST : _FIRST_VALID + n_frames]] for side in sides}
     taken: dict[str, list[tuple[float, float]]] = {
         source: [] for source in ((*sides, BOTH) if len(sides) > 1 else sides)
     }
+    missed = {source: {"not_valid": 0, "lost": 0} for source in taken}
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
         boards = {side: Board(folder / side) for side in sides}
@@ -56,13 +58,17 @@ def fused_latency(rig: Path, sides: tuple[str, ...], n_frames: int, pause_s: flo
                     try:
                         arrived_ns, content = received(estimates)
                     except zmq.Again:
+                        for source in awaited:
+                            missed[source]["lost"] += 1
                         break
                     if content["frame"] == number and content["source"] in awaited:
                         awaited.remove(content["source"])
                         if content["valid"]:
                             took_ms = (arrived_ns - sent_ns) / 1e6, content["latency_s"] * 1e3
                             taken[content["source"]].append(took_ms)
-    return {source: _figures(np.array(found)) for source, found in taken.items()}
+                        else:
+                            missed[content["source"]]["not_valid"] += number >= _FIRST_VALID - _FIRST
+    return {source: {**_figures(np.array(found)), **missed[source]} for source, found in taken.items()}
 
 
 def _figures(taken: np.ndarray) -> dict[str, float]:

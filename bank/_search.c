@@ -131,7 +131,8 @@ static Outcome find_at_all_lags(Hunt *hunt, const float *parts, int first, int e
         double reached = highest_apart(bank, known, n, best->cell);
         if (reached >= least)
             return settle(hunt, best->cell, reached, most_scores, other);
-        /* It is another one than was known, with the known runner-up in its peak: once more, from further down. */
+        /* It is another one than was known, with the known runner-up in its peak: once more, from further down. The best
+           is the same then, and so is what is known beside it, which ends it. */
         least = reached;
     }
 }

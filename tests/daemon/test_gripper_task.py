@@ -12,7 +12,7 @@ from daemon.experiment.wishes import GripTo
 from daemon.gripper_task import GripperTask
 from daemon.loop.watch import HAND_STALE_S
 from tests.daemon.conftest import DEADLINE_S
-from tests.drivers.robotiq.test_gripper import WAYS, Rig, a_rig
+from tests.drivers.robotiq.gripper_rig import WAYS, Rig, a_rig
 
 GRIP = GripTo(0.0, 60.0, 40.0, expect_object=True)
 

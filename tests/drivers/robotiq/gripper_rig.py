@@ -1,0 +1,100 @@
+"""The driver beside the played gripper, by both ways in: real socket and real pseudo-terminal, real pymodbus.
+
+Model time runs as fast as the loop turns, but stands still while a busy machine keeps the driver waiting for an answer;
+the driver is given the same clock.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
+from drivers.emulators.robotiq.modbus_face import ModbusServer
+from drivers.emulators.robotiq.urcap_face import UrcapServer
+from drivers.robotiq.gripper import RobotiqGripper
+from drivers.robotiq.messages import (
+    GripperClient,
+)
+from drivers.robotiq.modbus_client import ModbusClient
+from drivers.robotiq.socket_client import SocketClient
+from drivers.robotiq.width import WidthCalibration
+from drivers.serial_port import LinkEvent, ReconnectPolicy
+
+STEP_S = 0.01
+# Between two looks of the driver at its clock.
+MOST_STEPS = 20
+MECHANICS = GripperMechanics(open_counts=4.0, closed_counts=224.0)
+CALIBRATION = WidthCalibration(open_counts=4.0, open_mm=140.0, closed_counts=224.0, std_mm=0.4)
+WAYS = pytest.mark.parametrize("way", ["socket", "modbus"])
+
+
+@dataclass
+class Rig:
+    model: Gripper
+    server: UrcapServer | ModbusServer
+    t_s: float = 0.0
+    steps_left: int = MOST_STEPS
+    object_mm: float | None = None
+    stopped: bool = False
+    driver: RobotiqGripper = field(init=False)
+    events: list[LinkEvent] = field(default_factory=list)
+    lost: asyncio.Event = field(default_factory=asyncio.Event)
+
+    def clock_ns(self) -> int:
+        self.steps_left = MOST_STEPS
+        return round(self.t_s * 1e9)
+
+    def on_event(self, event: LinkEvent) -> None:
+        self.events.append(event)
+        if not event.up:
+            self.lost.set()
+
+    def silence(self, silent: bool) -> None:
+        self.server.silent = silent
+
+
+@contextlib.asynccontextmanager
+async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
+    model = Gripper(MECHANICS)
+    server: UrcapServer | ModbusServer
+    client: GripperClient
+    if way == "socket":
+        server = UrcapServer(model, port=0)
+        await server.bring_back()
+        client = SocketClient("127.0.0.1", server.port, reply_deadline_s=0.2)
+    else:
+        link = tmp_path / "gripper"
+        server = ModbusServer(model, link)
+        await server.bring_back()
+        client = ModbusClient(path=str(link), reply_deadline_s=0.2)
+    rig = Rig(model, server)
+    driver = rig.driver = RobotiqGripper(
+        client,
+        CALIBRATION,
+        poll_s=0.0,
+        policy=ReconnectPolicy(0.001, 0.002),
+        on_event=rig.on_event,
+        clock_ns=rig.clock_ns,
+    )
+    model.between = lambda _: rig.object_mm
+
+    async def pass_time() -> None:
+        while True:
+            if not rig.stopped and rig.steps_left > 0:
+                rig.steps_left -= 1
+                model.step(STEP_S)
+                rig.t_s += STEP_S
+            await asyncio.sleep(0)
+
+    tasks = [asyncio.create_task(pass_time()), asyncio.create_task(server.run())]
+    try:
+        yield rig
+    finally:
+        await driver.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.wait(tasks)

@@ -1,0 +1,145 @@
+"""A gripper that is lost, silent, garbled or not there, by both ways in: nothing old is given as new."""
+
+import asyncio
+import contextlib
+from pathlib import Path
+
+import pytest
+
+from drivers.emulators.robotiq.modbus_face import ModbusServer
+from drivers.emulators.robotiq.urcap_face import UrcapServer
+from drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
+from drivers.robotiq.messages import (
+    ActivationStatus,
+    GripperCommand,
+)
+from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
+
+
+@WAYS
+async def test_silence_is_a_loss_and_nothing_old_is_given_as_new(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig:
+        await rig.driver.connect()
+        assert rig.driver.latest is not None
+        rig.silence(True)
+        with pytest.raises(DeviceLostError, match=r"within 0\.2 s"):
+            await rig.driver.read()
+        assert rig.driver.latest is None
+        assert not rig.driver.connected
+        # A reply that comes too late must not be taken for the next one's: the connection is closed.
+        rig.silence(False)
+        with pytest.raises(DeviceLostError, match="no connection"):
+            await rig.driver.read()
+        with pytest.raises(DeviceLostError, match="no connection"):
+            await rig.driver.move(GripperCommand(10.0))
+        assert (await rig.driver.connect()).seq > 0
+
+
+@WAYS
+async def test_it_comes_back_by_itself_and_says_so(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
+        first = await anext(states)
+        assert rig.driver.latest == first
+        await rig.server.lose()
+        # The next states are awaited, not made up.
+        coming = asyncio.create_task(anext(states))
+        await rig.lost.wait()
+        assert rig.driver.latest is None
+        assert not coming.done()
+        lost_ns = round(rig.t_s * 1e9)
+        await rig.server.bring_back()
+        second = await coming
+        assert second.t_ns >= lost_ns
+        assert second.seq > first.seq
+        openings = rig.driver.facts()["openings"]
+        assert openings == 2
+        ups = [event.up for event in rig.events]
+        assert ups[0]
+        assert ups[-1]
+        assert not all(ups)
+        # The first loss is news, its repetitions are not.
+        assert [event.repeated for event in rig.events if not event.up][1:] == [True] * (ups.count(False) - 1)
+
+
+@WAYS
+async def test_a_loss_that_a_command_meets_is_told_as_well(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
+        await anext(states)
+        await rig.driver.activate()
+        rig.silence(True)
+        with pytest.raises(DeviceLostError) as met:
+            await rig.driver.move(GripperCommand(50.0))
+        rig.silence(False)
+        await anext(states)
+        assert [(event.up, event.sentence == str(met.value)) for event in rig.events] == [
+            (True, False),
+            (False, True),
+            (True, False),
+        ]
+        assert rig.driver.facts()["last_loss"] == str(met.value)
+
+
+@WAYS
+async def test_states_are_polled_while_a_command_runs(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
+        await anext(states)
+        activating = asyncio.create_task(rig.driver.activate())
+        seen = [await anext(states)]
+        while not activating.done():
+            seen.append(await anext(states))
+        assert ActivationStatus.ACTIVATING in {state.activation for state in seen}
+        assert (await activating).activation is ActivationStatus.ACTIVE
+        assert [state.seq for state in seen] == sorted({state.seq for state in seen})
+
+
+@WAYS
+async def test_a_call_that_is_cancelled_does_not_leave_its_answer_to_the_next(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig:
+        await rig.driver.connect()
+        rig.silence(True)
+        reading = asyncio.create_task(rig.driver.read())
+        await asyncio.sleep(0)
+        reading.cancel()
+        await asyncio.wait([reading])
+        rig.silence(False)
+        with contextlib.suppress(DriverError):
+            await rig.driver.read()
+        await rig.driver.connect()
+        assert (await rig.driver.read()).position_counts == rig.model.pos
+
+
+@WAYS
+async def test_nobody_there_is_said_in_a_sentence(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig:
+        await rig.server.lose()
+        with pytest.raises(DeviceNotFoundError, match="There is no"):
+            await rig.driver.connect()
+
+
+async def test_a_gripper_without_power_is_not_read_as_zero(tmp_path: Path) -> None:
+    async with a_rig("socket", tmp_path) as rig:
+        await rig.driver.connect()
+        assert isinstance(rig.server, UrcapServer)
+        rig.server.no_data = True
+        with pytest.raises(DeviceLostError, match="no data of the gripper"):
+            await rig.driver.read()
+
+
+async def test_a_damaged_modbus_reply_is_not_believed(tmp_path: Path) -> None:
+    async with a_rig("modbus", tmp_path) as rig:
+        await rig.driver.connect()
+        assert isinstance(rig.server, ModbusServer)
+        rig.server.damage_next = True
+        with pytest.raises(DeviceLostError):
+            await rig.driver.read()
+        await rig.driver.connect()
+
+
+async def test_the_gripper_notices_a_master_that_was_silent(tmp_path: Path) -> None:
+    async with a_rig("modbus", tmp_path) as rig:
+        await rig.driver.connect()
+        rig.stopped = True
+        rig.model.watchdog_s = 1.0
+        rig.model.step(1.1)
+        assert (await rig.driver.read()).fault.name == "no communication"
+        assert (await rig.driver.read()).fault.code == 0

@@ -11,7 +11,7 @@ from daemon.experiment.steps import ExperimentFile
 from daemon.gripper_task import GripperTask
 from daemon.loop.brain import Brain, Orders
 from daemon.loop.senses import Arm, Source, Torque
-from daemon.loop.watch import ARM_STALE_S
+from daemon.loop.watch import ARM_STALE_S, LONGEST_TICK_S
 from daemon.loop_actions import DeviceActions
 from daemon.loop_messages import loop_state, robot_state
 from daemon.messages import Scalar
@@ -22,8 +22,6 @@ from drivers.ur.client import UrRobot, unheard
 from drivers.ur.messages import Enable, Reply, RobotState, Stop, Unlock, WristSpeed
 
 WRENCH = "wrench"
-# The brain is asked at each state of the robot while an experiment runs, and is late where that takes longer than this.
-LONGEST_TICK_S = 0.02
 # Without a state it is asked after so long: half of the time after which the arm's is stale.
 LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
 # Of every fifth of the robot's cycles the state is published, and speaks as the torque of the wrench: 25 a second.
@@ -141,6 +139,11 @@ class LoopTask:
             self._listen_no_more()
             if self._over is not None and not self._over.done():
                 self._over.set_result(error)
+
+    def decide_now(self) -> None:
+        """Ask the brain at once, where the loop runs: of a robot that is lost no state tells, and none comes."""
+        if self._over is not None and not self._over.done():
+            self._decide()
 
     def _listen(self) -> None:
         """Agree with the robot on how often a state is needed, and decide without one where none comes in time."""

@@ -220,6 +220,7 @@ class Rig:
             self.brain.senses.lost.pop(device, None)
         else:
             self.brain.senses.lost[device] = sentence
+            self.loop.decide_now()
 
     def _hear(self, torque: Torque) -> None:
         self.brain.hear(torque)

@@ -12,8 +12,10 @@ from drivers.values import value
 # 2.5 periods of their topics. The arm stands still by itself when it hears nothing for 0.3 s.
 ARM_STALE_S = stale_after_s("robot.state")
 HAND_STALE_S = stale_after_s("gripper.state")
-# Later than this and the wrist would turn on an angle that it has left.
-LATEST_LOOP_S = 0.1
+# The brain is asked at each state of the robot while an experiment runs, and is late where that takes longer than this.
+LONGEST_TICK_S = 0.02
+# Later than this, and the state that was last decided upon had become stale while the wrist turned on it.
+LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -132,7 +132,7 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
         assert Event.LOOP_LATE in [trouble.event for trouble in cell.brain.standing.verdict.troubles]
 
 
-@pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2)])
+@pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2), (12, 1)])
 async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read: int) -> None:
     """Though it then reads many states at once, or decides in time before it is late again."""
     async with driven() as cell:
@@ -144,6 +144,16 @@ async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read:
             if cell.phase is not Phase.RUNNING:
                 break
         assert "loop was woken" in cell.why
+
+
+async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -> None:
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        for _ in range(100):
+            for _ in range(11):
+                cell.robot.cycle(read=False)
+            await cell.cycles(1)
+            assert cell.brain.standing.verdict.troubles == ()
 
 
 async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkeypatch: pytest.MonkeyPatch) -> None:

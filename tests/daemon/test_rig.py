@@ -1,0 +1,49 @@
+"""What belongs to the rig's parts together, without any device."""
+
+import asyncio
+import contextlib
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+from daemon.clock import Clock
+from daemon.config import DaemonConfig
+from daemon.loop.senses import Source
+from daemon.rig import Rig
+from drivers.ur.client import LinkEvent
+from tests.daemon.cell import Published
+
+SOURCES = {"right": Source(name="right", period_s=0.5)}
+
+
+@contextlib.asynccontextmanager
+async def a_rig() -> AsyncIterator[Rig]:
+    """Return a rig whose loop runs, and whose robot is never connected to."""
+    config = DaemonConfig.model_construct(robot=Path("config/ur.yaml"))
+
+    async def no_tare() -> str:
+        return ""
+
+    rig = Rig(config, Published(), Clock(), SOURCES, no_tare, dict)  # type: ignore[arg-type]
+    driving = asyncio.create_task(rig.loop.drive())
+    await asyncio.sleep(0)
+    try:
+        yield rig
+    finally:
+        driving.cancel()
+        await asyncio.gather(driving, return_exceptions=True)
+
+
+async def test_a_robot_that_is_lost_is_told_at_once_and_not_when_its_state_is_missed() -> None:
+    async with a_rig() as rig:
+        assert rig.brain.standing.verdict.troubles == ()
+        rig._robot_link(LinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
+        assert "the robot's process died" in " ".join(rig.brain.standing.verdict.reasons)
+
+
+async def test_a_device_that_is_lost_before_the_loop_runs_and_after_its_end_is_noted() -> None:
+    async with a_rig() as rig:
+        pass
+    rig._robot_link(LinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
+    assert rig.brain.senses.lost == {"robot": "the robot's process died"}
+    assert rig.brain.standing.verdict.troubles == ()

@@ -197,10 +197,13 @@ class LoopTask:
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the robot."""
+        errors = dict(self._robot.losses)
+        if self._robot.stops_in_vain:
+            errors["paused program not stopped"] = self._robot.stops_in_vain
         return {
             "connected": self._robot.state is not None,
             "states": self._robot.states,
-            "errors": dict(self._robot.losses),
+            "errors": errors,
             "trouble": "" if self._robot.link.status == "up" else self._robot.link.sentence,
         }
 

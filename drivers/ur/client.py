@@ -18,7 +18,7 @@ from typing import Final, Literal
 from drivers.errors import DriverError
 from drivers.ur import sentences
 from drivers.ur.conversation import HEARTBEAT, Conversation, Descriptor, LossKind, LostError, output
-from drivers.ur.messages import RUNTIME_STOPPED, Command, Ease, Failed, Message, Reply, RobotState
+from drivers.ur.messages import Command, Ease, Failed, Message, Reply, RobotState
 from drivers.ur.settings import UrSettings
 from drivers.ur.wire import encode
 
@@ -63,8 +63,8 @@ class UrRobot:
         self._waiting: dict[int, Callable[[Reply], None]] = {}
         self._number = 0
         self._lost_s = -math.inf
-        # Whether what runs on the robot, or is paused there, was seen to be somebody else's.
-        self._foreign = False
+        # How many times our program was paused, asked to stop, and did not.
+        self.stops_in_vain = 0
         # How many states have come since the beginning.
         self.states = 0
         # Who waits for the next state; None is for those who wait no longer.
@@ -223,7 +223,7 @@ class UrRobot:
         self._end_ease()
         if self._state is not None:
             # A network that failed makes no program ours.
-            self._lost_s = -math.inf if self._foreign else time.monotonic()
+            self._lost_s = time.monotonic() if self._state.ours else -math.inf
         self._state = None
         waiting, self._waiting = self._waiting, {}
         for answered in waiting.values():
@@ -246,10 +246,11 @@ class UrRobot:
         """Act on a message of the process."""
         match message:
             case RobotState():
-                first = self._state is None
+                before = self._state
                 self._state = message
-                self._foreign = _is_foreign(message, before=self._foreign)
-                if first:
+                # Each process counts from zero.
+                self.stops_in_vain += message.stops_in_vain - (before.stops_in_vain if before is not None else 0)
+                if before is None:
                     self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
                 self.states += 1
                 self.on_state(message)
@@ -266,13 +267,6 @@ class UrRobot:
     def _tell(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
         self.link = LinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
         self._on_link(self.link)
-
-
-def _is_foreign(state: RobotState, *, before: bool) -> bool:
-    """Return whether somebody else's program is on the robot; of a state that does not tell, as it was before."""
-    if state.runtime_state == RUNTIME_STOPPED or state.blocked in ("", sentences.NOT_ENABLED):
-        return False
-    return before or state.blocked == sentences.NOT_OURS
 
 
 def unheard(_state: RobotState) -> None:

@@ -118,6 +118,11 @@ class Reading:
         return self.runtime_state == RUNTIME_PLAYING
 
     @property
+    def program_paused(self) -> bool:
+        """Whether a program is there that does not play: it was paused, or is on its way there or back."""
+        return self.runtime_state not in (RUNTIME_STOPPED, RUNTIME_PLAYING)
+
+    @property
     def rests(self) -> bool:
         """Whether every joint rests."""
         return all(abs(speed) < REST_RAD_PER_S for speed in self.qd_rad_per_s)
@@ -154,6 +159,10 @@ class RobotState(Reading):
     clipped: tuple[str, ...]
     # Number of the process's cycle; several pass between two states while the daemon is at ease.
     cycle: int
+    # Whether a program on the robot is one that was started here, or that a process before has left behind.
+    ours: bool
+    # How many times such a program was paused, asked to stop, and did not.
+    stops_in_vain: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,6 @@ but a command given after it.
 from drivers.ur import sentences
 from drivers.ur.limits import violation
 from drivers.ur.messages import (
-    RUNTIME_PLAYING,
     RUNTIME_STOPPED,
     SAFETY_EMERGENCY_STOPS,
     SAFETY_PROTECTIVE_STOP,
@@ -26,6 +25,7 @@ from drivers.ur.messages import (
 )
 from drivers.ur.motion import tool_axis_torque
 from drivers.ur.mover import Mover
+from drivers.ur.paused import PausedProgram
 from drivers.ur.ports import PilotArm
 from drivers.ur.recovery import Outcome, Recovery
 from drivers.ur.settings import UrSettings
@@ -37,13 +37,18 @@ class Pilot:
     def __init__(self, settings: UrSettings, arm: PilotArm, now_ns: int, *, takes_over: bool = False) -> None:
         """Begin with motion not enabled, and with starting the control program where the robot lets us.
 
-        `takes_over`: a program that runs there is one that we may stop for that.
+        `takes_over`: a program that is there is one that a process before has left behind, and that we may stop.
         """
         self._settings = settings
         self._limits = settings.limits
         self._arm = arm
         self._held = sentences.NOT_ENABLED
-        self._started = self._leaving = False
+        self._leaving = False
+        # Whether a program that is there was started here, or left behind by a process before; not while one is begun.
+        self._ours = takes_over
+        self._paused = PausedProgram(arm)
+        # Whether it is stopped in the next cycle, of which the daemon learns beforehand that it may take long.
+        self._stops_paused = False
         self._mover = Mover(settings, arm, now_ns)
         self._heard_ns = now_ns
         self._recovery: Recovery | None = Recovery(
@@ -65,7 +70,12 @@ class Pilot:
     @property
     def recovering(self) -> bool:
         """Whether calls may take seconds: the dashboard's, and the first one to a new program."""
-        return self._recovery is not None
+        return self._recovery is not None or self._stops_paused
+
+    @property
+    def ours(self) -> bool:
+        """Whether a program on the robot is one that was started here, or that a process before has left behind."""
+        return self._ours or (self._recovery is not None and self._recovery.starts)
 
     def puzzled(self) -> bool:
         """Return, once, whether the robot did not take something: the next reading may say why.
@@ -76,8 +86,8 @@ class Pilot:
         return puzzled
 
     def left_paused(self, reading: Reading) -> bool:
-        """Whether the program that was started here is paused, and could be resumed by anybody."""
-        return self._started and reading.runtime_state not in (RUNTIME_STOPPED, RUNTIME_PLAYING)
+        """Whether a program of ours is paused, and could be resumed by anybody."""
+        return self.ours and reading.program_paused
 
     def heard(self, now_ns: int) -> None:
         """Note a sign of life of the daemon."""
@@ -106,6 +116,11 @@ class Pilot:
     def tick(self, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
         """Let one cycle pass: judge the reading, send what is due; return the reply to an `Unlock` that is decided."""
         self._mover.watch(reading, now_ns)
+        announced, self._stops_paused = self._stops_paused, False
+        if reading.runtime_state == RUNTIME_STOPPED:
+            # What is there next may be anybody's.
+            self._ours = False
+            self._paused.forget()
         if self._recovery is not None:
             return self._recover(self._recovery, reading, now_ns)
         trouble = self._unfit(reading)
@@ -117,7 +132,7 @@ class Pilot:
                 self._mover.let_go(trouble)
             if not reading.program_running:
                 self._mover.barred = sentences.NOT_OURS
-                self._started = self._started and reading.runtime_state != RUNTIME_STOPPED
+                self._end_what_is_paused(reading, now_ns, announced=announced)
             return None
         beyond = self._violation(reading)
         if beyond:
@@ -155,6 +170,8 @@ class Pilot:
             sent=self._mover.sent,
             clipped=self._mover.clipped,
             cycle=cycle,
+            ours=self.ours,
+            stops_in_vain=self._paused.in_vain,
         )
 
     # ---- commands -------------------------------------------------------------------------------------------------
@@ -217,6 +234,7 @@ class Pilot:
             return self._enable(reading)
         self._mover.bar(self._unfit(reading), self._mover.barred or sentences.NOT_OURS)
         self._unlock_number = number
+        self._ours = self.ours
         self._recovery = Recovery(
             self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True, may_stop_program=True
         )
@@ -245,19 +263,31 @@ class Pilot:
     def _blocked(self, reading: Reading) -> str:
         if self._recovery is not None:
             return sentences.BEING_MADE_READY
-        return self._unfit(reading) or self._violation(reading) or self._held
+        why = self._unfit(reading) or self._violation(reading) or self._held
+        return f"{why} {self._paused.why}" if self._paused.why else why
+
+    def _end_what_is_paused(self, reading: Reading, now_ns: int, *, announced: bool) -> None:
+        """Stop a program of ours that is paused, in the cycle after the one that has announced it."""
+        if self._leaving or not (self._ours and reading.program_paused and self._is_new(reading)):
+            return
+        if self._paused.due(now_ns):
+            if announced:
+                self._paused.stop(now_ns)
+            self._stops_paused = not announced
+
+    def _is_new(self, reading: Reading) -> bool:
+        return reading.connected and reading.age_ns <= self._settings.state_timeout_s * 1e9
 
     def _recover(self, recovery: Recovery, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
-        silent = not reading.connected or reading.age_ns > self._settings.state_timeout_s * 1e9
         # States may stay old for minutes, and not so old that the connection is given up: the operator is answered.
-        if silent and not recovery.ended(now_ns):
+        if not self._is_new(reading) and not recovery.ended(now_ns):
             return None
         outcome = recovery.advance(reading, now_ns)
         if outcome is Outcome.UNDER_WAY:
             return None
-        self._recovery = None
+        self._ours, self._recovery = self.ours, None
         if outcome is Outcome.DONE:
-            self._mover.barred, self._started = "", True
+            self._mover.barred = ""
         number, self._unlock_number = self._unlock_number, None
         if number is None:
             self._held = recovery.why or self._held

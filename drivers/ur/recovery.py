@@ -53,6 +53,11 @@ class Recovery:
         self._cleared = self._uploaded = False
         self.why = ""
 
+    @property
+    def starts(self) -> bool:
+        """Whether the control program is started now, or has been: one that is there may be ours."""
+        return self._cleared
+
     def give_up(self, why: str) -> None:
         """Do nothing more, and say so when asked again."""
         self.why = why
@@ -105,7 +110,7 @@ class Recovery:
 
     def _make_safe(self, reading: Reading, now_ns: int) -> Outcome:
         if not self._operator_asked:
-            return self._end_what_is_paused(reading, now_ns)
+            return self._refuse("")
         if reading.safety_mode in SAFETY_EMERGENCY_STOPS:
             return self._refuse(
                 "The emergency stop is still pressed: make the cell safe, release it, and unlock again."
@@ -122,14 +127,6 @@ class Recovery:
             self._every_second("power", now_ns, self._arm.power_on)
         elif reading.robot_mode == ROBOT_MODE_IDLE:
             self._every_second("brakes", now_ns, self._arm.release_brakes)
-        return Outcome.UNDER_WAY
-
-    def _end_what_is_paused(self, reading: Reading, now_ns: int) -> Outcome:
-        """Stop a program that a process before this one has left paused: resumed, it would move until its watchdog."""
-        given_up_ns = self._asked_ns.setdefault("end", now_ns) + int(_ENDS_ITSELF_S * 1e9)
-        if not self._may_stop_program or reading.runtime_state == RUNTIME_STOPPED or now_ns > given_up_ns:
-            return self._refuse("")
-        self._every_second("stop", now_ns, self._arm.stop_program)
         return Outcome.UNDER_WAY
 
     def _close_popups(self, now_ns: int) -> None:

@@ -83,6 +83,14 @@ def left_to_watchdog(why: str) -> str:
     return f"{why} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
 
 
+def still_paused(why: str) -> str:
+    """Return the sentence for a program of ours that is paused and could not be stopped."""
+    return (
+        f"The program that is paused could not be stopped ({why.strip().removesuffix('.')}): stop it at the teach "
+        "pendant, do not resume it."
+    )
+
+
 def unfit(reading: Reading, host: str, state_timeout_s: float) -> str:
     """Return why the controller cannot take motion commands, or the empty string."""
     if not reading.connected:

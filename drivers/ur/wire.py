@@ -41,8 +41,8 @@ _MOTIONS: Final[tuple[MotionKind, ...]] = ("idle", "wrist", "linear", "stopping"
 
 
 # The numbers of a state in the order of its fields, its four vectors as one: t_mono_ns, timestamp_s, age_ns, vectors,
-# modes, speed_scaling, wrist_torque_nm, motion_id, cycle, motion, flags.
-_NUMBERS = struct.Struct("<qdq24diiiddIQB5?")
+# modes, speed_scaling, wrist_torque_nm, motion_id, cycle, stops_in_vain, motion, flags.
+_NUMBERS = struct.Struct("<qdq24diiiddIQIB6?")
 # What was last sent to the robot: its kind, and its numbers in the order of its fields.
 _SENT = struct.Struct("<B8d")
 _WRIST_SPEED = struct.Struct("<2d")
@@ -138,8 +138,9 @@ def _state_body(state: RobotState) -> bytes:
         state.t_mono_ns, state.timestamp_s, state.age_ns,
         *state.q_rad, *state.qd_rad_per_s, *state.tcp_pose, *state.wrench,
         state.robot_mode, state.safety_mode, state.runtime_state, state.speed_scaling, state.wrist_torque_nm,
-        state.motion_id, state.cycle, _MOTIONS.index(state.motion),
+        state.motion_id, state.cycle, state.stops_in_vain, _MOTIONS.index(state.motion),
         state.connected, state.moving_linearly, state.protective_stop, state.emergency_stop, state.recovering,
+        state.ours,
     ) + _sent_body(state.sent) + _words_of_state_body(state.blocked, state.ended, state.clipped)  # fmt: skip
 
 
@@ -205,8 +206,8 @@ def _state(body: bytes) -> RobotState:
     numbers = _NUMBERS.unpack_from(body)
     t_mono_ns, timestamp_s, age_ns = numbers[:3]
     (
-        robot_mode, safety_mode, runtime_state, speed_scaling, wrist_torque_nm, motion_id, cycle, motion,
-        connected, moving_linearly, protective_stop, emergency_stop, recovering,
+        robot_mode, safety_mode, runtime_state, speed_scaling, wrist_torque_nm, motion_id, cycle, stops_in_vain, motion,
+        connected, moving_linearly, protective_stop, emergency_stop, recovering, ours,
     ) = numbers[27:]  # fmt: skip
     if motion >= len(_MOTIONS):
         raise ValueError(f"there is no motion {motion}")
@@ -217,5 +218,5 @@ def _state(body: bytes) -> RobotState:
         numbers[3:9], numbers[9:15], numbers[15:21], numbers[21:27],
         robot_mode, safety_mode, runtime_state, speed_scaling, moving_linearly,
         wrist_torque_nm, protective_stop, emergency_stop, blocked, recovering,
-        _MOTIONS[motion], motion_id, ended, sent, clipped, cycle,
+        _MOTIONS[motion], motion_id, ended, sent, clipped, cycle, ours, stops_in_vain,
     )  # fmt: skip

@@ -15,6 +15,7 @@ FAULTS = """Prints what happens, a JSON object a line. Faults, one a line on sta
   release                 release the button; power comes back from the dashboard
   drop-rtde               close the RTDE connections, the dashboard living on
   silence SECONDS         send nothing on any port
+  stop-hangs N            neither answer nor carry out the next N times that the dashboard is asked to stop
   registers-in-use [off]  refuse input registers as if a fieldbus had them
   local-control [off]     leave remote control
   refuse-protocol [off]   refuse the RTDE protocol version

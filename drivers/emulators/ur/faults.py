@@ -33,9 +33,14 @@ def _refuse_protocol(controller: Controller, arguments: list[str]) -> None:
     controller.protocol_refused = _on(arguments)
 
 
+def _stop_hangs(controller: Controller, arguments: list[str]) -> None:
+    controller.stop_hangs = int(arguments[0])
+
+
 def _normal(controller: Controller, _arguments: list[str]) -> None:
     controller.robot.clear_faults()
     controller.protocol_refused = False
+    controller.stop_hangs = 0
     controller.silence(0.0)
 
 
@@ -49,6 +54,7 @@ FAULTS: dict[str, Callable[[Controller, list[str]], None]] = {
     "release": lambda controller, _: controller.robot.release(),
     "drop-rtde": lambda controller, _: controller.drop_rtde(),
     "silence": lambda controller, arguments: controller.silence(float(arguments[0])),
+    "stop-hangs": _stop_hangs,
     "registers-in-use": _registers_in_use,
     "local-control": _local_control,
     "refuse-protocol": _refuse_protocol,

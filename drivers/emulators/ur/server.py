@@ -35,6 +35,8 @@ class Controller:
         """Take a robot; `on_event` is told of everything that happens to it."""
         self.robot = robot
         self.protocol_refused = False
+        # How many of the next requests to stop the dashboard neither answers nor carries out.
+        self.stop_hangs = 0
         self._host = host
         self._dt_s = 1.0 / rate_hz
         self._rate_hz = rate_hz
@@ -135,6 +137,9 @@ class Controller:
         with self._connection(writer):
             self._send(writer, dashboard.BANNER.encode() + b"\n")
             while line := await reader.readline():
+                if self.stop_hangs and line.strip() == b"stop":
+                    self.stop_hangs -= 1
+                    continue
                 self._send(writer, dashboard.answer(self.robot, line.decode("utf-8", "replace")).encode() + b"\n")
 
     def _connection(self, writer: asyncio.StreamWriter) -> "_Connection":

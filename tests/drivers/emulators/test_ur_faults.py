@@ -10,14 +10,19 @@ from drivers.emulators.ur.server import Controller
 def test_faults_are_carried_out_and_ended() -> None:
     controller = Controller(Robot())
     robot = controller.robot
-    for line in ("registers-in-use", "local-control", "refuse-protocol on", "protective-stop", "emergency-stop"):
+    for line in (
+        "registers-in-use", "local-control", "refuse-protocol on", "stop-hangs 2", "protective-stop",
+        "emergency-stop",
+    ):  # fmt: skip
         obey(controller, line)
+    assert controller.stop_hangs == 2
     assert (robot.registers_taken, robot.remote_control, controller.protocol_refused) == (True, False, True)
     assert robot.safety_mode == 7
     obey(controller, "registers-in-use off")
     assert not robot.registers_taken
     obey(controller, "normal")
     assert (robot.remote_control, controller.protocol_refused, robot.safety_mode) == (True, False, 1)
+    assert controller.stop_hangs == 0
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ class FakeArm:
         self.target, self.acceleration = 0.0, 4.0
         self.takes = True
         self.stops_moves = True
-        self.unlockable = True
+        self.unlockable = self.stoppable = True
         self.stale_command = False
         self._resumed_target = 0.0
         self._watched = False
@@ -129,6 +129,8 @@ class FakeArm:
 
     def stop_program(self) -> None:
         self.calls.append("stop_program")
+        if not self.stoppable:
+            raise DriverError("the dashboard does not answer")
         self.end_program()
 
     def upload(self) -> bool:

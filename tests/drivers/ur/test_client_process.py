@@ -4,6 +4,7 @@ import asyncio
 import os
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -15,7 +16,7 @@ from drivers.ur.client import UrRobot
 from drivers.ur.conversation import LAST_WORDS_BYTES, Conversation, output
 from drivers.ur.messages import Reply, Stop
 from drivers.ur.wire import encode
-from tests.drivers.ur.flight import SETTINGS, Flight
+from tests.drivers.ur.flight import SETTINGS, Flight, flying
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
 
@@ -72,16 +73,17 @@ async def test_long_line_of_a_process_is_heard_and_told_in_short(play: Callable[
 BRIEFLY = """
 import os, sys
 from drivers.ur.messages import Configure
-from drivers.ur.pilot import Pilot
 from drivers.ur.wire import Decoder, encode
-from tests.drivers.ur.flight import SETTINGS, FakeArm
+from tests.drivers.ur.flight import Flight
 
 decoder = Decoder()
 while not (heard := decoder.feed(os.read(0, 1 << 16))):
     pass
 with open(sys.argv[1], "a") as told:
     print(heard[0][1].takes_over, file=told)
-os.write(1, encode(Pilot(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
+flight = Flight()
+flight.fly(CYCLES)
+os.write(1, encode(flight.state))
 """
 
 
@@ -125,42 +127,68 @@ async def test_process_is_ended_in_good_order_though_who_waits_for_a_reply_dies_
     assert [repr(context["exception"]) for context in unheard] == ["ZeroDivisionError('nothing to divide')"]
 
 
-async def test_process_after_one_that_was_connected_may_stop_what_that_left_running(
-    play: Callable[[str], None], tmp_path: Path
+# In the first cycle the register is cleared, in the second the program is sent.
+@pytest.mark.parametrize(("cycles", "may_stop"), [(0, "False"), (1, "True"), (5, "True")])
+async def test_process_after_one_that_has_begun_a_program_may_stop_what_that_left_running(
+    play: Callable[[str], None], tmp_path: Path, cycles: int, may_stop: str
 ) -> None:
     told = tmp_path / "told"
-    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{BRIEFLY}' '{told}'")
+    briefly = BRIEFLY.replace("CYCLES", str(cycles))
+    play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{briefly}' '{told}'")
     link = Link()
     async with running(settings_for("127.0.0.254"), link):
         await link.down(2)
-    assert told.read_text().split()[:2] == ["False", "True"]
+    assert told.read_text().split()[:2] == ["False", may_stop]
 
 
-@pytest.mark.parametrize(
-    "before_the_loss",
-    [{}, {"age_ns": 400_000_000}, {"safety_mode": 3, "runtime_state": 4}],
-    ids=["playing", "silent", "paused"],
-)
-async def test_program_that_was_seen_to_be_somebody_elses_is_not_taken_for_one_left_behind(
-    before_the_loss: dict[str, int],
+STALE, PAUSED = {"age_ns": 400_000_000}, {"safety_mode": 3, "runtime_state": 4}
+
+
+def lost_after(*readings: dict[str, int], flight: Flight) -> UrRobot:
+    """Return a robot that was lost after a flight in which these were read."""
+    robot = UrRobot(SETTINGS)
+    for reading in readings:
+        flight.arm.be(**reading)
+        flight.fly(1)
+        robot.take(0, flight.state)
+    robot._disconnected()
+    return robot
+
+
+@pytest.mark.parametrize("cycles", [1, 500], ids=["just connected", "for long"])
+@pytest.mark.parametrize("last", [{}, STALE, PAUSED], ids=["playing", "silent", "paused"])
+@pytest.mark.parametrize("first", [{"runtime_state": 2}, PAUSED], ids=["played", "was paused"])
+async def test_program_that_was_there_before_us_is_not_taken_for_one_left_behind(
+    first: dict[str, int], last: dict[str, int], cycles: int
 ) -> None:
-    robot, flight = UrRobot(SETTINGS), Flight()
-    flight.arm.be(runtime_state=2)
-    flight.fly(500)
-    robot.take(0, flight.state)
-    flight.arm.be(**before_the_loss)
-    flight.fly(1)
-    robot.take(0, flight.state)
-    robot._disconnected()
-    assert not robot.takes_over
+    assert not lost_after(*[first] * cycles, last, flight=Flight()).takes_over
 
-    # Once the operator has had ours started in its place, it is ours that a lost process leaves.
-    again = Flight()
-    for _ in range(30):
-        again.fly(1)
-        robot.take(0, again.state)
-    robot._disconnected()
-    assert robot.takes_over
+
+@pytest.mark.parametrize("last", [{}, STALE, PAUSED], ids=["playing", "silent", "paused"])
+async def test_program_that_was_started_here_is_taken_for_one_left_behind(last: dict[str, int]) -> None:
+    flight = flying()
+    flight.arm.stoppable = False
+    assert lost_after({}, *[last] * 5, flight=flight).takes_over
+    # And so on, from process to process, until it was seen to be gone.
+    after = Flight(takes_over=True)
+    after.arm.be(**{"runtime_state": 2, **last})
+    after.arm.stoppable = False
+    assert lost_after(*[{}] * 5, flight=after).takes_over
+
+
+async def test_program_that_is_begun_after_ours_has_ended_is_not_taken_for_one_left_behind() -> None:
+    flight = flying()
+    flight.arm.end_program()
+    assert not lost_after({}, PAUSED, flight=flight).takes_over
+
+
+async def test_stops_in_vain_are_counted_across_processes() -> None:
+    robot = UrRobot(SETTINGS)
+    for counts in ((0, 1, 1, 2), (0, 3)):
+        for count in counts:
+            robot.take(0, replace(Flight().state, stops_in_vain=count))
+        robot._disconnected()
+    assert robot.stops_in_vain == 5
 
 
 async def test_of_states_that_are_read_at_once_all_but_the_last_are_overtaken() -> None:

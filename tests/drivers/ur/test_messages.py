@@ -45,7 +45,7 @@ mode, time_ns = st.integers(-(2**31), 2**31 - 1), st.integers(-(2**63), 2**63 - 
 states = st.builds(
     RobotState,
     t_mono_ns=time_ns, age_ns=time_ns, robot_mode=mode, safety_mode=mode, runtime_state=mode,
-    motion_id=st.integers(0, 2**32 - 1), cycle=st.integers(0, 2**64 - 1),
+    motion_id=st.integers(0, 2**32 - 1), cycle=st.integers(0, 2**64 - 1), stops_in_vain=st.integers(0, 2**32 - 1),
     q_rad=six, qd_rad_per_s=six, tcp_pose=six, wrench=six, sent=sent, clipped=reasons,
     timestamp_s=finite, speed_scaling=finite, wrist_torque_nm=finite,
     motion=st.sampled_from(["idle", "wrist", "linear", "stopping"]),
@@ -131,7 +131,7 @@ def test_reply_with_anything_missing_wrong_or_more_is_refused(change: Callable[[
 def test_a_state_with_anything_missing_wrong_or_more_is_refused(change: str) -> None:
     state = RobotState(
         0, 0.0, 0, True, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, 7, 1, 2, 1.0, False,
-        0.0, False, False, "", False, "stopping", 0, "", None, (), 3,
+        0.0, False, False, "", False, "stopping", 0, "", None, (), 3, True, 0,
     )  # fmt: skip
     body = encode(state)[9:]
     # What was sent to the robot is a byte and eight numbers.
@@ -140,8 +140,8 @@ def test_a_state_with_anything_missing_wrong_or_more_is_refused(change: str) -> 
         "a byte less of words": body[:-1],
         "a word more": body[:-1] + b',"more"]',
         "half of the numbers": body[: sent // 2],
-        # Before the five flags.
-        "no such motion": body[: sent - 6] + b"\x04" + body[sent - 5 :],
+        # Before the six flags.
+        "no such motion": body[: sent - 7] + b"\x04" + body[sent - 6 :],
         "nothing like it sent": body[:sent] + b"\x04" + body[sent + 1 :],
     }[change]
     with pytest.raises(ProtocolError, match="RobotState"):
@@ -155,7 +155,7 @@ def _with_body(message: Message, body: bytes) -> bytes:
 def test_states_carry_what_is_no_number() -> None:
     state = RobotState(
         0, 0.0, 0, True, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0, False,
-        0.0, False, False, "", False, "idle", 0, "", None, (), 3,
+        0.0, False, False, "", False, "idle", 0, "", None, (), 3, False, 0,
     )  # fmt: skip
     ((_, got),) = Decoder().feed(encode(state))
     assert isinstance(got, RobotState)

@@ -52,6 +52,10 @@ class AnyFlight(RuleBasedStateMachine):
         if self.flight.arm.reading.safety_mode == 1:
             self.flight.arm.protective_stop()
 
+    @rule(answers=st.booleans())
+    def dashboard(self, answers: bool) -> None:
+        self.flight.arm.stoppable = answers
+
     @precondition(lambda self: self.flight.arm.reading.runtime_state == 4)
     @rule()
     def someone_resumes_the_program(self) -> None:

@@ -1,0 +1,94 @@
+"""A program that is paused on an emulated controller: ours is stopped by the real ur-rtde, another's is left alone."""
+
+import asyncio
+import os
+import signal
+import time
+
+import pytest
+
+from drivers.emulators.ur.server import SCRIPT_PORT
+from drivers.ur.client import UrRobot
+from tests.drivers.ur.robots import Link, enable, running, settings_for, until
+from tests.emulator_process import EmulatorProcess as ControllerProcess
+
+pytestmark = pytest.mark.real_time
+
+pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
+
+STOPPED = "stopped from the dashboard"
+PAUSED = 4
+
+
+async def begin_somebody_elses_program(controller: ControllerProcess) -> None:
+    since_ns = time.monotonic_ns()
+    _, writer = await asyncio.open_connection(controller.host, SCRIPT_PORT)
+    writer.write(b"def theirs():\n  sync()\nend\n")
+    await controller.event("program-started", since_ns)
+    writer.close()
+    await writer.wait_closed()
+
+
+async def kill(robot: UrRobot, link: Link) -> None:
+    """Kill the robot's process, and return when the next one has its first states."""
+    assert robot.pid is not None
+    os.kill(robot.pid, signal.SIGKILL)
+    await link.down()
+    await robot.next_state()
+
+
+async def test_paused_program_of_somebody_else_outlives_the_loss_of_our_first_process(
+    controller: ControllerProcess,
+) -> None:
+    """It was paused before we came, and nothing that we see tells whose it is but that we did not start it."""
+    await begin_somebody_elses_program(controller)
+    since_ns = await controller.fault("protective-stop")
+    link = Link()
+    async with running(settings_for(controller.host), link) as robot:
+        await until(robot, lambda state: state.runtime_state == PAUSED and not state.recovering)
+        await kill(robot, link)
+        await until(robot, lambda state: not state.recovering)
+        # As long as ours takes to be stopped, ten times over.
+        for _ in range(100):
+            state = await robot.next_state()
+        assert state.runtime_state == PAUSED
+    assert not controller.happened("program-ended", since_ns)
+
+
+async def test_our_paused_program_is_stopped_by_the_process_that_started_it(controller: ControllerProcess) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        since_ns = await controller.fault("protective-stop")
+        assert (await controller.event("program-ended", since_ns))["detail"] == STOPPED
+        assert robot.state is not None
+        assert robot.state.protective_stop
+
+
+@pytest.mark.parametrize("hangs", [0, 1])
+async def test_our_paused_program_is_stopped_by_the_next_process(controller: ControllerProcess, hangs: int) -> None:
+    link = Link()
+    async with running(settings_for(controller.host), link) as robot:
+        await enable(robot)
+        assert robot.pid is not None
+        os.kill(robot.pid, signal.SIGSTOP)
+        await controller.fault(f"stop-hangs {hangs}")
+        since_ns = await controller.fault("protective-stop")
+        os.kill(robot.pid, signal.SIGKILL)
+        await link.down()
+        assert (await controller.event("program-ended", since_ns))["detail"] == STOPPED
+        assert robot.stops_in_vain == hangs
+
+
+async def test_dashboard_that_hangs_is_asked_again_and_the_operator_told_meanwhile(
+    controller: ControllerProcess,
+) -> None:
+    async with running(settings_for(controller.host)) as robot:
+        await enable(robot)
+        await controller.fault("stop-hangs 1")
+        since_ns = await controller.fault("protective-stop")
+        state = await until(robot, lambda state: "do not resume it" in state.blocked)
+        assert state.runtime_state == PAUSED
+        assert (await controller.event("program-ended", since_ns))["detail"] == STOPPED
+        await until(robot, lambda state: "do not resume it" not in state.blocked)
+        assert robot.stops_in_vain == 1
+        assert not robot.losses

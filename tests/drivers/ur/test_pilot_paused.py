@@ -1,0 +1,158 @@
+"""A program that is paused, in the pilot's own time: whose it is, when it is asked to stop, and what is told of it."""
+
+from itertools import pairwise
+
+import pytest
+
+from drivers.ur.messages import Disconnect, Enable, Unlock
+from drivers.ur.paused import AGAIN_S
+from tests.drivers.ur.flight import CYCLE_NS, Flight, flying, turning
+
+ASKED = "stop_program"
+
+
+def asked_s(flight: Flight, seconds: float) -> list[float]:
+    """Let time pass, and return when a program was asked to stop."""
+    since_ns, times = flight.now_ns, []
+    for _ in range(round(seconds * 1e9 / CYCLE_NS)):
+        before = flight.arm.calls.count(ASKED)
+        flight.fly(1)
+        times += [(flight.now_ns - CYCLE_NS - since_ns) / 1e9] * (flight.arm.calls.count(ASKED) - before)
+    return times
+
+
+def test_program_that_a_process_before_left_paused_is_stopped_before_anybody_resumes_it() -> None:
+    flight = Flight(takes_over=True)
+    flight.arm.target = 0.5
+    flight.arm.be(runtime_state=2)
+    flight.arm.protective_stop()
+    flight.fly(4)
+    assert flight.arm.calls == ["stop_program"]
+    assert not flight.pilot.recovering
+    flight.arm.be_resumed_at_the_pendant()
+    flight.fly(5)
+    assert flight.wrist_speed == 0.0
+
+
+def test_paused_program_that_cannot_be_stopped_keeps_nobody_from_unlocking() -> None:
+    flight = Flight(takes_over=True)
+    flight.arm.stoppable = False
+    flight.arm.be(safety_mode=3, runtime_state=4)
+    flight.fly(300)
+    assert not flight.pilot.recovering
+    assert "Protective stop" in flight.state.blocked
+    flight.arm.stoppable = True
+    assert flight.ask(Unlock()).accepted
+
+
+def test_paused_program_of_somebody_else_is_left_alone() -> None:
+    flight = Flight()
+    flight.arm.be(safety_mode=3, runtime_state=4)
+    flight.fly(300)
+    assert flight.arm.calls == []
+
+
+@pytest.mark.parametrize("takes_over", [False, True], ids=["ours", "of the process before"])
+def test_dashboard_that_does_not_answer_is_asked_again_ever_less_often_and_not_for_ever(takes_over: bool) -> None:
+    flight = Flight(takes_over=True) if takes_over else turning()
+    flight.arm.be(runtime_state=2)
+    flight.arm.stoppable = False
+    flight.arm.protective_stop()
+    times = asked_s(flight, 200.0)
+    pauses = [later - sooner for sooner, later in pairwise(times)]
+    assert times[0] < 0.05
+    assert pauses == pytest.approx(AGAIN_S, abs=0.02)
+    assert flight.state.stops_in_vain == len(times)
+    assert "the dashboard does not answer): stop it at the teach pendant, do not resume it" in flight.state.blocked
+    assert flight.state.blocked.startswith("Protective stop")
+
+
+def test_dashboard_that_says_yes_and_does_nothing_is_asked_again_and_that_is_told() -> None:
+    flight = turning()
+    stop_program = flight.arm.stop_program
+    flight.arm.stop_program = lambda: None  # type: ignore[method-assign]
+    flight.arm.protective_stop()
+    flight.fly(100)
+    assert flight.state.stops_in_vain == 0, "it may take a moment"
+    flight.fly(50)
+    assert flight.state.stops_in_vain == 1
+    assert "said that it is stopped, and it is not" in flight.state.blocked
+    flight.arm.stop_program = stop_program  # type: ignore[method-assign]
+    flight.fly_until(lambda state: "could not be stopped" not in state.blocked, 400)
+    assert flight.arm.reading.runtime_state == 1
+    assert flight.state.stops_in_vain == 1
+    assert len(flight.state.blocked) > 0
+
+
+def test_daemon_learns_before_each_time_that_it_may_take_long() -> None:
+    flight = turning()
+    flight.arm.stoppable = False
+    flight.arm.protective_stop()
+    for _ in range(400):
+        announced, before = flight.state.recovering, flight.arm.calls.count(ASKED)
+        flight.fly(1)
+        assert announced == (flight.arm.calls.count(ASKED) > before)
+
+
+def test_another_pause_is_a_new_one() -> None:
+    flight = turning()
+    flight.arm.stoppable = False
+    flight.arm.protective_stop()
+    flight.fly(5000)
+    flight.arm.stoppable = True
+    assert flight.ask(Unlock()).accepted
+    assert "could not be stopped" not in flight.state.blocked
+    flight.arm.calls.clear()
+    flight.arm.protective_stop()
+    flight.fly(3)
+    assert flight.arm.calls == [ASKED]
+
+
+def test_what_is_read_late_is_not_acted_upon() -> None:
+    """Whatever was paused then, somebody else's may be there by now."""
+    flight = turning()
+    flight.arm.protective_stop()
+    flight.arm.be(age_ns=300_000_000)
+    assert asked_s(flight, 5.0) == []
+
+
+def test_program_that_is_begun_at_the_pendant_after_ours_has_ended_is_left_alone() -> None:
+    flight = flying()
+    flight.arm.end_program()
+    flight.fly(3)
+    flight.arm.be(runtime_state=2)
+    flight.fly(3)
+    flight.arm.protective_stop()
+    assert asked_s(flight, 5.0) == []
+    assert not flight.pilot.left_paused(flight.arm.reading)
+
+
+def test_program_that_another_process_left_is_asked_for_once_more_when_this_one_leaves() -> None:
+    flight = Flight(takes_over=True)
+    flight.arm.stoppable = False
+    flight.arm.be(safety_mode=3, runtime_state=4)
+    flight.fly(10)
+    assert flight.ask(Disconnect()).accepted
+    assert asked_s(flight, 5.0) == [], "while it leaves, by who leaves"
+    assert flight.pilot.left_paused(flight.arm.reading)
+
+
+def test_paused_program_that_is_stopped_is_started_by_the_operator_alone() -> None:
+    flight = turning()
+    flight.arm.protective_stop()
+    flight.fly(100)
+    # Cleared at the pendant.
+    flight.arm.be(safety_mode=1)
+    flight.arm.calls.clear()
+    flight.fly(300)
+    assert flight.arm.calls == []
+    assert not flight.ask(Enable()).accepted
+    assert flight.ask(Unlock()).accepted
+
+
+def test_program_that_is_just_being_started_is_ours_though_the_operator_starts_anew() -> None:
+    flight = Flight()
+    flight.fly(2)
+    assert flight.arm.calls == ["clear_command", "upload"]
+    assert flight.pilot.request(1, Unlock(), flight.arm.reading, flight.now_ns) is None
+    assert flight.state.ours

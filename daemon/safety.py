@@ -36,6 +36,7 @@ class Event(Enum):
     GRIP_LOST = "grip lost"
     NOT_RELEASED = "not released"
     STATE_STALE = "state stale"
+    DEVICE_AWAITED = "device awaited"
     DEVICE_LOST = "device lost"
     TASK_DIED = "task died"
     LOOP_LATE = "loop late"
@@ -131,6 +132,11 @@ TABLE: Mapping[Event, Rule] = {
         "a device's state is out of date: {detail}.",
         "It goes on by itself when the state comes again; look at its cable, and whether this computer is overloaded.",
         hold_at_most_s=2.0,
+    ),
+    Event.DEVICE_AWAITED: Rule(
+        _KEEP,
+        "what an experiment needs has not been there yet: {detail}.",
+        "Switch it on and connect it; it is found by itself. `shearloop doctor CONFIG` examines it.",
     ),
     Event.DEVICE_LOST: Rule(
         _KEEP,

@@ -51,7 +51,7 @@ def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: in
     yield from _limits(senses, watched, settings, t_ns)
     yield from _arm_and_hand(senses, watched, t_ns)
     for name, why in senses.lost.items():
-        if name in watched.required:
+        if name in watched.required and name not in _awaited(senses, watched):
             yield Trouble(Event.DEVICE_LOST, f"{name}: {why}")
     for name, why in senses.died.items():
         yield Trouble(Event.TASK_DIED, f"{name}: {why}")
@@ -95,9 +95,9 @@ def _unusable(senses: Senses, source: Source, settings: WatchSettings, t_ns: int
 
 def _not_fresh(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> str:
     """Return why a source says nothing about the present, or the empty string."""
-    if source.name in senses.lost:
-        return f"{source.name} is gone: {senses.lost[source.name]}"
     latest = senses.torques.get(source.name)
+    if lost := senses.lost.get(source.name):
+        return f"{source.name} has not been there yet: {lost}" if latest is None else f"{source.name} is gone: {lost}"
     if latest is None:
         return f"{source.name} has not measured anything yet"
     came_s, measured_s = (t_ns - latest.t_ns) / 1e9, (t_ns - latest.t_mid_ns) / 1e9
@@ -161,10 +161,20 @@ def _limits(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int
         )
 
 
+def _awaited(senses: Senses, watched: Watched) -> tuple[str, ...]:
+    """Return the devices that have not told anything since the daemon began: of those none can be gone."""
+    robot = ("robot",) if senses.arm is None else ()
+    return (*robot, "gripper") if senses.hand is None and "gripper" in watched.required else robot
+
+
 def _arm_and_hand(senses: Senses, watched: Watched, t_ns: int) -> Iterator[Trouble]:
     arm, hand = senses.arm, senses.hand
+    if awaited := _awaited(senses, watched):
+        # All at once: before they are switched on there is one thing to say.
+        told = (f"{name}, {senses.lost[name].removesuffix('.')}" if name in senses.lost else name for name in awaited)
+        yield Trouble(Event.DEVICE_AWAITED, "; ".join(told))
     if arm is None:
-        yield Trouble(Event.DEVICE_LOST, "the robot has not reported its state yet")
+        pass
     elif t_ns - arm.t_ns > ARM_STALE_S * 1e9:
         yield Trouble(Event.STATE_STALE, f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago")
     elif arm.emergency_stop:
@@ -173,10 +183,7 @@ def _arm_and_hand(senses: Senses, watched: Watched, t_ns: int) -> Iterator[Troub
         yield Trouble(Event.PROTECTIVE_STOP, arm.blocked or "the controller reports it")
     elif arm.blocked:
         yield Trouble(Event.DEVICE_LOST, f"the robot does not move: {arm.blocked}")
-    if "gripper" not in watched.required:
-        return
-    if hand is None:
-        yield Trouble(Event.DEVICE_LOST, "the gripper has not reported its state yet")
+    if hand is None or "gripper" not in watched.required:
         return
     if t_ns - hand.t_ns > HAND_STALE_S * 1e9:
         yield Trouble(Event.STATE_STALE, f"the gripper last reported its state {(t_ns - hand.t_ns) / 1e9:.1f} s ago")

@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from daemon.experiment.steps import Limits
-from daemon.loop.senses import Arm, Senses, Source, Torque
+from daemon.loop.senses import Arm, Hand, Senses, Source, Torque
 from daemon.loop.watch import ARM_STALE_S, Watched, WatchSettings, compared_for_s, troubles
 from daemon.safety import TABLE, Event
 from drivers.ur.sample_age import SampleAge
@@ -110,6 +110,43 @@ def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_h
     (trouble,) = troubles(senses, watched(EIT, (quick,)), WatchSettings(), NOW_NS)
     assert trouble.event is Event.TORQUES_DISAGREE
     assert len(senses.recent[LOAD.name].torque_nm) <= 10 * rate_hz, "and the rest is forgotten"
+
+
+LOST = {"robot": "No UR controller at 10.0.0.1. Check that it is on.", "gripper": "There is no gripper socket."}
+
+
+def devices(lost: dict[str, str], *, arm: Arm | None = None, hand: Hand | None = None) -> list[tuple[Event, str]]:
+    """Return what is said of the devices while nothing moves."""
+    senses = Senses(arm=arm, hand=hand, lost=lost)
+    idle = replace(watched(EIT, ()), torque_needed=False, gripped=False, required=("robot", "gripper"))
+    return [(each.event, each.detail) for each in troubles(senses, idle, WatchSettings(), NOW_NS)]
+
+
+def test_devices_that_were_never_there_are_awaited_in_one_sentence() -> None:
+    assert devices({}) == [(Event.DEVICE_AWAITED, "robot; gripper")]
+    both = "robot, No UR controller at 10.0.0.1. Check that it is on; gripper, There is no gripper socket"
+    assert devices(LOST) == [(Event.DEVICE_AWAITED, both)]
+
+
+def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there() -> None:
+    arm, hand = Arm(0.0, 0.0, NOW_NS), Hand(NOW_NS, 30.0, holding=False, moving=False)
+    assert devices(LOST, arm=arm, hand=hand) == [
+        (Event.DEVICE_LOST, f"robot: {LOST['robot']}"),
+        (Event.DEVICE_LOST, f"gripper: {LOST['gripper']}"),
+    ]
+    assert devices({"gripper": LOST["gripper"]}, arm=arm) == [
+        (Event.DEVICE_AWAITED, "gripper, There is no gripper socket")
+    ]
+    assert [event for event, _ in devices(LOST, hand=hand)] == [Event.DEVICE_AWAITED, Event.DEVICE_LOST]
+
+
+def test_a_sensor_that_was_never_there_is_not_gone() -> None:
+    senses = Senses(arm=Arm(0.0, 0.0, NOW_NS), lost={"right": "There is no port."})
+    (trouble,) = troubles(senses, watched(EIT, ()), WatchSettings(), NOW_NS)
+    assert trouble.detail == "right has not been there yet: There is no port."
+    senses.hear(torque(EIT, 0.1))
+    (trouble,) = troubles(senses, watched(EIT, ()), WatchSettings(), NOW_NS)
+    assert trouble.detail == "right is gone: There is no port."
 
 
 def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wrist() -> None:

@@ -184,8 +184,9 @@ class GripperStateMessage(Message):
     diameter_std_mm: float | None = column("mm", "its standard deviation")
     tool_diameter_mm: float | None = column("mm", "diameter from gripper and fingertips, weighted by their variances")
     tool_diameter_std_mm: float | None = column("mm", "its standard deviation")
-    current_ma: float | None = column(
-        "mA", "motor current; of a gripper that stands, by way of the controller, up to half a second old"
+    current_ma: float | None = column("mA", "motor current")
+    current_age_s: float = column(
+        "s", "how long before the rest that was asked for: up to 0.5 where it stands and is reached by the controller"
     )
     object: str = column("", "moving, contact opening, contact closing or at target")
     fault: int = column("", "fault code, 0 for none")

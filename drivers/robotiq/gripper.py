@@ -28,7 +28,7 @@ from drivers.robotiq.width import COUNTS_MAX, WidthCalibration
 from drivers.serial_port import LinkEvent, ReconnectPolicy
 
 POLL_S = 0.1
-# Of so many polls of a gripper that stands one asks for everything, so that what someone else has asked of it is seen.
+# Of so many polls of a gripper that stands one asks for the current too.
 ASKED_WHOLE_EVERY = 5
 
 
@@ -62,6 +62,8 @@ class RobotiqGripper:
         self._openings = 0
         # The latest readout of a gripper that stands and of which nothing was asked since.
         self._standing: Readout | None = None
+        # When everything was asked for last, current included.
+        self._whole_ns = 0
         self._polls = 0
         self._loss: DriverError | None = None
         self.connected = False
@@ -98,7 +100,7 @@ class RobotiqGripper:
         return self.latest
 
     async def _poll(self) -> GripperState:
-        """Return the gripper's state, asked for now as far as it can change by itself, and as a whole now and then."""
+        """Return the gripper's state, asked for now; while it stands, its current only now and then."""
         self._polls += 1
         readout, t_ns = await self._read(again=self._polls % ASKED_WHOLE_EVERY != 0)
         self.latest = self._state(readout, t_ns)
@@ -229,11 +231,15 @@ class RobotiqGripper:
             standing, self._standing = self._standing, None
             try:
                 if again and standing is not None:
-                    return await self._client.read_again(standing), t_ns
-                return await self._client.read(), t_ns
+                    readout = await self._client.read_again(standing)
+                else:
+                    readout = await self._client.read()
             except DriverError as error:
                 self._note_loss(error)
                 raise
+            if readout is not standing:
+                self._whole_ns = t_ns
+            return readout, t_ns
 
     async def _write(self, request: Request) -> None:
         async with self._exchange:
@@ -261,6 +267,7 @@ class RobotiqGripper:
             object=object_status(readout, self._last_request),
             activation=readout.sta,
             current_ma=None if readout.current is None else readout.current * MA_PER_COUNT,
+            current_t_ns=self._whole_ns,
             fault=fault_of(readout.flt),
         )
         self._seq += 1

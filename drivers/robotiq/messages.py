@@ -97,7 +97,8 @@ class GripperClient(Protocol):
     async def read_again(self, before: Readout) -> Readout:
         """Return the status of a gripper that stood at `before`, and of which nothing was asked since.
 
-        What only a request changes may be that of before, unless something else has changed.
+        It is `before` itself where nothing has changed but what is of no consequence then, current and ACT; those may
+        be as old as that.
         """
 
     async def write(self, request: Request) -> None:
@@ -128,8 +129,7 @@ class SentCommand:
 class GripperState:
     """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were asked for). It is never repeated as a new one.
 
-    While it stands, of the registers by way of the controller only those of activation, object, position and fault are
-    as new as that; target and current are of the latest of every fifth poll.
+    The current alone may be older: it is of `current_t_ns`.
 
     width_mm ± width_std_mm is between the fingertips. While the fingers stand on an object, closing, diameter_mm is
     that width: a measurement of the object. `object` is MOVING until the gripper has taken up the last command.
@@ -144,6 +144,7 @@ class GripperState:
     object: ObjectStatus
     activation: ActivationStatus
     current_ma: float | None
+    current_t_ns: int
     fault: Fault
 
     @property

@@ -66,10 +66,10 @@ class SocketClient:
     async def read_again(self, before: Readout) -> Readout:
         """Return the same, of which fewer are asked for while the fingers stand as before.
 
-        Each question wakes this process: half of them are half of what the gripper costs.
+        Each question wakes this process.
         """
         values = await self._values(STANDING_ORDER)
-        if tuple(values.values()) != (before.sta, before.obj, before.pos, before.flt):
+        if tuple(values.values()) != (before.sta, before.gto, before.pre, before.obj, before.pos, before.flt):
             return await self.read()
         return before
 

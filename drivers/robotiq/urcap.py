@@ -22,9 +22,9 @@ _ACK = b"ack"
 MAX_REPLY_BYTES = 32
 # PRE before OBJ, and OBJ before POS: what OBJ says is then never older than the target, nor the position than the stop.
 READ_ORDER = ("ACT", "STA", "GTO", "PRE", "OBJ", "POS", "FLT", "COU")
-# What tells whether a gripper that stands still does, and still is active, which safety goes by. Of the others GTO, PRE
-# and ACT change by a request alone, and the current of a gripper that stands is of no use in between.
-STANDING_ORDER = ("STA", "OBJ", "POS", "FLT")
+# What tells whether a gripper that stands still does, still is active and still does what it was asked to: all that a
+# state tells but the current, which has an age of its own.
+STANDING_ORDER = ("STA", "GTO", "PRE", "OBJ", "POS", "FLT")
 # Older URCaps have no motor current.
 _OPTIONAL = ("COU",)
 

@@ -1,18 +1,25 @@
-"""How a gripper that stands is asked."""
+"""A gripper that stands: how it is asked, and that nothing old is told as new."""
 
+import asyncio
 import contextlib
+from collections.abc import AsyncIterator
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
 
 from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import (
     ActivationStatus,
     GoTo,
     GripperCommand,
+    GripperState,
     ObjectStatus,
     Readout,
     Request,
 )
-from tests.drivers.robotiq.gripper_rig import CALIBRATION
+from tests.drivers.robotiq.gripper_rig import CALIBRATION, STEP_S, WAYS, Rig, a_rig
 
 
 class Counted:
@@ -61,3 +68,47 @@ async def test_a_gripper_that_stands_is_asked_as_a_whole_every_fifth_time_and_af
         await gripper.halt()
         await anext(states)
         assert client.asked == ["whole", "write", "whole"]
+
+
+@contextlib.asynccontextmanager
+async def holding(way: str, tmp_path: Path) -> AsyncIterator[tuple[Rig, AsyncIterator[GripperState]]]:
+    """Return a rig whose gripper holds an object and stands, with time stopped, and its states."""
+    async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
+        await anext(states)
+        await rig.driver.activate()
+        rig.object_mm = 20.0
+        await rig.driver.finish(await rig.driver.move(GripperCommand(0.0)))
+        rig.stopped = True
+        # The first of them is asked for as a whole, and the next in part.
+        while (await anext(states)).object is not ObjectStatus.CONTACT_CLOSING or rig.driver._polls % 5:
+            pass
+        yield rig, states
+
+
+@WAYS
+@pytest.mark.parametrize("asked", [{"gto": False}, {"pos": 250}], ids=["halted", "sent further"])
+async def test_what_another_master_asks_of_a_gripper_that_stands_is_seen_at_the_next_poll(
+    way: str, tmp_path: Path, asked: dict[str, Any]
+) -> None:
+    """It holds as before, which is what position and object tell; but whether it does is no longer what we asked."""
+    async with holding(way, tmp_path) as (rig, states):
+        for name, wanted in asked.items():
+            setattr(rig.model.command, name, wanted)
+        rig.model.step(STEP_S)
+        assert rig.model.obj == ObjectStatus.CONTACT_CLOSING
+        assert (await anext(states)).diameter_mm is None
+
+
+@WAYS
+async def test_the_age_of_a_current_is_told(way: str, tmp_path: Path) -> None:
+    async with holding(way, tmp_path) as (rig, states):
+        whole = await anext(states)
+        for polls in range(12):
+            rig.t_s += 0.1
+            # As of a motor that warms up.
+            rig.model._current += 1
+            state = await anext(states)
+            assert state.t_ns - whole.t_ns == pytest.approx((polls + 1) * 1e8, abs=1e3)
+            behind = round((state.t_ns - state.current_t_ns) / 1e8)
+            assert state.current_ma == 10.0 * (rig.model.current - behind)
+            assert 0 <= behind <= (4 if way == "socket" else 0)

@@ -84,14 +84,14 @@ async def test_of_a_gripper_that_stands_as_before_no_more_is_asked_than_tells_th
     async with connected(peer) as client:
         before = await client.read()
         values["COU"] = 9
-        assert await client.read_again(before) == before
+        assert await client.read_again(before) is before
         assert peer.lines == [*whole, *some]
-        for changed, now in (("POS", 50), ("OBJ", 2), ("FLT", 9), ("STA", 0)):
+        for changed, now in (("POS", 50), ("OBJ", 2), ("FLT", 9), ("STA", 0), ("GTO", 0), ("PRE", 60)):
             peer.lines.clear()
-            values.update({changed: now, "PRE": now})
+            values.update({changed: now, "COU": now})
             after = await client.read_again(before)
             assert peer.lines == [*some, *whole]
-            assert after.pre == now
+            assert after.current == now
             assert after != before
             values.pop(changed)
             values["STA"] = 3

@@ -36,15 +36,16 @@ def recordings(folder: Path, scratch: Path) -> dict[str, FrameSeries]:
     found = {}
     streams = folder / "streams"
     for name, inside in BOTH_DAYS.items():
-        found[name] = _imported([streams / inside], scratch / f"{inside}.mcap")
+        found[name] = imported([streams / inside], scratch / f"{inside}.mcap")
         found[name + EXCHANGED] = replace(found[name], channels=found[name].channels[:, ::-1].copy())
     for mm in DIAMETERS_MM:
         files = sorted((streams / "cylinders").glob(f"{mm}mm_*.mat"))
-        found[f"cylinder of {mm} mm"] = _imported(files, scratch / f"{mm}mm.mcap")
+        found[f"cylinder of {mm} mm"] = imported(files, scratch / f"{mm}mm.mcap")
     return found
 
 
-def _imported(sources: list[Path], out: Path) -> FrameSeries:
+def imported(sources: list[Path], out: Path) -> FrameSeries:
+    """Return what files of the paper hold, imported as a recording."""
     import_mat(sources, out)
     return series_of(read_recording(out))
 

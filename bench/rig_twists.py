@@ -29,7 +29,8 @@ from drivers.emulators.rig import NOISE_NM, SIDES, FrameOf
 from drivers.emulators.robotiq.gripper import Command, Gripper
 from drivers.emulators.scene import Scene
 
-DIAMETERS_MM = (10.0, 25.0, 40.0)
+# Three are enough to read others between them by; of five the interval is half as wide (python -m bench.cylinders).
+DIAMETERS_MM = (10.0, 17.5, 25.0, 32.5, 40.0)
 # Of the twin: an injection of a frame takes about as long.
 STEP_S = 0.02
 IDLE_S, SETTLE_S = 12.0, 10.0

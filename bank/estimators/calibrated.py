@@ -254,13 +254,14 @@ class Tracker:
             said = np.full(N_CHANNELS, np.nan) if curve else guard.filled(difference[0], usable[0])
             difference = np.where(usable, difference, said)
         seen = features_of(calibration, self._locator, difference, places, t_s)
+        held = self._memory.held if self._memory is not None else difference
         if seen.place is not None and seen.place.ambiguous:
             return _with_place(
                 Estimate(valid=False, why=("two places of the bank far apart fit the frame equally well",)), seen.place
             )
         values: dict[str, tuple[float, float, float]] = {}
         for name, task in wanted.items():
-            features = read_from(calibration, name, seen.features, difference)
+            features = read_from(calibration, name, seen.features, held)
             widening = 1.0 if task.guard is None else task.guard.widening(difference[0], usable[0])
             read = task.reader.read(features, usable_share, widening)
             why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])
@@ -278,13 +279,13 @@ def columns_for(estimator: Name, quantity: str, features: FloatArray) -> FloatAr
     return features[..., PAPER_COLUMNS[quantity]] if estimator == "paper" else features
 
 
-def read_from(calibration: Calibration, quantity: str, features: FloatArray, difference: FloatArray) -> FloatArray:
-    """Return the (d,) features that a quantity is read from, given a frame's and its (m, 896) difference.
+def read_from(calibration: Calibration, quantity: str, features: FloatArray, held: FloatArray) -> FloatArray:
+    """Return the (d,) features that a quantity is read from, given a frame's and the (m, 896) mean place of its grip.
 
-    A diameter is read from where the gel stands, whatever the torque is read from.
+    A diameter is read from where the gel has stood in this grip, whatever the torque is read from.
     """
     if calibration.motion is not None and quantity == "diameter":
-        return np.asarray((difference / calibration.scale).ravel())
+        return np.asarray((held / calibration.scale).ravel())
     return columns_for(calibration.estimator, quantity, features)
 
 

@@ -22,8 +22,8 @@ from bank.estimators.calibrated import (
     columns_for,
     features_of,
     locator_for,
-    read_from,
 )
+from bank.estimators.cylinders import LEAST_LEFT, Gripped, fit_cylinders
 from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import SideGuard
@@ -34,7 +34,6 @@ from bank.estimators.reader import (
     STRENGTHS,
     Difficulty,
     Head,
-    HeadOf,
     Reader,
     error_on_later,
     fit_reader,
@@ -281,20 +280,30 @@ def _diameter_task(calibration: Calibration, rows: list["_Row"]) -> Task | None:
     """Return how diameters are read, None where the recordings do not know of different ones."""
     # Each recording has one tool: in the order of time within them, every part has all.
     known = sorted((row for row in rows if np.isfinite(row.diameter_mm)), key=lambda row: row.since_s)
+    if len({row.diameter_mm for row in known}) < _LEAST_DIAMETERS:
+        return None
+    if calibration.motion is not None:
+        return Task(fit_cylinders(_grips(known)), None, np.zeros(0))
     known = known[:: 1 + len(known) // _MOST_FOR_DIAMETER]
     diameters = np.array([row.diameter_mm for row in known])
-    if len(np.unique(diameters)) < _LEAST_DIAMETERS:
-        return None
-    features = np.array([read_from(calibration, "diameter", row.features, row.difference) for row in known])
-    motion = calibration.motion is not None
-    head: HeadOf = Ridge.fit if motion else _ridge(calibration.estimator)
-    strengths = STRENGTHS if motion else _strengths(calibration.estimator)
+    features = np.array([columns_for(calibration.estimator, "diameter", row.features) for row in known])
     # Whoever grips a tool again sees another recording, not a later part of this one.
     number = np.array([row.recording for row in known])
     each = [(np.flatnonzero(number != one), np.flatnonzero(number == one)) for one in np.unique(number)]
-    left_out = [pair for pair in each if len(np.unique(diameters[pair[0]])) >= _LEAST_DIAMETERS]
+    left_out = [pair for pair in each if len(np.unique(diameters[pair[0]])) >= LEAST_LEFT]
+    head, strengths = _ridge(calibration.estimator), _strengths(calibration.estimator)
     reader = fit_reader(features, diameters, head, strengths=strengths, left_out=left_out)
     return Task(reader, None, _ks(calibration.estimator, np.array([row.features for row in known])))
+
+
+def _grips(rows: list["_Row"]) -> list[Gripped]:
+    """Return what each recording's frames say of its tool."""
+    grips = []
+    for number in sorted({row.recording for row in rows}):
+        own = [row for row in rows if row.recording == number]
+        frames, held = (np.array([getattr(row, name) for row in own]) for name in ("place", "held"))
+        grips.append(Gripped(own[0].diameter_mm, frames, held))
+    return grips
 
 
 def _undetermined(recordings: list[FrameSeries], unexplained: float) -> bool:
@@ -309,12 +318,16 @@ def _tools(recordings: Sequence[FrameSeries]) -> list[Measured]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """One frame that is calibrated on: of which recording, how long after its first, what is seen and what is true."""
+    """One frame that is calibrated on: of which recording, how long after its first, what is seen and what is true.
+
+    place and held (d,) are the difference to the idle frame and its mean over the grip, in units of noise.
+    """
 
     recording: int
     since_s: float
     features: FloatArray
-    difference: FloatArray
+    place: FloatArray
+    held: FloatArray
     torque_nm: float
     diameter_mm: float
 
@@ -332,7 +345,8 @@ def _replayed(
         if not moment.why and np.isfinite(torque) and i % every == 0:
             features = features_of(calibration, locator, moment.difference, memory.places, float(t_s)).features
             since_s = float(t_s - series.t_s[0])
-            rows.append(_Row(recording, since_s, features, moment.difference, float(torque), float(diameter)))
+            place, held = ((one / calibration.scale).ravel() for one in (moment.difference, memory.held))
+            rows.append(_Row(recording, since_s, features, place, held, float(torque), float(diameter)))
     return rows
 
 

@@ -20,7 +20,10 @@ from bank.estimators.guards import Guards
 from bank.estimators.values import BoolArray, FloatArray, TactileFrame, everywhere
 
 # Frames that an idle baseline is averaged over at the most recent end.
-_BASELINE_FRAMES = 10
+BASELINE_FRAMES = 10
+# Frames, half a minute of them, that the mean place of a grip reaches back over: twists come and go within it, and the
+# gel's creep does not add up.
+_HELD_FRAMES = 60
 # Frames further apart than this have lost the thread: two of a period of 0.54 s are missing.
 _LARGEST_GAP_S = 1.4
 # Of so many steps in time the middle one is the period, if that is not known to be shorter; a step longer than this
@@ -112,11 +115,14 @@ class Memory:
         self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
         self._newest: FloatArray = np.zeros(0)
         self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
-        self._idle: list[deque[FloatArray]] = [deque(maxlen=_BASELINE_FRAMES) for _ in guards]
+        self._idle: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in guards]
         # The calibration's, until the session has its own.
         self._baselines = self._guards.idle.copy()
         # (m, 1) of each fingertip's idle frame of this session against the calibration's.
         self._gains: FloatArray = np.ones((len(guards), 1))
+        # The mean difference to the idle frame since the grip, and of how many frames.
+        self._held: FloatArray = np.zeros_like(self._baselines)
+        self._n_held = 0
         self._begun = False
         self._before: FloatArray | None = None
         self._refused: FloatArray | None = None
@@ -155,6 +161,14 @@ class Memory:
         None while incomplete.
         """
         return np.array(self._recent) if len(self._recent) == self._recent.maxlen else None
+
+    @property
+    def held(self) -> FloatArray:
+        """The (m, 896) mean difference to the idle frame of this grip's last frames that nothing spoke against.
+
+        What does not change while a tool is held is read from it: a single frame has several times the noise.
+        """
+        return self._held
 
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
@@ -243,7 +257,12 @@ class Memory:
             return Moment(channels, difference, (f"gripped too lately: {missing} more frames are needed",), usable)
         if sum(self._bridged) > _LARGEST_BRIDGED:
             return Moment(channels, difference, ("too many of the last frames were disturbed, or are missing",), usable)
+        self._hold(difference)
         return Moment(channels, difference, (), usable)
+
+    def _hold(self, difference: FloatArray) -> None:
+        self._n_held = min(self._n_held + 1, _HELD_FRAMES)
+        self._held = difference if self._n_held == 1 else self._held + (difference - self._held) / self._n_held
 
     def _holds(self, layer: int, score: float) -> bool:
         """Return whether a fingertip is gripped; with a baseline of a few frames only an outright grip is one."""
@@ -324,6 +343,7 @@ class Memory:
     def _forget_grip(self) -> None:
         self._recent.clear()
         self._bridged.clear()
+        self._n_held = 0
 
     def _forget(self) -> None:
         self._forget_grip()

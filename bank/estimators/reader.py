@@ -28,7 +28,7 @@ _INFLATION = 1.05
 _CURVE_INFLATION = 0.81
 _LEAST_FRAMES = 8
 # No interval is narrower than this share of the calibrated range: a load cell has noise too.
-_LEAST_HALF_WIDTH = 1e-3
+LEAST_HALF_WIDTH = 1e-3
 # Values this far beyond the calibrated range, in spans of it, are extrapolated and not believed.
 _LARGEST_BEYOND = 0.35
 # Features this many times larger than any at calibration are of something else.
@@ -145,7 +145,7 @@ def fit_reader(
         inflation = _CURVE_INFLATION
     centre = features.mean(axis=0)
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)
-    least = _LEAST_HALF_WIDTH * float(np.ptp(values))
+    least = LEAST_HALF_WIDTH * float(np.ptp(values))
     intervals = Intervals.fit(predicted, residuals / hardness, edges, inflation, least)
     low_end, high_end = -np.inf, np.inf
     if difficulty is not None:

@@ -47,7 +47,7 @@ class Twins:
 
     @classmethod
     def _explaining(cls, differences: FloatArray, largest_misfit: float) -> Self:
-        pairs = _paired(differences)
+        pairs = paired(differences)
         mean, variance = pairs.mean(axis=0), pairs.var(axis=0)
         # Half is everybody's: of few slices a channel's own variance says little.
         spread = np.sqrt(0.5 * variance + 0.5 * np.median(variance) + np.finfo(np.float64).tiny)
@@ -57,10 +57,10 @@ class Twins:
     def misfit(self, difference: FloatArray, usable: BoolArray) -> float:
         """Return the median square by which a (896,) difference is off to the side of the directions."""
         both = usable[_FIRST] & usable[_SECOND]
-        x, v = ((_paired(difference) - self.mean) / self.spread)[both], self.directions[:, both]
+        x, v = ((paired(difference) - self.mean) / self.spread)[both], self.directions[:, both]
         return float(np.median((x - np.linalg.lstsq(v.T, x, rcond=None)[0] @ v) ** 2))
 
 
-def _paired(differences: FloatArray) -> FloatArray:
+def paired(differences: FloatArray) -> FloatArray:
     """Return the (…, 448) means of what is measured twice in (…, 896) differences."""
     return np.asarray((differences[..., _FIRST] + differences[..., _SECOND]) / 2)

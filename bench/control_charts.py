@@ -2,14 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from bench.closed_loop import Trace
+from daemon.topics import STALE_AFTER_PERIODS
 
 mpl.use("Agg")
 mpl.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "savefig.dpi": 130})
@@ -107,3 +110,47 @@ def _draw_traces(axis: Axes, traces: Mapping[str, Trace], title: str, top_nm: fl
         axis.plot(trace.t_s - trace.t_s[0], trace.torque_nm, style, color=_INK, linewidth=1.2, label=name)
     _draw_band(axis, top_nm)
     axis.set_title(title, fontsize=10)
+
+
+def draw_rig_faults(path: Path, faults: Sequence[Mapping[str, Any]], gaps_ms: Mapping[str, Sequence[float]]) -> None:
+    """Draw how soon each fault was told, and how regularly the robot's states come (each sorted)."""
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    draw_answers(left, faults)
+    for (name, gaps), style, ink in zip(gaps_ms.items(), _STYLES, (_INK, _MIDDLE, _INK), strict=False):
+        longer = 1.0 - np.arange(len(gaps)) / len(gaps)
+        right.plot(gaps, longer, style, color=ink, linewidth=1.4, label=name, drawstyle="steps-post")
+    right.set_xscale("log")
+    right.set_yscale("log")
+    right.set_xlabel("time between two states of the robot / ms (125 a second)")
+    right.set_ylabel("share that is longer")
+    right.legend(fontsize=7, frameon=False)
+    figure.savefig(path)
+
+
+def draw_answers(axis: Axes, faults: Sequence[Mapping[str, Any]]) -> list[Text]:
+    """Draw a bar for each fault, with its time, in it where it is long: no label on the limit or beyond the frame."""
+    stale = STALE_AFTER_PERIODS
+    longest = max(stale, *(fault["periods"] for fault in faults))
+    axis.axvline(stale, color=_INK, linewidth=0.8, linestyle=":", zorder=0, label=f"stale: {stale:g} periods")
+    axis.barh([fault["fault"] for fault in faults], [fault["periods"] for fault in faults], color=_MIDDLE)
+    labels: list[Text] = []
+    for place, fault in enumerate(faults):
+        inside = fault["periods"] > 0.5 * stale
+        labels.append(
+            axis.annotate(
+                f"{fault['after_s'] * 1e3:.0f} ms",
+                (fault["periods"], place),
+                xytext=(-3 if inside else 3, 0),
+                textcoords="offset points",
+                ha="right" if inside else "left",
+                va="center",
+                color="white" if inside else _INK,
+                fontsize=7,
+            )
+        )
+    axis.set_xlim(0.0, 1.04 * longest)
+    axis.set_xlabel("periods of the topic from the fault to the response")
+    axis.legend(fontsize=7, frameon=False, loc="lower right")
+    axis.invert_yaxis()
+    return labels

@@ -7,7 +7,7 @@ twist something fails; measured is the time until `loop.state` tells of it, in p
 failed, what the operator reads, and whether the next experiment runs to its end after the fault has gone. Then the
 daemon is killed with SIGKILL in the middle of a twist, and the emulated robot says when it stood. Then the robot's
 states are timed as they arrive, while as many busy processes as there are processors compete with the loop.
-Writes rig_faults.json and rig_faults.png.
+Writes rig_faults.json and rig_faults.png; `--only-draw` draws anew what the JSON says.
 """
 
 import argparse
@@ -266,39 +266,28 @@ def measure_kill(bench: Bench) -> dict[str, Any]:
     return {"stopped_after_s": (stopped["t_mono_ns"] - killed_ns) / 1e9, "asked_s": STOPPED_WITHIN_S}
 
 
-def draw(path: Path, faults: list[dict[str, Any]], jitter: dict[str, NDArray[np.float64]]) -> None:
-    """Draw how soon each fault was told, and how regularly the robot's states come."""
-    from matplotlib.figure import Figure
+def _draw(folder: Path) -> None:
+    # Not loaded beside what is timed.
+    from bench.control_charts import draw_rig_faults
 
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    names = [fault["fault"] for fault in faults]
-    left.barh(names, [fault["periods"] for fault in faults], color="tab:blue")
-    for place, fault in enumerate(faults):
-        left.text(fault["periods"], place, f" {fault['after_s'] * 1e3:.0f} ms", va="center", fontsize=7)
-    left.axvline(2.5, color="tab:red", linewidth=0.8, label="stale: 2.5 periods")
-    left.set_xlabel("periods of the topic from the fault to the response")
-    left.legend(fontsize=7)
-    left.invert_yaxis()
-    for name, gaps in jitter.items():
-        ordered = np.sort(gaps) * 1e3
-        right.plot(ordered, 1.0 - np.arange(len(ordered)) / len(ordered), label=name, drawstyle="steps-post")
-    right.set_xscale("log")
-    right.set_yscale("log")
-    right.set_xlabel("time between two states of the robot, ms (125 a second)")
-    right.set_ylabel("share that is longer")
-    right.legend(fontsize=7)
-    figure.savefig(path, dpi=120)
+    told = json.loads((folder / "rig_faults.json").read_text())
+    draw_rig_faults(folder / "rig_faults.png", told["faults"], told["gaps_ms"])
 
 
 def main() -> None:
     """Measure, write the numbers, draw the chart."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--bank", type=Path, required=True)
-    parser.add_argument("--calibration", type=Path, required=True)
+    parser.add_argument("--bank", type=Path)
+    parser.add_argument("--calibration", type=Path)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--host", default="127.0.0.62")
+    parser.add_argument("--only-draw", action="store_true", help="measure nothing, draw what rig_faults.json says")
     args = parser.parse_args()
+    if args.only_draw:
+        _draw(args.out)
+        return
+    if args.bank is None or args.calibration is None:
+        parser.error("to measure, --bank and --calibration are needed")
     args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         bench = Bench(Path(folder), args, stack)
@@ -318,9 +307,10 @@ def main() -> None:
         name: {f"p{q:g}_s": float(np.quantile(gaps, q / 100)) for q in (1, 50, 99, 99.9)} | {"n": len(gaps)}
         for name, gaps in jitter.items()
     }
-    result = {"faults": faults, "between_states": quantiles, "sigkill": killed}
-    (args.out / "rig_faults.json").write_text(json.dumps(result, indent=2, ensure_ascii=False) + "\n")
-    draw(args.out / "rig_faults.png", faults, jitter)
+    gaps_ms = {name: (np.sort(gaps) * 1e3).round(3).tolist() for name, gaps in jitter.items()}
+    result = {"faults": faults, "between_states": quantiles, "sigkill": killed, "gaps_ms": gaps_ms}
+    (args.out / "rig_faults.json").write_text(json.dumps(result, ensure_ascii=False) + "\n")
+    _draw(args.out)
     print(json.dumps({"between_states": quantiles, "sigkill": killed}, indent=2))
 
 

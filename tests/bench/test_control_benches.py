@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from bench import stability_map, step_response, twin_step
 from bench.closed_loop import nanoseconds, run
+from bench.control_charts import draw_answers
 from bench.plant import LOAD_CELL, Plant, Sensor, Tool
 from daemon.control.controller import WristCommand
 
@@ -121,3 +123,19 @@ def test_the_step_on_the_rigs_own_physics_is_held_and_a_screw_ends_at_its_target
     assert (abs(beyond) <= allowed).all()
     creep = twin_step.calibrated_creep()
     assert (creep.share, creep.time_s) == (pytest.approx(0.08, abs=0.02), pytest.approx(20.0, rel=0.5))
+
+
+@pytest.mark.parametrize("periods", [0.2, 1.2, 1.3, 2.3, 2.42, 2.5, 2.6, 4.0])
+def test_no_label_lies_on_the_limits_line_or_beyond_the_frame(periods: float) -> None:
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, _ = figure.subplots(1, 2)
+    faults = [{"fault": name, "periods": p, "after_s": 10.0} for name, p in (("short", 0.1), ("the one", periods))]
+    _, label = draw_answers(left, faults)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    box = label.get_window_extent(canvas.get_renderer())  # type: ignore[no-untyped-call]
+    line, end = (left.transData.transform((x, 0.0))[0] for x in (2.5, periods))
+    in_the_bar = box.x1 < end
+    assert in_the_bar or box.x1 < line, "the bar covers the line"
+    assert left.bbox.x0 < box.x0
+    assert box.x1 < left.bbox.x1

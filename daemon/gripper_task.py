@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 
 from bank.estimators import Measured, fused
 from bank.gaussian import TWO_SIDED_95
@@ -17,8 +17,8 @@ from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
 
 RELEASE_WIDTH_MM = 140.0
-# Longer than a lost connection takes to be there again.
-RELEASE_WITHIN_S, RELEASE_AGAIN_S = 5.0, 0.1
+# What a stop asks for is tried for longer than a lost connection takes to be there again.
+TRIED_FOR_S, TRIED_AGAIN_S = 5.0, 0.1
 
 
 class GripperTask:
@@ -64,15 +64,18 @@ class GripperTask:
         return ""
 
     async def release(self) -> str:
-        """Open wide; return why it went wrong, or an empty text.
+        """Open wide; return why it went wrong, or an empty text."""
+        return await _tried(lambda: self.grip(GripTo(RELEASE_WIDTH_MM, 100.0, 10.0, expect_object=False)))
 
-        It is tried again for a while: a grip that is broken off for it may have cost the connection.
-        """
-        tries_until_s = asyncio.get_running_loop().time() + RELEASE_WITHIN_S
-        while why := await self.grip(GripTo(RELEASE_WIDTH_MM, 100.0, 10.0, expect_object=False)):
-            if asyncio.get_running_loop().time() > tries_until_s:
-                return why
-            await asyncio.sleep(RELEASE_AGAIN_S)
+    async def halt(self) -> str:
+        """Stop the fingers where they are; return why it went wrong, or an empty text."""
+        return await _tried(self._halt)
+
+    async def _halt(self) -> str:
+        try:
+            await self._gripper.halt()
+        except DriverError as error:
+            return str(error)
         return ""
 
     async def unlock(self) -> str:
@@ -117,6 +120,16 @@ class GripperTask:
                 fault_text=state.fault.sentence if state.fault.code else "",
             )
         )
+
+
+async def _tried(act: Callable[[], Awaitable[str]]) -> str:
+    """Return an empty text once something has gone well, or why it has not for a while."""
+    tries_until_s = asyncio.get_running_loop().time() + TRIED_FOR_S
+    while why := await act():
+        if asyncio.get_running_loop().time() > tries_until_s:
+            return why
+        await asyncio.sleep(TRIED_AGAIN_S)
+    return ""
 
 
 def tool_diameter(state: GripperState, fingertips: Measured | None) -> Measured | None:

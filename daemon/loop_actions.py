@@ -35,6 +35,8 @@ class DeviceActions:
         self._free.set()
         # Whether a straight move is under way, and whether it was held back since it was begun.
         self._moves = self._interrupted = False
+        # Whether the fingers were told to go somewhere, and are not known to have come there.
+        self.grips = False
 
     async def perform(self, action: Action) -> str:
         """Carry an action out to its end; return why it went wrong, or an empty text."""
@@ -44,11 +46,18 @@ class DeviceActions:
             case GripTo():
                 if self._gripper is None:
                     return "no gripper is configured; add a `gripper` section to the configuration"
-                return await self._gripper.grip(action)
+                return await self._grip(self._gripper, action)
             case TakeZero():
                 return await self._zero()
             case _:
                 raise TypeError(f"{action} is not carried out by devices")
+
+    async def _grip(self, gripper: GripperTask, action: GripTo) -> str:
+        self.grips = True
+        try:
+            return await gripper.grip(action)
+        finally:
+            self.grips = False
 
     def hold_back(self) -> bool:
         """Begin no straight move until `let_go`; return whether one has to be stopped for it, once for each."""

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 
 import structlog
 
@@ -75,8 +76,8 @@ class LoopTask:
         self._unanswered = 0
         self._actions = DeviceActions(robot, gripper, take_zero, lambda: bool(self._sent_rad_per_s or self._unanswered))
         self._action: asyncio.Task[None] | None = None
-        # The last of them that lets a tool go after a stop.
-        self._release: asyncio.Task[None] | None = None
+        # The last of them that a stop asks of the gripper: to open, or to move no more.
+        self._last_word: asyncio.Task[None] | None = None
         # What the loop, or a command of it, died of since the brain was told last.
         self._own_death = ""
         self._sent_rad_per_s = 0.0
@@ -133,9 +134,9 @@ class LoopTask:
                 self._tell(now_ns)
             self._listen()
         except Exception as error:  # noqa: BLE001 - raised again by `drive`, whose task it ends
-            if self._action is not self._release:
+            if self._action is not self._last_word:
                 # First of all: it may be about to begin a straight move, which would come after the stop.
-                self._cancel_action()
+                self._break_off()
             self._listen_no_more()
             if self._over is not None and not self._over.done():
                 self._over.set_result(error)
@@ -181,9 +182,11 @@ class LoopTask:
         return experiment
 
     async def released(self) -> None:
-        """Wait until the gripper has opened, or could not, where a stop has told it to."""
-        if self._release is not None:
-            await asyncio.wait({self._release}, timeout=RELEASED_WITHIN_S)
+        """Wait until the gripper has opened or stopped, or could not, where it was told to; fingers that move are."""
+        if self._actions.grips:
+            self._break_off()
+        if self._last_word is not None:
+            await asyncio.wait({self._last_word}, timeout=RELEASED_WITHIN_S)
 
     async def unlock(self) -> str | None:
         """Let robot and gripper move again after a stop, on the operator's word; return why they would not."""
@@ -264,11 +267,11 @@ class LoopTask:
         if orders.stop:
             if not self._stopped:
                 self._stopped = True
-                self._cancel_action()
+                self._break_off()
                 self._send(Stop(self._acceleration_rad_per_s2))
             if orders.release and self._gripper is not None:
-                self._begin(self._gripper.release(), self._has_released)
-                self._release = self._action
+                self._begin(self._gripper.release, self._has_released)
+                self._last_word = self._action
             return
         self._stopped = False
         if not orders.hold:
@@ -276,7 +279,7 @@ class LoopTask:
         elif self._actions.hold_back():
             self._send(Stop(self._acceleration_rad_per_s2))
         if orders.begin is not None:
-            self._begin(self._actions.perform(orders.begin), self._brain.action_ended)
+            self._begin(partial(self._actions.perform, orders.begin), self._brain.action_ended)
         speed = orders.wrist_rad_per_s
         if speed == 0.0 and self._sent_rad_per_s == 0.0:
             return
@@ -305,13 +308,13 @@ class LoopTask:
         structlog.get_logger().exception("a command to the robot died")
         self._own_death = _said(error)
 
-    def _begin(self, action: Awaitable[str], tell: Callable[[str], None]) -> None:
+    def _begin(self, act: Callable[[], Awaitable[str]], tell: Callable[[str], None]) -> None:
         """Carry an action out beside the loop; `tell` hears why it went wrong, or an empty text."""
         self._cancel_action()
 
         async def carried_out() -> None:
             try:
-                failure = await action
+                failure = await act()
             except Exception as error:  # noqa: BLE001 - the step has failed, whatever of
                 structlog.get_logger().exception("an action of the devices died")
                 failure = f"it died of {_said(error)}; the log has more"
@@ -323,6 +326,19 @@ class LoopTask:
         if failure:
             structlog.get_logger().error("the gripper was told to open and did not", why=failure)
         self._brain.release_ended(failure)
+
+    def _break_off(self) -> None:
+        """End the action that is under way; fingers that move go on by themselves, and are told not to."""
+        fingers_move = self._actions.grips
+        self._cancel_action()
+        if fingers_move and self._gripper is not None:
+            self._begin(self._gripper.halt, self._has_halted)
+            self._last_word = self._action
+
+    def _has_halted(self, failure: str) -> None:
+        if failure:
+            structlog.get_logger().error("the fingers were told to stop and did not", why=failure)
+            self._brain.note_refusal(f"the fingers were told to stop and did not: {failure}")
 
     def _cancel_action(self) -> None:
         if self._action is not None:

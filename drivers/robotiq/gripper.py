@@ -3,7 +3,8 @@
 import asyncio
 import math
 import time
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
+from typing import TypeVar
 
 from drivers.errors import DriverError
 from drivers.robotiq.faults import GripperFaultError, GripperRefusedError, fault_of
@@ -13,6 +14,7 @@ from drivers.robotiq.messages import (
     MA_PER_COUNT,
     SPEED_MAX_MM_S,
     SPEED_MIN_MM_S,
+    ActivationStatus,
     GoTo,
     GripperClient,
     GripperCommand,
@@ -21,11 +23,14 @@ from drivers.robotiq.messages import (
     ObjectStatus,
     Readout,
     Request,
+    Reset,
     SentCommand,
 )
 from drivers.robotiq.sequences import ActivationSequence, MotionWatch, blocking_fault, object_status
 from drivers.robotiq.width import COUNTS_MAX, WidthCalibration
 from drivers.serial_port import LinkEvent, ReconnectPolicy
+
+T = TypeVar("T")
 
 POLL_S = 0.1
 # Of so many polls of a gripper that stands one asks for the current too.
@@ -35,8 +40,9 @@ ASKED_WHOLE_EVERY = 5
 class RobotiqGripper:
     """One gripper: activation, motion, state, reconnection.
 
-    Commands and polling may come from different tasks: each exchange with the gripper is whole. A lost connection
-    raises DeviceLostError in the call that meets it, and `latest` is None from then on until new registers were read.
+    Commands and polling may come from different tasks: each exchange with the gripper is whole, that of a command also
+    where who gave it is cancelled. A lost connection raises DeviceLostError in the call that meets it, and `latest` is
+    None from then on until new registers were read.
     """
 
     def __init__(
@@ -114,7 +120,7 @@ class RobotiqGripper:
         After a major fault the operator has to say that the fingers are clear: only then, with `operator_confirmed`,
         is ACT raised again, and in any state. Raises GripperFaultError when it is refused or fails.
         """
-        readout, t_ns = await self._read()
+        readout, t_ns = await _whole(self._read())
         fault = fault_of(readout.flt)
         if not operator_confirmed:
             if fault.needs_activation:
@@ -126,11 +132,11 @@ class RobotiqGripper:
             request = sequence.step(readout, t_ns)
             if request is not None:
                 self._last_request = None
-                await self._write(request)
+                await _whole(self._write(request))
             elif not sequence.done:
                 await asyncio.sleep(self._poll_s)
             if not sequence.done:
-                readout, t_ns = await self._read()
+                readout, t_ns = await _whole(self._read())
         return self._state(readout, t_ns)
 
     async def move(self, command: GripperCommand) -> SentCommand:
@@ -139,19 +145,19 @@ class RobotiqGripper:
         Raises GripperRefusedError for a command that is no number, GripperFaultError when the gripper would not move.
         """
         sent = self.clip(command)
-        readout, _ = await self._read()
+        readout, _ = await _whole(self._read())
         blocking = blocking_fault(readout)
         if blocking is not None:
             raise GripperFaultError(blocking)
         self._last_request = sent.request
-        await self._write(sent.request)
+        await _whole(self._write(sent.request))
         return sent
 
     async def finish(self, sent: SentCommand) -> GripperState:
         """Return the state in which the motion ended: at its target, or on an object."""
         watch = MotionWatch(sent.request, self._clock_ns())
         while True:
-            readout, t_ns = await self._read()
+            readout, t_ns = await _whole(self._read())
             if self._last_request is not sent.request:
                 raise GripperRefusedError("Another command took over before the gripper had finished its motion.")
             if watch.finished(readout, t_ns):
@@ -159,9 +165,15 @@ class RobotiqGripper:
             await asyncio.sleep(self._poll_s)
 
     async def halt(self) -> None:
-        """Stop the fingers where they are; they keep holding what they hold."""
+        """Stop the fingers where they are; they keep holding what they hold.
+
+        An activation moves them by itself, and is ended by a reset: the gripper has to be activated again.
+        """
         self._last_request = None
-        await self._write(Halt())
+        await _whole(self._write(Halt()))
+        readout, _ = await _whole(self._read())
+        if readout.sta is ActivationStatus.ACTIVATING:
+            await _whole(self._write(Reset()))
 
     async def states(self) -> AsyncGenerator[GripperState]:
         """Yield a state every poll period, for ever, whatever becomes of the gripper meanwhile.
@@ -272,6 +284,11 @@ class RobotiqGripper:
         )
         self._seq += 1
         return state
+
+
+async def _whole(exchange: Coroutine[object, object, T]) -> T:
+    """Return what an exchange does, which is not broken off with who waits for it: that would cost the connection."""
+    return await asyncio.shield(asyncio.ensure_future(exchange))
 
 
 def _clip(name: str, value: float, low: float, high: float, unit: str, clipped: list[str]) -> float:

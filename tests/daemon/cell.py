@@ -112,15 +112,24 @@ class StepClock(Clock):
 
 
 class Gripper:
-    """A gripper's task as the loop knows it; `answers` is what it says, or raises."""
+    """A gripper's task as the loop knows it; `answers` is what it says, or raises, once it is `there`."""
 
     def __init__(self) -> None:
         self.answers: str | Exception = ""
+        self.there = asyncio.Event()
+        self.there.set()
+        self.asked: list[str] = []
 
     async def grip(self, _wish: GripTo) -> str:
+        self.asked.append("grip")
+        await self.there.wait()
         if isinstance(self.answers, Exception):
             raise self.answers
         return self.answers
+
+    async def halt(self) -> str:
+        self.asked.append("halt")
+        return ""
 
     async def release(self) -> str:
         return await self.grip(GripTo(140.0, 100.0, 10.0, expect_object=False))

@@ -12,7 +12,7 @@ from daemon.experiment.wishes import GripTo
 from daemon.gripper_task import GripperTask
 from daemon.loop.watch import HAND_STALE_S
 from tests.daemon.conftest import DEADLINE_S
-from tests.drivers.robotiq.gripper_rig import WAYS, Rig, a_rig
+from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 
 GRIP = GripTo(0.0, 60.0, 40.0, expect_object=True)
 
@@ -48,6 +48,52 @@ async def test_a_grip_that_is_broken_off_in_the_middle_of_an_exchange_is_opened_
             assert await task.release() == ""
             assert rig.model.width_mm > 130.0
         read.cancel()
+
+
+@WAYS
+async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
+        task = task_of(rig)
+        read = tasks.create_task(task.read())
+        while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
+            await asyncio.sleep(0)
+        await rig.driver.activate()
+        for turns in range(1, 40, 3):
+            assert await task.release() == ""
+            grip = asyncio.create_task(task.grip(GRIP))
+            for _ in range(turns):
+                await asyncio.sleep(0)
+            grip.cancel()
+            assert await task.halt() == ""
+            halted_mm = rig.model.width_mm
+            for _ in range(200):
+                await asyncio.sleep(0)
+            # What is written is taken up at the model's next step.
+            assert rig.model.width_mm == pytest.approx(halted_mm, abs=60.0 * STEP_S + 1e-6)
+            assert not rig.model.gto
+        assert rig.driver.facts()["openings"] == 1
+        read.cancel()
+
+
+@WAYS
+async def test_an_activation_that_is_broken_off_moves_the_fingers_no_further(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
+        task = task_of(rig)
+        await rig.driver.connect()
+        grip = asyncio.create_task(task.grip(GRIP))
+        while rig.model.width_mm < 100.0:  # noqa: ASYNC110 - the model is looked at, as it moves
+            await asyncio.sleep(0)
+        grip.cancel()
+        assert await task.halt() == ""
+        rig.model.step(STEP_S)
+        halted_mm = rig.model.width_mm
+        for _ in range(200):
+            await asyncio.sleep(0)
+        assert rig.model.width_mm == halted_mm
+        assert (
+            await task.grip(GRIP) == "the fingers closed to 0.0 mm and met nothing; put the tool between them, or "
+            "correct `width_mm`"
+        )
 
 
 @WAYS
@@ -88,6 +134,6 @@ async def test_the_held_tool_has_a_diameter_while_it_is_held_and_the_gripper_spe
 
 
 async def test_a_gripper_that_stays_away_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gripper_task, "RELEASE_WITHIN_S", 0.2)
+    monkeypatch.setattr(gripper_task, "TRIED_FOR_S", 0.2)
     async with a_rig("socket", tmp_path) as rig:
         assert "There is no connection to the gripper" in await task_of(rig).release()

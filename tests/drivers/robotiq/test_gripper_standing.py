@@ -67,7 +67,7 @@ async def test_a_gripper_that_stands_is_asked_as_a_whole_every_fifth_time_and_af
         await anext(states)
         await gripper.halt()
         await anext(states)
-        assert client.asked == ["whole", "write", "whole"]
+        assert client.asked == ["whole", "write", "whole", "whole"]
 
 
 @contextlib.asynccontextmanager

@@ -1,0 +1,84 @@
+"""Fingers that are on their way when the loop stops are stopped too: they would go on by themselves."""
+
+from typing import Any
+
+import pytest
+
+from daemon.loop.senses import Torque
+from daemon.loop_task import WRENCH
+from tests.daemon.cell import driven
+
+GRIP = {"do": "grip", "width_mm": 10.0}
+
+
+async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once() -> None:
+    async with driven() as cell:
+        cell.gripper.there.clear()
+        await cell.start(GRIP)
+        await cell.cycles(10)
+        assert cell.gripper.asked == ["grip"]
+        cell.brain.stop("the operator said stop")
+        await cell.cycles(20)
+        assert cell.gripper.asked == ["grip", "halt"]
+
+
+async def test_a_stop_after_a_grip_leaves_the_fingers_alone() -> None:
+    async with driven() as cell:
+        await cell.start(GRIP, {"do": "wait", "wait_s": 60})
+        await cell.cycles(50)
+        cell.brain.stop("the operator said stop")
+        await cell.cycles(20)
+        assert cell.gripper.asked == ["grip"]
+
+
+async def test_a_stop_that_lets_the_tool_go_in_the_middle_of_a_grip_opens_the_fingers() -> None:
+    async with driven() as cell:
+        cell.gripper.there.clear()
+        await cell.start(GRIP)
+        await cell.cycles(10)
+        now_ns = cell.robot.flight.now_ns
+        cell.brain.hear(Torque(WRENCH, 0.9, "", now_ns, now_ns))
+        await cell.cycles(20)
+        assert cell.gripper.asked == ["grip", "grip"], "the second one wide open"
+
+
+async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with driven() as cell:
+        cell.gripper.there.clear()
+        await cell.start(GRIP)
+        await cell.cycles(10)
+
+        def no_tick(_t_ns: int) -> Any:
+            raise ZeroDivisionError("a tick went wrong")
+
+        monkeypatch.setattr(cell.brain, "tick", no_tick)
+        await cell.cycles(2)
+        assert cell.task is not None
+        with pytest.raises(ZeroDivisionError):
+            await cell.task
+        assert cell.gripper.asked == ["grip", "halt"]
+
+
+async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_first() -> None:
+    async with driven() as cell:
+        cell.gripper.there.clear()
+        await cell.start(GRIP)
+        await cell.cycles(10)
+        await cell.loop.released()
+        assert cell.gripper.asked == ["grip", "halt"]
+
+
+async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with driven() as cell:
+
+        async def does_not() -> str:
+            return "the gripper does not answer"
+
+        monkeypatch.setattr(cell.gripper, "halt", does_not)
+        cell.gripper.there.clear()
+        await cell.start(GRIP)
+        await cell.cycles(10)
+        cell.brain.stop("the operator said stop")
+        await cell.cycles(20)
+        reasons = [one.reasons for one in cell.published.messages if one.topic == "loop.state"]
+        assert any("the fingers were told to stop and did not: the gripper does not answer" in one for one in reasons)

@@ -129,12 +129,25 @@ def draw_rig_faults(path: Path, faults: Sequence[Mapping[str, Any]], gaps_ms: Ma
 
 
 def draw_answers(axis: Axes, faults: Sequence[Mapping[str, Any]]) -> list[Text]:
-    """Draw a bar for each fault, with its time, in it where it is long: no label on the limit or beyond the frame."""
+    """Draw a bar for each fault, with its time, in it where it is long: no label on the limit or beyond the frame.
+
+    Returns the labels: the limit's, then one a fault.
+    """
     stale = STALE_AFTER_PERIODS
     longest = max(stale, *(fault["periods"] for fault in faults))
-    axis.axvline(stale, color=_INK, linewidth=0.8, linestyle=":", zorder=0, label=f"stale: {stale:g} periods")
+    axis.axvline(stale, color=_INK, linewidth=0.8, linestyle=":", zorder=0)
     axis.barh([fault["fault"] for fault in faults], [fault["periods"] for fault in faults], color=_MIDDLE)
-    labels: list[Text] = []
+    labels: list[Text] = [
+        axis.annotate(
+            f"stale: {stale:g} periods",
+            (stale, 0.02),
+            xycoords=axis.get_xaxis_transform(),
+            xytext=(-3, 0),
+            textcoords="offset points",
+            ha="right",
+            fontsize=7,
+        )
+    ]
     for place, fault in enumerate(faults):
         inside = fault["periods"] > 0.5 * stale
         labels.append(
@@ -151,6 +164,5 @@ def draw_answers(axis: Axes, faults: Sequence[Mapping[str, Any]]) -> list[Text]:
         )
     axis.set_xlim(0.0, 1.04 * longest)
     axis.set_xlabel("periods of the topic from the fault to the response")
-    axis.legend(fontsize=7, frameon=False, loc="lower right")
     axis.invert_yaxis()
     return labels

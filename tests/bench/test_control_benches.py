@@ -130,11 +130,12 @@ def test_no_label_lies_on_the_limits_line_or_beyond_the_frame(periods: float) ->
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, _ = figure.subplots(1, 2)
     faults = [{"fault": name, "periods": p, "after_s": 10.0} for name, p in (("short", 0.1), ("the one", periods))]
-    _, label = draw_answers(left, faults)
+    limit, _, label = draw_answers(left, faults)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     box = label.get_window_extent(canvas.get_renderer())  # type: ignore[no-untyped-call]
     line, end = (left.transData.transform((x, 0.0))[0] for x in (2.5, periods))
+    assert limit.get_window_extent(canvas.get_renderer()).x1 < line  # type: ignore[no-untyped-call]
     in_the_bar = box.x1 < end
     assert in_the_bar or box.x1 < line, "the bar covers the line"
     assert left.bbox.x0 < box.x0

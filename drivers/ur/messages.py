@@ -119,8 +119,8 @@ class Reading:
 
     @property
     def program_paused(self) -> bool:
-        """Whether a program is there that does not play: it was paused, or is on its way there or back."""
-        return self.runtime_state not in (RUNTIME_STOPPED, RUNTIME_PLAYING)
+        """Whether a program is there that neither plays nor ends: it was paused, or is on its way there or back."""
+        return self.runtime_state not in (RUNTIME_STOPPING, RUNTIME_STOPPED, RUNTIME_PLAYING)
 
     @property
     def rests(self) -> bool:
@@ -230,6 +230,7 @@ RECOVERY_HANG_S: Final = 6.0
 ROBOT_MODE_POWER_OFF: Final = 3
 ROBOT_MODE_IDLE: Final = 5
 ROBOT_MODE_RUNNING: Final = 7
+RUNTIME_STOPPING: Final = 0
 RUNTIME_STOPPED: Final = 1
 RUNTIME_PLAYING: Final = 2
 SAFETY_NORMAL: Final = 1

@@ -108,6 +108,15 @@ def test_another_pause_is_a_new_one() -> None:
     assert flight.arm.calls == [ASKED]
 
 
+@pytest.mark.parametrize(("runtime_state", "times"), [(0, 0), (1, 0), (3, 1), (4, 1), (5, 1)])
+def test_program_that_ends_by_itself_is_not_asked_to(runtime_state: int, times: int) -> None:
+    """Of the controller's states 0 is stopping, 1 stopped, 3 pausing, 4 paused and 5 resuming."""
+    flight = turning()
+    flight.arm.stoppable = False
+    flight.arm.be(runtime_state=runtime_state)
+    assert len(asked_s(flight, 0.5)) == times
+
+
 def test_what_is_read_late_is_not_acted_upon() -> None:
     """Whatever was paused then, somebody else's may be there by now."""
     flight = turning()

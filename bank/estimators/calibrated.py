@@ -179,21 +179,23 @@ class Tracker:
 
     def tare(self) -> None:
         """Forget the session: the next frame is its first."""
-        calibration = self.calibration
-        self._memory: Memory | None = None
-        if calibration.kind == "raw":
-            self._memory = Memory(calibration.guards, calibration.motion, self._period_s)
-        self._difference: FloatArray | None = None
+        self._begin()
 
     def take_idle(self, frames: int) -> None:
         """Forget the session, and take the next `frames` usable frames for those of an untouched fingertip.
 
         Raises CalibrationError for a calibration of slices, which have no idle frame.
         """
-        self.tare()
-        if self._memory is None:
+        if self.calibration.kind != "raw":
             raise CalibrationError("slices are differences already: they have no zero to take")
-        self._memory.take_idle(frames)
+        self._begin(frames)
+
+    def _begin(self, idle_frames: int = 0) -> None:
+        calibration = self.calibration
+        self._memory: Memory | None = None
+        if calibration.kind == "raw":
+            self._memory = Memory(calibration.guards, calibration.motion, self._period_s, idle_frames)
+        self._difference: FloatArray | None = None
 
     @property
     def taking_idle(self) -> bool:

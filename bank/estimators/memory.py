@@ -24,11 +24,11 @@ BASELINE_FRAMES = 10
 # Frames, half a minute of them, that the mean place of a grip reaches back over: twists come and go within it, and the
 # gel's creep does not add up.
 _HELD_FRAMES = 60
-# Frames further apart than this have lost the thread: two of a period of 0.54 s are missing.
+# Frames further apart than this have lost the thread, as long as the period is not known: two of 0.54 s are missing.
 _LARGEST_GAP_S = 1.4
-# Of so many steps in time the middle one is the period, if that is not known to be shorter; a step longer than this
-# share of it has one frame missing.
-_STEPS, _MISSING_SHARE = 9, 1.5
+# Of so many steps in time the middle one is the period, if that is not known to be shorter; a step longer than the
+# first share of it has one frame missing, and longer than the second more than one.
+_STEPS, _MISSING_SHARE, _LARGEST_GAP_SHARE = 9, 1.5, 2.5
 # A session's baseline is made of at least so many frames before a grip is looked for that is not half as strong as the
 # calibration's.
 _LEAST_IDLE, _OUTRIGHT = 5, 0.5
@@ -105,7 +105,10 @@ def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: Floa
 class Memory:
     """The state of one session; every frame goes through `see` in order."""
 
-    def __init__(self, guards: tuple[SideGuard, ...], motion: Motion | None, period_s: float = np.inf) -> None:
+    def __init__(
+        self, guards: tuple[SideGuard, ...], motion: Motion | None, period_s: float = np.inf, idle_frames: int = 0
+    ) -> None:
+        """Begin a session; its first `idle_frames` usable frames are, on somebody's word, of untouched fingertips."""
         self._guards = Guards(guards)
         # The board's, where it is known beforehand: of one that leaves out half of its frames it cannot be learned.
         self._period_s = period_s
@@ -134,20 +137,15 @@ class Memory:
         self._let_go = [False for _ in guards]
         self._grips = [Grip(guard.grip_threshold) for guard in guards]
         self._lost = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
-        # Frames that are still to be taken for idle ones, on somebody's word, and those taken.
-        self._idle_wanted = 0
+        # Frames that are to be taken for idle ones, and those taken.
+        self._idle_wanted = idle_frames
         self._idle_taken: list[FloatArray] = []
-
-    def take_idle(self, frames: int) -> None:
-        """Take the next so many usable frames for those of an untouched fingertip: the session's baseline."""
-        self._idle_wanted, self._idle_taken = frames, []
-        # What was gripped before is further back than the frames after it would tell, and has another gain.
-        self._forget_grip()
+        self._least_idle = min(_LEAST_IDLE, idle_frames or _LEAST_IDLE)
 
     @property
     def taking_idle(self) -> bool:
         """Whether frames are being taken for idle ones."""
-        return self._idle_wanted > 0
+        return len(self._idle_taken) < self._idle_wanted
 
     @property
     def own_baseline(self) -> bool:
@@ -188,7 +186,7 @@ class Memory:
             return Moment(channels, np.zeros_like(channels), tuple(filter(None, why)), usable)
         if disturbed:
             return self._bridge(channels, disturbed, usable)
-        if self._idle_wanted:
+        if self.taking_idle:
             return self._taken_for_idle(channels, usable)
         if self._before is None:
             self._before = channels
@@ -200,13 +198,15 @@ class Memory:
 
     def _pass_time(self, t_s: float) -> None:
         step_s, self._t_s, self._missing = t_s - self._t_s, t_s, False
-        if not 0 < step_s <= _LARGEST_GAP_S:
+        learned_s = sorted(self._steps_s)[_STEPS // 2] if len(self._steps_s) == _STEPS else np.inf
+        period_s = min(learned_s, self._period_s)
+        if 0 < step_s <= _LARGEST_GAP_S:
+            self._steps_s.append(step_s)
+        if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_SHARE * period_s):
             # A frame from before the last one says nothing of how the gel has moved since that.
             self._forget()
             return
-        learned_s = sorted(self._steps_s)[_STEPS // 2] if len(self._steps_s) == _STEPS else np.inf
-        self._missing = step_s > _MISSING_SHARE * min(learned_s, self._period_s)
-        self._steps_s.append(step_s)
+        self._missing = step_s > _MISSING_SHARE * period_s
 
     def _remember(self, channels: FloatArray, *, bridged: bool) -> None:
         """Add a frame to the last ones; where one is missing before it, that one lies halfway."""
@@ -230,7 +230,6 @@ class Memory:
             for layer, idle in enumerate(self._idle):
                 idle.extend(one[layer] for one in self._idle_taken)
             self._take_gains()
-            self._idle_wanted, self._idle_taken = 0, []
         return Moment(
             channels, np.zeros_like(channels), (f"taking the homogeneous frame, {taken} of {wanted}",), usable
         )
@@ -267,7 +266,7 @@ class Memory:
     def _holds(self, layer: int, score: float) -> bool:
         """Return whether a fingertip is gripped; with a baseline of a few frames only an outright grip is one."""
         guard, grip = self._guards.sides[layer], self._grips[layer]
-        learning = 0 < len(self._idle[layer]) < _LEAST_IDLE and not grip.held
+        learning = 0 < len(self._idle[layer]) < self._least_idle and not grip.held
         return grip.see(score) if not learning or score > max(_OUTRIGHT, guard.grip_threshold) else False
 
     def _notice_release(self, channels: FloatArray) -> None:
@@ -288,6 +287,9 @@ class Memory:
         ):
             self._forget_grip()
             self._refused, self._before = None, channels
+            if self.taking_idle:
+                # A tool was let go or gripped meanwhile: the mean of before and after is neither.
+                self._idle_taken.clear()
         else:
             self._refused = channels
             if self._recent:
@@ -328,7 +330,8 @@ class Memory:
             idle = self._idle[layer]
             begun = first and guard.idle_like(channels[layer])
             # One frame is a poor baseline: the first few are taken unless they look gripped outright.
-            limit = 0.5 * guard.grip_threshold if len(idle) >= _LEAST_IDLE else max(_OUTRIGHT, guard.grip_threshold)
+            learned = len(idle) >= self._least_idle
+            limit = 0.5 * guard.grip_threshold if learned else max(_OUTRIGHT, guard.grip_threshold)
             following = bool(idle) and guard.grip(channels[layer], self._baselines[layer]) < limit
             if begun or following:
                 idle.append(channels[layer])

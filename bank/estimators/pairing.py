@@ -28,8 +28,12 @@ class Pairing(Generic[Item]):
         if side not in self._sides:
             return None
         self._waiting[side] = (t_ns, item)
-        # What is too old for this frame is too old for all that follow.
+        # What is too old for this frame is too old for all that follow …
         self._waiting = {name: kept for name, kept in self._waiting.items() if t_ns - kept[0] <= self._apart_ns}
+        # … and this one, where it was held up on its way, for what waits already.
+        if any(kept_ns - t_ns > self._apart_ns for kept_ns, _ in self._waiting.values()):
+            del self._waiting[side]
+            return None
         if len(self._waiting) < len(self._sides):
             return None
         found = [self._waiting[name] for name in self._sides]

@@ -63,7 +63,7 @@ def test_the_interval_tells_how_far_grips_differ_that_the_line_goes_through():
         one = grip(mm, int(mm))
         placed.append(replace(one, frames=one.frames + place, held=one.held + place))
     # Another grip of the same cylinder vouches for no other.
-    reader = fit_cylinders([*placed, *placed])
+    reader = fit_cylinders([*placed, *map(replace, placed)])
     read = [reader.read(one.held[-1]) for one in placed]
     assert max(abs(one.diameter_mm - value) for one, (value, _, _) in zip(placed, read, strict=True)) < 2.0
     assert read[0][1] > 10.0

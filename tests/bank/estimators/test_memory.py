@@ -1,25 +1,88 @@
 """What a session keeps of its frames, where what it keeps would say something of another time."""
 
 import numpy as np
+import pytest
 
+from bank.estimators import Tracker
 from bank.estimators.memory import Memory
 from bank.estimators.values import TactileFrame
 
+UP, DOWN = np.linspace(0, 1, 21), np.linspace(1, 0, 21)[1:]
 
-def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(fused_calibration):
-    """A zero that is asked for while a tool is held, which is let go and gripped again before it is complete."""
+
+@pytest.fixture
+def like(fused_calibration):
+    """Return what makes a frame at a time, so far from idle to gripped."""
     idle, gripped = (
         np.array([getattr(guard, name) for guard in fused_calibration.guards]) for name in ("idle", "gripped")
     )
-    memory = Memory(fused_calibration.guards, fused_calibration.motion)
-    n_lags, told = fused_calibration.motion.n_lags, []
-    down, up = np.linspace(1, 0, 21)[1:], np.linspace(0, 1, 21)
-    before = [*np.zeros(12), *up, *np.ones(n_lags)]
-    for i, share in enumerate([*before, *down, *up, *np.ones(n_lags + 1)]):
+    return lambda t_s, share: TactileFrame.of(t_s, 1.1 * (idle + share * (gripped - idle)))
+
+
+def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(fused_calibration, like):
+    """A zero that is asked for while a tool is held, which is let go and gripped again before it is complete."""
+    tracker, told = Tracker(fused_calibration), []
+    n_lags = fused_calibration.motion.n_lags
+    before = [*np.zeros(12), *UP, *np.ones(n_lags)]
+    for i, share in enumerate([*before, *DOWN, *UP, *np.ones(n_lags + 1)]):
         if i == len(before):
-            memory.take_idle(len(down) + len(up))
-        told.append(memory.see(TactileFrame.of(0.5 * i, 1.1 * (idle + share * (gripped - idle)))).why)
+            tracker.take_idle(len(DOWN) + len(UP))
+        told.append(tracker.estimate(like(0.5 * i, share)).why)
     assert not told[len(before) - 1]
     after = told[-n_lags - 1 :]
     assert after[:-1] == [(f"gripped too lately: {n} more frames are needed",) for n in range(n_lags, 0, -1)]
     assert not after[-1]
+
+
+def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(fused_calibration, like):
+    """What a grip was before a zero says nothing of the next one, which comes before an idle frame was seen again."""
+    tracker = Tracker(fused_calibration)
+    for i, share in enumerate([*np.zeros(12), *UP, *np.ones(13)]):
+        tracker.estimate(like(0.5 * i, share))
+    tracker.take_idle(10)
+    shares = [*np.zeros(10), *np.full(18, 0.3)]
+    told = [tracker.estimate(like(100 + 0.5 * i, share)).why for i, share in enumerate(shares)]
+    assert not told[-1]
+
+
+def test_a_zero_during_which_a_tool_is_let_go_begins_anew(fused_calibration, like):
+    """The mean of gripped and idle frames was taken for an idle one, and what was gripped next was read from there."""
+    memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
+    told = [memory.see(like(0.5 * i, share)).why for i, share in enumerate([1, 1, 1, 1, 1, *np.zeros(9)])]
+    assert [why[0] for why in told[2:5]] == [f"taking the homogeneous frame, {n} of 8" for n in (3, 4, 5)]
+    assert all("jumped" in why[0] for why in told[5:7])
+    assert told[7] == ("taking the homogeneous frame, 1 of 8",)
+    assert memory.taking_idle
+    memory.see(like(7.0, 0.0))
+    assert not memory.taking_idle
+    assert np.abs(memory.see(like(7.5, 0.0)).difference).max() < 1e-12
+
+
+def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(fused_calibration, like):
+    """With fewer than five idle frames only an outright grip was one, and others were taken for idle."""
+    memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=2)
+    seen = [memory.see(like(0.5 * i, share)) for i, share in enumerate([0, 0, *np.full(18, 0.3)])]
+    assert not seen[-1].why
+    steps = np.array([guard.gripped - guard.idle for guard in fused_calibration.guards])
+    assert seen[-1].difference == pytest.approx(0.3 * steps)
+
+
+@pytest.mark.parametrize("lost", [2, 3, 4])
+def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(fused_calibration, like, lost):
+    """A frame is put halfway where one is missing: with more of them lost, all before would be of another time."""
+    tracker = Tracker(fused_calibration, period_s=0.27)
+    shares = [*np.zeros(12), *UP, *np.ones(14)]
+    for i, share in enumerate(shares):
+        estimate = tracker.estimate(like(0.27 * i, share))
+    assert estimate.valid
+    after = [tracker.estimate(like(0.27 * (len(shares) + lost + i), 1.0)).why for i in range(2)]
+    assert after[0] == ("there is no frame before to compare with",)
+    assert after[1] == ("gripped too lately: 12 more frames are needed",)
+
+
+def test_a_board_that_turns_out_slower_than_its_first_frames_is_followed(fused_calibration, like):
+    tracker = Tracker(fused_calibration)
+    times = [*0.1 * np.arange(12), *(2.0 + 0.5 * np.arange(60))]
+    shares = [*np.zeros(20), *UP, *np.ones(31)]
+    told = [tracker.estimate(like(t_s, share)).why for t_s, share in zip(times, shares, strict=True)]
+    assert not told[-1]

@@ -29,7 +29,7 @@ def test_a_board_that_is_silent_leaves_the_other_without_a_partner() -> None:
 def test_every_frame_is_used_once_and_with_one_that_is_near(frames: list[tuple[str, int]]) -> None:
     pairing: Pairing[tuple[int, int]] = Pairing(("right", "left"), PERIOD_NS)
     used = []
-    for number, (side, t_ns) in enumerate(sorted(frames, key=lambda one: one[1])):
+    for number, (side, t_ns) in enumerate(frames):
         found = pairing.take(side, t_ns, (number, t_ns))
         if found is not None:
             (first, first_ns), (second, second_ns) = found[1]

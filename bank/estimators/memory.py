@@ -118,6 +118,8 @@ class Memory:
         self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
         self._newest: FloatArray = np.zeros(0)
         self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
+        # How many frames in a row were left out until now.
+        self._left_out = 0
         self._idle: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in guards]
         # The calibration's, until the session has its own.
         self._baselines = self._guards.idle.copy()
@@ -182,7 +184,9 @@ class Memory:
             why = why if any(why) else self._guards.too_few(usable)
             channels = self._filled(frame.channels, usable)
         if any(why):
-            self._forget()
+            # One garbled frame is no other fingertip: it is left out like one that is disturbed.
+            self._refused = None
+            self._leave_out()
             return Moment(channels, np.zeros_like(channels), tuple(filter(None, why)), usable)
         if disturbed:
             return self._bridge(channels, disturbed, usable)
@@ -191,7 +195,7 @@ class Memory:
         if self._before is None:
             self._before = channels
             return Moment(channels, np.zeros_like(channels), ("there is no frame before to compare with",), usable)
-        self._refused, self._before = None, channels
+        self._refused, self._before, self._left_out = None, channels, 0
         self._learn_baseline(channels)
         self._notice_release(channels)
         return self._judged(channels, usable)
@@ -216,6 +220,14 @@ class Memory:
         self._recent.append(self._placed(channels))
         self._newest = channels
         self._bridged.append(bridged)
+
+    def _leave_out(self) -> None:
+        """Put the last frame that passed in the place of one that did not; after too many in a row it is too old."""
+        self._left_out += 1
+        if self._left_out > _LARGEST_BRIDGED:
+            self._forget_grip()
+        elif self._recent:
+            self._remember(self._newest, bridged=True)
 
     def _placed(self, channels: FloatArray) -> FloatArray:
         """Return the (m·p,) places of a frame at the calibration's gain, which does not change while it is gripped."""
@@ -292,8 +304,7 @@ class Memory:
                 self._idle_taken.clear()
         else:
             self._refused = channels
-            if self._recent:
-                self._remember(self._newest, bridged=True)
+            self._leave_out()
         return Moment(channels, np.zeros_like(channels), (disturbed,), usable)
 
     def _disturbed(self, channels: FloatArray, usable: BoolArray) -> str | None:

@@ -67,6 +67,26 @@ def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(fused_calibration, l
     assert seen[-1].difference == pytest.approx(0.3 * steps)
 
 
+@pytest.mark.parametrize("kind", ["garbled", "saturated"])
+@pytest.mark.parametrize("spoilt", [1, 3, 4])
+def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(fused_calibration, like, spoilt, kind):
+    """One garbled frame in a hundred left a quarter of the estimates void: each was taken for another fingertip."""
+    tracker, rng = Tracker(fused_calibration), np.random.default_rng(4)
+    shares = [*np.zeros(12), *UP, *np.ones(14)]
+    for i, share in enumerate(shares):
+        estimate = tracker.estimate(like(0.5 * i, share))
+    assert estimate.valid
+    for i in range(len(shares), len(shares) + spoilt):
+        frame = like(0.5 * i, 1.0)
+        if kind == "garbled":
+            frame = TactileFrame.of(frame.t_s, frame.channels * (1 + rng.normal(0, 0.3, frame.channels.shape)))
+        else:
+            frame = TactileFrame.of(frame.t_s, frame.channels, rng.random(frame.channels.shape) > 0.4)
+        assert "fingertip" in tracker.estimate(frame).why[0]
+    after = tracker.estimate(like(0.5 * (len(shares) + spoilt), 1.0))
+    assert after.why == (() if spoilt <= 3 else ("gripped too lately: 12 more frames are needed",))
+
+
 @pytest.mark.parametrize("lost", [2, 3, 4])
 def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(fused_calibration, like, lost):
     """A frame is put halfway where one is missing: with more of them lost, all before would be of another time."""

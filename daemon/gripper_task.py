@@ -81,8 +81,8 @@ class GripperTask:
     async def unlock(self) -> str:
         """Activate anew after a fault, on the operator's word that the fingers are clear."""
         try:
-            # Where the connection was lost just now nothing is known of a fault, and activating opens the fingers.
-            state = self._gripper.latest or await self._gripper.read()
+            # Asked for now: the latest state may be from before the fault, and activating opens the fingers.
+            state = await self._gripper.read()
             if state.fault.needs_activation:
                 await self._gripper.activate(operator_confirmed=True)
         except DriverError as error:

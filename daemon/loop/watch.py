@@ -96,7 +96,8 @@ def _unusable(senses: Senses, source: Source, settings: WatchSettings, t_ns: int
 def _not_fresh(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> str:
     """Return why a source says nothing about the present, or the empty string."""
     latest = senses.torques.get(source.name)
-    if lost := senses.lost.get(source.name):
+    if source.name in senses.lost:
+        lost = senses.lost[source.name]
         return f"{source.name} has not been there yet: {lost}" if latest is None else f"{source.name} is gone: {lost}"
     if latest is None:
         return f"{source.name} has not measured anything yet"

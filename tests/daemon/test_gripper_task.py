@@ -115,6 +115,17 @@ async def test_unlocking_a_gripper_without_a_fault_does_not_open_it(way: str, tm
         assert not (await rig.driver.read()).fault.needs_activation
 
 
+@WAYS
+async def test_a_fault_that_came_since_the_last_state_is_unlocked_too(way: str, tmp_path: Path) -> None:
+    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
+        await rig.driver.connect()
+        await rig.driver.activate()
+        assert not (await rig.driver.read()).fault.needs_activation
+        rig.model.fail(12)
+        assert await task_of(rig).unlock() == ""
+        assert not (await rig.driver.read()).fault.needs_activation
+
+
 async def test_the_held_tool_has_a_diameter_while_it_is_held_and_the_gripper_speaks(tmp_path: Path) -> None:
     async with a_rig("socket", tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         rig.object_mm = 40.0

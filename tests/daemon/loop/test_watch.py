@@ -147,6 +147,9 @@ def test_a_sensor_that_was_never_there_is_not_gone() -> None:
     senses.hear(torque(EIT, 0.1))
     (trouble,) = troubles(senses, watched(EIT, ()), WatchSettings(), NOW_NS)
     assert trouble.detail == "right is gone: There is no port."
+    senses.lost["right"] = ""
+    (trouble,) = troubles(senses, watched(EIT, ()), WatchSettings(), NOW_NS)
+    assert trouble.detail == "right is gone: ", "though it does not say why"
 
 
 def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wrist() -> None:

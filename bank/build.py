@@ -35,16 +35,21 @@ class RowSolver:
         self._forward = BatchForwardModel(mesh)
         self._conductivities = Conductivities(mesh, definition.variation)
         self._definition = definition
+        self._n_triangles = len(mesh.triangles)
         (self.homogeneous,) = self._forward.voltages(np.ones((1, len(mesh.triangles))))
 
     def solve(self, row: int) -> BankRow:
         """Return the cells of the k at `row`. A cell whose conductivity is not positive is not solved."""
         k, sigmas = float(self._definition.k_grid[row]), self._definition.sigma_grid
-        cells = np.array([self._conductivities.of(self._definition.model, k, sigma) for sigma in sigmas.tolist()])
-        smallest = cells.min(axis=1)
+        cells, smallest, n_solved = np.empty((len(sigmas), self._n_triangles)), np.empty(len(sigmas)), 0
+        for cell, sigma in enumerate(sigmas.tolist()):
+            # What is not positive is written over by the next one.
+            cells[n_solved] = self._conductivities.of(self._definition.model, k, sigma)
+            smallest[cell] = cells[n_solved].min()
+            n_solved += smallest[cell] > 0
         valid = smallest > 0
         signals = np.zeros((len(sigmas), N_CHANNELS), dtype=np.float32)
-        differences = self._forward.voltages(cells[valid]) - self.homogeneous
+        differences = self._forward.voltages(cells[:n_solved]) - self.homogeneous
         loud = np.linalg.norm(differences, axis=1) >= MIN_SIGNAL_NORM
         valid[valid] = loud
         signals[valid] = differences[loud]

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 Values = NDArray[np.float64]
 
 _SUBDIVISIONS = 5
+# Triangles whose points are computed in one go.
+_AT_ONCE = 1300
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +70,14 @@ def _cut_linear(y: Values, k: float, sigma: float, c: float) -> Values:
 
 
 def _gaussian_derivative(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - as above
-    return -(y - k) / sigma**2 * np.exp(-((y - k) ** 2) / (2 * sigma**2))
+    # In place: memory that is new at each step takes longer than the arithmetic.
+    d = y - k
+    f = d * d
+    f *= -0.5 / np.square(sigma)
+    np.exp(f, out=f)
+    f *= d
+    f *= -1 / np.square(sigma)
+    return f
 
 
 def _modulated_gaussian(y: Values, k: float, sigma: float, c: float) -> Values:
@@ -113,7 +122,7 @@ def conductivity(mesh: "Mesh", model: str, k: float, sigma: float, variation: Va
     It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
     """
     heights = _heights(mesh, variation)[mesh.triangles] @ averaging_points().T
-    values: NDArray[np.float64] = _mean(heights, _centre(mesh), model, k, sigma, variation)
+    values: NDArray[np.float64] = _mean(_pieces(heights), _centre(mesh), model, k, sigma, variation)
     return values
 
 
@@ -125,7 +134,7 @@ class Conductivities:
         heights = _heights(mesh, variation)
         corners = heights[mesh.triangles]
         _, first, self._alike = np.unique(corners, axis=0, return_index=True, return_inverse=True)
-        self._heights = (corners @ averaging_points().T)[first]
+        self._heights = _pieces((corners @ averaging_points().T)[first])
         self._centre = _centre(mesh)
         self._variation = variation
 
@@ -149,12 +158,18 @@ def _centre(mesh: "Mesh") -> float:
     return float((mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2)
 
 
-def _mean(heights: Values, centre: float, model: str, k: float, sigma: float, variation: Variation) -> Values:
+def _pieces(heights: Values) -> list[Values]:
+    """Cut (T, 15) heights into (15, ≤ _AT_ONCE) of some triangles each: small enough for the processor's caches."""
+    return [np.ascontiguousarray(piece.T) for piece in np.array_split(heights, -(-len(heights) // _AT_ONCE))]
+
+
+def _mean(pieces: list[Values], centre: float, model: str, k: float, sigma: float, variation: Variation) -> Values:
     basis = model_named(model)
     if not (np.isfinite(k) and np.isfinite(sigma)):
         raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
     if sigma <= 0 and basis.sigma_unit != "not used":
         raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
-    shape = basis.function(heights, k, sigma, centre).mean(axis=1)
+    shape = np.concatenate([basis.function(heights, k, sigma, centre).sum(axis=0) for heights in pieces])
+    shape /= len(pieces[0])
     values: Values = 1.0 + variation.offset + variation.amplitude * shape
     return values

@@ -106,7 +106,7 @@ def batch(mesh: Mesh) -> Callable[[], Floats]:
     """Return what solves the same signals all at once, as `bank build` does."""
     model, of = BatchForwardModel(mesh), Conductivities(mesh)
     (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
-    # Sixteen cells go through the elimination together; six alone would pay for all of them.
+    # Several cells go through the elimination together; six alone would pay for lanes that are empty.
     cells = np.array([of.of(MODEL, k, s) for k, s in CELLS])
     many = np.resize(np.arange(len(CELLS)), BATCHES * len(CELLS))
     return lambda: (model.voltages(cells[many]) - homogeneous)[: len(CELLS)]

@@ -1,15 +1,21 @@
 """Many solutions at once against the direct solve of each, and against what a Schur complement is."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bank.batch_forward import LARGEST_LEAK, BatchForwardModel, rounding_leaks
-from bank.elimination import LANES, Elimination, Pattern
+from bank.elimination import Elimination
 from bank.errors import ConductivityError, GeometryError
+from bank.fronts import Pattern
 from bank.mesh import Mesh
 from bank.models import MODELS, conductivity
+from bank.tiles import LANES
 from tests.bank.conftest import rectangle
 
 
@@ -22,33 +28,74 @@ def relative(found, expected):
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
 
 
-@given(st.integers(0, 2**32 - 1), st.integers(2, 14), st.integers(1, 4))
-@settings(max_examples=25, deadline=None)
-def test_what_is_left_is_the_schur_complement(seed, n, kept):
-    rng = np.random.default_rng(seed)
-    kept = min(kept, n - 1)
-    links = [(i, int(rng.integers(0, i))) for i in range(1, n)] + [tuple(p) for p in rng.integers(0, n, (n, 2))]
-    links = [(max(pair), min(pair)) for pair in links if pair[0] != pair[1]]
-    # Each link adds its factor to a Laplacian, and the last factor stands on the whole diagonal.
+def chained(rng: np.random.Generator, n: int, far: int, factors: int) -> Pattern:
+    """Return a Laplacian, each unknown linked to some that follow, each link with a factor; and 1 on the diagonal."""
+    links = [(min(i + int(step), n - 1), i) for i in range(n - 1) for step in rng.integers(1, far + 1, 2)]
     rows, columns, values, source = [], [], [], []
     for number, (i, j) in enumerate(links):
         rows += [i, j, i, j]
         columns += [i, j, j, i]
         values += [1.0, 1.0, -1.0, -1.0]
-        source += [number] * 4
-    pattern = Pattern(
-        *(np.array(each + list(range(n)) if k < 2 else each) for k, each in enumerate((rows, columns))),
+        source += [number % factors] * 4
+    return Pattern(
+        np.array(rows + list(range(n))),
+        np.array(columns + list(range(n))),
         np.array(values + [1.0] * n),
-        np.array(source + [len(links)] * n),
+        np.array(source + [factors] * n),
     )
-    factors = rng.uniform(0.1, 10, (LANES + 3, len(links) + 1))
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 200), st.integers(1, 9), st.integers(1, 20))
+@settings(max_examples=40, deadline=None)
+def test_what_is_left_is_the_schur_complement(seed, n, kept, far):
+    rng = np.random.default_rng(seed)
+    kept = min(kept, n - 1)
+    pattern = chained(rng, n, far, 30)
+    factors = rng.uniform(0.1, 10, (LANES + 3, 30))
     found = Elimination(pattern, n, kept).schur_complements(factors)
     for each, factor in zip(found, factors, strict=True):
         matrix = np.zeros((n, n))
-        np.add.at(matrix, (pattern.rows, pattern.columns), pattern.values * factor[pattern.source])
+        np.add.at(matrix, (pattern.rows, pattern.columns), pattern.values * np.append(factor, 1.0)[pattern.source])
         inner, coupling = matrix[:-kept, :-kept], matrix[:-kept, -kept:]
         expected = matrix[-kept:, -kept:] - coupling.T @ np.linalg.solve(inner, coupling)
         np.testing.assert_allclose(each, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_few_unknowns_share_a_front_and_fronts_the_memory(batch):
+    fronts = batch._elimination._plan.fronts
+    assert (fronts["end"] - fronts["first"]).sum() == 17 * 17
+    assert 20 < len(fronts) < 17 * 17 / 4
+    tiles = -(-fronts["size"] // 4)
+    assert batch._elimination._entries < 0.4 * (8 * tiles * (tiles + 1)).sum()
+
+
+def test_factors_that_are_missing_are_refused():
+    elimination = Elimination(chained(np.random.default_rng(0), 9, 2, 4), 9, 2)
+    assert elimination.schur_complements(np.ones((1, 5))).shape == (1, 2, 2)
+    with pytest.raises(ValueError, match="names factor 4, but there are 3"):
+        elimination.schur_complements(np.ones((1, 3)))
+
+
+# As on a machine whose registers hold four numbers: prints what is left of some matrices.
+NARROW = """
+import llvmlite.binding
+llvmlite.binding.get_host_cpu_features = dict
+from bank.tiles import LANES
+from tests.bank.test_batch_forward import what_is_left
+assert LANES == 4
+print(what_is_left().tobytes().hex())
+"""
+
+
+def what_is_left():
+    factors = np.random.default_rng(1).uniform(0.1, 10, (5, 30))
+    return Elimination(chained(np.random.default_rng(0), 60, 5, 30), 60, 3).schur_complements(factors)
+
+
+def test_narrow_registers_give_the_same_bits(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}
+    narrow = subprocess.run([sys.executable, "-c", NARROW], env=environment, check=True, capture_output=True, text=True)
+    assert narrow.stdout.strip() == what_is_left().tobytes().hex()
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -89,8 +136,7 @@ def test_a_cell_that_rounding_spoils_is_solved_directly(batch, fingertip):
     middle = fingertip.nodes[fingertip.triangles].mean(axis=1)
     cells = np.ones((3, len(fingertip.triangles)))
     cells[1, middle[:, 1] > 1.6] = 1e-13
-    factors = np.column_stack([cells, np.ones(3)])
-    leaks = rounding_leaks(batch._elimination.schur_complements(factors))
+    leaks = rounding_leaks(batch._elimination.schur_complements(cells))
     assert leaks[1] > LARGEST_LEAK > 1e-13 > max(leaks[0], leaks[2])
     found = batch.voltages(cells)
     np.testing.assert_array_equal(found[1], batch.direct.voltages(cells[1]))

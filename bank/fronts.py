@@ -1,0 +1,255 @@
+"""In which groups the unknowns of a sparse symmetric matrix are eliminated, and where in memory: planned once.
+
+The multifrontal method (Duff and Reid 1983; Liu 1992). A front is a small dense matrix of a few unknowns, its pivots,
+and of all that they meet when they are eliminated. What that leaves of it is added to the front of the first unknown
+that is left, its parent. Fronts are dense, so that a number that is loaded is used several times, and they take each
+other's place in memory, so that all of it stays in the processor's caches.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Records = NDArray[np.void]
+
+# Fronts are kept in tiles of so many rows and columns, on and below the diagonal, one row of tiles after the other.
+# A tile holds its columns one after the other: entry (i, j) is at row_start(i) + TILE · j.
+TILE = 4
+
+
+class Pattern(NamedTuple):
+    """What the entries of the matrices are made of: entry (rows, columns)[p] gets Σ values[p] · factors[source[p]].
+
+    All are (P,); several p of one place add up. Of symmetric pairs both or the lower one are given.
+    """
+
+    rows: Indices
+    columns: Indices
+    values: FloatArray
+    source: Indices
+
+    def where(self, keep: NDArray[np.bool_]) -> "Pattern":
+        """Return some of it."""
+        return Pattern(self.rows[keep], self.columns[keep], self.values[keep], self.source[keep])
+
+
+class Plan(NamedTuple):
+    """What is done front by front; the last one holds what is kept. Places are entries of the memory for all fronts.
+
+    fronts: each begins at `base` and has the rows from `first` to `size`, of which those before `end` are pivots (the
+    rows before `first` are empty, so that `end` is where a tile begins); `tile_row` is its first one among all.
+    tile_rows: what each is made of, terms from `term` and arrivals from `arrival`; one more says where these end.
+    terms: each adds value · factors[source] at `place`.
+    arrivals: each adds `length` entries of a front before, TILE apart from `source`, to those that are as far from
+    `target` as columns[column], columns[column + 1], … say.
+    """
+
+    fronts: Records
+    tile_rows: Records
+    terms: Records
+    arrivals: Records
+    columns: NDArray[np.int32]
+
+
+def plan_of(pattern: Pattern, n: int, kept: int) -> tuple[Plan, int]:
+    """Return the plan for matrices of n unknowns, the last `kept` of which stay, and how many entries it works on."""
+    lower = pattern.where(pattern.rows >= pattern.columns)
+    layout = _Layout(_in_order(_tree(_structures(lower, n, n - kept), n - kept, n)), n)
+    terms, term_starts = layout.terms(lower)
+    arrivals, arrival_starts, columns = layout.arrivals()
+    fronts = _records(
+        base=layout.base, first=layout.first, end=layout.end, size=layout.size,
+        tile_row=np.searchsorted(layout.tile_rows, layout.apart),
+    )  # fmt: skip
+    tile_rows = _records(term=term_starts, arrival=arrival_starts)
+    return Plan(fronts, tile_rows, terms, arrivals, columns), layout.entries
+
+
+def row_start(row: Indices) -> Indices:
+    """Return where a row of a front begins."""
+    tiles = row // TILE
+    found: Indices = TILE * TILE // 2 * tiles * (tiles + 1) + row % TILE
+    return found
+
+
+class _Front:
+    """Pivots and the unknowns below them, by number, and the fronts whose remains it takes."""
+
+    def __init__(self, pivots: list[int], below: Indices, children: list["_Front"]) -> None:
+        self.pivots = pivots
+        self.below = below
+        self.children = children
+
+    @property
+    def end(self) -> int:
+        """Where the pivots end: they fill whole tiles."""
+        return _whole(len(self.pivots))
+
+    @property
+    def rows(self) -> int:
+        """Its rows, with empty ones at both ends that fill whole tiles."""
+        return _whole(self.end + len(self.below))
+
+    @property
+    def entries(self) -> int:
+        """The memory that it takes."""
+        return int(row_start(np.array(self.rows)))
+
+
+def _structures(lower: Pattern, n: int, eliminated: int) -> list[Indices]:
+    """Return the rows below every unknown in its column when it is eliminated (George and Liu 1981, chapter 5)."""
+    matrix = sp.csc_array((np.ones(len(lower.rows)), (lower.rows, lower.columns)), shape=(n, n))
+    matrix.sum_duplicates()
+    found: list[Indices] = []
+    children: list[list[Indices]] = [[] for _ in range(n)]
+    for column in range(eliminated):
+        own = matrix.indices[matrix.indptr[column] : matrix.indptr[column + 1]].astype(np.int64)
+        below = np.unique(np.concatenate([own, *children[column]]))
+        below = below[below > column]
+        children[column].clear()
+        # Its neighbours become neighbours of each other: the first of them takes over the rest.
+        children[below[0]].append(below)
+        found.append(below)
+    return found
+
+
+def _tree(below: list[Indices], eliminated: int, n: int) -> _Front:
+    """Return the last front, which has no pivots. A front takes its children in where that costs nothing."""
+    waiting: list[list[_Front]] = [[] for _ in range(eliminated + 1)]
+    for column, rows in enumerate(below):
+        front = _Front([column], rows, [])
+        for child in sorted(waiting[column], key=lambda each: -len(each.pivots)):
+            pivots = child.pivots + front.pivots
+            apart = _cost(len(front.pivots), len(rows)) + _cost(len(child.pivots), len(child.below))
+            if _cost(len(pivots), len(rows)) <= apart:
+                front = _Front(pivots, rows, front.children + child.children)
+            else:
+                front.children.append(child)
+        waiting[min(int(rows[0]), eliminated)].append(front)
+    return _Front([], np.arange(eliminated, n), waiting[eliminated])
+
+
+def _cost(pivots: int, below: int) -> float:
+    """Return what a front costs, in products of two entries: these, adding up what is left of it, and all the rest.
+
+    The two numbers are rough: with half or double of them, banks take as long.
+    """
+    products = sum((below + left) * (below + left + 1) // 2 for left in range(pivots))
+    return products + 4 * below * (below + 1) / 2 + 200
+
+
+def _in_order(last: _Front) -> list[_Front]:
+    """Return all fronts, children before their parents and whole families one after the other."""
+    found, waiting = [], [last]
+    while waiting:
+        front = waiting.pop()
+        found.append(front)
+        waiting.extend(front.children)
+    return found[::-1]
+
+
+class _Layout:
+    """Fronts in order, with all unknowns numbered anew as they are eliminated, and their places in memory.
+
+    Each front begins at `base`. As they take each other's place, what belongs to which is told by places `apart`, where
+    one front follows the other. Rows of tiles begin at `tile_rows`, apart.
+    """
+
+    def __init__(self, fronts: list[_Front], n: int) -> None:
+        self.fronts = fronts
+        self.number = np.arange(n)
+        pivots = [pivot for front in fronts for pivot in front.pivots]
+        self.number[pivots] = np.arange(len(pivots))
+        many = np.array([len(front.pivots) for front in fronts])
+        self.owner = np.append(np.repeat(np.arange(len(fronts)), many), np.full(n - len(pivots), len(fronts) - 1))
+        self.end = np.array([front.end for front in fronts])
+        self.first = self.end - many
+        self.below = [np.sort(self.number[front.below]) for front in fronts]
+        members = [np.append(self.number[front.pivots], rows) for front, rows in zip(fronts, self.below, strict=True)]
+        self.size = self.first + [len(each) for each in members]
+        self._keys = np.concatenate([s * n + each for s, each in enumerate(members)])
+        self._shift = self.size - np.cumsum([len(each) for each in members])
+        self.base, self.entries = _places(fronts)
+        sizes = [front.entries for front in fronts]
+        self.apart = np.cumsum(sizes) - sizes
+        self.tile_rows = np.concatenate(
+            [self.apart[s] + row_start(np.arange(0, front.rows, TILE)) for s, front in enumerate(fronts)]
+        )
+
+    def row(self, front: Indices, unknown: Indices) -> Indices:
+        """Return the rows of unknowns in fronts."""
+        found: Indices = np.searchsorted(self._keys, front * len(self.number) + unknown) + self._shift[front]
+        return found
+
+    def terms(self, lower: Pattern) -> tuple[Records, Indices]:
+        """Return what the matrices' own entries are made of, and where each row of tiles begins in it."""
+        upper, under = np.sort([self.number[lower.rows], self.number[lower.columns]], axis=0)
+        front = self.owner[upper]
+        at = self.apart[front] + row_start(self.row(front, under)) + TILE * self.row(front, upper)
+        # Those of one place and one source are one.
+        n_sources = lower.source.max() + 1
+        keys, which = np.unique(at * n_sources + lower.source, return_inverse=True)
+        at, source = np.divmod(keys, n_sources)
+        front = np.searchsorted(self.apart, at, side="right") - 1
+        place = at + (self.base - self.apart)[front]
+        terms = _records(place=place, source=source, value=np.bincount(which, lower.values))
+        return terms, np.append(np.searchsorted(at, self.tile_rows), len(at))
+
+    def arrivals(self) -> tuple[Records, Indices, NDArray[np.int32]]:
+        """Return which rows of fronts go where in their parents, where each row of tiles begins in it, and columns."""
+        position = {id(front): s for s, front in enumerate(self.fronts)}
+        parents = np.empty(len(self.fronts) - 1, dtype=np.int64)
+        for s, front in enumerate(self.fronts):
+            parents[[position[id(child)] for child in front.children]] = s
+        many = np.array([len(rows) for rows in self.below[:-1]])
+        child = np.repeat(np.arange(len(many)), many)
+        parent = parents[child]
+        nth = np.arange(len(child)) - np.repeat(np.cumsum(many) - many, many)
+        row = self.row(parent, np.concatenate(self.below[:-1]))
+        arrivals = _records(
+            source=self.base[child] + row_start(self.end[child] + nth) + TILE * self.end[child],
+            target=self.base[parent] + row_start(row),
+            length=nth + 1,
+            column=np.arange(len(child)) - nth,
+        )
+        at = self.apart[parent] + row_start(row)
+        order = np.argsort(at, kind="stable")
+        starts = np.append(np.searchsorted(at[order], self.tile_rows), len(at))
+        return arrivals[order], starts, (TILE * row).astype(np.int32)
+
+
+def _places(fronts: list[_Front]) -> tuple[Indices, int]:
+    """Return where fronts begin, and how many entries all of them take.
+
+    There are two stacks. A front lies on the one and its children, which it takes the place of, on top of the other.
+    """
+    side = {id(fronts[-1]): 0}
+    for front in reversed(fronts):
+        side.update((id(child), 1 - side[id(front)]) for child in front.children)
+    begin: dict[int, int] = {}
+    top, most = [0, 0], [0, 0]
+    for front in fronts:
+        on = side[id(front)]
+        begin[id(front)] = top[on]
+        top[on] += front.entries
+        most[on] = max(most[on], top[on])
+        top[1 - on] = min([begin[id(child)] for child in front.children], default=top[1 - on])
+    return np.array([begin[id(front)] + side[id(front)] * most[0] for front in fronts]), sum(most)
+
+
+def _whole(rows: int) -> int:
+    """Return a number of rows rounded up to whole tiles."""
+    return -(-rows // TILE) * TILE
+
+
+def _records(**fields: Indices | FloatArray) -> Records:
+    """Return one array of what belongs together, with small integers."""
+    kinds = [(name, np.float64 if values.dtype.kind == "f" else np.int32) for name, values in fields.items()]
+    found = np.empty(len(next(iter(fields.values()))), dtype=kinds)
+    for name, values in fields.items():
+        found[name] = values
+    return found

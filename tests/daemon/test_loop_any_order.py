@@ -1,0 +1,151 @@
+"""Whatever happens in whatever order to loop, robot and operator: nothing moves that an experiment does not move."""
+
+import asyncio
+import itertools
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from daemon.experiment.machine import Phase
+from daemon.experiment.steps import ExperimentFile
+from daemon.loop.senses import Torque
+from daemon.loop_task import WRENCH
+from daemon.safety import Response
+from tests.daemon.cell import SPEED_M_PER_S, Cell, driven
+
+TURN = {"do": "turn_to", "angle_rad": 0.5}
+TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}
+MOVE = {"do": "approach", "along_tool_m": 0.1, "speed_m_per_s": SPEED_M_PER_S}
+GRIP = {"do": "grip", "width_mm": 10.0}
+# A stop, and what a program that is resumed at the pendant does until its watchdog ends it, takes less, in cycles.
+STANDS_AFTER, EXCUSED_FOR = 60, 60
+# Its supervisor's first pause is half a second.
+BEGUN_AGAIN_AFTER = 65
+
+
+class Story:
+    """A cell to which things happen; after each cycle it is looked at."""
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+        self.arm = cell.robot.flight.arm
+        self.idle = self.excused = self.dead = 0
+        self.moved = False
+
+    async def go(self, cycles: int) -> None:
+        for _ in range(cycles):
+            assert self.cell.task is not None
+            self.dead = self.dead + 1 if self.cell.task.done() else 0
+            if self.dead > BEGUN_AGAIN_AFTER:
+                assert isinstance(self.cell.task.exception(), ZeroDivisionError)
+                self.cell.drive()
+                await asyncio.sleep(0)
+            await self.cell.cycles(1)
+            self.look()
+
+    def look(self) -> None:
+        experiment, verdict = self.cell.brain.experiment, self.cell.brain.standing.verdict
+        runs = experiment is not None and experiment.phase is Phase.RUNNING and verdict.response is Response.NOTE
+        self.idle = 0 if runs and not self.dead and self.arm.reading.age_ns < 1e8 else self.idle + 1
+        self.excused = max(0, self.excused - 1)
+        moves = self.arm.reading.fastest_rad_per_s > 0 or self.arm.reading.moving_linearly
+        self.moved |= moves
+        assert not moves or self.idle < STANDS_AFTER or self.excused, f"it moves: {self.cell.state}"
+
+    async def within(self, doing: Awaitable[Any], cycles: int) -> None:
+        task = asyncio.ensure_future(doing)
+        for _ in range(cycles):
+            if task.done():
+                return
+            await self.go(1)
+
+    async def start(self, *steps: dict[str, Any]) -> None:
+        file = ExperimentFile.model_validate({"name": "any", "drive": WRENCH, "steps": list(steps)})
+        await self.within(self.cell.loop.start(file), 100)
+
+    async def mend(self) -> None:
+        self.arm.be(age_ns=0, wrench=(0.0,) * 6, safety_mode=1)
+        self.arm.stoppable, self.cell.died = True, {}
+        await self.go(5)
+        await self.within(self.cell.loop.unlock(), 300)
+
+    def tick_dies(self) -> None:
+        tick = self.cell.brain.tick
+
+        def once(_t_ns: int) -> Any:
+            self.cell.brain.tick = tick  # type: ignore[method-assign]
+            raise ZeroDivisionError("a tick went wrong")
+
+        self.cell.brain.tick = once  # type: ignore[method-assign]
+
+    def protective_stop(self) -> None:
+        if self.arm.reading.safety_mode == 1:
+            self.arm.protective_stop()
+            self.arm.be(moving_linearly=False)
+
+    def resumed(self) -> None:
+        if self.arm.reading.runtime_state == 4:
+            self.arm.be_resumed_at_the_pendant()
+            self.excused = EXCUSED_FOR
+
+    def beyond(self) -> None:
+        now_ns = self.cell.robot.flight.now_ns
+        self.cell.brain.hear(Torque(WRENCH, 0.9, "", now_ns, now_ns))
+
+    def unread(self) -> None:
+        for _ in range(40):
+            self.cell.robot.cycle(read=False)
+
+
+HAPPENINGS: dict[str, Callable[[Story], Any]] = {
+    "turn": lambda story: story.start(TURN, GRIP, TWIST),
+    "move": lambda story: story.start(MOVE, TURN),
+    "twist": lambda story: story.start(TWIST),
+    "mend": lambda story: story.mend(),
+    "wait": lambda story: story.go(40),
+    "wait long": lambda story: story.go(90),
+    "pause": lambda story: story.cell.brain.pause(),
+    "resume": lambda story: story.cell.brain.resume(),
+    "stop": lambda story: story.cell.brain.stop("the operator said stop"),
+    "protective stop": lambda story: story.protective_stop(),
+    "resumed at the pendant": lambda story: story.resumed(),
+    "program ends": lambda story: story.arm.end_program(),
+    "dashboard hangs": lambda story: setattr(story.arm, "stoppable", False),
+    "states are late": lambda story: story.arm.be(age_ns=150_000_000),
+    "states are old": lambda story: story.arm.be(age_ns=300_000_000),
+    "states are new": lambda story: story.arm.be(age_ns=0),
+    "states are not read": lambda story: story.unread(),
+    "a task dies": lambda story: setattr(story.cell, "died", {"right": "it died"}),
+    "the loop dies": lambda story: story.tick_dies(),
+    "torque beyond its limit": lambda story: story.beyond(),
+    "pushed": lambda story: story.arm.be(wrench=(100.0, 0.0, 0.0, 0.0, 0.0, 0.0)),
+}
+
+
+async def told(happenings: Sequence[str]) -> bool:
+    """Let things happen, one after the other; return whether anything has moved at all."""
+    async with driven() as cell:
+        story = Story(cell)
+        for name in happenings:
+            happened = HAPPENINGS[name](story)
+            if asyncio.iscoroutine(happened):
+                await happened
+            await story.go(5)
+        await story.go(STANDS_AFTER)
+        return story.moved
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.sampled_from([*HAPPENINGS]), max_size=25))
+def test_nothing_moves_that_no_experiment_moves(happenings: list[str]) -> None:
+    asyncio.run(told(happenings))
+
+
+@pytest.mark.parametrize("begun", ["turn", "move", "twist"])
+def test_whatever_befalls_a_motion_and_then_again_it_stands(begun: str) -> None:
+    others = [name for name in HAPPENINGS if name not in ("turn", "move", "twist", "mend", "wait long")]
+    for first, second in itertools.permutations(others, 2):
+        assert asyncio.run(told(["mend", begun, first, second])), "it moved at first"

@@ -92,6 +92,7 @@ def fit(
     physics = physics or Physics()
     if not recordings:
         raise CalibrationError("there is no recording to calibrate on")
+    _check_values(recordings)
     kinds = {one.kind for one in recordings}
     if len(kinds) > 1:
         raise CalibrationError("raw frames and slices of differences do not go into one calibration; make two")
@@ -121,6 +122,19 @@ def fit(
     if blank.kind == "raw" and not trust_times:
         check_alignment(recordings)
     return _fit_raw(blank, chosen, physics) if blank.kind == "raw" else _fit_slices(blank, chosen, physics)
+
+
+def _check_values(recordings: Sequence[FrameSeries]) -> None:
+    """Raise CalibrationError for a recording without frames, or with values that are no numbers."""
+    for number, one in enumerate(recordings, 1):
+        which = f"recording {number} of {len(recordings)}"
+        if not len(one.t_s):
+            raise CalibrationError(f"{which} has no frames to calibrate on; leave it out, or use a longer part of it")
+        # A slice without a torque of its own may be of a cylinder.
+        torque = one.torque_nm if one.kind == "raw" else np.zeros(0)
+        wrong = sum(int(np.count_nonzero(~np.isfinite(values))) for values in (one.t_s, one.channels, torque))
+        if wrong:
+            raise CalibrationError(f"{which} holds {wrong} values that are not finite numbers; leave those frames out")
 
 
 def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:

@@ -12,6 +12,8 @@ _LARGE_STEP = 1.4
 # Frames that are less than this share of the way from the idle to the loaded ones, in the median of so many, are idle.
 # Gripped and not twisted they are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
 _LIKE_IDLE_SHARE, _LIKE_IDLE_FRAMES = 0.45, 5
+# From the first torque to the last: of fewer frames there are no second differences to tell the noise by.
+_LEAST_SPAN = 3
 # Fewer frames than this after a step are not yet the gel let go.
 _LEAST_RELEASED = 10
 
@@ -26,10 +28,15 @@ def gripped_part(series: FrameSeries) -> tuple[slice, slice, slice]:
     """
     known = series.torque_at_frames()
     torque = np.abs(np.nan_to_num(known))
-    loaded = np.flatnonzero(torque > 0.1 * torque.max()) if torque.max() > 0 else np.zeros(0, dtype=np.int64)
+    loaded = np.flatnonzero(torque > 0.1 * torque.max(initial=np.finfo(np.float64).tiny))
     if len(loaded) == 0:
         raise CalibrationError("the recording holds no torque to calibrate on; record the load cell beside the frames")
     n, span = len(series.t_s), slice(int(loaded[0]), int(loaded[-1]) + 1)
+    if span.stop - span.start < _LEAST_SPAN:
+        raise CalibrationError(
+            f"from the first torque to the last there are {span.stop - span.start} frames, too few to tell a grip; "
+            "record several twists"
+        )
     step = np.zeros(n)
     for layer in range(len(series.sides)):
         frames = series.channels[:, layer]

@@ -75,9 +75,12 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
 
 
 def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:
-    """Return the frames between two shares (0 to 1) of a series, in time order."""
+    """Return the frames between two shares (0 to 1) of a series, in time order; UserError where there are none."""
     n = len(series.t_s)
-    return series.between(round(start * n), round(stop * n))
+    first, end = round(start * n), round(stop * n)
+    if first == end:
+        raise UserError(f"of {n} frames none lies between the shares {start:g} and {stop:g}; use a longer part")
+    return series.between(first, end)
 
 
 def _nearest(wanted: NDArray[np.int64], times: NDArray[np.int64]) -> NDArray[np.int64]:

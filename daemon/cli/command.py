@@ -11,7 +11,7 @@ COMMANDS = {
     "tare": "take the zero of the torque sensors anew: nothing gripped, no experiment running",
     "status": "how each task is",
     "start": "begin an experiment",
-    "pause": "stand still until `resume`",
+    "pause": "the arm stands still until `resume`; fingers that move go on to their end",
     "resume": "go on",
     "stop": "end the experiment and stand still; where none is running, end the daemon",
     "unlock": "let robot and gripper move again after a stop, once nobody is in reach of them",

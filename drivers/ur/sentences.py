@@ -85,10 +85,8 @@ def left_to_watchdog(why: str) -> str:
 
 def still_paused(why: str) -> str:
     """Return the sentence for a program of ours that is paused and could not be stopped."""
-    return (
-        f"The program that is paused could not be stopped ({why.strip().removesuffix('.')}): stop it at the teach "
-        "pendant, do not resume it."
-    )
+    why = why.strip().removesuffix(".")
+    return f"The program that is paused could not be stopped ({why}): stop it at the teach pendant, do not resume it."
 
 
 def unfit(reading: Reading, host: str, state_timeout_s: float) -> str:

@@ -52,9 +52,9 @@ def rig_messages(t_ns: int, turn: int) -> Iterator[Message]:
     yield RobotStateMessage(
         source="robot",
         t_mono_ns=t_ns,
-        joints_rad=np.zeros(6),
-        tcp_pose=np.zeros(6),
-        wrench=np.zeros(6),
+        joints_rad=(0.0,) * 6,
+        tcp_pose=(0.0,) * 6,
+        wrench=(0.0,) * 6,
         wrist_rad=swing,
         wrist_speed_rad_per_s=0.0,
         wrist_torque_nm=-torque_nm,

@@ -1,13 +1,8 @@
 """What the loop publishes: where it stands, and the state of the robot."""
 
-import numpy as np
-
 from daemon.loop.brain import Brain
 from daemon.messages import LoopState, RobotStateMessage
 from drivers.ur.messages import RobotState
-
-# Looked up once: from its text it would be at each state.
-_FLOAT32 = np.dtype("<f4")
 
 
 def loop_state(brain: Brain, sent_rad_per_s: float, now_ns: int) -> LoopState:
@@ -50,13 +45,12 @@ def loop_state(brain: Brain, sent_rad_per_s: float, now_ns: int) -> LoopState:
 
 def robot_state(state: RobotState) -> RobotStateMessage:
     """Return a state of the robot's process as it is published."""
-    joints_rad, tcp_pose, wrench = np.array((*state.q_rad, *state.tcp_pose, *state.wrench), _FLOAT32).reshape(3, 6)
     return RobotStateMessage(
         source="robot",
         t_mono_ns=state.t_mono_ns,
-        joints_rad=joints_rad,
-        tcp_pose=tcp_pose,
-        wrench=wrench,
+        joints_rad=state.q_rad,
+        tcp_pose=state.tcp_pose,
+        wrench=state.wrench,
         wrist_rad=state.wrist_rad,
         wrist_speed_rad_per_s=state.qd_rad_per_s[5],
         wrist_torque_nm=state.wrist_torque_nm,

@@ -6,7 +6,9 @@ has `timestamp` (Unix seconds), `t_mono_ns`, `seq` (per topic and source, withou
 """
 
 import dataclasses
+import sys
 import threading
+from array import array
 from collections.abc import Mapping
 from dataclasses import field
 from typing import Any, ClassVar, TypeAlias
@@ -19,7 +21,8 @@ from drivers.values import value
 
 Scalar: TypeAlias = float | int | str | bool | None
 FloatArray: TypeAlias = NDArray[np.floating]
-
+# An array of a few numbers, 25 times a second: NumPy takes longer to begin than they take to write.
+Few: TypeAlias = tuple[float, ...]
 
 _WIRE = np.dtype("<f4")
 _NAMES: dict[type, tuple[str, ...]] = {}
@@ -157,9 +160,9 @@ class RobotStateMessage(Message):
     topic: ClassVar[str] = "robot.state"
     rate_hz: ClassVar[float | None] = 25.0
 
-    joints_rad: FloatArray = column("rad", "the six joint angles, base to wrist 3")
-    tcp_pose: FloatArray = column("m, rad", "position and rotation vector of the tool centre in the base frame")
-    wrench: FloatArray = column("N, N·m", "force and torque at the tool centre")
+    joints_rad: Few = column("rad", "the six joint angles, base to wrist 3")
+    tcp_pose: Few = column("m, rad", "position and rotation vector of the tool centre in the base frame")
+    wrench: Few = column("N, N·m", "force and torque at the tool centre")
     wrist_rad: float = column("rad", "angle of wrist 3, about which the tool twists")
     wrist_speed_rad_per_s: float = column("rad/s", "its speed")
     wrist_torque_nm: float = column("N·m", "torque about the tool's axis, from the wrench")
@@ -248,9 +251,20 @@ def wire_map(message: Message, timestamp: float, seq: int) -> dict[str, Any]:
         if isinstance(value, np.ndarray):
             content[name] = value.astype(_WIRE, copy=False).tobytes()
             content[f"{name}_shape"] = list(value.shape)
+        elif isinstance(value, tuple):
+            content[name] = _few_bytes(value)
+            content[f"{name}_shape"] = [len(value)]
         else:
             content[name] = value
     return content
+
+
+def _few_bytes(numbers: Few) -> bytes:
+    # Not `struct`, which raises where a number is too large for float32: as of NumPy, it is infinite then.
+    found = array("f", numbers)
+    if sys.byteorder == "big":
+        found.byteswap()
+    return found.tobytes()
 
 
 def _names(kind: type[Message]) -> tuple[str, ...]:

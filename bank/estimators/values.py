@@ -176,8 +176,12 @@ def fused(*measured: Measured | None) -> Measured | None:
         return None
     if any(one.half_width <= 0 for one in present):
         raise ValueError("a measurement with no uncertainty cannot be weighed against others")
-    weights = np.array([one.half_width**-2 for one in present])
-    values = np.array([one.value for one in present])
-    value = float(weights @ values / weights.sum())
-    apart = TWO_SIDED_95**2 * float(weights @ (values - value) ** 2) / max(len(present) - 1, 1)
-    return Measured(value, float(np.sqrt(max(apart, 1.0) / weights.sum())))
+    weighed = [(one.half_width**-2, one.value) for one in present]
+    total = sum(weight for weight, _ in weighed)
+    if not total:
+        # Each of them may be anything.
+        return None
+    mean = sum(weight * value for weight, value in weighed) / total
+    squares = sum(weight * (value - mean) ** 2 for weight, value in weighed)
+    apart = TWO_SIDED_95**2 * squares / max(len(present) - 1, 1)
+    return Measured(mean, math.sqrt(max(apart, 1.0) / total))

@@ -88,7 +88,7 @@ def _type_name(hint: Any) -> str:
     if origin in (Union, types.UnionType):
         names = [_type_name(part) for part in get_args(hint) if part is not type(None)]
         return " or ".join([*dict.fromkeys(names), *(["nil"] if type(None) in get_args(hint) else [])])
-    if origin is np.ndarray or hint is np.ndarray:
+    if origin in (np.ndarray, tuple) or hint is np.ndarray:
         return "array"
     plain: dict[Any, str] = {float: "number", int: "integer", bool: "truth value", str: "text"}
     return plain.get(hint, "map")

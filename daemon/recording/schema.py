@@ -134,7 +134,7 @@ def _type(hint: Any) -> dict[str, Any]:
         hint = next(part for part in typing.get_args(hint) if part is not type(None))
     if hint in _NAMES:
         return {"type": _NAMES[hint]}
-    if typing.get_origin(hint) is np.ndarray:
+    if typing.get_origin(hint) in (np.ndarray, tuple):
         # An element that is NaN has no JSON form and is null, for which there is no word that Foxglove takes.
         return {"type": "array", "items": {"type": "number"}}
     return {"type": "object", "properties": {}}

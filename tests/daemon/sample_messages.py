@@ -16,6 +16,8 @@ def sample(kind: type[Message]) -> Message:
         hint = str(get_type_hints(kind)[item.name])
         if "ndarray" in hint:
             values[item.name] = np.arange(6.0).reshape(2, 3)
+        elif "tuple" in hint:
+            values[item.name] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0)
         elif "Mapping" in hint:
             values[item.name] = {"right": {"alive": True, "rate_hz": 1.85, "errors": {"nan": 2}, "last_error": ""}}
         elif "bool" in hint:

@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from daemon.messages import EitHeatmap, decode, encode, wire_map
+from daemon.messages import EitHeatmap, RobotStateMessage, decode, encode, wire_map
 from daemon.topics import TOPICS
+from tests.daemon.sample_messages import sample
 
 SCALARS = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | st.text()
 ARRAYS = hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=3, max_side=8))
@@ -41,6 +42,15 @@ def test_an_array_is_bin_with_its_shape_beside_it_so_that_plotting_tools_pass_ov
     content = wire_map(heatmap(np.array([[0.25, np.nan]])), timestamp=0.0, seq=0)
     assert content["scores"] == np.array([0.25, np.nan], "<f4").tobytes()
     assert content["scores_shape"] == [1, 2]
+
+
+@given(st.lists(st.floats(), max_size=8))
+def test_a_few_numbers_go_as_an_array_of_them_would(numbers: list[float]) -> None:
+    with np.errstate(over="ignore"):
+        array = np.array(numbers).astype("<f4")
+    content = wire_map(dataclasses.replace(sample(RobotStateMessage), joints_rad=tuple(numbers)), 0.0, 0)  # type: ignore[call-arg]
+    assert content["joints_rad_shape"] == [len(numbers)]
+    np.testing.assert_array_equal(np.frombuffer(content["joints_rad"], "<f4"), array)
 
 
 @given(st.dictionaries(st.text().filter(lambda key: not key.endswith("_shape")), SCALARS))

@@ -56,6 +56,7 @@ def test_the_interval_of_fused_measurements_holds_the_truth_as_often_as_it_says(
 
 def test_nothing_measured_is_nothing():
     assert fused(None, None) is None
+    assert fused(Measured(1.0, float("inf")), Measured(2.0, float("inf"))) is None, "each may be anything"
     with pytest.raises(ValueError, match="no uncertainty"):
         fused(Measured(1.0, 0.0), Measured(1.0, 1.0))
 

@@ -114,9 +114,9 @@ MESSAGES: Mapping[str, Mapping[str, Any]] = {
     "robot": {
         "kind": RobotStateMessage,
         "source": "robot",
-        "joints_rad": np.zeros(6),
-        "tcp_pose": np.array([-0.4921, -0.1333, 0.4876, 0, 0, 0]),
-        "wrench": np.zeros(6),
+        "joints_rad": (0.0,) * 6,
+        "tcp_pose": (-0.4921, -0.1333, 0.4876, 0.0, 0.0, 0.0),
+        "wrench": (0.0,) * 6,
         "wrist_rad": 0.1476,
         "wrist_speed_rad_per_s": -0.0124,
         "wrist_torque_nm": -0.1023,

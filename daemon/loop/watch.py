@@ -1,10 +1,10 @@
 """From what is sensed to what is wrong: the events of the safety table, with the numbers of this moment."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from daemon.experiment.steps import Limits
-from daemon.loop.senses import Senses, Source
+from daemon.loop.senses import Arm, Hand, Senses, Source
 from daemon.safety import Event, Trouble
 from daemon.topics import STALE_AFTER_PERIODS, stale_after_s
 from drivers.values import value
@@ -44,53 +44,58 @@ class Watched:
     required: tuple[str, ...] = ()
 
 
-def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
-    """Yield everything that is wrong at t_ns, in the order of the table."""
+def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> list[Trouble]:
+    """Return everything that is wrong at t_ns, in the order of the table."""
+    # In each of the robot's cycles, and nearly always nothing: generators would cost more than what they look at.
+    found: list[Trouble] = []
     if watched.torque_needed:
-        yield from _torque(senses, watched, settings, t_ns)
-    yield from _limits(senses, watched, settings, t_ns)
-    yield from _arm_and_hand(senses, watched, t_ns)
+        found += _torque(senses, watched, settings, t_ns)
+    found += _limits(senses, watched, settings, t_ns)
+    found += _arm_and_hand(senses, watched, t_ns)
     for name, why in senses.lost.items():
         if name in watched.required and name not in _awaited(senses, watched):
-            yield Trouble(Event.DEVICE_LOST, f"{name}: {why}")
+            found.append(Trouble(Event.DEVICE_LOST, f"{name}: {why}"))
     for name, why in senses.died.items():
-        yield Trouble(Event.TASK_DIED, f"{name}: {why}")
+        found.append(Trouble(Event.TASK_DIED, f"{name}: {why}"))
     if senses.late_s > LATEST_LOOP_S:
-        yield Trouble(Event.LOOP_LATE, f"the 8 ms loop was woken {senses.late_s * 1e3:.0f} ms late")
+        found.append(Trouble(Event.LOOP_LATE, f"the 8 ms loop was woken {senses.late_s * 1e3:.0f} ms late"))
     if senses.recording_failed:
-        yield Trouble(Event.RECORDING_FAILED, senses.recording_failed)
+        found.append(Trouble(Event.RECORDING_FAILED, senses.recording_failed))
     if watched.overdue:
-        yield Trouble(Event.STEP_OVERDUE, watched.overdue)
+        found.append(Trouble(Event.STEP_OVERDUE, watched.overdue))
+    return found
 
 
-def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
+def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> list[Trouble]:
     source = watched.driving
+    found: list[Trouble] = []
     for other in watched.supervising:
         # The wrench comes with the arm's state, which is watched by itself.
         if not other.of_the_arm:
-            yield from _unusable(senses, other, settings, t_ns)
-    driving = list(_unusable(senses, source, settings, t_ns))
-    yield from driving
+            found += _unusable(senses, other, settings, t_ns)
+    driving = _unusable(senses, source, settings, t_ns)
+    found += driving
     latest = senses.torques.get(source.name)
     if driving or latest is None or latest.torque_nm is None:
-        return
+        return found
     if watched.expected_nm is not None and abs(latest.torque_nm - watched.expected_nm) > settings.jump_nm:
-        yield Trouble(
-            Event.ESTIMATE_JUMPED,
-            f"{source.name} says {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was to be expected",
+        jumped = (
+            f"{source.name} says {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was to be expected"
         )
+        found.append(Trouble(Event.ESTIMATE_JUMPED, jumped))
     for other in watched.supervising:
-        yield from _disagreement(senses, source, other, settings, t_ns)
+        found += _disagreement(senses, source, other, settings, t_ns)
+    return found
 
 
-def _unusable(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
-    """Yield why a source says nothing about the torque of now: it is silent, late or gone, or what it says is void."""
+def _unusable(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> list[Trouble]:
+    """Return why a source says nothing about the torque of now: it is silent, late or gone, or what it says is void."""
     if why := _not_fresh(senses, source, settings, t_ns):
-        yield Trouble(Event.ESTIMATE_STALE, why)
-        return
+        return [Trouble(Event.ESTIMATE_STALE, why)]
     latest = senses.torques[source.name]
     if latest.torque_nm is None and source.measures_torque:
-        yield Trouble(Event.ESTIMATE_INVALID, f"{source.name} says: {latest.why or 'nothing'}")
+        return [Trouble(Event.ESTIMATE_INVALID, f"{source.name} says: {latest.why or 'nothing'}")]
+    return []
 
 
 def _not_fresh(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> str:
@@ -126,40 +131,40 @@ def compared_for_s(sources: Iterable[Source], settings: WatchSettings) -> float:
     return max(_fresh_for_s(one, settings) + 2.0 * max(one.window_s, one.period_s) for one in sources)
 
 
-def _disagreement(senses: Senses, one: Source, other: Source, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
+def _disagreement(senses: Senses, one: Source, other: Source, settings: WatchSettings, t_ns: int) -> list[Trouble]:
     """Compare two torques at the time of the slower one's latest frame, over its own window."""
-    slow, fast = sorted((one, other), key=lambda source: source.period_s, reverse=True)
+    slow, fast = (one, other) if one.period_s >= other.period_s else (other, one)
     latest = senses.torques.get(slow.name)
     if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > _fresh_for_s(slow, settings) * 1e9:
-        return
+        return []
     half_ns = round(max(slow.window_s, fast.period_s) * 0.5e9)
     beside_nm = senses.mean_torque_nm(fast.name, latest.t_mid_ns - half_ns, latest.t_mid_ns + half_ns)
     if beside_nm is None:
-        return
+        return []
     apart_nm = abs(latest.torque_nm - beside_nm)
     if apart_nm > settings.disagreement_nm:
-        yield Trouble(
-            Event.TORQUES_DISAGREE,
+        apart = (
             f"{slow.name} says {latest.torque_nm:+.3f} N·m and {fast.name} {beside_nm:+.3f} N·m, "
-            f"{apart_nm:.3f} N·m apart where {settings.disagreement_nm:g} are allowed",
+            f"{apart_nm:.3f} N·m apart where {settings.disagreement_nm:g} are allowed"
         )
+        return [Trouble(Event.TORQUES_DISAGREE, apart)]
+    return []
 
 
-def _limits(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> Iterator[Trouble]:
+def _limits(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> list[Trouble]:
     limit_nm, limit_rad = watched.limits.torque_nm, watched.limits.angle_rad
+    found: list[Trouble] = []
     for source in (watched.driving, *watched.supervising):
         torque = senses.torques.get(source.name)
         if torque is None or torque.torque_nm is None or t_ns - torque.t_ns > _fresh_for_s(source, settings) * 1e9:
             continue
         if abs(torque.torque_nm) > limit_nm:
-            yield Trouble(
-                Event.TORQUE_LIMIT, f"{source.name} says {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
-            )
+            beyond = f"{source.name} says {torque.torque_nm:+.3f} N·m, the limit is {limit_nm:g} N·m"
+            found.append(Trouble(Event.TORQUE_LIMIT, beyond))
     if watched.gripped and abs(watched.twisted_rad) > limit_rad:
-        yield Trouble(
-            Event.ANGLE_LIMIT,
-            f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad",
-        )
+        turned = f"turned by {watched.twisted_rad:+.3f} rad since the grip, the limit is {limit_rad:g} rad"
+        found.append(Trouble(Event.ANGLE_LIMIT, turned))
+    return found
 
 
 def _awaited(senses: Senses, watched: Watched) -> tuple[str, ...]:
@@ -168,28 +173,37 @@ def _awaited(senses: Senses, watched: Watched) -> tuple[str, ...]:
     return (*robot, "gripper") if senses.hand is None and "gripper" in watched.required else robot
 
 
-def _arm_and_hand(senses: Senses, watched: Watched, t_ns: int) -> Iterator[Trouble]:
+def _arm_and_hand(senses: Senses, watched: Watched, t_ns: int) -> list[Trouble]:
     arm, hand = senses.arm, senses.hand
+    found: list[Trouble] = []
     if awaited := _awaited(senses, watched):
         # All at once: before they are switched on there is one thing to say.
         told = (f"{name}, {senses.lost[name].removesuffix('.')}" if name in senses.lost else name for name in awaited)
-        yield Trouble(Event.DEVICE_AWAITED, "; ".join(told))
-    if arm is None:
-        pass
-    elif t_ns - arm.t_ns > ARM_STALE_S * 1e9:
-        yield Trouble(Event.STATE_STALE, f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago")
-    elif arm.emergency_stop:
-        yield Trouble(Event.EMERGENCY_STOP, arm.blocked or "the controller reports it")
-    elif arm.protective_stop:
-        yield Trouble(Event.PROTECTIVE_STOP, arm.blocked or "the controller reports it")
-    elif arm.blocked:
-        yield Trouble(Event.DEVICE_LOST, f"the robot does not move: {arm.blocked}")
-    if hand is None or "gripper" not in watched.required:
-        return
+        found.append(Trouble(Event.DEVICE_AWAITED, "; ".join(told)))
+    if arm is not None:
+        found += _arm(arm, t_ns)
+    if hand is not None and "gripper" in watched.required:
+        found += _hand(hand, t_ns, gripped=watched.gripped)
+    return found
+
+
+def _arm(arm: Arm, t_ns: int) -> list[Trouble]:
+    if t_ns - arm.t_ns > ARM_STALE_S * 1e9:
+        return [Trouble(Event.STATE_STALE, f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago")]
+    if arm.emergency_stop:
+        return [Trouble(Event.EMERGENCY_STOP, arm.blocked or "the controller reports it")]
+    if arm.protective_stop:
+        return [Trouble(Event.PROTECTIVE_STOP, arm.blocked or "the controller reports it")]
+    if arm.blocked:
+        return [Trouble(Event.DEVICE_LOST, f"the robot does not move: {arm.blocked}")]
+    return []
+
+
+def _hand(hand: Hand, t_ns: int, *, gripped: bool) -> list[Trouble]:
     if t_ns - hand.t_ns > HAND_STALE_S * 1e9:
-        yield Trouble(Event.STATE_STALE, f"the gripper last reported its state {(t_ns - hand.t_ns) / 1e9:.1f} s ago")
-        return
+        return [Trouble(Event.STATE_STALE, f"the gripper last reported its state {(t_ns - hand.t_ns) / 1e9:.1f} s ago")]
     if hand.fault:
-        yield Trouble(Event.GRIPPER_FAULT, hand.fault)
-    elif watched.gripped and not hand.holding:
-        yield Trouble(Event.GRIP_LOST, f"its fingers are {hand.width_mm:.1f} mm apart with nothing between them")
+        return [Trouble(Event.GRIPPER_FAULT, hand.fault)]
+    if gripped and not hand.holding:
+        return [Trouble(Event.GRIP_LOST, f"its fingers are {hand.width_mm:.1f} mm apart with nothing between them")]
+    return []

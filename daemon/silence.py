@@ -3,6 +3,9 @@
 import asyncio
 from collections.abc import Callable
 
+# A timer is put off where no more is left of it than this share of the time.
+SOON = 0.25
+
 
 class Silence:
     """Calls `broken_by` when nothing was heard for as long as was said when something was heard last."""
@@ -12,13 +15,16 @@ class Silence:
         self._broken_by = broken_by
         self._timer: asyncio.TimerHandle | None = None
         self._due_s = 0.0
+        self._loop: asyncio.AbstractEventLoop | None = None
 
     def heard(self, longest_s: float) -> None:
         """Take note that something was heard, and may stay away for so long."""
-        loop = asyncio.get_running_loop()
-        self._due_s = loop.time() + longest_s
-        # A timer that waits is not put off at every state, which costs more than to look now and then in vain.
-        if self._timer is None or self._due_s < self._timer.when():
+        loop = self._loop = self._loop or asyncio.get_running_loop()
+        now_s = loop.time()
+        self._due_s = now_s + longest_s
+        # A timer that waits is not put off at every state, which is dear, but before it would wake us to look in vain,
+        # which is dearer still.
+        if self._timer is None or not now_s + SOON * longest_s < self._timer.when() <= self._due_s:
             self.end()
             self._timer = loop.call_at(self._due_s, self._look)
 

@@ -107,18 +107,14 @@ class UrRobot:
 
     def hurry(self) -> None:
         """Have a state in every cycle again, the next one in the present one."""
-        if self._end_ease() and self._stdin is not None:
-            self._write(self._stdin, HEARTBEAT)
+        if self.at_ease:
+            self._hurried.set()
+            if self._stdin is not None:
+                self._write(self._stdin, HEARTBEAT)
 
     async def hurried(self) -> None:
         """Wait until a state is needed in every cycle, and signs of life with them."""
         await self._hurried.wait()
-
-    def _end_ease(self) -> bool:
-        """Return whether the process was at ease, and will not be: whatever it hears next ends that."""
-        at_ease = self.at_ease
-        self._hurried.set()
-        return at_ease
 
     async def _awaited(self, seconds: float | None) -> RobotState | None:
         loop = asyncio.get_running_loop()
@@ -154,7 +150,8 @@ class UrRobot:
             return
         self._number += 1
         self._waiting[self._number] = answered
-        self._end_ease()
+        # Whatever the process hears ends its ease.
+        self._hurried.set()
         self._write(self._stdin, encode(command, self._number))
 
     def _write(self, stdin: asyncio.StreamWriter, data: bytes) -> None:
@@ -220,7 +217,7 @@ class UrRobot:
     def _disconnected(self) -> None:
         self._stdin = None
         # The next process begins with every cycle.
-        self._end_ease()
+        self._hurried.set()
         if self._state is not None:
             # A network that failed makes no program ours.
             self._lost_s = time.monotonic() if self._state.ours else -math.inf

@@ -66,6 +66,7 @@ class Conversation:
         self._said = b""
         self._said_all = asyncio.Event()
         self._doing = "starting"
+        self._controls = False
         self._stdin.write(encode(Configure(robot.settings, robot.takes_over)))
 
     async def listen(self) -> None:
@@ -90,7 +91,10 @@ class Conversation:
         try:
             data = os.read(self._stdout, 1 << 16)
             self._heard_s = time.monotonic()
-            self._take(list(self._decoder.feed(data)))
+            messages = self._decoder.feed(data)
+            if not self._controls:
+                self._begin_with(messages)
+            self._robot.take_all(messages)
         except BlockingIOError:
             return
         except ProtocolError as error:
@@ -102,14 +106,15 @@ class Conversation:
             if not data:
                 self._end_with(None)
 
-    def _take(self, messages: list[tuple[int, Message]]) -> None:
+    def _begin_with(self, messages: list[tuple[int, Message]]) -> None:
+        """Follow how far the process has come; from its first state on it controls the robot, and takes commands."""
         for _, message in messages:
             if isinstance(message, RobotState):
+                self._controls = True
                 self._doing = "controlling"
                 self._robot.connected(self._stdin)
             elif isinstance(message, Phase):
                 self._doing = message.doing
-        self._robot.take_all(messages)
 
     def _turn_away(self) -> None:
         asyncio.get_running_loop().remove_reader(self._stdout)

@@ -36,6 +36,8 @@ LONGEST_EASE_S = 0.5 * ARM_STALE_S
 # Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
 # take the first one's place.
 MOST_UNANSWERED = 1
+# A wrist speed that stays the same is told again after so much of the time for which the robot's process holds it.
+RENEWED_AFTER = 0.2
 LOOP_STATE_PERIOD_S = 1.0
 # A loop that died tells the arm to stop, and waits no longer than this for the answer.
 BRAKE_S = 0.5
@@ -81,6 +83,9 @@ class LoopTask:
         # What the loop, or a command of it, died of since the brain was told last.
         self._own_death = ""
         self._sent_rad_per_s = 0.0
+        # When the robot was commanded last, and how soon it is again though nothing else is wanted.
+        self._commanded_ns = 0
+        self._renewed_ns = round(RENEWED_AFTER * robot.settings.command_timeout_s * 1e9)
         self._stopped = True
         self._told: tuple[object, ...] = ()
         self._told_ns = self._told_hold = 0
@@ -283,11 +288,29 @@ class LoopTask:
         speed = orders.wrist_rad_per_s
         if speed == 0.0 and self._sent_rad_per_s == 0.0:
             return
-        if self._unanswered < MOST_UNANSWERED:
-            self._send(WristSpeed(speed, self._acceleration_rad_per_s2))
+        command = WristSpeed(speed, self._acceleration_rad_per_s2)
+        if self._unanswered < MOST_UNANSWERED and not self._turns_so(command):
+            self._send(command)
+
+    def _turns_so(self, command: WristSpeed) -> bool:
+        """Whether the robot's process turns the wrist just so, and will go on without being told again for now.
+
+        It sends that speed in each of its cycles, within the limits of what it reads in it. What it has clipped is told
+        again in each of ours: it would be taken up by itself as soon as the limits allow.
+        """
+        state = self._robot.state
+        return (
+            state is not None
+            and state.motion == "wrist"
+            and state.sent == command
+            and not state.clipped
+            and command.rad_per_s == self._sent_rad_per_s
+            and self._decided_ns - self._commanded_ns < self._renewed_ns
+        )
 
     def _send(self, command: WristSpeed | Stop) -> None:
         self._unanswered += 1
+        self._commanded_ns = self._decided_ns
         try:
             self._robot.tell(command, self._answered)
         except Exception as error:  # noqa: BLE001 - told by the next tick, which ends the experiment

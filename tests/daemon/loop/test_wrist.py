@@ -1,0 +1,48 @@
+"""The speed of the wrist for a wish: near what is asked, and not another one in each cycle."""
+
+from functools import partial
+from itertools import pairwise
+
+import pytest
+
+from daemon.experiment.wishes import GoTo
+from daemon.loop.senses import Source
+from daemon.loop.tune import TuneSettings, tuned
+from daemon.loop.wrist import AS_GOOD_RAD_PER_S, Wrist, WristSettings
+
+CYCLE_NS = 8_000_000
+SETTINGS = WristSettings()
+# Without anything under way: what is sent shows in the angle at once.
+AT_ONCE = WristSettings(actuation_s=0.0)
+
+
+def wrist(settings: WristSettings = AT_ONCE) -> Wrist:
+    return Wrist(Source(name="load_cell", period_s=0.1), settings, partial(tuned, TuneSettings()))
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_speed_as_good_as_the_one_that_was_sent_is_that_one(sign: float) -> None:
+    one, sent = wrist(), sign * 0.01
+    one.sent(sent)
+    for apart, is_kept in ((0.9 * AS_GOOD_RAD_PER_S, True), (1.1 * AS_GOOD_RAD_PER_S, False)):
+        wanted = sent + sign * apart
+        turn = one.turn(GoTo(wanted / SETTINGS.angle_bandwidth_per_s, 0.2), 10**9, 0.0, 0.0)
+        assert turn.speed_rad_per_s == pytest.approx(sent if is_kept else wanted, abs=1e-12)
+
+
+def test_a_wrist_that_stands_sets_out_for_however_little() -> None:
+    turn = wrist().turn(GoTo(0.1 * AS_GOOD_RAD_PER_S, 0.2), 10**9, 0.0, 0.0)
+    assert turn.speed_rad_per_s == pytest.approx(0.1 * AS_GOOD_RAD_PER_S * SETTINGS.angle_bandwidth_per_s)
+
+
+def test_a_held_angle_is_kept_and_seldom_needs_another_speed() -> None:
+    one, angle_rad, speeds, errors_rad = wrist(), 0.0, [], []
+    for cycle in range(1000):
+        speed = one.turn(GoTo(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
+        one.sent(speed)
+        angle_rad += speed * CYCLE_NS / 1e9
+        speeds.append(speed)
+        errors_rad.append(abs(angle_rad - 0.15))
+    # From two seconds after the arrival on.
+    assert max(errors_rad[375:]) < 1.1 * AS_GOOD_RAD_PER_S / SETTINGS.angle_bandwidth_per_s
+    assert sum(one != other for one, other in pairwise(speeds[375:])) < 30

@@ -55,10 +55,7 @@ class Arm:
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return Reading(
-            now_ns,
             sample.timestamp_s,
-            self._age.age_ns(sample.timestamp_s, now_ns),
-            self._receiver.connected and self._control.isConnected(),
             sample.q_rad,
             sample.qd_rad_per_s,
             sample.tcp_pose,
@@ -67,6 +64,9 @@ class Arm:
             sample.safety_mode,
             sample.runtime_state,
             sample.speed_scaling,
+            now_ns,
+            self._age.age_ns(sample.timestamp_s, now_ns),
+            self._receiver.connected and self._control.isConnected(),
             # Two calls that wrap an object: not in each cycle in which the answer is known.
             self._may_move_linearly and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )

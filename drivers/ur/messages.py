@@ -92,16 +92,13 @@ class Reply:
 
 
 @value(frozen=True, slots=True)
-class Reading:
-    """One reading of the controller: SI units, base frame, joints from base to wrist 3."""
+class Sample:
+    """What the controller says of itself at one time: SI units, base frame, joints from base to wrist 3."""
 
     __pydantic_config__: ClassVar = _STRICT
 
-    t_mono_ns: int
+    # By the controller's own clock.
     timestamp_s: float
-    # How long ago the controller made the sample, by its own clock: it can be new to us, and have waited.
-    age_ns: int
-    connected: bool
     q_rad: Six
     qd_rad_per_s: Six
     tcp_pose: Six
@@ -110,6 +107,16 @@ class Reading:
     safety_mode: int
     runtime_state: int
     speed_scaling: float
+
+
+@value(frozen=True, slots=True)
+class Reading(Sample):
+    """The controller's latest sample as it was read here, and what is known of the connection."""
+
+    t_mono_ns: int
+    # How long ago the controller made the sample, by its own clock: it can be new to us, and have waited.
+    age_ns: int
+    connected: bool
     moving_linearly: bool
 
     @property

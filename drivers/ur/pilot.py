@@ -146,10 +146,7 @@ class Pilot:
     def state(self, reading: Reading, cycle: int) -> RobotState:
         """Return the reading of a cycle with everything that this pilot adds to it."""
         return RobotState(
-            reading.t_mono_ns,
             reading.timestamp_s,
-            reading.age_ns,
-            reading.connected,
             reading.q_rad,
             reading.qd_rad_per_s,
             reading.tcp_pose,
@@ -158,6 +155,9 @@ class Pilot:
             reading.safety_mode,
             reading.runtime_state,
             reading.speed_scaling,
+            reading.t_mono_ns,
+            reading.age_ns,
+            reading.connected,
             reading.moving_linearly,
             wrist_torque_nm=tool_axis_torque(reading),
             protective_stop=reading.safety_mode == SAFETY_PROTECTIVE_STOP,

@@ -9,9 +9,8 @@ import socket
 import struct
 
 from drivers.errors import ProtocolError
+from drivers.ur.messages import Sample
 from drivers.ur.probe import HEADER, RTDE_PORT, agree_on_protocol, explained, request
-from drivers.ur.settings import Six
-from drivers.values import value
 
 _OUTPUTS, _START, _DATA = ord("O"), ord("S"), ord("U")
 # The outputs, with their types, in the order of a sample's fields.
@@ -32,21 +31,6 @@ _PACKAGE_BYTES = HEADER.size + 1 + _VALUES.size
 _RATE = struct.Struct(">d")
 # A second's worth of samples.
 _READ_BYTES = 1 << 15
-
-
-@value(frozen=True, slots=True)
-class Sample:
-    """One sample of the controller: SI units, base frame, joints from base to wrist 3."""
-
-    timestamp_s: float
-    q_rad: Six
-    qd_rad_per_s: Six
-    tcp_pose: Six
-    wrench: Six
-    robot_mode: int
-    safety_mode: int
-    runtime_state: int
-    speed_scaling: float
 
 
 class SampleParser:

@@ -40,9 +40,9 @@ _STRICT = ConfigDict(strict=True)
 _MOTIONS: Final[tuple[MotionKind, ...]] = ("idle", "wrist", "linear", "stopping")
 
 
-# The numbers of a state in the order of its fields, its four vectors as one: t_mono_ns, timestamp_s, age_ns, vectors,
-# modes, speed_scaling, wrist_torque_nm, motion_id, cycle, stops_in_vain, motion, flags.
-_NUMBERS = struct.Struct("<qdq24diiiddIQIB6?")
+# The numbers of a state, its four vectors as one: timestamp_s, vectors, modes, speed_scaling, t_mono_ns, age_ns,
+# wrist_torque_nm, motion_id, cycle, stops_in_vain, motion, flags.
+_NUMBERS = struct.Struct("<d24d3idqqdIQIB6?")
 # What was last sent to the robot: its kind, and its numbers in the order of its fields.
 _SENT = struct.Struct("<B8d")
 _WRIST_SPEED = struct.Struct("<2d")
@@ -135,9 +135,9 @@ def _checked(adapter: TypeAdapter[T], body: bytes, name: str) -> T:
 
 def _state_body(state: RobotState) -> bytes:
     return _NUMBERS.pack(
-        state.t_mono_ns, state.timestamp_s, state.age_ns,
-        *state.q_rad, *state.qd_rad_per_s, *state.tcp_pose, *state.wrench,
-        state.robot_mode, state.safety_mode, state.runtime_state, state.speed_scaling, state.wrist_torque_nm,
+        state.timestamp_s, *state.q_rad, *state.qd_rad_per_s, *state.tcp_pose, *state.wrench,
+        state.robot_mode, state.safety_mode, state.runtime_state, state.speed_scaling,
+        state.t_mono_ns, state.age_ns, state.wrist_torque_nm,
         state.motion_id, state.cycle, state.stops_in_vain, _MOTIONS.index(state.motion),
         state.connected, state.moving_linearly, state.protective_stop, state.emergency_stop, state.recovering,
         state.ours,
@@ -204,19 +204,18 @@ def _words_of_reply(body: bytes) -> tuple[str, tuple[str, ...]]:
 
 def _state(body: bytes) -> RobotState:
     numbers = _NUMBERS.unpack_from(body)
-    t_mono_ns, timestamp_s, age_ns = numbers[:3]
     (
-        robot_mode, safety_mode, runtime_state, speed_scaling, wrist_torque_nm, motion_id, cycle, stops_in_vain, motion,
+        robot_mode, safety_mode, runtime_state, speed_scaling, t_mono_ns, age_ns,
+        wrist_torque_nm, motion_id, cycle, stops_in_vain, motion,
         connected, moving_linearly, protective_stop, emergency_stop, recovering, ours,
-    ) = numbers[27:]  # fmt: skip
+    ) = numbers[25:]  # fmt: skip
     if motion >= len(_MOTIONS):
         raise ValueError(f"there is no motion {motion}")
     sent = _sent(body[_NUMBERS.size : _NUMBERS.size + _SENT.size])
     blocked, ended, clipped = _words_of_state(body[_NUMBERS.size + _SENT.size :])
     return RobotState(
-        t_mono_ns, timestamp_s, age_ns, connected,
-        numbers[3:9], numbers[9:15], numbers[15:21], numbers[21:27],
-        robot_mode, safety_mode, runtime_state, speed_scaling, moving_linearly,
+        numbers[0], numbers[1:7], numbers[7:13], numbers[13:19], numbers[19:25],
+        robot_mode, safety_mode, runtime_state, speed_scaling, t_mono_ns, age_ns, connected, moving_linearly,
         wrist_torque_nm, protective_stop, emergency_stop, blocked, recovering,
         _MOTIONS[motion], motion_id, ended, sent, clipped, cycle, ours, stops_in_vain,
     )  # fmt: skip

@@ -8,8 +8,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from drivers.ur.messages import MoveLinear, WristSpeed
-from drivers.ur.receiver import Sample
+from drivers.ur.messages import MoveLinear, Sample, WristSpeed
 from tests.drivers.ur.flight import SETTINGS
 
 SIX = (0.0,) * 6

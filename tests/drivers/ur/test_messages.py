@@ -130,7 +130,7 @@ def test_reply_with_anything_missing_wrong_or_more_is_refused(change: Callable[[
 )
 def test_a_state_with_anything_missing_wrong_or_more_is_refused(change: str) -> None:
     state = RobotState(
-        0, 0.0, 0, True, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, 7, 1, 2, 1.0, False,
+        0.0, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, (0.0,) * 6, 7, 1, 2, 1.0, 0, 0, True, False,
         0.0, False, False, "", False, "stopping", 0, "", None, (), 3, True, 0,
     )  # fmt: skip
     body = encode(state)[9:]
@@ -154,7 +154,7 @@ def _with_body(message: Message, body: bytes) -> bytes:
 
 def test_states_carry_what_is_no_number() -> None:
     state = RobotState(
-        0, 0.0, 0, True, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0, False,
+        0.0, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0, 0, 0, True, False,
         0.0, False, False, "", False, "idle", 0, "", None, (), 3, False, 0,
     )  # fmt: skip
     ((_, got),) = Decoder().feed(encode(state))

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from drivers.errors import ProtocolError
 from drivers.ur import receiver as receiver_module
+from drivers.ur.messages import Sample
 from drivers.ur.probe import ProbeError
-from drivers.ur.receiver import Receiver, Sample, SampleParser
+from drivers.ur.receiver import Receiver, SampleParser
 
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE"
 

@@ -22,7 +22,11 @@ def compiled(name: str, sources: list[str], headers: list[str]) -> Extension:
 
 setup(
     ext_modules=[
-        compiled("bank._search", ["bank/_search.c", "bank/search.c"], ["bank/search.h"]),
+        compiled(
+            "bank._search",
+            ["bank/_search.c", "bank/candidates.c", "bank/lags.c", "bank/search.c"],
+            ["bank/eight.h", "bank/search.h"],
+        ),
         compiled("drivers._cells", ["drivers/_cells.c"], []),
     ]
 )

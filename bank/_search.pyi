@@ -1,5 +1,3 @@
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,7 +7,6 @@ class Search:
     def __init__(
         self,
         basis: NDArray[np.float32],
-        coarse: NDArray[np.float32],
         fine: NDArray[np.float32],
         signals: NDArray[np.float32],
         places: NDArray[np.int64],
@@ -17,9 +14,11 @@ class Search:
         k_of: NDArray[np.int32],
         sigma_of: NDArray[np.int32],
         overlaps: NDArray[np.float64],
-        cells: NDArray[np.int32],
-        levels: tuple[tuple[NDArray[np.float32], NDArray[np.int32]], ...],
+        spectra: NDArray[np.float32],
+        roots: NDArray[np.float32],
+        levels: tuple[tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]], ...],
         multiply: object,
+        coarse_rank: int,
         rounding: float,
         square_rounding: float,
         tie: float,
@@ -31,12 +30,7 @@ class Search:
         self, difference: NDArray[np.float64], runner_up: bool, most_scores: int, /
     ) -> tuple[int, float, int, float] | None: ...
     def match_at_all_lags(
-        self,
-        difference: NDArray[np.float64],
-        correlate: Callable[[bytes, int, int], NDArray[np.float32]],
-        runner_up: bool,
-        most_scores: int,
-        /,
+        self, difference: NDArray[np.float64], runner_up: bool, most_scores: int, /
     ) -> tuple[int, float, int, float] | None: ...
 
 def energy(difference: NDArray[np.float64], noise: NDArray[np.float64], /) -> float: ...

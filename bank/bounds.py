@@ -245,14 +245,3 @@ class AllLagsBounds:
 def spectra_of(bank: CompressedBank) -> Spectra:
     """Return the conjugate transforms of the basis's first directions, (r, n // 2 + 1), by length n."""
     return {length: np.conj(fft.rfft(bank.basis[:COARSE_RANK], length)) for length in _LENGTHS}
-
-
-def correlated(spectra: Spectra, frame: bytes, first: int, end: int) -> Single:
-    """Return the (r, end − first) products of the basis's first directions and a frame, at lags from `first` ≤ 0 on.
-
-    frame are the bytes of its (896,) float32.
-    """
-    length = next(n for n in spectra if n >= N_CHANNELS + max(-first, end - 1))
-    parts = fft.irfft(fft.rfft(np.frombuffer(frame, np.float32), length) * spectra[length], length)
-    # A transform is a circle: lags below 0 lie at its end.
-    return np.concatenate([parts[:, length + first :], parts[:, :end]], axis=1)

@@ -1,7 +1,7 @@
 """What is compiled of the bank's work, where there was a C compiler when this was installed.
 
-The compiled code is `search.c`; numpy does the same without, and the tests compare the two. Its one purpose is the
-time from a frame to its estimate.
+The compiled code is `search.c` and what that calls; numpy does the same without, and the tests compare the two. Its
+one purpose is the time from a frame to its estimate.
 """
 
 from pathlib import Path
@@ -10,6 +10,7 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 from scipy.linalg import cython_blas
 
 from bank.compression import ROUNDING, SQUARE_ROUNDING, CompressedBank, FloatArray, Indices, Single
@@ -31,12 +32,18 @@ def is_stale(module: ModuleType, *names: str) -> bool:
     return there and crc32(b"".join(source.read_bytes() for source in sources)) != getattr(module, "SOURCES", None)
 
 
-Starts = NDArray[np.int32]
+# Rows in blocks, the numbers of what they bound, and where those of each group begin.
+Blocks = tuple[Single, NDArray[np.int32], NDArray[np.int32]]
+# In the order of setup.py.
+_SOURCES = ("_search.c", "candidates.c", "lags.c", "search.c", "eight.h", "search.h")
+# Numbers that compiled code takes side by side, and the length of its transforms.
+_LANES = 8
+_LENGTH = 2048
+# The norm of what is left out of nothing, so that its bound is below everything.
+_NEVER = -1e6
 # BLAS as scipy hands it to compiled code.
 _SGEMM = getattr(cython_blas, "__pyx_capi__", {}).get("sgemm")
-IS_COMPILED = (
-    _search is not None and not is_stale(_search, "_search.c", "search.c", "search.h") and _search.is_sgemm(_SGEMM)
-)
+IS_COMPILED = _search is not None and not is_stale(_search, *_SOURCES) and _search.is_sgemm(_SGEMM)
 
 
 def search_of(
@@ -59,10 +66,10 @@ def search_of(
     flags = signals.flags
     if not (IS_COMPILED and signals.dtype == np.float32 and flags.c_contiguous and flags.aligned):
         return None
-    levels, cells = _in_order(bank)
+    levels = _levels_of(bank)
     return _search.Search(
-        *(bank.basis, bank.coarse[cells], bank.fine, signals, places, norms, *grid, bank.overlaps, cells, levels),
-        *(_SGEMM, ROUNDING, SQUARE_ROUNDING, tie, tie_rounding, radius),
+        *(bank.basis, bank.fine, signals, places, norms, *grid, bank.overlaps, _spectra_of(bank), _rows_of(levels[0])),
+        *(levels, _SGEMM, bank.coarse.shape[1] - 2, ROUNDING, SQUARE_ROUNDING, tie, tie_rounding, radius),
     )
 
 
@@ -77,19 +84,44 @@ def energy(difference: FloatArray, noise: FloatArray) -> float | None:
     return None if found < 0 else found
 
 
-def _in_order(bank: CompressedBank) -> tuple[tuple[tuple[Single, Starts], ...], Starts]:
-    """Return each level's groups so that the parts of each lie one after the other, and the cells (n,) likewise.
+def _levels_of(bank: CompressedBank) -> tuple[Blocks, ...]:
+    """Return each level's groups, and the cells after them, in blocks of eight that are parts of the same group.
 
-    A level is its rows, (m, r + 2), and where the parts of each group begin in what comes next, (m + 1,).
+    A level is its rows in blocks (m, w + 2, 8), filled up with zeros to w numbers, a multiple of eight; the numbers of
+    the groups or cells there (m, 8); and where the blocks of each group of the level before begin (n + 1,).
     """
-    levels = []
-    order = np.arange(len(bank.levels[0].rows))
-    for level, group_of in zip(bank.levels, [*(each.part_of for each in bank.levels[1:]), bank.group_of], strict=True):
-        place = np.empty_like(order)
-        place[order] = np.arange(len(order))
-        placed = place[group_of]
-        parts = np.argsort(placed, kind="stable")
-        starts = np.searchsorted(placed[parts], np.arange(len(order) + 1))
-        levels.append((level.rows[order], starts.astype(np.int32)))
-        order = parts
-    return tuple(levels), order.astype(np.int32)
+    part_of = [*(level.part_of for level in bank.levels), bank.group_of]
+    rows = [*(level.rows for level in bank.levels), bank.coarse]
+    n_before = [1, *(len(level.rows) for level in bank.levels)]
+    return tuple(_blocks(*each) for each in zip(rows, part_of, n_before, strict=True))
+
+
+def _blocks(rows: Single, part_of: Indices, n_before: int) -> Blocks:
+    counts = np.bincount(part_of, minlength=n_before)
+    starts = np.concatenate([[0], np.cumsum(-(-counts // _LANES))])
+    order = np.argsort(part_of, kind="stable")
+    # The place of each part in its group.
+    within = np.arange(len(order)) - (np.cumsum(counts) - counts)[part_of[order]]
+    places = starts[part_of[order]] * _LANES + within
+    parts = np.zeros(starts[-1] * _LANES, dtype=np.int32)
+    parts[places] = order
+    width = rows.shape[1] - 2
+    filled = np.zeros((len(parts), -(-width // _LANES) * _LANES + 2), dtype=np.float32)
+    # Where there is no part, nothing is reached: what is left of a frame is never 0.
+    filled[:, -1] = _NEVER
+    filled[places, :width], filled[places, -2:] = rows[order, :width], rows[order, -2:]
+    blocks = filled.reshape(-1, _LANES, filled.shape[1]).transpose(0, 2, 1)
+    return np.ascontiguousarray(blocks), parts.reshape(-1, _LANES), starts.astype(np.int32)
+
+
+def _rows_of(level: Blocks) -> Single:
+    return np.ascontiguousarray(level[0].transpose(0, 2, 1)).reshape(-1, level[0].shape[1])
+
+
+def _spectra_of(bank: CompressedBank) -> Single:
+    """Return the conjugate transforms of the basis's first directions, eight side by side: (m, n, 2, 8), scaled."""
+    spectra = np.conj(fft.rfft(bank.basis[: bank.coarse.shape[1] - 2].astype(np.float64), _LENGTH)) / _LENGTH
+    filled = np.zeros((-(-len(spectra) // _LANES) * _LANES, spectra.shape[1]), dtype=np.complex128)
+    filled[: len(spectra)] = spectra
+    parts = filled.reshape(-1, _LANES, spectra.shape[1]).transpose(0, 2, 1)
+    return np.ascontiguousarray(np.stack([parts.real, parts.imag], axis=2), dtype=np.float32)

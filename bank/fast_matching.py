@@ -14,7 +14,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, correlated, spectra_of
+from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, spectra_of
 from bank.channels import N_CHANNELS
 from bank.compiled import search_of
 from bank.compression import ROUNDING, Indices, compress
@@ -287,10 +287,7 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
         return self._match(best, self._settled(frame, left, least, quick=quick) if len(left.cells) else None)
 
     def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
-        if self._compiled is None:
-            return None
-        correlate = partial(correlated, self._spectra)
-        return self._compiled.match_at_all_lags(difference, correlate, runner_up, most_scores)
+        return None if self._compiled is None else self._compiled.match_at_all_lags(difference, runner_up, most_scores)
 
     def _around(self, cell: int, radius: int) -> Neighbourhood:
         return Neighbourhood(self._row, self._column, cell, radius)

@@ -8,121 +8,16 @@
 
 #include <limits.h>
 #include <math.h>
-#include <stdlib.h>
 #include <string.h>
 
 enum {
-    LANES = 8,
-    /* With fewer candidates, scoring them costs less than to bound them anew. */
-    FEW_CANDIDATES = 64,
-    /* More bounds than this at all lags take longer than numpy, whose products are quicker where much is left. */
-    MOST_LOOKS = 1 << 16
+    /* More blocks than this at all lags take longer than numpy, whose products are quicker where much is left. */
+    MOST_LOOKS = 1 << 16,
+    /* So many lags are looked at in the order of their bounds: what is found there leaves out most of the others. */
+    LIKELY_LAGS = 8,
+    /* And at lag 0 so many groups in the order of their estimates. */
+    LIKELY_ROOTS = 3
 };
-
-/* Compiled twice, also for wider registers where the processor has them: the same sums in the same order, bit for bit. */
-#if defined(__GLIBC__) && defined(__x86_64__) && defined(__GNUC__) && !defined(__clang__)
-#define ALSO_WIDE __attribute__((target_clones("avx2", "default")))
-#else
-#define ALSO_WIDE
-#endif
-
-/* Eight numbers side by side. */
-typedef float Eight __attribute__((vector_size(32)));
-
-#define INLINE static inline __attribute__((always_inline))
-
-INLINE void eight(Eight *to, const float *from)
-{
-    memcpy(to, from, sizeof *to);
-}
-
-INLINE float product(const float *a, const float *b, ptrdiff_t n)
-{
-    Eight sum = {0}, x, y;
-    float rest = 0;
-    ptrdiff_t whole = n - n % 8;
-    for (ptrdiff_t i = 0; i < whole; i += 8) {
-        eight(&x, a + i);
-        eight(&y, b + i);
-        sum += x * y;
-    }
-    for (ptrdiff_t i = whole; i < n; i++)
-        rest += a[i] * b[i];
-    return ((sum[0] + sum[4]) + (sum[1] + sum[5])) + ((sum[2] + sum[6]) + (sum[3] + sum[7])) + rest;
-}
-
-/* The same for channels: with four sums at once, for each waits for the one before. */
-INLINE float over_channels(const float *a, const float *b)
-{
-    Eight sums[4] = {{0}}, x, y;
-    for (int i = 0; i < CHANNELS; i += 32)
-        for (int j = 0; j < 4; j++) {
-            eight(&x, a + i + 8 * j);
-            eight(&y, b + i + 8 * j);
-            sums[j] += x * y;
-        }
-    Eight sum = (sums[0] + sums[1]) + (sums[2] + sums[3]);
-    return ((sum[0] + sum[4]) + (sum[1] + sum[5])) + ((sum[2] + sum[6]) + (sum[3] + sum[7]));
-}
-
-ALSO_WIDE static double score_of(const Hunt *hunt, int32_t cell, int32_t lag)
-{
-    const Bank *bank = hunt->bank;
-    const float *signal = bank->signals + bank->places[cell] * CHANNELS;
-    const double *frame = hunt->padded + CHANNELS + lag;
-    double lanes[LANES] = {0};
-    double sum = 0;
-    for (int i = 0; i < CHANNELS; i += LANES)
-        for (int lane = 0; lane < LANES; lane++)
-            lanes[lane] += frame[i + lane] * fabs((double)signal[i + lane]);
-    for (int lane = 0; lane < LANES; lane++)
-        sum += lanes[lane];
-    return sum / bank->norms[cell];
-}
-
-static void reaches(Hunt *hunt, double score)
-{
-    hunt->reached = score;
-    hunt->least = (float)(score - hunt->bank->rounding);
-}
-
-static void look_up(Hunt *hunt, Candidate *candidate)
-{
-    candidate->score = score_of(hunt, candidate->cell, candidate->lag);
-    hunt->scores_left--;
-    if (candidate->score > hunt->reached)
-        reaches(hunt, candidate->score);
-}
-
-static int may_reach(const Hunt *hunt, float bound)
-{
-    return bound >= hunt->least;
-}
-
-int in_peak_of(const Bank *bank, int32_t cell, int32_t other)
-{
-    return other >= 0 && labs((long)bank->k_of[cell] - bank->k_of[other]) <= bank->radius
-        && labs((long)bank->sigma_of[cell] - bank->sigma_of[other]) <= bank->radius;
-}
-
-/* Complete a column of bank/compression.py at a lag: after the frame's first `rank` numbers come the norm of all of these
-   but the first, and what is left of the frame. */
-static void complete_column(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
-{
-    double across = 0;
-    for (ptrdiff_t i = 1; i < rank; i++)
-        across += (double)column[i] * column[i];
-    double left = hunt->energies[CHANNELS + lag] - (double)column[0] * column[0] - across;
-    column[rank] = (float)sqrt(across);
-    column[rank + 1] = (float)sqrt((left > 0 ? left : 0) + hunt->bank->square_rounding);
-}
-
-ALSO_WIDE static void project(const Hunt *hunt, int32_t lag, ptrdiff_t rank, float *column)
-{
-    for (ptrdiff_t i = 0; i < rank; i++)
-        column[i] = over_channels(hunt->bank->basis + i * CHANNELS, hunt->single + CHANNELS + lag);
-    complete_column(hunt, lag, rank, column);
-}
 
 int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
 {
@@ -156,118 +51,18 @@ int take_frame(Hunt *hunt, const Bank *bank, const double *difference)
         sum += frame[i] * frame[i];
     }
     hunt->bank = bank;
-    project(hunt, 0, bank->coarse_rank, hunt->column);
+    project(hunt, 0, 0, bank->coarse_rank, hunt->column);
+    memset(hunt->column + bank->coarse_rank, 0, (size_t)(bank->width - bank->coarse_rank) * sizeof(float));
+    complete_column(hunt, 0, bank->width, hunt->column);
     return 1;
 }
 
-static void look_at_cell(Hunt *hunt, float estimate, float bound, int32_t lag, int32_t cell)
+static void look_up(Hunt *hunt, Candidate *candidate)
 {
-    const Bank *bank = hunt->bank;
-    if (in_peak_of(bank, cell, hunt->apart_from))
-        return;
-    if (hunt->n_candidates == bank->most_candidates) {
-        hunt->looks_left = -1;
-        return;
-    }
-    Candidate *found = &bank->candidates[hunt->n_candidates++];
-    *found = (Candidate){bound, cell, lag, -1.0};
-    if (estimate > hunt->highest) {
-        hunt->highest = estimate;
-        hunt->likeliest = found;
-    }
-}
-
-ALSO_WIDE static void look_into(Hunt *hunt, const float *column, int32_t lag, int level, int32_t group)
-{
-    const Bank *bank = hunt->bank;
-    const Level *here = &bank->levels[level];
-    int of_cells = level + 1 == bank->n_levels;
-    ptrdiff_t rank = bank->coarse_rank, size = rank + 2;
-    const float *rows = of_cells ? bank->coarse : bank->levels[level + 1].rows;
-    for (int32_t part = here->starts[group]; part < here->starts[group + 1] && hunt->looks_left >= 0; part++) {
-        const float *row = rows + part * size;
-        float estimate = product(row, column, rank);
-        float bound = estimate + row[rank] * column[rank] + row[rank + 1] * column[rank + 1];
-        hunt->looks_left--;
-        if (!may_reach(hunt, bound))
-            continue;
-        if (of_cells)
-            look_at_cell(hunt, estimate, bound, lag, bank->cells[part]);
-        else
-            look_into(hunt, column, lag, level + 1, part);
-    }
-}
-
-static int by_estimate(const void *one, const void *other)
-{
-    float a = ((const Root *)one)->estimate, b = ((const Root *)other)->estimate;
-    return (a < b) - (a > b);
-}
-
-static int by_bound(const void *one, const void *other)
-{
-    float a = ((const Candidate *)one)->bound, b = ((const Candidate *)other)->bound;
-    return (a < b) - (a > b);
-}
-
-static int by_lag(const void *one, const void *other)
-{
-    int32_t a = ((const Candidate *)one)->lag, b = ((const Candidate *)other)->lag;
-    return (a > b) - (a < b);
-}
-
-ALSO_WIDE static void bound_roots(const Hunt *hunt, const float *column)
-{
-    const Bank *bank = hunt->bank;
-    ptrdiff_t rank = bank->coarse_rank;
-    for (ptrdiff_t group = 0; group < bank->levels[0].n; group++) {
-        const float *row = bank->levels[0].rows + group * (rank + 2);
-        float estimate = product(row, column, rank);
-        float bound = estimate + row[rank] * column[rank] + row[rank + 1] * column[rank + 1];
-        bank->roots[group] = (Root){estimate, bound, (int32_t)group};
-    }
-    /* A high score is known the sooner. */
-    qsort(bank->roots, (size_t)bank->levels[0].n, sizeof(Root), by_estimate);
-}
-
-static ptrdiff_t those_that_may_reach(const Hunt *hunt)
-{
-    Candidate *all = hunt->bank->candidates;
-    ptrdiff_t kept = 0;
-    for (ptrdiff_t i = 0; i < hunt->n_candidates; i++)
-        if (may_reach(hunt, all[i].bound))
-            all[kept++] = all[i];
-    return kept;
-}
-
-/* Bound the candidates anew at each lag that has many: the frame's numbers there cost as much as some scores. */
-ALSO_WIDE static void bound_anew(const Hunt *hunt)
-{
-    const Bank *bank = hunt->bank;
-    Candidate *all = bank->candidates;
-    float column[MOST_RANK + 2];
-    ptrdiff_t n;
-    qsort(all, (size_t)hunt->n_candidates, sizeof(Candidate), by_lag);
-    for (ptrdiff_t i = 0; i < hunt->n_candidates; i += n) {
-        for (n = 1; i + n < hunt->n_candidates && all[i + n].lag == all[i].lag; n++)
-            ;
-        if (n <= FEW_CANDIDATES)
-            continue;
-        project(hunt, all[i].lag, bank->fine_rank, column);
-        for (ptrdiff_t j = i; j < i + n; j++)
-            all[j].bound = product(bank->fine + all[j].cell * (bank->fine_rank + 2), column, bank->fine_rank + 2);
-    }
-}
-
-static void keep_what_may_reach(Hunt *hunt)
-{
-    hunt->n_candidates = those_that_may_reach(hunt);
-    if (hunt->n_candidates > FEW_CANDIDATES) {
-        bound_anew(hunt);
-        hunt->n_candidates = those_that_may_reach(hunt);
-    }
-    /* The highest first: what is scored then leaves out others. */
-    qsort(hunt->bank->candidates, (size_t)hunt->n_candidates, sizeof(Candidate), by_bound);
+    candidate->score = score_of(hunt, candidate->cell, candidate->lag);
+    hunt->scores_left--;
+    if (candidate->score > hunt->reached)
+        reaches(hunt, candidate->score);
 }
 
 /* Of cells that tie the first, and of its lags the one of the highest score. */
@@ -313,138 +108,145 @@ static void begin(Hunt *hunt, int32_t apart_from, double reached, long most_look
 {
     hunt->apart_from = apart_from;
     reaches(hunt, reached);
-    hunt->highest = -1;
     hunt->looks_left = most_looks;
     hunt->scores_left = 0;
     hunt->n_candidates = 0;
-    hunt->likeliest = NULL;
 }
 
-static Outcome find_at(Hunt *hunt, const float *column, int32_t lag, int32_t apart_from, long most_scores, Found *found)
+/* Of the groups that may still hold something, the one of the highest estimate; -1 where there is none. */
+static ptrdiff_t next_root(const Hunt *hunt)
 {
     const Bank *bank = hunt->bank;
-    bound_roots(hunt, column);
-    begin(hunt, apart_from, 0, LONG_MAX);
-    for (ptrdiff_t i = 0; i < bank->levels[0].n; i++) {
-        if (!may_reach(hunt, bank->roots[i].bound))
-            continue;
-        look_into(hunt, column, lag, 0, bank->roots[i].group);
-        /* The higher the score that is known, the more can be left out. */
-        if (hunt->likeliest && hunt->likeliest->score < 0)
-            look_up(hunt, hunt->likeliest);
-    }
-    keep_what_may_reach(hunt);
-    return settle(hunt, apart_from, hunt->reached, most_scores, found);
+    ptrdiff_t found = -1;
+    for (ptrdiff_t i = 0; i < bank->levels[0].n * LANES; i++)
+        if (may_reach(hunt, bank->root_bounds[i]) && (found < 0 || bank->root_estimates[i] > bank->root_estimates[found]))
+            found = i;
+    return found;
+}
+
+/* Look into n groups of the first level, which are listed, and look up the likeliest of the cells that are found. */
+static void look_at_lag_0(Hunt *hunt, ptrdiff_t n)
+{
+    ptrdiff_t from = hunt->n_candidates;
+    look_into(hunt, hunt->column, 0, 0, n);
+    Candidate *best = likeliest(hunt, from, -1, hunt->least);
+    if (best)
+        look_up(hunt, best);
 }
 
 Outcome find_at_lag_0(Hunt *hunt, int32_t apart_from, long most_scores, Found *found)
 {
-    return find_at(hunt, hunt->column, 0, apart_from, most_scores, found);
-}
-
-int lags_that_may_reach(const Hunt *hunt, double score, int *first, int *end)
-{
     const Bank *bank = hunt->bank;
-    int n = 0;
-    for (int i = 0; i < 2 * CHANNELS; i++) {
-        if (bank->overlaps[i] * sqrt(hunt->energies[i]) < score - bank->rounding)
-            continue;
-        *end = i + 1 - CHANNELS;
-        if (!n++)
-            *first = i - CHANNELS;
+    begin(hunt, apart_from, 0, LONG_MAX);
+    bound_roots(hunt, hunt->column);
+    /* The higher the score that is known, the more can be left out. */
+    for (ptrdiff_t turn = 0, root; turn < LIKELY_ROOTS && (root = next_root(hunt)) >= 0; turn++) {
+        bank->root_bounds[root] = -INFINITY;
+        bank->lists[0][0] = bank->levels[0].parts[root];
+        look_at_lag_0(hunt, 1);
     }
-    return n;
+    ptrdiff_t n = 0;
+    for (ptrdiff_t i = 0; i < bank->levels[0].n; i++)
+        n = list_parts(hunt, bank->root_bounds + i * LANES, bank->levels[0].parts + i * LANES, bank->lists[0], n);
+    look_at_lag_0(hunt, n);
+    bound_anew(hunt, hunt->column, 0, 0);
+    sort_candidates(hunt);
+    return settle(hunt, apart_from, hunt->reached, most_scores, found);
 }
 
-static void take_parts(const Hunt *hunt, int32_t lag, const float *parts, ptrdiff_t stride, float *column)
+/* The highest score that is known of a cell outside the peak of another; -1 where none is. */
+static double highest_apart(const Hunt *hunt, int32_t cell)
 {
-    for (ptrdiff_t i = 0; i < hunt->bank->coarse_rank; i++)
-        column[i] = parts[i * stride];
-    complete_column(hunt, lag, hunt->bank->coarse_rank, column);
+    double highest = -1;
+    for (int i = 0; i < hunt->n_known; i++)
+        if (!in_peak_of(hunt->bank, hunt->known[i].cell, cell) && hunt->known[i].score > highest)
+            highest = hunt->known[i].score;
+    return highest;
 }
 
-/* One direction at all lags after the other: it stays in the cache meanwhile. */
-ALSO_WIDE static void project_at_lags(const Hunt *hunt)
+/* Look up a score; where it is higher than is known, less may reach what is looked for. */
+static void learn(Hunt *hunt, Candidate *candidate, int with_runner_up, int is_settled)
 {
-    const Bank *bank = hunt->bank;
-    for (ptrdiff_t i = 0; i < bank->coarse_rank; i++)
-        for (int j = 0; j < hunt->n_lags; j++)
-            bank->columns[j * (bank->coarse_rank + 2) + i] =
-                over_channels(bank->basis + i * CHANNELS, hunt->single + CHANNELS + hunt->first + j);
+    Found *found = &hunt->known[hunt->n_known];
+    candidate->score = score_of(hunt, candidate->cell, candidate->lag);
+    if (hunt->n_known == MOST_KNOWN)
+        return;
+    *found = (Found){candidate->cell, candidate->score};
+    hunt->n_known++;
+    if (!is_settled && found->score > hunt->best.score)
+        hunt->best = *found;
+    double reached = with_runner_up ? highest_apart(hunt, hunt->best.cell) : hunt->best.score;
+    if (reached > hunt->reached)
+        reaches(hunt, reached);
 }
 
-void take_lags(Hunt *hunt, const float *parts, int first, int end)
-{
-    const Bank *bank = hunt->bank;
-    hunt->first = first;
-    hunt->n_lags = end - first;
-    if (!parts)
-        project_at_lags(hunt);
-    for (int j = 0; j < hunt->n_lags; j++) {
-        float *column = bank->columns + j * (bank->coarse_rank + 2);
-        if (parts)
-            take_parts(hunt, first + j, parts + j, hunt->n_lags, column);
-        else
-            complete_column(hunt, first + j, bank->coarse_rank, column);
-    }
-    /* bounds = rows columns; BLAS takes a matrix by columns, and so all of them for transposed. */
-    int size = (int)bank->coarse_rank + 2, n_groups = (int)bank->levels[0].n;
-    float one = 1, none = 0;
-    bank->multiply("T", "N", &hunt->n_lags, &n_groups, &size, &one, bank->columns, &size, bank->levels[0].rows, &size,
-                   &none, bank->bounds, &hunt->n_lags);
-}
-
-/* The highest bound of each lag that is looked at. */
-ALSO_WIDE static void highest_bounds(const Hunt *hunt, float *highest)
-{
-    int n = hunt->n_lags;
-    const float *bounds = hunt->bank->bounds;
-    memcpy(highest, bounds, (size_t)n * sizeof(float));
-    for (ptrdiff_t group = 1; group < hunt->bank->levels[0].n; group++) {
-        const float *others = bounds + group * n;
-        for (int j = 0; j < n; j++)
-            highest[j] = others[j] > highest[j] ? others[j] : highest[j];
-    }
-}
-
-int likeliest_lag(Hunt *hunt, double score)
+/* Collect the cells that may reach, at one of the lags, what is known. */
+static void collect_at(Hunt *hunt, int number, int with_runner_up, int is_settled)
 {
     const Bank *bank = hunt->bank;
-    float highest[2 * CHANNELS];
-    int n = hunt->n_lags, kept = 0, likeliest = 0;
-    highest_bounds(hunt, highest);
-    for (int j = 0; j < n; j++) {
-        if ((double)highest[j] < score - bank->rounding)
-            continue;
-        bank->lags[kept] = j;
-        if (highest[j] > highest[bank->lags[likeliest]])
-            likeliest = kept;
-        kept++;
-    }
-    hunt->n_left = kept;
-    return kept ? bank->lags[likeliest] : -1;
+    ptrdiff_t from = hunt->n_candidates, n_groups = bank->levels[0].n * LANES;
+    const float *column = bank->columns + number * (bank->width + 2), *bounds = bank->bounds + number * n_groups;
+    int32_t lag = hunt->first + number;
+    ptrdiff_t n = 0;
+    for (ptrdiff_t i = 0; i < n_groups; i += LANES)
+        n = list_parts(hunt, bounds + i, bank->levels[0].parts + i, bank->lists[0], n);
+    look_into(hunt, column, lag, 0, n);
+    if (hunt->n_candidates == from || hunt->looks_left < 0)
+        return;
+    Candidate *best = likeliest(hunt, from, -1, (float)(hunt->best.score - bank->rounding));
+    if (best)
+        learn(hunt, best, with_runner_up, is_settled);
+    Candidate *other = with_runner_up ? likeliest(hunt, from, hunt->best.cell, hunt->least) : NULL;
+    if (other)
+        learn(hunt, other, with_runner_up, is_settled);
+    bound_anew(hunt, column, lag, from);
 }
 
-Outcome find_at_lag(Hunt *hunt, int number, int32_t apart_from, long most_scores, Found *found)
+/* Collect what may reach a score at any lag, and score some of it. 0 where there is too much. */
+static int collect(Hunt *hunt, double score, int with_runner_up, int is_settled)
 {
-    const float *column = hunt->bank->columns + number * (hunt->bank->coarse_rank + 2);
-    return find_at(hunt, column, hunt->first + number, apart_from, most_scores, found);
-}
-
-int collect(Hunt *hunt, double score)
-{
-    const Bank *bank = hunt->bank;
-    /* No score is looked up meanwhile: the runner-up's must not be raised by the best cell's. */
     begin(hunt, -1, score, MOST_LOOKS);
-    for (ptrdiff_t group = 0; group < bank->levels[0].n && hunt->looks_left >= 0; group++)
-        for (int i = 0; i < hunt->n_left; i++) {
-            int number = bank->lags[i];
-            if (may_reach(hunt, bank->bounds[group * hunt->n_lags + number]))
-                look_into(hunt, bank->columns + number * (bank->coarse_rank + 2), hunt->first + number, 0,
-                          (int32_t)group);
-        }
-    if (hunt->looks_left < 0)
-        return 0;
-    keep_what_may_reach(hunt);
-    return 1;
+    for (int turn = 0; turn < LIKELY_LAGS; turn++) {
+        int highest = 0;
+        for (int i = 1; i < hunt->n_lags; i++)
+            if (hunt->highest[i] > hunt->highest[highest])
+                highest = i;
+        if (!may_reach(hunt, hunt->highest[highest]))
+            break;
+        collect_at(hunt, highest, with_runner_up, is_settled);
+        hunt->highest[highest] = -INFINITY;
+    }
+    for (int i = 0; i < hunt->n_lags && hunt->looks_left >= 0; i++)
+        if (may_reach(hunt, hunt->highest[i]))
+            collect_at(hunt, i, with_runner_up, is_settled);
+    hunt->collected = hunt->reached;
+    keep_what_may_reach(hunt, 0);
+    sort_candidates(hunt);
+    return hunt->looks_left >= 0;
+}
+
+Outcome find_at_all_lags(Hunt *hunt, long most_scores, Found *best, Found *other)
+{
+    const int with_runner_up = other != NULL;
+    for (int i = 0; i <= with_runner_up; i++)
+        if (find_at_lag_0(hunt, i ? hunt->known[0].cell : -1, most_scores, &hunt->known[i]) != FOUND)
+            return UNDECIDED;
+    hunt->n_known = 1 + with_runner_up;
+    hunt->best = hunt->known[0];
+    double least = hunt->known[with_runner_up].score;
+    if (!take_lags(hunt, least) || !collect(hunt, least, with_runner_up, 0)
+        || settle(hunt, -1, hunt->best.score, most_scores, best) != FOUND)
+        return UNDECIDED;
+    if (!with_runner_up)
+        return FOUND;
+    least = highest_apart(hunt, best->cell);
+    if (least < hunt->collected) {
+        /* It is another one than was thought, with the known runner-up in its peak: once more, from further down, where
+           lags that were left out may have it. */
+        hunt->best = *best;
+        if (!take_lags(hunt, least) || !collect(hunt, least, 1, 1))
+            return UNDECIDED;
+        least = hunt->collected;
+    }
+    return settle(hunt, best->cell, least, most_scores, other);
 }

@@ -1,0 +1,95 @@
+"""How long one recorded frame takes to match, hot and cold: the median, and what the slowest take.
+
+    python -m bench.match_times --bank run/paper.bank --recordings FOLDER --every 12 --out run/match_times.json
+
+Hot: a frame is matched five times, and the least time counts. Cold: before each match others have had the caches, as in
+a daemon between two frames, and of three times the middle one counts. Times are of the thread's processor; two states
+are compared by runs of both that alternate.
+"""
+
+import argparse
+import json
+import statistics
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bank.bank_file import Bank
+from bank.fast_matching import FastMatcher, FastZeroLagMatcher
+from bank.matching import Match
+from bench.peers import OTHERS_BYTES
+from bench.same_maxima import recorded
+
+N_HOT, N_COLD = 5, 3
+SHARES = (50, 90, 99, 100)
+
+
+class _AllLags(FastMatcher):
+    """Counts the frames that the compiled search leaves to numpy."""
+
+    left_to_numpy = 0
+
+    def _search(self, frame: NDArray[np.float64], runner_up: bool, *, quick: bool = False) -> Match:
+        self.left_to_numpy += 1
+        return super()._search(frame, runner_up, quick=quick)
+
+
+class _ZeroLag(FastZeroLagMatcher):
+    """The same at lag 0."""
+
+    left_to_numpy = 0
+
+    def _search(self, frame: NDArray[np.float64], runner_up: bool, *, quick: bool = False) -> Match:
+        self.left_to_numpy += 1
+        return super()._search(frame, runner_up, quick=quick)
+
+
+KINDS: dict[str, type[_AllLags | _ZeroLag]] = {"all lags": _AllLags, "zero lag": _ZeroLag}
+
+
+def seconds(matcher: FastMatcher | FastZeroLagMatcher, frame: NDArray[np.float64]) -> float:
+    """Return what a match with runner-up takes of the processor."""
+    begun = time.thread_time_ns()
+    matcher.match(frame)
+    return (time.thread_time_ns() - begun) / 1e9
+
+
+def percentiles(times: list[float]) -> dict[str, float]:
+    """Return the percentiles of SHARES, in milliseconds."""
+    return {f"p{share}_ms": round(1e3 * float(np.percentile(times, share)), 4) for share in SHARES}
+
+
+def main() -> None:
+    """Time both kinds, and count the frames that the compiled search leaves to numpy."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--bank", type=Path, required=True)
+    parser.add_argument("--recordings", type=Path, required=True)
+    parser.add_argument("--every", type=int, default=12)
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    bank, others = Bank.open(args.bank), np.zeros(OTHERS_BYTES // 8)
+    frames = np.vstack(list(recorded(args.recordings, 1)))[:: args.every]
+    found: dict[str, Any] = {"frames": len(frames)}
+    for name, kind in KINDS.items():
+        matcher = kind.from_bank(bank)
+        hot, cold, left = [], [], 0
+        for frame in frames:
+            matcher.left_to_numpy = 0
+            hot.append(min(seconds(matcher, frame) for _ in range(N_HOT)))
+            middle = []
+            for _ in range(N_COLD):
+                others += 1.0
+                middle.append(seconds(matcher, frame))
+            left += matcher.left_to_numpy > 0
+            cold.append(statistics.median(middle))
+        found[name] = {"hot": percentiles(hot), "cold": percentiles(cold), "left_to_numpy": left}
+        print(name, found[name])
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(found, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

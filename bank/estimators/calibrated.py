@@ -1,5 +1,6 @@
 """A calibration of one estimator, and the tracker that follows one session with it."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +14,12 @@ from bank.errors import CalibrationError
 from bank.estimators.archive import read_archive, write_archive
 from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.guard import SideGuard
+from bank.estimators.heads import Ridge
 from bank.estimators.memory import Memory, Motion
 from bank.estimators.physics import BestCell, Locator, NearestCell, Place, Registration
-from bank.estimators.reader import Reader
+from bank.estimators.reader import Head, Reader
 from bank.estimators.values import BoolArray, Estimate, FloatArray, Kind, Measured, TactileFrame
+from bank.gaussian import TWO_SIDED_95
 
 Name = Literal["paper", "bank", "regression", "reconstruction", "fused"]
 NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
@@ -266,6 +269,8 @@ class Tracker:
             features = read_from(calibration, name, seen.features, held)
             widening = 1.0 if task.guard is None else task.guard.widening(difference[0], usable[0])
             read = task.reader.read(features, usable_share, widening)
+            if name == "diameter" and self._memory is not None and calibration.motion is not None:
+                read = _of_few_frames(read, task.reader.head, self._memory.held_frames)
             why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])
             refused += [reason for reason in why if reason not in refused]
             if not why:
@@ -289,6 +294,17 @@ def read_from(calibration: Calibration, quantity: str, features: FloatArray, hel
     if calibration.motion is not None and quantity == "diameter":
         return np.asarray((held / calibration.scale).ravel())
     return columns_for(calibration.estimator, quantity, features)
+
+
+def _of_few_frames(read: tuple[float, float, float], head: Head, frames: int) -> tuple[float, float, float]:
+    """Widen the interval of what is read from the mean of so many frames by what these add, each with a noise of 1.
+
+    How far grips go astray was seen on means of all their frames, nearly all of which have little noise left.
+    """
+    if not isinstance(head, Ridge):
+        return read
+    noise = TWO_SIDED_95 * float(np.linalg.norm(head.weights)) / math.sqrt(frames)
+    return read[0], math.hypot(read[1], noise), math.hypot(read[2], noise)
 
 
 def _estimate(values: dict[str, tuple[float, float, float]], refused: Sequence[str]) -> Estimate:

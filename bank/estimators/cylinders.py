@@ -93,7 +93,9 @@ def fit_line(grips: Sequence[Gripped]) -> Ridge:
     told: BoolArray = squares > max(_CLEAR * noise, _ROUNDING * float(squares[-1]))
     told[-1] = True
     squares, ways = squares[told], ways[:, told]
-    true = np.maximum(squares - noise, _LEAST_SHARE * squares) + np.finfo(np.float64).tiny
+    # Of recordings that are one under several diameters rounding would make a line that is infinitely steep.
+    least = _ROUNDING * noise + math.sqrt(np.finfo(np.float64).tiny)
+    true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
     along = apart.T @ (ways @ (ways.T @ (diameters - diameters.mean()) / true))
     everything = np.mean([one.frames.mean(axis=0) for one in grips], axis=0)
     return Ridge(everything, seen @ whitened(along), float(diameters.mean()), 0.0)

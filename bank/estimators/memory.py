@@ -170,6 +170,11 @@ class Memory:
         """
         return self._held
 
+    @property
+    def held_frames(self) -> int:
+        """Of how many frames `held` is the mean."""
+        return self._n_held
+
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
         self._pass_time(frame.t_s)

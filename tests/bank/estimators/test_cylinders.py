@@ -81,6 +81,16 @@ def test_places_that_have_no_noise_still_make_a_line(known):
     assert fit_line([*still, *still]).predict(20 * PER_MM[None])[0] == pytest.approx(20.0, abs=1e-6)
 
 
+@pytest.mark.parametrize("frames", [1, N_FRAMES])
+def test_one_recording_under_three_diameters_reads_none_of_them_apart(known, frames):
+    """Nothing tells them apart but rounding, which was divided by."""
+    one = replace(known[0], frames=known[0].frames[:frames])
+    reader = fit_cylinders([replace(one, diameter_mm=mm) for mm in KNOWN_MM])
+    value, below, above = reader.read(one.held[-1])
+    assert value == pytest.approx(25.0, abs=0.1)
+    assert min(below, above) > 15.0
+
+
 def test_a_diameter_is_of_this_grip_alone(twisting):
     """It is read from the mean place of a grip, and each grip has its own."""
     recorded = twisting(cycles=1, tips=(1,))
@@ -101,3 +111,26 @@ def test_a_diameter_is_of_this_grip_alone(twisting):
     truth, found = np.array(read).T
     assert {12.0, 38.0} == set(truth)
     assert np.abs(found - truth).max() < 6.0
+
+
+def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few(twisting):
+    """Of one frame the interval was that of a mean of sixty: on the played rig it held 0.7 of the tools."""
+    recorded = twisting(cycles=1)
+
+    def of(mm, seed):
+        whole = twisting(cycles=1, seed=seed)
+        gripped = (whole.t_s > 20.0) & (whole.t_s < 50.0)
+        channels = whole.channels + gripped[:, None, None] * (mm - 25) * 2e-5 * np.sin(np.arange(N_CHANNELS) / 9.0)
+        return replace(whole, channels=channels, diameter_mm=np.full(len(whole.t_s), mm))
+
+    calibration = fit("fused", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "a played rig", trust_times=True)
+    inside, widths = [], []
+    for seed in range(20, 40):
+        tracker, known_half_mm = Tracker(calibration), calibration.diameter.reader.intervals.half_widths[0]
+        frames = zip(recorded.t_s, of(15.0, seed).channels, strict=True)
+        told = [tracker.estimate(TactileFrame.of(*one)) for one in frames]
+        grip = [one for one in told if one.diameter_mm is not None]
+        inside.append(grip[0].diameter_low_mm <= 15.0 <= grip[0].diameter_high_mm)
+        widths.append([0.5 * (one.diameter_high_mm - one.diameter_low_mm) for one in (grip[0], grip[-1])])
+    assert np.mean(inside) >= 0.9
+    assert np.mean(widths, axis=0)[1] < 1.1 * known_half_mm

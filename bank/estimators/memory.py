@@ -214,6 +214,9 @@ class Memory:
         if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_SHARE * period_s):
             # A frame from before the last one says nothing of how the gel has moved since that.
             self._forget()
+            if self._idle_taken and self.taking_idle:
+                # A tool that was let go or gripped in the gap shows against the zero's last frame.
+                self._before = self._idle_taken[-1]
             return
         self._missing = step_s > _MISSING_SHARE * period_s
 

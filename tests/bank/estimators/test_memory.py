@@ -58,6 +58,26 @@ def test_a_zero_during_which_a_tool_is_let_go_begins_anew(fused_calibration, lik
     assert np.abs(memory.see(like(7.5, 0.0)).difference).max() < 1e-12
 
 
+@pytest.mark.parametrize(("first", "then"), [(1.0, 0.0), (0.0, 1.0)])
+@pytest.mark.parametrize("step_s", [1.5, 20.0, -5.0])
+def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(fused_calibration, like, first, then, step_s):
+    """After frames that were lost the next one was compared with none before, and half of the zero was of a tool."""
+    memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
+    for i in range(5):
+        memory.see(like(0.5 * i, first))
+    told = [memory.see(like(2.0 + step_s + 0.5 * i, then)).why for i in range(9)]
+    assert all("jumped" in why[0] for why in told[:2])
+    assert [why[0] for why in told[2:]] == [f"taking the homogeneous frame, {n} of 8" for n in range(1, 8)]
+    assert memory.taking_idle
+
+
+def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(fused_calibration, like):
+    memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
+    for i in range(8):
+        memory.see(like(0.5 * i + 20.0 * (i > 4), 0.0))
+    assert not memory.taking_idle
+
+
 def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(fused_calibration, like):
     """With fewer than five idle frames only an outright grip was one, and others were taken for idle."""
     memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=2)

@@ -35,7 +35,7 @@ class DeviceActions:
         self._free.set()
         # Whether a straight move is under way, and whether it was held back since it was begun.
         self._moves = self._interrupted = False
-        # Whether the fingers were told to go somewhere, and are not known to have come there.
+        # Whether the fingers were told to go somewhere and are not known to be there; set back by who stops them.
         self.grips = False
 
     async def perform(self, action: Action) -> str:
@@ -54,10 +54,10 @@ class DeviceActions:
 
     async def _grip(self, gripper: GripperTask, action: GripTo) -> str:
         self.grips = True
-        try:
-            return await gripper.grip(action)
-        finally:
-            self.grips = False
+        # Of a gripper whose connection was lost, or that answers what it should not, the fingers move on.
+        why = await gripper.grip(action)
+        self.grips = bool(why)
+        return why
 
     def hold_back(self) -> bool:
         """Begin no straight move until `let_go`; return whether one has to be stopped for it, once for each."""

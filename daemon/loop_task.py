@@ -352,7 +352,7 @@ class LoopTask:
 
     def _break_off(self) -> None:
         """End the action that is under way; fingers that move go on by themselves, and are told not to."""
-        fingers_move = self._actions.grips
+        fingers_move, self._actions.grips = self._actions.grips, False
         self._cancel_action()
         if fingers_move and self._gripper is not None:
             self._begin(self._gripper.halt, self._has_halted)

@@ -22,6 +22,23 @@ async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once() -> None:
         assert cell.gripper.asked == ["grip", "halt"]
 
 
+@pytest.mark.parametrize("answer", ["the connection to the gripper broke", RuntimeError("no such register")])
+async def test_a_grip_that_has_failed_stops_the_fingers_once(answer: str | Exception) -> None:
+    """Where its connection is lost in the middle, the experiment ends, and they go on to where they were sent."""
+    async with driven() as cell:
+        cell.gripper.answers = answer
+        await cell.start(GRIP)
+        await cell.cycles(20)
+        assert cell.gripper.asked == ["grip", "halt"]
+        cell.gripper.answers = ""
+        await cell.start(GRIP, {"do": "wait", "wait_s": 60})
+        await cell.cycles(20)
+        cell.brain.stop("the operator said stop")
+        await cell.cycles(20)
+        await cell.loop.released()
+        assert cell.gripper.asked == ["grip", "halt", "grip"]
+
+
 async def test_a_stop_after_a_grip_leaves_the_fingers_alone() -> None:
     async with driven() as cell:
         await cell.start(GRIP, {"do": "wait", "wait_s": 60})

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bank.fronts import Pattern, plan_of
-from bank.tiles import LANES, schur_complements
+from bank.tiles import LANES, require_compiler, schur_complements
 
 FloatArray = NDArray[np.float64]
 _CACHE_LINE = 64
@@ -22,7 +22,8 @@ class Elimination:
     """
 
     def __init__(self, pattern: Pattern, n: int, kept: int) -> None:
-        """Plan it."""
+        """Plan it. Raises BankError where numba was told to compile nothing."""
+        require_compiler()
         self._kept = kept
         self._last_factor = int(pattern.source.max())
         self._plan, self._entries = plan_of(pattern, n, kept)

@@ -7,14 +7,15 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeVar
 
-import llvmlite.binding
 import numpy as np
 from llvmlite import ir
-from numba import njit
+from numba import config, njit
 from numba.core import cgutils, types
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 from numpy.typing import NDArray
 
+from bank.errors import BankError
 from bank.fronts import TILE, Plan
 
 FloatArray = NDArray[np.float64]
@@ -26,7 +27,10 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 # has rows. Such values can be added, subtracted and multiplied, each lane on its own.
 
 # Eight doubles are a register of AVX-512. Elsewhere a register holds four at most, and there are half as many of them.
-LANES: Final = 8 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 4
+# What numba keeps on the disk is found by the processor it compiles for, which NUMBA_CPU_NAME may say. If that did not
+# decide alone, machines that share a folder would run each other's code on arrays of another width, unchecked.
+_, _, _FEATURES = cpu_target.target_context.codegen().magic_tuple()
+LANES: Final = 8 if "+avx512f" in _FEATURES.split(",") else 4
 _DOUBLE, _INDEX = ir.DoubleType(), ir.IntType(32)
 
 
@@ -128,6 +132,15 @@ def _define(sign: Callable[[Any, Any], Any], instruction: str, *cases: tuple[Any
 _define(operator.add, "fadd", (_ONE, _ONE, _ONE))
 _define(operator.sub, "fsub", (_COLUMN, _COLUMN, _COLUMN))
 _define(operator.mul, "fmul", (_COLUMN, _ONE, _COLUMN), (types.float64, _ONE, _ONE))
+
+
+def require_compiler() -> None:
+    """Raise BankError where numba was told to compile nothing: Python itself cannot add such values."""
+    if config.DISABLE_JIT:
+        raise BankError(
+            "the environment variable NUMBA_DISABLE_JIT is set, and a bank's cells are solved by compiled code alone; "
+            "unset it"
+        )
 
 
 def _compiled(function: _F) -> _F:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 
 from bank.batch_forward import LARGEST_LEAK, BatchForwardModel, rounding_leaks
 from bank.elimination import Elimination
-from bank.errors import ConductivityError, GeometryError
+from bank.errors import BankError, ConductivityError, GeometryError
 from bank.fronts import Pattern
 from bank.mesh import Mesh
 from bank.models import MODELS, conductivity
@@ -76,10 +77,15 @@ def test_factors_that_are_missing_are_refused():
         elimination.schur_complements(np.ones((1, 3)))
 
 
-# As on a machine whose registers hold four numbers: prints what is left of some matrices.
+def test_without_a_compiler_it_is_said_what_to_do(fingertip, monkeypatch):
+    """It died of a type that numpy does not add."""
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+    with pytest.raises(BankError, match=r"NUMBA_DISABLE_JIT is set.* unset it"):
+        BatchForwardModel(fingertip)
+
+
+# For registers that hold four numbers, whatever this machine's do: prints what is left of some matrices.
 NARROW = """
-import llvmlite.binding
-llvmlite.binding.get_host_cpu_features = dict
 from bank.tiles import LANES
 from tests.bank.test_batch_forward import what_is_left
 assert LANES == 4
@@ -93,6 +99,10 @@ def what_is_left():
 
 
 def test_narrow_registers_give_the_same_bits(tmp_path):
+    """How wide they are follows from what numba compiles for, and finds its code by, not from the machine.
+
+    Two machines with one cache and NUMBA_CPU_NAME=generic ran code for eight lanes on memory for four.
+    """
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}
     narrow = subprocess.run([sys.executable, "-c", NARROW], env=environment, check=True, capture_output=True, text=True)
     assert narrow.stdout.strip() == what_is_left().tobytes().hex()

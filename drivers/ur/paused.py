@@ -7,6 +7,7 @@ again, less and less often and not for ever; what became of it is told.
 from drivers.errors import DriverError
 from drivers.ur import sentences
 from drivers.ur.ports import CureArm
+from drivers.ur.recovery import ENDS_ITSELF_S
 
 # After so long it is asked again, while the program is paused still. A dashboard that hangs takes 2.5 s more each time.
 AGAIN_S = (1.0, 2.0, 5.0, 10.0, 10.0)
@@ -46,3 +47,19 @@ class PausedProgram:
     def _failed(self, why: str) -> None:
         self.in_vain += 1
         self.why = sentences.still_paused(why)
+
+
+class Unkicked:
+    """Tells a program that is somebody else's by its going on without a sign of life from us: ours ends by itself."""
+
+    def __init__(self) -> None:
+        """Know of no program that plays."""
+        self._since_ns: int | None = None
+
+    def outlives(self, now_ns: int, *, plays: bool) -> bool:
+        """Return whether one has played without us for longer than ours can; to be asked in every cycle."""
+        if not plays:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = now_ns
+        return self._since_ns is not None and now_ns - self._since_ns > ENDS_ITSELF_S * 1e9

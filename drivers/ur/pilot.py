@@ -25,7 +25,7 @@ from drivers.ur.messages import (
 )
 from drivers.ur.motion import tool_axis_torque
 from drivers.ur.mover import Mover
-from drivers.ur.paused import PausedProgram
+from drivers.ur.paused import PausedProgram, Unkicked
 from drivers.ur.ports import PilotArm
 from drivers.ur.recovery import Outcome, Recovery
 from drivers.ur.settings import UrSettings
@@ -37,7 +37,7 @@ class Pilot:
     def __init__(self, settings: UrSettings, arm: PilotArm, now_ns: int, *, takes_over: bool = False) -> None:
         """Begin with motion not enabled, and with starting the control program where the robot lets us.
 
-        `takes_over`: a program that is there is one that a process before has left behind, and that we may stop.
+        `takes_over`: a program that is there, and does not go on and on, is one that a process before has left behind.
         """
         self._settings = settings
         self._limits = settings.limits
@@ -46,13 +46,13 @@ class Pilot:
         self._leaving = False
         # Whether a program that is there was started here, or left behind by a process before; not while one is begun.
         self._ours = takes_over
-        self._paused = PausedProgram(arm)
+        self._paused, self._unkicked = PausedProgram(arm), Unkicked()
         # Whether it is stopped in the next cycle, of which the daemon learns beforehand that it may take long.
         self._stops_paused = False
         self._mover = Mover(settings, arm, now_ns)
         self._heard_ns = now_ns
         self._recovery: Recovery | None = Recovery(
-            arm, now_ns, settings.recover_timeout_s, operator_asked=False, may_stop_program=takes_over
+            arm, now_ns, settings.recover_timeout_s, operator_asked=False, takes_over=takes_over
         )
         self._unlock_number: int | None = None
         self._judged: Reading | None = None
@@ -117,8 +117,10 @@ class Pilot:
         """Let one cycle pass: judge the reading, send what is due; return the reply to an `Unlock` that is decided."""
         self._mover.watch(reading, now_ns)
         announced, self._stops_paused = self._stops_paused, False
-        if reading.runtime_state == RUNTIME_STOPPED:
-            # What is there next may be anybody's.
+        left = self._recovery is not None or self._mover.barred
+        plays = bool(left) and reading.program_running and self._is_new(reading)
+        if reading.runtime_state == RUNTIME_STOPPED or self._unkicked.outlives(now_ns, plays=plays):
+            # What is there next may be anybody's; and ours may have ended while nothing was read.
             self._ours = False
             self._paused.forget()
         if self._recovery is not None:
@@ -235,9 +237,7 @@ class Pilot:
         self._mover.bar(self._unfit(reading), self._mover.barred or sentences.NOT_OURS)
         self._unlock_number = number
         self._ours = self.ours
-        self._recovery = Recovery(
-            self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True, may_stop_program=True
-        )
+        self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
         return None
 
     def _zero_wrench(self, reading: Reading) -> Reply:

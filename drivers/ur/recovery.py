@@ -34,21 +34,21 @@ class Outcome(enum.Enum):
 # How often a step is asked for again while the robot does not follow: the controller needs a moment after each.
 _AGAIN_S = 1.0
 # A program that nobody kicks has ended by its watchdog after so long.
-_ENDS_ITSELF_S = 2.0
+ENDS_ITSELF_S = 2.0
 
 
 class Recovery:
     """One attempt to get the robot ready."""
 
     def __init__(
-        self, arm: CureArm, now_ns: int, timeout_s: float, *, operator_asked: bool, may_stop_program: bool
+        self, arm: CureArm, now_ns: int, timeout_s: float, *, operator_asked: bool, takes_over: bool = False
     ) -> None:
-        """Begin; `operator_asked` allows unlocking and powering."""
+        """Begin; `operator_asked` allows unlocking, powering and stopping any program, `takes_over` a paused one."""
         self._arm = arm
         self._deadline_ns = now_ns + int(timeout_s * 1e9)
         self._timeout_s = timeout_s
         self._operator_asked = operator_asked
-        self._may_stop_program = may_stop_program
+        self._takes_over = takes_over
         self._asked_ns: dict[str, int] = {}
         self._cleared = self._uploaded = False
         self.why = ""
@@ -89,7 +89,7 @@ class Recovery:
             # The control connection may see the program start a sample later than the one that reads; then once more.
             return Outcome.DONE if self._arm.arm_watchdog() else Outcome.UNDER_WAY
         if reading.runtime_state != RUNTIME_STOPPED:
-            if not self._may_stop_program:
+            if not (self._operator_asked or (self._takes_over and reading.program_paused)):
                 return self._leave_it_alone(now_ns)
             self._every_second("stop", now_ns, self._arm.stop_program)
         elif not self._cleared:
@@ -106,7 +106,7 @@ class Recovery:
     def _leave_it_alone(self, now_ns: int) -> Outcome:
         """Wait for the end of a program that is not ours to stop; one whose daemon has died ends by its watchdog."""
         since_ns = self._asked_ns.setdefault("end", now_ns)
-        return self._refuse("") if now_ns > since_ns + int(_ENDS_ITSELF_S * 1e9) else Outcome.UNDER_WAY
+        return self._refuse("") if now_ns > since_ns + int(ENDS_ITSELF_S * 1e9) else Outcome.UNDER_WAY
 
     def _make_safe(self, reading: Reading, now_ns: int) -> Outcome:
         if not self._operator_asked:

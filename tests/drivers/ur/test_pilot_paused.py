@@ -165,3 +165,35 @@ def test_program_that_is_just_being_started_is_ours_though_the_operator_starts_a
     assert flight.arm.calls == ["clear_command", "upload"]
     assert flight.pilot.request(1, Unlock(), flight.arm.reading, flight.now_ns) is None
     assert flight.state.ours
+
+
+@pytest.mark.parametrize(("played_s", "times"), [(0.5, 1), (4.0, 0)])
+def test_program_that_took_the_place_of_ours_unseen_is_somebody_elses(played_s: float, times: int) -> None:
+    """Its end may fall into the seconds that a dashboard hangs, in which nothing is read."""
+    flight = turning()
+    flight.arm.stoppable = False
+    flight.arm.protective_stop()
+    flight.fly(3)
+    flight.arm._watched = False
+    flight.arm.be(safety_mode=1, runtime_state=2)
+    assert asked_s(flight, played_s) == []
+    flight.arm.be(runtime_state=4)
+    # Ours may have been resumed just now, and is paused again.
+    assert len(asked_s(flight, 1.5)) == times
+
+
+def test_our_program_is_ours_for_however_long_it_plays() -> None:
+    flight = flying()
+    flight.fly(500)
+    flight.arm.protective_stop()
+    assert len(asked_s(flight, 0.5)) == 1
+
+
+def test_program_whose_states_are_old_is_not_taken_for_somebody_elses() -> None:
+    flight = turning()
+    # Its last state, which is repeated.
+    flight.arm._watched = False
+    flight.arm.be(age_ns=300_000_000)
+    flight.fly(500)
+    flight.arm.be(age_ns=0, runtime_state=4)
+    assert len(asked_s(flight, 0.5)) == 1

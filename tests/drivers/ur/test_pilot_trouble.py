@@ -82,22 +82,28 @@ def test_program_that_somebody_else_runs_is_not_stopped_before_the_operator_says
     assert "stop_program" in flight.arm.calls
 
 
-def test_program_that_a_process_before_left_behind_is_stopped() -> None:
-    flight = Flight(takes_over=True)
-    flight.arm.be(runtime_state=2)
-    flight.fly(20)
-    assert flight.arm.calls[:4] == ["stop_program", "clear_command", "upload", "arm_watchdog"]
-    assert flight.ask(Enable()).accepted
-
-
-def test_program_of_a_daemon_that_died_is_outlived() -> None:
-    flight = Flight()
+@pytest.mark.parametrize("takes_over", [False, True], ids=["daemon", "process"])
+def test_program_of_who_died_before_us_is_outlived(takes_over: bool) -> None:
+    flight = Flight(takes_over=takes_over)
     flight.arm.be(runtime_state=2)
     flight.fly(60)
     flight.arm.end_program()
     flight.fly(5)
     assert flight.arm.calls[:3] == ["clear_command", "upload", "arm_watchdog"]
     assert flight.ask(Enable()).accepted
+
+
+def test_program_that_was_begun_after_the_loss_of_ours_is_not_stopped_before_the_operator_says_so() -> None:
+    """Left behind by a process, ours would have ended by its watchdog before the next one was there."""
+    flight = Flight(takes_over=True)
+    flight.arm.be(runtime_state=2)
+    flight.fly(500)
+    assert "someone else" in flight.state.blocked
+    flight.arm.be(runtime_state=4)
+    flight.fly(50)
+    assert flight.arm.calls == []
+    assert not flight.state.ours
+    assert flight.ask(Unlock()).accepted
 
 
 def test_program_that_was_not_started_here_is_sent_nothing() -> None:

@@ -116,7 +116,6 @@ class Memory:
         n_lags = motion.n_lags if motion is not None else 0
         # Where the last frames were along the directions, and the last of these frames.
         self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
-        self._newest: FloatArray = np.zeros(0)
         self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
         # How many frames in a row were left out until now.
         self._left_out = 0
@@ -220,14 +219,25 @@ class Memory:
             return
         self._missing = step_s > _MISSING_SHARE * period_s
 
-    def _remember(self, channels: FloatArray, *, bridged: bool) -> None:
-        """Add a frame to the last ones; where one is missing before it, that one lies halfway."""
+    def _remember(self, channels: FloatArray) -> None:
+        """Add a frame to the last ones; those that were left out or are missing before it lie on the way to it."""
         if self._missing and self._recent:
-            self._recent.append(self._placed(0.5 * (self._newest + channels)))
-            self._bridged.append(True)
-        self._recent.append(self._placed(channels))
-        self._newest = channels
-        self._bridged.append(bridged)
+            self._stand_in()
+        place, between = self._placed(channels), 0
+        while between < len(self._bridged) and self._bridged[-1 - between]:
+            between += 1
+        if 0 < between < len(self._recent):
+            # Left where the gel was, they would say that it has moved in one step as far as in all of these.
+            begin = self._recent[-1 - between]
+            for i in range(1, between + 1):
+                self._recent[i - 1 - between] = begin + i / (between + 1) * (place - begin)
+        self._recent.append(place)
+        self._bridged.append(False)
+
+    def _stand_in(self) -> None:
+        """Put the last frame in the place of one that is not there, until the next one tells where that was."""
+        self._recent.append(self._recent[-1])
+        self._bridged.append(True)
 
     def _leave_out(self) -> None:
         """Put the last frame that passed in the place of one that did not; after too many in a row it is too old."""
@@ -235,7 +245,8 @@ class Memory:
         if self._left_out > _LARGEST_BRIDGED:
             self._forget_grip()
         elif self._recent:
-            self._remember(self._newest, bridged=True)
+            for _ in range(1 + self._missing):
+                self._stand_in()
 
     def _placed(self, channels: FloatArray) -> FloatArray:
         """Return the (m·p,) places of a frame at the calibration's gain, which does not change while it is gripped."""
@@ -270,7 +281,7 @@ class Memory:
         if loose:
             self._forget_grip()
             return Moment(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
-        self._remember(channels, bridged=False)
+        self._remember(channels)
         missing = (self._recent.maxlen or 0) - len(self._recent)
         if missing:
             return Moment(channels, difference, (f"gripped too lately: {missing} more frames are needed",), usable)

@@ -309,3 +309,23 @@ def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(fused_c
     fast = changed(whole, t_s=whole.t_s / 5, torque_t_s=whole.torque_t_s / 5)
     configured = follow(Tracker(fused_calibration, period_s=0.54), fast)
     assert [one.torque_nm for one in configured] == [one.torque_nm for one in follow(fused_calibration, whole)]
+
+
+@pytest.mark.parametrize("spoilt", [2, 3])
+def test_after_frames_that_were_left_out_the_interval_holds_a_load_that_rises_meanwhile(
+    fused_calibration, twisting, spoilt
+):
+    """The gel was remembered where it had been before them, as if all of its motion were of the last step."""
+    inside, rng = [], np.random.default_rng(0)
+    for seed in range(1, 5):
+        series = twisting(seed=seed)
+        garbled = (np.arange(len(series.t_s)) + seed) % 17 < spoilt
+        noise = 1 + garbled[:, None, None] * rng.normal(0, 0.4, series.channels.shape)
+        estimates = follow(fused_calibration, changed(series, channels=series.channels * noise))
+        loaded = np.abs(series.torque_at_frames()) > 0.006
+        for i in np.flatnonzero(loaded & ~garbled):
+            if estimates[i].valid:
+                low_nm, high_nm = estimates[i].torque_low_nm, estimates[i].torque_high_nm
+                inside.append(low_nm <= series.torque_at_frames()[i] <= high_nm)
+    assert len(inside) > 80
+    assert np.mean(inside) >= 0.95

@@ -55,6 +55,25 @@ async def test_paused_program_of_somebody_else_outlives_the_loss_of_our_first_pr
     assert not controller.happened("program-ended", since_ns)
 
 
+async def test_program_that_somebody_begins_after_the_loss_of_our_process_is_left_alone(
+    controller: ControllerProcess,
+) -> None:
+    link = Link()
+    async with running(settings_for(controller.host), link) as robot:
+        await enable(robot)
+        assert robot.pid is not None
+        since_ns = time.monotonic_ns()
+        os.kill(robot.pid, signal.SIGKILL)
+        await controller.event("program-ended", since_ns)
+        await begin_somebody_elses_program(controller)
+        since_ns = time.monotonic_ns()
+        await link.down()
+        state = await until(robot, lambda state: not state.recovering)
+        assert state.program_running
+        assert "someone else" in state.blocked
+    assert not controller.happened("program-ended", since_ns)
+
+
 async def test_our_paused_program_is_stopped_by_the_process_that_started_it(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)

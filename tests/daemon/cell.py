@@ -36,10 +36,12 @@ class Robot(UrRobot):
         # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
         self.brakes_for = 0
         self.flight.fly(5)
-        self._held: list[Callable[[], None]] = []
+        self._held: list[tuple[Callable[[Reply], None], Reply]] = []
         self._unread: list[tuple[int, Message]] = []
         # Of how many cycles the daemon needs one.
         self.of_cycles = 1
+        # For how many cycles there is no process yet.
+        self.gone_for = 0
 
     def ease(self, cycles: int) -> None:
         self.of_cycles = cycles
@@ -52,6 +54,9 @@ class Robot(UrRobot):
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
+        if self.gone_for:
+            answered(Reply(refused="The robot is not connected."))
+            return
         asyncio.get_running_loop().call_soon(self._obey, command, answered)
 
     def _obey(self, command: Command, answered: Callable[[Reply], None]) -> None:
@@ -60,13 +65,27 @@ class Robot(UrRobot):
         reply = self.flight.ask(command)
         if isinstance(command, WristSpeed):
             # Its reply comes with the next state.
-            self._held.append(partial(answered, reply))
+            self._held.append((answered, reply))
         else:
             answered(reply)
+
+    def die(self, gone_for: int) -> None:
+        """End the process with all that it has not said; the next one is there after so many cycles."""
+        self.gone_for = gone_for
+        held, self._held, self._unread = self._held, [], []
+        self._disconnected()
+        for answered, _ in held:
+            answered(Reply(refused="The robot's process ended before it answered."))
 
     def cycle(self, *, read: bool = True) -> None:
         """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""
         arm = self.flight.arm
+        if self.gone_for:
+            self.gone_for -= 1
+            self.flight.be_alone()
+            if not self.gone_for:
+                self.flight.begin_anew(takes_over=self.takes_over)
+            return
         # A real arm's move is under way until its end is told, though its joints rest.
         arm.stops_moves = not self.brakes_for
         if self.flight.state.motion == "stopping" and self.brakes_for:
@@ -84,9 +103,9 @@ class Robot(UrRobot):
             self._unread.append((0, self.flight.state))
         if not read:
             return
-        for answer in self._held:
-            answer()
-        self._held.clear()
+        held, self._held = self._held, []
+        for answered, reply in held:
+            answered(reply)
         self.take_all(self._unread)
         self._unread.clear()
 

@@ -95,6 +95,11 @@ class Story:
         now_ns = self.cell.robot.flight.now_ns
         self.cell.brain.hear(Torque(WRENCH, 0.9, "", now_ns, now_ns))
 
+    def process_dies(self) -> None:
+        self.cell.robot.die(50)
+        self.arm.be(moving_linearly=False)
+        self.cell.loop.decide_now()
+
     def unread(self) -> None:
         for _ in range(40):
             self.cell.robot.cycle(read=False)
@@ -118,6 +123,7 @@ HAPPENINGS: dict[str, Callable[[Story], Any]] = {
     "states are old": lambda story: story.arm.be(age_ns=300_000_000),
     "states are new": lambda story: story.arm.be(age_ns=0),
     "states are not read": lambda story: story.unread(),
+    "the robot's process dies": lambda story: story.process_dies(),
     "a task dies": lambda story: setattr(story.cell, "died", {"right": "it died"}),
     "the loop dies": lambda story: story.tick_dies(),
     "torque beyond its limit": lambda story: story.beyond(),

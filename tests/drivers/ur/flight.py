@@ -155,7 +155,18 @@ class Flight:
         self.now_ns = 10**12
         self.number = self.cycle = 0
         self.decided: dict[int, Reply] = {}
-        self.pilot = Pilot(settings, self.arm, self.now_ns, takes_over=takes_over)
+        self._settings = settings
+        self.begin_anew(takes_over=takes_over)
+
+    def begin_anew(self, *, takes_over: bool) -> None:
+        """Put another pilot in the place of the one before."""
+        self.cycle = 0
+        self.pilot = Pilot(self._settings, self.arm, self.now_ns, takes_over=takes_over)
+
+    def be_alone(self) -> None:
+        """Let a cycle pass without a pilot; what is done then is the program's own."""
+        self.arm.cycle()
+        self.now_ns += CYCLE_NS
 
     def ask(self, command: Command) -> Reply:
         """Send a command and return its reply, letting cycles pass until it comes."""

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from bank.estimators import Tracker
 from bank.estimators.memory import Memory
@@ -126,3 +128,57 @@ def test_a_board_that_turns_out_slower_than_its_first_frames_is_followed(fused_c
     shares = [*np.zeros(20), *UP, *np.ones(31)]
     told = [tracker.estimate(like(t_s, share)).why for t_s, share in zip(times, shares, strict=True)]
     assert not told[-1]
+
+
+STEPS_S = {"garbled": 0.5, "saturated": 0.5, "lost": 1.0, "late": 1.2, "gap": 1.3, "back": -2.0}
+
+
+@st.composite
+def sessions(draw):
+    """Return how each frame comes, and whether a tool is gripped, or let go, just before it."""
+    told = []
+    for _ in range(draw(st.integers(3, 8))):
+        some = draw(st.lists(st.sampled_from(sorted(STEPS_S)), max_size=4))
+        told += [(kind, draw(st.booleans())) for kind in some] + [("good", draw(st.booleans()))]
+        told += [("good", False)] * draw(st.sampled_from((0, 1, 2, 14)))
+    return told
+
+
+def test_what_is_valid_is_of_one_grip_and_hardly_made_up(fused_calibration):
+    """Against a plain account of what happened: whatever frames are lost or spoilt, and whatever happens meanwhile."""
+    guards, motion = fused_calibration.guards, fused_calibration.motion
+    idle, gripped = (np.array([getattr(guard, name) for guard in guards]) for name in ("idle", "gripped"))
+    begun = [*[("good", False)] * 12, ("good", True), *[("good", False)] * 14]
+
+    @given(sessions(), st.sampled_from((0.5, np.inf)))
+    @settings(max_examples=100, deadline=None)
+    def holds(session, period_s):
+        memory, rng = Memory(guards, motion, period_s), np.random.default_rng(0)
+        t_s, held, before, other, account = 0.0, False, None, None, []
+        for kind, changes in [*begun, *session]:
+            t_s, held = t_s + STEPS_S.get(kind, 0.5), held ^ changes
+            channels = idle + held * (gripped - idle)
+            usable = rng.random(channels.shape) > 0.4 if kind == "saturated" else None
+            if kind == "garbled":
+                channels = channels * (1 + rng.normal(0, 0.4, channels.shape))
+            moment = memory.see(TactileFrame.of(t_s, channels, usable))
+            spoilt = kind in ("garbled", "saturated")
+            # A single frame like another is left out; of two, all before is of another time.
+            changed = not spoilt and before not in (None, held)
+            if kind in ("gap", "back") or (changed and other):
+                account.clear()
+                changed, before = False, None
+            if kind in ("lost", "late"):
+                account.append(None)
+            account.append(None if spoilt or changed else held)
+            before, other = before if spoilt or changed else held, changed
+            if not moment.why:
+                last = account[-motion.n_lags - 1 :]
+                assert not spoilt
+                assert len(last) == motion.n_lags + 1
+                assert last.count(None) <= 3
+                assert set(last) <= {True, None}
+                for found in (moment.difference, memory.held):
+                    np.testing.assert_allclose(found, gripped - idle, atol=1e-9)
+
+    holds()

@@ -76,6 +76,33 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
 
 
 @WAYS
+async def test_fingers_whose_connection_is_lost_in_the_middle_of_a_grip_are_stopped_when_it_is_back(
+    way: str, tmp_path: Path
+) -> None:
+    async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
+        task = task_of(rig)
+        read = tasks.create_task(task.read())
+        while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
+            await asyncio.sleep(0)
+        assert await task.release() == ""
+        grip = asyncio.create_task(task.grip(GRIP))
+        while rig.model.width_mm > 120.0:  # noqa: ASYNC110 - the model is looked at, as it moves
+            await asyncio.sleep(0)
+        rig.silence(True)
+        rig.stopped = True
+        assert await grip, "why it went wrong"
+        halt = asyncio.create_task(task.halt())
+        rig.lost.clear()
+        await rig.lost.wait()
+        rig.silence(False)
+        assert await halt == ""
+        rig.model.step(STEP_S)
+        assert not rig.model.gto
+        assert rig.model.width_mm > 110.0
+        read.cancel()
+
+
+@WAYS
 async def test_an_activation_that_is_broken_off_moves_the_fingers_no_further(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S):
         task = task_of(rig)

@@ -19,8 +19,9 @@ from daemon.messages import Scalar
 from daemon.silence import Silence
 from daemon.supervisor import LONGEST_ERROR
 from daemon.wire.publisher import Publisher
+from daemon.wrist_commands import WristCommands
 from drivers.ur.client import UrRobot, unheard
-from drivers.ur.messages import Enable, Reply, RobotState, Stop, Unlock, WristSpeed
+from drivers.ur.messages import Enable, RobotState, Stop, Unlock
 
 WRENCH = "wrench"
 # Without a state it is asked after so long: half of the time after which the arm's is stale.
@@ -33,11 +34,6 @@ LONGEST_REST_S = PUBLISH_EVERY * LONGEST_TICK_S
 SHORTEST_REST_S = 0.5 * LONGEST_REST_S
 # Then too states come twice within the time after which the arm's is stale.
 LONGEST_EASE_S = 0.5 * ARM_STALE_S
-# Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
-# take the first one's place.
-MOST_UNANSWERED = 1
-# A wrist speed that stays the same is told again after so much of the time for which the robot's process holds it.
-RENEWED_AFTER = 0.2
 LOOP_STATE_PERIOD_S = 1.0
 # A loop that died tells the arm to stop, and waits no longer than this for the answer.
 BRAKE_S = 0.5
@@ -74,18 +70,13 @@ class LoopTask:
         self._acceleration_rad_per_s2 = acceleration_rad_per_s2
         # Which of the robot's cycles, in fives, was published last.
         self._published = -1
-        # Commands that the robot's process has not answered yet.
-        self._unanswered = 0
-        self._actions = DeviceActions(robot, gripper, take_zero, lambda: bool(self._sent_rad_per_s or self._unanswered))
+        self._wrist = WristCommands(robot, brain, acceleration_rad_per_s2, self._died_of)
+        self._actions = DeviceActions(robot, gripper, take_zero, lambda: self._wrist.turns)
         self._action: asyncio.Task[None] | None = None
         # The last of them that a stop asks of the gripper: to open, or to move no more.
         self._last_word: asyncio.Task[None] | None = None
         # What the loop, or a command of it, died of since the brain was told last.
         self._own_death = ""
-        self._sent_rad_per_s = 0.0
-        # When the robot was commanded last, and how soon it is again though nothing else is wanted.
-        self._commanded_ns = 0
-        self._renewed_ns = round(RENEWED_AFTER * robot.settings.command_timeout_s * 1e9)
         self._stopped = True
         self._told: tuple[object, ...] = ()
         self._told_ns = self._told_hold = 0
@@ -273,7 +264,7 @@ class LoopTask:
             if not self._stopped:
                 self._stopped = True
                 self._break_off()
-                self._send(Stop(self._acceleration_rad_per_s2))
+                self._wrist.stop(self._decided_ns)
             if orders.release and self._gripper is not None:
                 self._begin(self._gripper.release, self._has_released)
                 self._last_word = self._action
@@ -282,50 +273,10 @@ class LoopTask:
         if not orders.hold:
             self._actions.let_go()
         elif self._actions.hold_back():
-            self._send(Stop(self._acceleration_rad_per_s2))
+            self._wrist.stop(self._decided_ns)
         if orders.begin is not None:
             self._begin(partial(self._actions.perform, orders.begin), self._brain.action_ended)
-        speed = orders.wrist_rad_per_s
-        if speed == 0.0 and self._sent_rad_per_s == 0.0:
-            return
-        command = WristSpeed(speed, self._acceleration_rad_per_s2)
-        if self._unanswered < MOST_UNANSWERED and not self._turns_so(command):
-            self._send(command)
-
-    def _turns_so(self, command: WristSpeed) -> bool:
-        """Whether the robot's process turns the wrist just so, and will go on without being told again for now.
-
-        It sends that speed in each of its cycles, within the limits of what it reads in it. What it has clipped is told
-        again in each of ours: it would be taken up by itself as soon as the limits allow.
-        """
-        state = self._robot.state
-        return (
-            state is not None
-            and state.motion == "wrist"
-            and state.sent == command
-            and not state.clipped
-            and command.rad_per_s == self._sent_rad_per_s
-            and self._decided_ns - self._commanded_ns < self._renewed_ns
-        )
-
-    def _send(self, command: WristSpeed | Stop) -> None:
-        self._unanswered += 1
-        self._commanded_ns = self._decided_ns
-        try:
-            self._robot.tell(command, self._answered)
-        except Exception as error:  # noqa: BLE001 - told by the next tick, which ends the experiment
-            self._unanswered -= 1
-            self._died_of(error)
-
-    def _answered(self, reply: Reply) -> None:
-        self._unanswered -= 1
-        try:
-            if not reply.accepted:
-                self._brain.note_refusal(reply.refused)
-            self._sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self._brain.sent(self._sent_rad_per_s)
-        except Exception as error:  # noqa: BLE001 - not the robot's process, which has answered, but the next tick's
-            self._died_of(error)
+        self._wrist.turn(orders.wrist_rad_per_s, self._decided_ns)
 
     def _died_of(self, error: Exception) -> None:
         structlog.get_logger().exception("a command to the robot died")
@@ -384,7 +335,7 @@ class LoopTask:
                 "loop", phase=standing.phase, doing=standing.doing, reasons=" ".join(standing.verdict.reasons)
             )
         self._told, self._told_ns = key, now_ns
-        self._publisher.publish(loop_state(self._brain, self._sent_rad_per_s, now_ns))
+        self._publisher.publish(loop_state(self._brain, self._wrist.sent_rad_per_s, now_ns))
         # Whoever waits now is woken, and whoever comes later waits for the next.
         self._news.set()
         self._news.clear()

@@ -1,12 +1,10 @@
 """Fingers that are on their way when the loop stops are stopped too: they would go on by themselves."""
 
-from typing import Any
-
 import pytest
 
 from daemon.loop.senses import Torque
 from daemon.loop_task import WRENCH
-from tests.daemon.cell import driven
+from tests.daemon.cell import driven, no_tick
 
 GRIP = {"do": "grip", "width_mm": 10.0}
 
@@ -64,9 +62,6 @@ async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkey
         cell.gripper.there.clear()
         await cell.start(GRIP)
         await cell.cycles(10)
-
-        def no_tick(_t_ns: int) -> Any:
-            raise ZeroDivisionError("a tick went wrong")
 
         monkeypatch.setattr(cell.brain, "tick", no_tick)
         await cell.cycles(2)

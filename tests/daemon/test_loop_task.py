@@ -12,10 +12,10 @@ from daemon.experiment.machine import Phase
 from daemon.experiment.steps import ExperimentFile
 from daemon.loop.senses import Torque
 from daemon.loop_actions import along_tool
-from daemon.loop_task import PUBLISH_EVERY, RENEWED_AFTER, WRENCH
+from daemon.loop_task import PUBLISH_EVERY, WRENCH
 from daemon.safety import Event
 from drivers.ur.messages import Enable, MoveLinear, Stop, WristSpeed
-from tests.daemon.cell import SPEED_M_PER_S, driven
+from tests.daemon.cell import SPEED_M_PER_S, driven, no_tick
 from tests.drivers.ur.flight import SETTINGS
 
 
@@ -198,9 +198,6 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         await cell.start(MOVE)
         await cell.cycles(40)
         assert cell.state.motion == "linear"
-
-        def no_tick(_t_ns: int) -> Any:
-            raise ZeroDivisionError("a tick went wrong")
 
         monkeypatch.setattr(cell.brain, "tick", no_tick)
         await cell.cycles(1)
@@ -394,55 +391,3 @@ async def test_a_paused_program_that_could_not_be_stopped_is_counted_in_health()
         cell.robot.flight.arm.protective_stop()
         await cell.cycles(200)
         assert cell.loop.facts()["errors"] == {"hung": 2, "paused program not stopped": 2}
-
-
-async def test_a_wrist_speed_that_stays_the_same_is_told_again_now_and_then_and_sent_in_each_cycle() -> None:
-    async with driven() as cell:
-        await cell.start(TWIST)
-        await cell.cycles(20)
-        cell.robot.commands.clear()
-        cell.robot.flight.arm.calls.clear()
-        await cell.cycles(200)
-        assert set(cell.robot.commands) == {WristSpeed(0.3, 4.0)}
-        renewed_s = RENEWED_AFTER * SETTINGS.command_timeout_s
-        assert len(cell.robot.commands) == pytest.approx(200 * 0.008 / renewed_s, rel=0.2)
-        assert cell.robot.flight.arm.calls.count("wrist") >= 200
-        assert cell.robot.flight.wrist_speed == pytest.approx(0.3)
-
-
-async def test_a_wrist_speed_that_is_clipped_is_told_in_each_cycle() -> None:
-    """What the robot's process clips, it would take up by itself as soon as its limits allow."""
-    async with driven() as cell:
-        await cell.start(TWIST)
-        cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
-        await cell.cycles(20)
-        assert 0.0 < cell.robot.flight.wrist_speed < 0.3
-        cell.robot.commands.clear()
-        await cell.cycles(50)
-        assert cell.robot.commands == [WristSpeed(0.3, 4.0)] * 50
-
-
-@pytest.mark.parametrize(
-    "otherwise",
-    [
-        {"motion": "stopping"},
-        {"sent": WristSpeed(0.2, 4.0)},
-        {"sent": WristSpeed(0.3, 2.0)},
-        {"clipped": ("wrist speed is limited to 0.3 rad/s",)},
-        {"answered": 0.2},
-        {"commanded_s_ago": 0.07},
-    ],
-)
-async def test_what_the_robot_does_not_do_for_certain_is_told_at_once(otherwise: dict[str, Any]) -> None:
-    async with driven() as cell:
-        await cell.start(TWIST)
-        await cell.cycles(20)
-        loop, robot = cell.loop, cell.robot
-        assert robot.state is not None
-        loop._commanded_ns = loop._decided_ns
-        assert loop._turns_so(WristSpeed(0.3, 4.0))
-        # The answer to the latest command may be known before a state that tells of it.
-        loop._sent_rad_per_s = otherwise.pop("answered", loop._sent_rad_per_s)
-        loop._commanded_ns -= round(otherwise.pop("commanded_s_ago", 0.0) * 1e9)
-        robot._state = replace(robot.state, **otherwise)
-        assert not loop._turns_so(WristSpeed(0.3, 4.0))

@@ -28,6 +28,11 @@ FloatArray = NDArray[np.float64]
 Single = NDArray[np.float32]
 Indices = NDArray[np.int64]
 
+# A basis is fitted to about so many cells, from all over the bank: a cell is much like its neighbours.
+_FITTED_CELLS = 1024
+# Cells whose signals are in memory at once: a process keeps most of the memory that it has once taken, which a daemon
+# does not need.
+COMPRESSED_CELLS = 128
 # Numbers per cell: few to find the neighbourhood, more to tell its cells apart.
 COARSE_RANK = 24
 FINE_RANK = 96
@@ -78,24 +83,26 @@ class CompressedBank:
     left_out: Single
 
 
-def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
-    """Compress unit signals, (n, 896) in parts; `parts()` is gone through twice."""
+def compress(unit_signals: Callable[[Indices], FloatArray], cells: Indices) -> CompressedBank:
+    """Compress the unit signals of n cells; `unit_signals` gives those, (m, 896), of m of these cells."""
     gram, total = np.zeros((N_CHANNELS, N_CHANNELS)), np.zeros(N_CHANNELS)
-    n = 0
-    for part in parts():
+    n, fitted = len(cells), cells[:: max(len(cells) // _FITTED_CELLS, 1)]
+    for some in _parts(fitted):
+        part = unit_signals(some)
         gram += part.T @ part
         total += part.sum(axis=0)
-        n += len(part)
-    rank = min(FINE_RANK, n, N_CHANNELS)
+    rank = min(FINE_RANK, len(fitted), N_CHANNELS)
     mean = total / np.linalg.norm(total)
     at_mean = gram @ mean
     # The gram of what is across the mean, and on the mean more than all of it: so the mean comes first.
-    gram -= np.outer(mean, at_mean) + np.outer(at_mean, mean) - (mean @ at_mean + 2 * n) * np.outer(mean, mean)
+    above = mean @ at_mean + 2 * len(fitted)
+    gram -= np.outer(mean, at_mean) + np.outer(at_mean, mean) - above * np.outer(mean, mean)
     _, ascending = linalg.eigh(gram, subset_by_index=[N_CHANNELS - rank, N_CHANNELS - 1])
     basis = np.column_stack([mean, ascending[:, -2::-1]])
     found = []
     least, most = np.ones(N_CHANNELS), np.zeros(N_CHANNELS)
-    for part in parts():
+    for some in _parts(cells):
+        part = unit_signals(some)
         found.append(part @ basis)
         up_to = np.square(part)
         np.cumsum(up_to, axis=1, out=up_to)
@@ -106,11 +113,11 @@ def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
     levels = []
     partitions = _partitions(coarse, [min(size, n // _LEAST_CELLS) for size in _N_GROUPS])
     for groups in partitions:
-        part_of = np.array([group_of[cells[0]] for cells in groups])
-        levels.append(Level(np.array([_bounding(coarse[cells]) for cells in groups]), part_of))
-        for group, cells in enumerate(groups):
-            group_of[cells] = group
-    members = partitions[SEED_LEVEL]
+        part_of = np.array([group_of[chosen[0]] for chosen, _ in groups])
+        levels.append(Level(np.array([row for _, row in groups]), part_of))
+        for group, (chosen, _) in enumerate(groups):
+            group_of[chosen] = group
+    members = tuple(chosen for chosen, _ in partitions[SEED_LEVEL])
     return CompressedBank(
         basis=np.ascontiguousarray(basis.T, dtype=np.float32),
         fine=_rows_of_cells(numbers),
@@ -118,8 +125,8 @@ def compress(parts: Callable[[], Iterable[FloatArray]]) -> CompressedBank:
         levels=tuple(levels),
         overlaps=np.sqrt(np.maximum(np.concatenate([1 - least[::-1], most[::-1]]), 0.0)),
         group_of=group_of,
-        members=tuple(members),
-        centres=np.array([_central(coarse, cells) for cells in members]),
+        members=members,
+        centres=np.array([_central(coarse, chosen) for chosen in members]),
         estimators=np.ascontiguousarray(coarse[:, :-2].T),
         left_out=np.ascontiguousarray(coarse[:, -1]),
     )
@@ -148,6 +155,10 @@ def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Sing
     return found
 
 
+def _parts(cells: Indices) -> Iterable[Indices]:
+    return (cells[start : start + COMPRESSED_CELLS] for start in range(0, len(cells), COMPRESSED_CELLS))
+
+
 def _rows_of_cells(numbers: FloatArray) -> Single:
     rows = np.zeros((len(numbers), numbers.shape[1] + 2), dtype=np.float32)
     rows[:, :-2] = numbers
@@ -158,44 +169,50 @@ def _rows_of_cells(numbers: FloatArray) -> Single:
 def _bounding(cells: Single) -> Single:
     """Return the row that bounds all of some cells."""
     centre = cells[:, :-2].mean(axis=0)
-    radius = np.linalg.norm(cells[:, 1:-2] - centre[1:], axis=1).max()
-    centre[0] = cells[:, 0].max()
-    return np.array([*centre, radius, cells[:, -1].max()], dtype=np.float32)
+    # Of the first direction and of what is left out the largest.
+    row: Single = cells.max(axis=0)
+    row[1:-2] = centre[1:]
+    row[-2] = math.sqrt(_squared_distances(cells[:, 1:-2], centre[1:]).max())
+    return row
 
 
-def _partitions(cells: Single, sizes: Sequence[int]) -> list[list[Indices]]:
+def _partitions(cells: Single, sizes: Sequence[int]) -> list[list[tuple[Indices, Single]]]:
     """Split the cells into groups, as many as each of the rising sizes says, or fewer where cells are alike.
+
+    Returns of each size the groups' cells, and the row that bounds those.
 
     The group of the widest bound is split in two, between the cell farthest from its centre and the one farthest from
     that; so every group is a part of one of the partition before.
     """
     order = count()
 
-    def entry(chosen: Indices) -> tuple[float, int, Indices]:
-        *_, radius, left_out = _bounding(cells[chosen]).tolist()
+    def entry(chosen: Indices) -> tuple[float, int, Indices, Single]:
+        row = _bounding(cells[chosen])
+        radius, left_out = row[-2:].tolist()
         width = (radius + _USUAL_T * left_out) * len(chosen) ** _CROWDING if radius > ROUNDING else 0.0
-        return -width, next(order), chosen
+        return -width, next(order), chosen, row
 
     heap = [entry(np.arange(len(cells)))]
     found = []
     for size in sizes:
         while len(heap) < size and heap[0][0] < 0:
-            _, _, chosen = heapq.heappop(heap)
+            _, _, chosen, _ = heapq.heappop(heap)
             points = cells[chosen, :-2]
-            one = points[np.argmax(_distances(points, points.mean(axis=0)))]
-            other = points[np.argmax(_distances(points, one))]
+            one = points[np.argmax(_squared_distances(points, points.mean(axis=0)))]
+            other = points[np.argmax(_squared_distances(points, one))]
             nearer = (points - (one + other) / 2) @ (one - other) > 0
             heapq.heappush(heap, entry(chosen[nearer]))
             heapq.heappush(heap, entry(chosen[~nearer]))
-        found.append([chosen for _, _, chosen in heap])
+        found.append([(chosen, row) for _, _, chosen, row in heap])
     return found
 
 
 def _central(cells: Single, chosen: Indices) -> int:
     points = cells[chosen, :-2]
-    return int(chosen[np.argmin(_distances(points, points.mean(axis=0)))])
+    return int(chosen[np.argmin(_squared_distances(points, points.mean(axis=0)))])
 
 
-def _distances(points: Single, place: Single) -> Single:
-    distances: Single = np.linalg.norm(points - place, axis=1)
-    return distances
+def _squared_distances(points: Single, place: Single) -> Single:
+    apart = points - place
+    squares: Single = np.einsum("ij,ij->i", apart, apart)
+    return squares

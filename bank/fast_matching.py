@@ -9,7 +9,6 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, spectra_of
 from bank.channels import N_CHANNELS
 from bank.compiled import search_of
-from bank.compression import ROUNDING, Indices, compress
+from bank.compression import COMPRESSED_CELLS, ROUNDING, Indices, compress
 from bank.errors import MatchingError
 from bank.matching import (
     CHUNK_CELLS,
@@ -44,8 +43,6 @@ _FEW_CELLS = 48
 _AT_ONCE = 8
 # With fewer cells at all lags, leaving out what cannot be the maximum costs more than the whole heatmap.
 FEWEST_PRUNED = 300
-# Cells compressed at a time: a process keeps most of the memory that it has once taken, which a daemon does not need.
-_COMPRESSED_CELLS = 128
 # Scoring more than this takes longer than about a millisecond.
 _QUICK_SCORES = 1 << 13
 
@@ -65,14 +62,14 @@ class _PruningMatcher(Matcher):
     _fewest = 0
 
     def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
-        """Compress the bank, which takes about a second for 10⁴ cells; arguments as of any matcher.
+        """Compress the bank, which takes about half a second for 10⁴ cells; arguments as of any matcher.
 
         Raises MatchingError as any matcher, and here, not at the first frame, where a valid cell has no signal.
         """
         super().__init__(signals, valid, k_grid, sigma_grid)
-        chunks = partial(self._chunks, _COMPRESSED_CELLS)
-        self._bank = compress(lambda: map(self._unit_signals, chunks()))
-        self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in chunks()])
+        self._bank = compress(self._unit_signals, self._cells)
+        chunks = self._chunks(COMPRESSED_CELLS)
+        self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in chunks])
         self._row, self._column = (each.astype(np.int32) for each in np.divmod(self._cells, valid.shape[1]))
         self._compiled = search_of(
             *(self._bank, self._signals, self._cells, self._norms, (self._row, self._column)),

@@ -119,10 +119,12 @@ def daemon(config: Path, folder: Path) -> Iterator[tuple[int, float]]:
         ready.bind(str(notify))
         ready.settimeout(READY_S)
         log = (folder / "daemon.log").open("wb")
+        # Some containers forbid Python to keep what it compiled, which pip has done where this is installed.
+        kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
         begun = time.monotonic()
         process = subprocess.Popen(
             [sys.executable, "-m", "daemon", "run", str(config)],
-            env={**os.environ, "NOTIFY_SOCKET": str(notify)},
+            env={**kept, "NOTIFY_SOCKET": str(notify)},
             stderr=log,
         )
         try:

@@ -28,7 +28,6 @@ from drivers.load_cell import LoadCell
 from drivers.raw_input import Tap, no_tap
 from drivers.robotiq.gripper import RobotiqGripper
 from drivers.robotiq.messages import GripperClient
-from drivers.robotiq.modbus_client import ModbusClient
 from drivers.robotiq.socket_client import SocketClient
 from drivers.robotiq.width import WidthCalibration
 from drivers.serial_port import LinkEvent
@@ -71,6 +70,9 @@ def make_gripper_client(config: GripperConfig) -> GripperClient:
     if config.socket is not None:
         return SocketClient(config.socket.host, config.socket.port)
     if config.modbus is not None:
+        # Here, for pymodbus takes long to import, and most grippers are reached by their socket.
+        from drivers.robotiq.modbus_client import ModbusClient
+
         path = str(config.modbus.path) if config.modbus.path is not None else None
         return ModbusClient(serial_number=config.modbus.serial_number, path=path)
     raise ValueError("a gripper has a way in")

@@ -1,7 +1,6 @@
 """Which frames of a recording are idle, gripped and let go: what a calibration learns a grip from. No I/O."""
 
 import numpy as np
-from scipy.ndimage import median_filter
 
 from bank.errors import CalibrationError
 from bank.estimators.guard import STEP_FRAMES, channel_noise, steps
@@ -79,6 +78,9 @@ def _like_idle(frames: FloatArray, idle: slice, loaded: slice) -> BoolArray:
     """Return which (n, 896) frames are nearer to the idle ones than to the loaded ones, along what parts the two."""
     if idle.stop == 0:
         return np.zeros(len(frames), dtype=np.bool_)
+    # Here, for the daemon calibrates nothing, and would be ready later.
+    from scipy.ndimage import median_filter
+
     base, noise = np.median(frames[idle], axis=0), channel_noise(frames[loaded])
     moved = (np.median(frames[loaded], axis=0) - base) / noise
     along = median_filter((frames - base) / noise @ moved, _LIKE_IDLE_FRAMES, mode="nearest")

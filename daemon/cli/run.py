@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 if TYPE_CHECKING:
     from daemon.cli.demonstration import Truth
     from daemon.config import Emulator
+    from daemon.matlab.slices import SliceRecorder
     from daemon.outlet import Outlet
     from daemon.wire.publisher import Listener
 
@@ -62,7 +63,6 @@ def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
     from daemon.cli.demonstration import Deaths, Happenings, Truth
     from daemon.config import RecordingConfig, load_daemon_config
     from daemon.errors import UserError
-    from daemon.matlab.slices import SliceRecorder
     from daemon.run_summary import RunSummary
     from daemon.service.priority import first_in_line
 
@@ -83,7 +83,7 @@ def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
             if emulator.device == "eit-kit":
                 # Here, and not in the emulator's process alone: without its frames the daemon would wait for ever.
                 read_stream(args.recording, _side(emulator.arguments))
-    slices = SliceRecorder(args.slices) if args.slices is not None else None
+    slices = _slice_recorder(args.slices) if args.slices is not None else None
     listeners: tuple[Listener, ...] = () if slices is None else (slices,)
     truth = Truth(config.emulators)
     try:
@@ -127,6 +127,13 @@ def checked_emulators(emulators: "tuple[Emulator, ...]", config: Path) -> None:
             checked_arguments(emulator.device, (*emulator.arguments, *emulator.synthetic), config.parent)
         except UserError as error:
             raise UserError(f"{config}: `emulators[{number}].arguments`: {emulator.device}: {error}") from error
+
+
+def _slice_recorder(folder: Path) -> "SliceRecorder":
+    # Only where it is wanted: scipy.io takes long to import.
+    from daemon.matlab.slices import SliceRecorder
+
+    return SliceRecorder(folder)
 
 
 def _side(arguments: tuple[str, ...]) -> str | None:

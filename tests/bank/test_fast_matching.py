@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
-from bank import compiled, fast_matching
+from bank import compiled, compression, fast_matching
 from bank.channels import N_CHANNELS, channels_of_line
 from bank.errors import MatchingError
 from bank.fast_matching import FastMatcher
@@ -99,6 +99,17 @@ def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, se
     valid, frame = signals.any(axis=2), random.choice([0, 1, 0.5], N_CHANNELS, p=[0.9, 0.05, 0.05])
     if valid.any() and frame.any():
         slow, fast = pair(*kind, (signals, valid))
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@pytest.mark.parametrize("kind", [*KINDS, *COMPILED])
+@pytest.mark.parametrize("bank", [BANK, bank_of_noise()], ids=["smooth", "noise"])
+def test_a_basis_that_is_fitted_to_few_cells_bounds_all(kind, bank, monkeypatch) -> None:
+    monkeypatch.setattr(compression, "_FITTED_CELLS", 5)
+    slow, fast = pair(*kind, bank)
+    random = np.random.default_rng(7)
+    for signal in bank[0][bank[1]][::40]:
+        frame = signal + 0.3 * signal.std() * random.normal(size=N_CHANNELS)
         assert_same(fast.match(frame), slow.match(frame))
 
 

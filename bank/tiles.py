@@ -11,6 +11,7 @@ import numpy as np
 from llvmlite import ir
 from numba import config, njit
 from numba.core import cgutils, types
+from numba.core.caching import FunctionCache
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
 from numpy.typing import NDArray
@@ -143,15 +144,33 @@ def require_compiler() -> None:
         )
 
 
+class _Cache(FunctionCache):  # type: ignore[misc]  # numba's types are not all known
+    """What numba keeps of a function; a file of it that was cut short, or is another's, counts as none."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return what was kept for a signature; None where nothing was, or nothing that can be read."""
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # noqa: BLE001 - a damaged pickle may raise anything, and everything is made anew
+            # The index may be what is damaged, and is read again before it is written.
+            self.flush()
+            return None
+
+
 def _compiled(function: _F) -> _F:
     """Compile a function, and keep the result on the disk where there is a place for it."""
     # Products and differences may be fused; nothing else may be reordered. Without the lock of the interpreter, several
     # threads eliminate at once.
     options: dict[str, Any] = {"nogil": True, "fastmath": {"contract"}}
     try:
-        kept: _F = njit(cache=True, **options)(function)
+        cache = _Cache(function)
     except RuntimeError:  # neither beside this file nor in the user's cache may anything be written
-        kept = njit(**options)(function)
+        cache = None
+    compiled = njit(**options)(function)
+    if cache is not None:
+        # As `cache=True` does it, which has no place for another cache than its own.
+        compiled._cache = cache
+    kept: _F = compiled
     return kept
 
 

@@ -108,6 +108,40 @@ def test_narrow_registers_give_the_same_bits(tmp_path):
     assert narrow.stdout.strip() == what_is_left().tobytes().hex()
 
 
+ELIMINATE = """
+from tests.bank.test_batch_forward import what_is_left
+print(what_is_left().tobytes().hex())
+"""
+
+
+@pytest.mark.parametrize(
+    ("damaged", "damage"),
+    [
+        ("*.nbi", lambda kept: kept[: len(kept) // 2]),
+        ("*.nbi", lambda _: b""),
+        ("*.nbc", lambda kept: kept[: len(kept) // 2]),
+        ("*.nbc", lambda kept: bytes(len(kept))),
+    ],
+)
+def test_what_numba_has_kept_is_made_anew_where_it_is_damaged(tmp_path, damaged, damage):
+    """It was a traceback of pickle's, at each build, until somebody found the file."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def eliminate() -> str:
+        command = [sys.executable, "-c", ELIMINATE]
+        return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.strip()
+
+    expected = what_is_left().tobytes().hex()
+    assert eliminate() == expected
+    whole = {path: path.read_bytes() for path in tmp_path.rglob(damaged)}
+    assert len(whole) > 5
+    for path, kept in whole.items():
+        path.write_bytes(damage(kept))
+    assert eliminate() == expected
+    # Kept again, to the size of the stamps in it.
+    assert all(path.stat().st_size > 0.9 * len(kept) for path, kept in whole.items())
+
+
 @pytest.mark.parametrize("model", MODELS)
 def test_all_models_give_the_direct_solves_signals(batch, fingertip, model):
     rng = np.random.default_rng(3)

@@ -267,8 +267,10 @@ class Tracker:
         values: dict[str, tuple[float, float, float]] = {}
         for name, task in wanted.items():
             features = read_from(calibration, name, seen.features, held)
-            widening = 1.0 if task.guard is None else task.guard.widening(difference[0], usable[0])
-            read = task.reader.read(features, usable_share, widening)
+            widening, nearness = 1.0, 0.0
+            if task.guard is not None:
+                widening, nearness = (of(difference[0], usable[0]) for of in (task.guard.widening, task.guard.nearness))
+            read = task.reader.read(features, usable_share, widening, nearness)
             if name == "diameter" and self._memory is not None and calibration.motion is not None:
                 read = _of_few_frames(read, task.reader.head, self._memory.held_frames)
             why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])

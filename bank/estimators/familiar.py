@@ -109,6 +109,13 @@ class DifferenceGuard:
         """Return by how much an interval grows because a difference is explained less well than is typical."""
         return max(self.misfit(difference, usable)[0] / self.typical_misfit, 1.0) ** _POWER
 
+    def nearness(self, difference: FloatArray, usable: BoolArray) -> float:
+        """Return how near a difference is to being refused by what it says twice: 1 at the limit, 0 without twins.
+
+        What is foreign in it moves this by the square of its share; up to the limit most of that may be hidden.
+        """
+        return self.twins.misfit(difference, usable) / self.twins.largest_misfit if self.twins is not None else 0.0
+
     def refuse(self, difference: FloatArray, usable: BoolArray) -> tuple[str, ...]:
         """Return the reasons against a (896,) difference, judged by its usable channels."""
         if 1.0 - usable.mean() > LARGEST_UNUSABLE_SHARE:

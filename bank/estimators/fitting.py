@@ -27,12 +27,12 @@ from bank.estimators.cylinders import LEAST_LEFT, Gripped, fit_cylinders
 from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import SideGuard
-from bank.estimators.heads import Censored, Curve, Ridge, Rows, later_origins
+from bank.estimators.heads import Censored, Curve, Ridge, later_origins
 from bank.estimators.memory import Memory, Motion
+from bank.estimators.mixtures import Mixtures
 from bank.estimators.physics import NOT_TURNED, Locator, Registration, image_matrix, register, settle_half_turn
 from bank.estimators.reader import (
     STRENGTHS,
-    Difficulty,
     Head,
     Reader,
     error_on_later,
@@ -166,6 +166,7 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
             ]
         )
         columns = columns_for(blank.estimator, name, features)
+        later = _mixtures(blank, registered, differences[:, 0], times[known]) if name == "torque" else None
         curve = TORQUE_CURVE if name == "torque" else DIAMETER_CURVE
         reader = fit_reader(
             columns,
@@ -173,7 +174,8 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
             _curve(curve) if blank.estimator == "fused" else _ridge(blank.estimator),
             strengths=_strengths(blank.estimator),
             left_out=later_origins(int(known.sum())) if name == "torque" else (),
-            difficulty=_misfits(differences[:, 0]) if name == "torque" else None,
+            difficulty=later.difficulty if later is not None else None,
+            mixed=later.passing if later is not None else None,
         )
         tasks[name] = Task(reader, DifferenceGuard.fit(differences[:, 0]), _ks(blank.estimator, features))
     if not tasks:
@@ -181,14 +183,14 @@ def _fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Phys
     return replace(blank, torque=tasks.get("torque"), diameter=tasks.get("diameter"))
 
 
-def _misfits(differences: FloatArray) -> Difficulty:
-    """Return how much wider the intervals of later ones among (n, 896) differences are, by a guard of the earlier."""
+def _mixtures(blank: Calibration, locator: Locator | None, differences: FloatArray, t_s: FloatArray) -> Mixtures:
+    """Return (n, 896) differences at (n,) times with what may be hidden in them, as the torque is read from it."""
 
-    def difficulty(past: Rows, future: Rows) -> FloatArray:
-        guard, usable = DifferenceGuard.fit(differences[past]), np.ones(N_CHANNELS, dtype=np.bool_)
-        return np.array([guard.widening(one, usable) for one in differences[future]])
+    def features(difference: FloatArray, row: int) -> FloatArray:
+        seen = features_of(blank, locator, difference[None], None, float(t_s[row]))
+        return columns_for(blank.estimator, "torque", seen.features)
 
-    return difficulty
+    return Mixtures(differences, features)
 
 
 def _ks(name: Name, features: FloatArray) -> FloatArray:

@@ -1,7 +1,7 @@
 """A reader turns the features of a frame into one value with its interval."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -9,7 +9,8 @@ import numpy as np
 
 from bank.errors import CalibrationError
 from bank.estimators.heads import Censored, Curve, Ridge, Rows, best_strength, later_splits, left_out_blocks
-from bank.estimators.intervals import Intervals
+from bank.estimators.intervals import LEVEL, Intervals
+from bank.estimators.mixtures import Passing
 from bank.estimators.values import BoolArray, FloatArray
 from bank.gaussian import TWO_SIDED_95
 
@@ -17,6 +18,8 @@ Head: TypeAlias = Ridge | Censored | Curve
 HeadOf: TypeAlias = Callable[[FloatArray, FloatArray, float], Head]
 # From (earlier, later) rows to how much harder each of the later ones is to read than is typical of the earlier ones.
 Difficulty: TypeAlias = Callable[[Rows, Rows], FloatArray]
+# From the same to the later ones mixed with what is foreign to them, as far as that passes.
+Mixed: TypeAlias = Callable[[Rows, Rows], Passing]
 
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
@@ -48,7 +51,9 @@ class Reader:
 
     Values at or below low_end may be read of anything lower, those at or above high_end of anything higher (−∞ and ∞
     where that was not looked at). One that misses_loads did not see too many of those left out: of what it says, an
-    interval reaches over all values that it was calibrated on.
+    interval reaches over all values that it was calibrated on. hidden_below and hidden_above are how far below and
+    above what is read the truth may lie for what is foreign in a frame unseen, at a nearness of 1 (0 where that was
+    not looked at, as in older calibrations).
     """
 
     head: Head
@@ -60,13 +65,16 @@ class Reader:
     misses_loads: bool
     mean_feature: FloatArray
     reach: FloatArray
+    hidden_below: float = 0.0
+    hidden_above: float = 0.0
 
     def read(
-        self, features: FloatArray, usable_share: float = 1.0, widening: float = 1.0
+        self, features: FloatArray, usable_share: float = 1.0, widening: float = 1.0, nearness: float = 0.0
     ) -> tuple[float, float, float]:
         """Return the value of (d,) features and how far its 95 % interval reaches below and above it.
 
         With a share of the channels unusable the rest have to carry the noise of all: the interval grows by the root.
+        What may be foreign in the frame is the more, the nearer it is to being refused (`nearness`, 1 at the limit).
         Where the lever of the calibration did not touch, the tool may have been twisted the other way as far as the
         frames say: nothing that was read then denies it.
         """
@@ -74,9 +82,9 @@ class Reader:
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
         value, beyond = _shown(self.head, raw), _UNSEEN * (self.high - self.low)
-        below, above = half, half
+        below, above = max(half, nearness * self.hidden_below), max(half, nearness * self.hidden_above)
         if self.misses_loads:
-            below, above = half + max(value - self.low, 0.0), half + max(self.high - value, 0.0)
+            below, above = below + max(value - self.low, 0.0), above + max(self.high - value, 0.0)
         if isinstance(self.head, Censored) and raw < 0:
             other_way = widening * TWO_SIDED_95 * self.head.sigma - raw
             below, above = (max(below, other_way), above) if self.head.sign > 0 else (below, max(above, other_way))
@@ -108,13 +116,14 @@ def fit_reader(
     limit_reach: bool = False,
     left_out: Sequence[tuple[Rows, Rows]] = (),
     difficulty: Difficulty | None = None,
+    mixed: Mixed | None = None,
 ) -> Reader:
     """Fit a head to (n, d) features and (n,) values in time order, and intervals to the residuals of what was left out.
 
     `left_out` are pairs of rows fitted to and rows that stand for what is to come; by default blocks of time in turn.
     With `difficulty` residuals are taken in units of it, and whoever reads widens by it (normalised conformal
     prediction, Papadopoulos et al. 2002); then it is also looked at whether values beyond the range would be read as
-    such.
+    such. With `mixed` intervals reach as far as what passes with something foreign in it goes astray.
     Raises CalibrationError where the data does not determine them.
     """
     if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
@@ -153,12 +162,39 @@ def fit_reader(
             _end(head, features, values, lambda rows: head_of(features[rows], values[rows], strength), sign)
             for sign in (1, -1)
         )
+    hidden = (0.0, 0.0)
+    if mixed is not None:
+        heads = ((head_of(features[past], values[past], strength), mixed(past, future)) for past, future in blocks)
+        hidden = _hidden(features, values, heads, inflation)
     half = np.array([intervals.half_width(one) for one in predicted])
     misses_loads = difficulty is None and _misses_loads(truth, np.abs(residuals) <= half)
     return Reader(
         head, intervals, float(values.min()), float(values.max()),
-        low_end, high_end, misses_loads, centre, reach,
+        low_end, high_end, misses_loads, centre, reach, *hidden,
     )  # fmt: skip
+
+
+def _hidden(
+    features: FloatArray, values: FloatArray, seen: Iterable[tuple[Head, Passing]], inflation: float
+) -> tuple[float, float]:
+    """Return how far below and above what heads read of mixtures the truth lies, but for one in twenty on each side.
+
+    In units of the nearness: so measured, mixtures that hold a seventh or more of something foreign go astray alike.
+    """
+    astray = [np.zeros(0)]
+    for head, passing in seen:
+        if not len(passing.rows):
+            continue
+        pure, mixed = (
+            np.array([_shown(head, one) for one in head.predict(rows)])
+            for rows in (features[passing.rows], passing.features)
+        )
+        # More slices mend the error of the slices, and not what is mixed in.
+        astray.append((inflation * (pure - values[passing.rows]) + mixed - pure) / passing.nearness)
+    found = np.concatenate(astray)
+    if not len(found):
+        return 0.0, 0.0
+    return max(float(np.quantile(found, LEVEL)), 0.0), max(float(-np.quantile(found, 1 - LEVEL)), 0.0)
 
 
 def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[Rows], Head], sign: int) -> float:

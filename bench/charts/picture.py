@@ -61,9 +61,11 @@ def draw_frontier(axes: Axes, costs: Sequence[float], errors: Sequence[float]) -
 
 # Where a name may stand beside its point, in points, the first ones liked best.
 _BESIDE = [
-    (dx, dy) for far in (5, 14, 24) for dx, dy in ((far, 4), (far, -4), (-far, 4), (-far, -4), (0, far), (0, -far))
+    (dx, dy) for far in (7, 16, 26, 38) for dx, dy in ((far, 4), (far, -4), (-far, 4), (-far, -4), (0, far), (0, -far))
 ]
-_MARK_PX = 6.0
+_MARK_PX = 7.0
+# Between two names, so that they do not read as one.
+_GAP_PX = 4.0
 
 
 def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize: float = 7) -> None:
@@ -79,7 +81,7 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize
     taken = [Bbox([centre - _MARK_PX, centre + _MARK_PX]) for centre in centres]
     legend = axes.get_legend()
     if legend is not None:
-        taken.append(legend.get_window_extent())
+        taken.append(legend.get_window_extent().padded(_GAP_PX))
     inside = axes.get_window_extent()
     for x, y, name in sorted(points):
         tried: list[tuple[float, int, Annotation, Bbox]] = []
@@ -98,7 +100,7 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize
             if tried[-1][0] == 0:
                 break
         _, _, chosen, box = min(tried, key=lambda one: one[:2])
-        taken.append(box)
+        taken.append(box.padded(_GAP_PX))
         for _, _, note, _ in tried:
             if note is not chosen:
                 note.remove()

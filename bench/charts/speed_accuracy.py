@@ -153,7 +153,12 @@ def _draw_forward(axes: Axes, solved: Sequence[Solved]) -> None:
             )  # fmt: skip
         for one in members:
             if one.error is None:
-                axes.axvline(one.cell_ms, color=shade, linestyle=LINES[number % len(LINES)], label=one.name)
+                axes.axvline(
+                    one.cell_ms,
+                    color=shade,
+                    linestyle=LINES[number % len(LINES)],
+                    label=f"{one.name}, {one.triangles} triangles",
+                )
     axes.set(
         title=f"Forward methods, {len(CELLS)} cells of the Gaussian derivative",
         xlabel="time per cell, ms (one thread; cited ones from elsewhere)",

@@ -1,12 +1,14 @@
 """The charts on small synthetic recordings: what they are drawn from, and that a user's mistakes are sentences."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from bench.charts.forwards import converged, direct, error_of, forwards
+from bank.mesh import Mesh
+from bench.charts.forwards import CELLS, converged, direct, error_of, forwards
 from bench.charts.picture import figure, frontier, plain_log, write_names
 from bench.charts.sources import bank_of, own_fingertip, splits, synthetic_stream
 from bench.charts.speed_accuracy import measured, write
@@ -91,15 +93,44 @@ def test_a_mistake_is_one_sentence(
     assert said.count("\n") == 1
 
 
-def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark() -> None:
+@pytest.mark.parametrize("there", [True, False])
+def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(
+    there: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved: list[int] = []
+
+    def solver(mesh: Mesh) -> Callable[[object], object] | None:
+        return (lambda _: solved.append(len(mesh.triangles))) if there else None
+
+    monkeypatch.setattr("bench.charts.forwards.pyeit_solver", solver)
+    rows = forwards(2, None, (0.4, 0.2), (0.2, 0.1))
+    (pyeit,) = (row for row in rows if row.family == "pyEIT")
+    assert (pyeit.name, pyeit.cited) == (("pyEIT", False) if there else ("pyEIT (cited)", True))
+    assert pyeit.error is None
+    # Twice all cells, on the mesh that has about as many triangles as the paper's.
+    assert solved == ([rows[2].triangles] * 2 * len(CELLS) if there else [])
+    assert (pyeit.triangles == rows[2].triangles) == there
+    assert pyeit.cell_low_ms <= pyeit.cell_ms <= pyeit.cell_high_ms
+    (eidors,) = (row for row in rows if row.family == "EIDORS")
+    assert (eidors.cited, eidors.error) == (True, rows[2].error)
+
+
+CROWD = [(1.0, 1.0, "one"), (1.05, 1.0, "another"), (1.0, 1.04, "a third"), (1.1, 1.0, "a fourth")]
+# Side by side, as methods of the same error are.
+ROW = [(each, 1.0, f"some method,\n{number} triangles") for number, each in enumerate((0.75, 0.79, 0.9, 1.34, 1.4))]
+
+
+@pytest.mark.usefixtures("fonts")
+@pytest.mark.parametrize("points", [CROWD, ROW])
+def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark(points: list[tuple[float, float, str]]) -> None:
     made = figure(6, 4)
     axes = made.subplots()
     plain_log(axes)
-    points = [(1.0, 1.0, "one"), (1.05, 1.0, "another"), (1.0, 1.04, "a third"), (1.1, 1.0, "a fourth")]
     axes.plot(*zip(*[point[:2] for point in points], strict=True), "o")
     axes.set(xlim=(0.5, 2), ylim=(0.5, 2))
     write_names(axes, points)
-    boxes = [note.get_window_extent() for note in axes.texts]
+    # Two that stand closer together read as one.
+    boxes = [note.get_window_extent().padded(1.9) for note in axes.texts]
     assert sorted(note.get_text() for note in axes.texts) == sorted(name for *_, name in points)
     for i, box in enumerate(boxes):
         assert not any(box.overlaps(other) for other in boxes[:i])

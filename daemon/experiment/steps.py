@@ -174,6 +174,17 @@ class ExperimentFile(_Section):
     steps: Annotated[tuple[Step, ...], Field(min_length=1)]
 
 
+def turns_before_a_grip(file: ExperimentFile) -> int | None:
+    """Return the number, from 1, of the step that turns the wrist before any has gripped or released; None of none."""
+    for number, step in enumerate(file.steps, 1):
+        match step:
+            case Grip() | Release():
+                return None
+            case Identify() | TurnTo() | Twist() | HoldTorque() | Tighten():
+                return number
+    return None
+
+
 def beyond_limits(file: ExperimentFile) -> str:
     """Return which step asks for what its limits forbid, or an empty text."""
     for number, step in enumerate(file.steps):

@@ -11,7 +11,7 @@ from daemon.control.controller import TwistController
 from daemon.control.creep import Creep
 from daemon.control.identify import Identified
 from daemon.experiment.machine import Experiment, Phase
-from daemon.experiment.steps import ExperimentFile, Limits
+from daemon.experiment.steps import ExperimentFile, Limits, turns_before_a_grip
 from daemon.experiment.wishes import (
     Action,
     ActionState,
@@ -121,6 +121,8 @@ class Brain:
         ]
         if against:
             return " ".join(against)
+        if why := self._may_hold_unknown(file):
+            return why
         self.experiment = Experiment(file, t_ns)
         self._begun, self._action, self._released = -1, ActionState.IDLE, False
         # Without a gripper of ours, somebody else holds the tool; with one, it may hold it already.
@@ -129,6 +131,17 @@ class Brain:
         self._origin_rad = None
         self._wish = Wish()
         return None
+
+    def _may_hold_unknown(self, file: ExperimentFile) -> str:
+        """Return why an experiment may turn a tool that nobody knows of and nothing would watch, or an empty text."""
+        hand, number = self.senses.hand, turns_before_a_grip(file)
+        if "gripper" not in self._required or hand is None or number is None or not (hand.unsure or hand.moving):
+            return ""
+        return (
+            f"the gripper does not say whether it holds a tool: its fingers, {hand.width_mm:.1f} mm apart, "
+            f"{'are moving' if hand.moving else 'stand where a stop or an activation has left them'}; put a `grip` or "
+            f"a `release` before step {number} ({file.steps[number - 1].do}), which turns the wrist"
+        )
 
     def pause(self) -> str | None:
         """Stand still until `resume`, or return why not."""

@@ -50,13 +50,18 @@ class Arm:
 
 @value(frozen=True, slots=True)
 class Hand:
-    """What the loop needs of the gripper's state."""
+    """What the loop needs of the gripper's state.
+
+    `unsure` where the gripper does not say whether it holds anything, though it may: it was not sent where its fingers
+    stand, as after a halt.
+    """
 
     t_ns: int
     width_mm: float
     holding: bool
     moving: bool
     fault: str = ""
+    unsure: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ from bank.gaussian import TWO_SIDED_95
 from daemon import gripper_task
 from daemon.experiment.wishes import GripTo
 from daemon.gripper_task import GripperTask
+from daemon.loop.senses import Hand
 from daemon.loop.watch import HAND_STALE_S
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
@@ -53,13 +54,17 @@ async def test_a_grip_that_is_broken_off_in_the_middle_of_an_exchange_is_opened_
 @WAYS
 async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
-        task = task_of(rig)
+        felt: list[Hand] = []
+        publisher: Any = Silent()
+        task = GripperTask(rig.driver, publisher, felt.append)
         read = tasks.create_task(task.read())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)
+        assert not felt[-1].unsure, "one that is not active holds nothing"
         await rig.driver.activate()
         for turns in range(1, 40, 3):
             assert await task.release() == ""
+            assert not felt[-1].unsure
             grip = asyncio.create_task(task.grip(GRIP))
             for _ in range(turns):
                 await asyncio.sleep(0)
@@ -71,6 +76,8 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
             # What is written is taken up at the model's next step.
             assert rig.model.width_mm == pytest.approx(halted_mm, abs=60.0 * STEP_S + 1e-6)
             assert not rig.model.gto
+            assert felt[-1].unsure
+            assert not felt[-1].holding
         assert rig.driver.facts()["openings"] == 1
         read.cancel()
 

@@ -238,6 +238,41 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
     assert rig.speed > 0.0, "it goes on by itself"
 
 
+TWIST = {"do": "twist", "angles_rad": [0.2]}
+
+
+@pytest.mark.parametrize(
+    ("sense", "what"),
+    [
+        ({"unsure": True}, "stand where a stop or an activation has left them"),
+        ({"moving": True}, "are moving"),
+    ],
+)
+@pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
+def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(
+    sense: dict[str, Any], what: str, turning: dict[str, Any]
+) -> None:
+    """After a stop in the middle of a grip the wrist turned, and nothing watched torque, angle or grip."""
+    rig = Rig(brain())
+    for _ in range(70):
+        rig.step()
+    rig.hand, rig.width_mm = replace(rig.hand, **sense), 43.2
+    rig.step()
+
+    def refused(*steps: dict[str, Any]) -> str | None:
+        return rig.brain.start(ExperimentFile.model_validate({"name": "test", "steps": list(steps)}), rig.t_ns)
+
+    why = refused({"do": "wait", "wait_s": 1}, turning, GRIP)
+    assert why == (
+        f"the gripper does not say whether it holds a tool: its fingers, 43.2 mm apart, {what}; put a `grip` or a "
+        f"`release` before step 2 ({turning['do']}), which turns the wrist"
+    )
+    assert rig.brain.experiment is None
+    assert refused({"do": "tare"}, GRIP, turning) is None
+    rig.brain.stop("")
+    assert refused({"do": "release"}, turning) is None
+
+
 def test_a_pause_is_refused_with_the_reason() -> None:
     rig = started(Rig(brain()), {"do": "wait", "wait_s": 60})
     rig.step()

@@ -12,6 +12,7 @@ from bank.bank_file import Bank
 from bank.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from bank.errors import CalibrationError
 from bank.estimators.archive import read_archive, write_archive
+from bank.estimators.cylinders import is_line
 from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Ridge
@@ -87,7 +88,13 @@ class Calibration:
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read a calibration; CalibrationError, naming the file, for one that cannot be used."""
-        return read_archive(path, {"channel_table": CHANNEL_TABLE_HASH}, cls)
+        read = read_archive(path, {"channel_table": CHANNEL_TABLE_HASH}, cls)
+        if read.motion is not None and read.diameter is not None and not is_line(read.diameter.reader.head):
+            raise CalibrationError(
+                f"{path}: the calibration is of an older version, which read diameters far too near to their mean and "
+                "called that certain; calibrate again on the same recordings"
+            )
+        return read
 
     def locator(self, bank: Bank | None) -> Locator | None:
         """Return what finds places in the bank, None for an estimator that does without.

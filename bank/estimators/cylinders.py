@@ -19,11 +19,13 @@ from bank.channels import N_CHANNELS, smoothed_along_channels
 from bank.estimators.heads import Ridge
 from bank.estimators.intervals import Intervals
 from bank.estimators.memory import BASELINE_FRAMES
-from bank.estimators.reader import LEAST_HALF_WIDTH, Reader
+from bank.estimators.reader import LEAST_HALF_WIDTH, Head, Reader
 from bank.estimators.twins import paired
 from bank.estimators.values import BoolArray, FloatArray
 from bank.gaussian import TWO_SIDED_95
 
+# Nothing holds a line back. Each ridge on single frames, which diameters were read from before, had a penalty.
+_STRENGTH = 0.0
 # Two diameters determine a line, which the recording that was left out is judged by.
 LEAST_LEFT = 2
 # Directions in which frames move within recordings, each of which counts no more than the next one does.
@@ -98,7 +100,12 @@ def fit_line(grips: Sequence[Gripped]) -> Ridge:
     true = np.maximum(squares - noise, _LEAST_SHARE * squares) + least
     along = apart.T @ (ways @ (ways.T @ (diameters - diameters.mean()) / true))
     everything = np.mean([one.frames.mean(axis=0) for one in grips], axis=0)
-    return Ridge(everything, seen @ whitened(along), float(diameters.mean()), 0.0)
+    return Ridge(everything, seen @ whitened(along), float(diameters.mean()), _STRENGTH)
+
+
+def is_line(head: Head) -> bool:
+    """Return whether a head is such a line, and not the ridge on single frames of an older calibration."""
+    return isinstance(head, Ridge) and head.strength == _STRENGTH
 
 
 def _reducing(n_sides: int) -> FloatArray:

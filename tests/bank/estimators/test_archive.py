@@ -1,4 +1,5 @@
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,6 +9,9 @@ from hypothesis import strategies as st
 from bank.errors import BankError, CalibrationError
 from bank.estimators import Calibration, TactileFrame, Tracker
 from bank.estimators.archive import write_archive
+from bank.estimators.calibrated import Task
+from bank.estimators.cylinders import Gripped, fit_cylinders
+from bank.estimators.heads import Ridge
 
 
 @pytest.fixture(scope="module")
@@ -65,6 +69,25 @@ def test_foreign_and_stale_files_are_refused(tmp_path, fused_calibration):
     write_archive(stale, {"channel_table": "0" * 64}, fused_calibration)
     with pytest.raises(CalibrationError, match="channel table 000000000000…, expected"):
         Calibration.load(stale)
+
+
+@pytest.mark.parametrize("strength", [1e-6, 1.0])
+def test_diameters_that_were_calibrated_on_single_frames_are_refused(tmp_path, fused_calibration, strength):
+    """They loaded, and another grip of a tool of 10 mm was read as 21, and called certain."""
+    weights = np.random.default_rng(0).normal(size=fused_calibration.scale.size)
+    frames = weights + np.linspace(-1.0, 1.0, 30)[:, None] * weights
+    grips = [Gripped(mm, frames + mm * weights, frames + mm * weights) for mm in (10.0, 25.0, 40.0)]
+    line, path = Task(fit_cylinders(grips), None, np.zeros(0)), tmp_path / "several.cal"
+    replace(fused_calibration, diameter=line).save(path)
+    assert Calibration.load(path).diameter is not None
+    ridge = Ridge.fit(np.concatenate([one.frames for one in grips]), np.repeat([10.0, 25.0, 40.0], 30), strength)
+    older = replace(fused_calibration, diameter=replace(line, reader=replace(line.reader, head=ridge)))
+    older.save(path)
+    with pytest.raises(CalibrationError, match=r"several\.cal: .*older version, which read diameters.*calibrate again"):
+        Calibration.load(path)
+    # Without motion a diameter is read from each frame, as ever.
+    replace(older, motion=None, guards=()).save(path)
+    assert Calibration.load(path).diameter is not None
 
 
 def test_what_cannot_be_kept_is_an_error(tmp_path):

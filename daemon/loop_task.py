@@ -1,4 +1,4 @@
-"""The task that closes the loop: the robot's states in, the brain's orders out, 125 times a second."""
+"""The task that closes the loop: the robot's states in, the brain's orders out, up to 125 times a second."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
@@ -29,7 +29,7 @@ LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
 # Of every fifth of the robot's cycles the state is published, and speaks as the torque of the wrench: 25 a second.
 PUBLISH_EVERY = 5
 # While nothing can move no other state is needed; without one the brain is asked no less often than this.
-LONGEST_REST_S = PUBLISH_EVERY * LONGEST_TICK_S
+LONGEST_REST_S = ARM_STALE_S
 # As long as states come, they are published then, and decided upon no more often than this: it is for who looks on.
 SHORTEST_REST_S = 0.5 * LONGEST_REST_S
 # Then too states come twice within the time after which the arm's is stale.
@@ -92,7 +92,7 @@ class LoopTask:
 
         Where something unexpected ends it, the arm is told to stop; begun again, it stops the experiment.
         """
-        # Each state is decided upon where it is read: 125 times a second, waking a task would cost as much again.
+        # Each state is decided upon where it is read: waking a task for each would cost as much again.
         over = self._over = asyncio.get_running_loop().create_future()
         self._decided_ns = self._clock.now_ns()
         self._robot.on_state = self._decide
@@ -165,7 +165,7 @@ class LoopTask:
             if state is not None and not state.blocked:
                 self._sense(state)
                 break
-        # From now on the brain is asked in each of the robot's cycles.
+        # From now on the brain is asked as often as the robot has something to say.
         self._robot.hurry()
         return self._brain.start(file, self._clock.now_ns())
 
@@ -226,7 +226,7 @@ class LoopTask:
             self._publisher.publish(robot_state(state))
 
     def _pace(self) -> float:
-        """Have the robot tell its state in each of its cycles, unless nothing can move; return how long to wait for it.
+        """Have the robot tell whatever is new of its state, unless nothing can move; return how long to wait for it.
 
         While no experiment runs and the arm was told to stop, and does rest, the states that are published will do.
         """

@@ -231,7 +231,7 @@ class SafetyGate:
     def judge(self, troubles: Iterable[Trouble], t_ns: int) -> Verdict:
         """Return the response to the troubles of this moment (t_ns on the monotonic clock)."""
         active = tuple(troubles)
-        # 125 times a second, and nearly always there is nothing to count.
+        # Up to 125 times a second, and nearly always there is nothing to count.
         if active or self._wrist_ns or self._holding:
             self._count(active, t_ns)
         self._judged_ns = t_ns

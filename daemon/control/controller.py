@@ -1,4 +1,4 @@
-"""The twist controller: torque measurements, late and noisy, become a wrist speed, 125 times a second.
+"""The twist controller: torque measurements, late and noisy, become a wrist speed, up to 125 times a second.
 
 The tool in the grip is a torsion spring on a wrist whose angle is known at all times: torque = K·(θ − θ₀) + d, where
 the offset d takes in all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d has to be

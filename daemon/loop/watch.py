@@ -12,8 +12,9 @@ from drivers.values import value
 # 2.5 periods of their topics. The arm stands still by itself when it hears nothing for 0.3 s.
 ARM_STALE_S = stale_after_s("robot.state")
 HAND_STALE_S = stale_after_s("gripper.state")
-# The brain is asked at each state of the robot while an experiment runs, and is late where that takes longer than this.
-LONGEST_TICK_S = 0.02
+# While an experiment runs the brain is asked at each state that the robot's process tells, at least at every third of its
+# cycles (`drivers.ur.pace`), and is late where that takes longer than this.
+LONGEST_TICK_S = 0.03
 # Later than this, and the state that was last decided upon had become stale while the wrist turned on it.
 LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 
@@ -58,7 +59,7 @@ def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: in
     for name, why in senses.died.items():
         found.append(Trouble(Event.TASK_DIED, f"{name}: {why}"))
     if senses.late_s > LATEST_LOOP_S:
-        found.append(Trouble(Event.LOOP_LATE, f"the 8 ms loop was woken {senses.late_s * 1e3:.0f} ms late"))
+        found.append(Trouble(Event.LOOP_LATE, f"the loop was woken {senses.late_s * 1e3:.0f} ms late"))
     if senses.recording_failed:
         found.append(Trouble(Event.RECORDING_FAILED, senses.recording_failed))
     if watched.overdue:

@@ -1,4 +1,4 @@
-"""What the wrist does for each wish: a speed in rad/s, 125 times a second. No I/O; times are passed in."""
+"""What the wrist does for each wish: a speed in rad/s, up to 125 times a second. No I/O; times are passed in."""
 
 import math
 from collections import deque

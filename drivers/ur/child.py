@@ -1,5 +1,5 @@
-"""The robot's own process, `python -m drivers.ur.child`: commands on stdin, states and replies on stdout, 125 times a
-second, or fewer while the daemon is at ease and nothing moves.
+"""The robot's own process, `python -m drivers.ur.child`: commands on stdin, states and replies on stdout. It goes through
+125 cycles a second, or fewer while the daemon is at ease and nothing moves, and tells of those in which something is new.
 
 It may hang or crash in ur-rtde at any time and holds nothing worth saving. Before every stretch that may hang it sets
 an alarm that the kernel answers by ending it, whatever holds the interpreter lock; the robot's watchdog then ends the
@@ -33,6 +33,7 @@ from drivers.ur.messages import (
     Stop,
     WristSpeed,
 )
+from drivers.ur.news import News
 from drivers.ur.pace import Pace
 from drivers.ur.pilot import Pilot
 from drivers.ur.probe import ProbeError, probe
@@ -89,12 +90,14 @@ class Pipe:
         if len(self._unsent) + len(self._held) > MOST_UNSENT:
             self.open = False
 
-    def send_latest(self, message: Message) -> None:
-        """Send a message unless others are still waiting."""
+    def send_latest(self, message: Message) -> bool:
+        """Send a message unless others are still waiting, and return whether it was."""
         if self._unsent:
             self._flush()
-        if not self._unsent:
-            self.send(message)
+        if self._unsent:
+            return False
+        self.send(message)
+        return True
 
     def _flush(self) -> None:
         try:
@@ -168,7 +171,7 @@ def _explain(host: str, text: str) -> tuple[FailureKind, str]:
 def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
     settings = configured.settings
     pilot = Pilot(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
-    pace = Pace(settings, time.monotonic())
+    pace, news = Pace(settings, time.monotonic()), News()
     leaving_s = 0.0
     # Whether nothing of the daemon's has come until the cycle was due.
     quiet = False
@@ -191,8 +194,10 @@ def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
         if decided is not None:
             pipe.send(decided[1], decided[0])
         rests = pilot.rests(reading) and not leaving_s
-        if not pilot.puzzled() and pace.tells(rests=rests):
-            pipe.send_latest(pilot.state(reading, pace.cycle))
+        if not pilot.puzzled():
+            state = pilot.state(reading, pace.cycle)
+            if pace.tells(rests=rests, news=news.brings(state)) and pipe.send_latest(state):
+                news.tell(state)
         if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
             _end_program(settings, pilot, arm)
             _leave(EXIT_DONE)
@@ -229,7 +234,7 @@ def _obey(pipe: Pipe, pilot: Pilot, pace: Pace, reading: Reading) -> bool:
     goes = False
     for number, command in _newest(pipe, pilot, pace):
         reply = pilot.request(number, command, reading, time.monotonic_ns())
-        if isinstance(command, WristSpeed) and reply is not None:
+        if isinstance(command, WristSpeed) and reply is not None and reply.accepted:
             # The loop asks for the next speed at the next state, and needs the reply no sooner.
             pipe.hold(reply, number)
         elif reply is not None:

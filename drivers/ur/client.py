@@ -106,14 +106,14 @@ class UrRobot:
             self._write(self._stdin, encode(Ease(cycles)))
 
     def hurry(self) -> None:
-        """Have a state in every cycle again, the next one in the present one."""
+        """Have every cycle gone through again, and whatever is new in it told."""
         if self.at_ease:
             self._hurried.set()
             if self._stdin is not None:
                 self._write(self._stdin, HEARTBEAT)
 
     async def hurried(self) -> None:
-        """Wait until a state is needed in every cycle, and signs of life with them."""
+        """Wait until every cycle is gone through, and signs of life are needed in them."""
         await self._hurried.wait()
 
     async def _awaited(self, seconds: float | None) -> RobotState | None:

@@ -87,7 +87,7 @@ class Conversation:
         raise await self._died()
 
     def _hear(self) -> None:
-        """Take what the process has said, as it arrives: 125 times a second, so that no task is woken for it."""
+        """Take what the process has said, as it arrives: up to 125 times a second, so that no task is woken for it."""
         try:
             data = os.read(self._stdout, 1 << 16)
             self._heard_s = time.monotonic()

@@ -1,8 +1,9 @@
-"""When the robot's process goes through its next cycle: at the rate, or at ease. No clock: the time is an argument.
+"""When the robot's process goes through its next cycle, and of which it tells. No clock: the time is an argument.
 
-Each waking costs, whatever is done then. While the daemon needs few states and nothing moves, all that can come between
-two of them is a message, and that is answered when it comes. The robot needs its signs of life more often than the
-daemon needs a state: not every cycle at ease tells one.
+Each waking costs, here and in the daemon, whatever is done then. While the daemon needs few states and nothing moves,
+all that can come between two of them is a message, and that is answered when it comes. The robot needs its signs of
+life more often than the daemon needs a state: not every cycle at ease tells one. Nor does every cycle of a wrist that
+turns: those that say nothing new are told in stretches (`drivers.ur.news`).
 """
 
 import math
@@ -13,6 +14,10 @@ from drivers.ur.settings import UrSettings
 # Of the robot's patience with a silent client (1/watchdog_hz): the three quarters left are for a busy computer. At rest
 # too the robot's program ends once they are over, and waits for the operator.
 OF_THE_WATCHDOG = 0.25
+# Where the daemon is not at ease one state of so many cycles is told though it says nothing new, and no later than so
+# long after the last one: the loop decides 42 times a second on a wrist that stands or turns slowly, and at each cycle
+# of one that turns fast.
+QUIET_CYCLES, LONGEST_QUIET_S = 3, 0.025
 
 
 class Pace:
@@ -22,24 +27,32 @@ class Pace:
         """Begin with a cycle that is due now, and with a daemon that needs every one."""
         self._period_s = 1.0 / settings.rate_hz
         self._most = max(1, int(OF_THE_WATCHDOG * settings.rate_hz / settings.watchdog_hz))
-        # How many cycles the daemon needs one state of, and which such stretch was the last to have one told.
-        self._wanted, self._told = 1, -1
+        self._quiet = max(1, min(QUIET_CYCLES, int(LONGEST_QUIET_S * settings.rate_hz)))
+        # How many cycles at rest the daemon needs one state of, and of which cycle it was told last.
+        self._wanted, self._told = 1, -QUIET_CYCLES
         self.cycle, self._due_s = 0, now_s
         self._next, self._next_s = 0, now_s
 
     @property
     def at_ease(self) -> bool:
-        """Whether the daemon does not need every cycle."""
+        """Whether the daemon does not need every cycle to be gone through."""
         return self._wanted > 1
 
     def hear(self, message: Message) -> None:
         """Note what the daemon needs: every cycle, once it has said anything but `Ease`."""
         self._wanted = max(1, message.cycles) if isinstance(message, Ease) else 1
 
-    def tells(self, *, rests: bool) -> bool:
-        """Return whether this cycle's state is needed; at ease only the first one's in each stretch that was named."""
-        told, self._told = self._told, self.cycle // self._wanted
-        return not rests or self._told != told
+    def tells(self, *, rests: bool, news: bool) -> bool:
+        """Return whether this cycle's state is told: always with `news`, else when the last one was long enough ago."""
+        if rests and self.at_ease:
+            # Those that are gone through are not those that are wanted: the first one in each stretch of these.
+            due = self.cycle // self._wanted != self._told // self._wanted
+        else:
+            due = self.cycle - self._told >= self._quiet
+        if not (news or due):
+            return False
+        self._told = self.cycle
+        return True
 
     def plan(self, now_s: float, *, rests: bool) -> None:
         """Choose the next cycle once the work of this one is done; `rests`: nothing moves, and nothing is under way."""

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import NoReturn
 
@@ -24,8 +25,9 @@ from drivers.ur.messages import (
     Unlock,
     WristSpeed,
 )
+from drivers.ur.pace import Pace
 from drivers.ur.wire import Decoder, encode
-from tests.drivers.ur.flight import SETTINGS, FakeArm, Flight
+from tests.drivers.ur.flight import SETTINGS, FakeArm, Flight, flying
 
 ROOT = Path(__file__).parents[3]
 
@@ -235,11 +237,12 @@ def test_at_ease_one_state_is_told_of_so_many_cycles_as_the_daemon_says(
     daemon: Daemon, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     eased = Eased(daemon, monkeypatch, (0.101, Ease(5)), (0.225, Heartbeat()), (0.301, Ease(5)), (0.405, Disconnect()))
-    assert eased.told_between(-0.001, 0.101) == [*range(13)]
-    # Of those that are gone through the first in each five; once the daemon has said something, the next one.
-    assert eased.told_between(0.101, 0.225) == [13, 15, 21, 27]
-    assert eased.told_between(0.225, 0.301) == [*range(29, 38)]
-    assert eased.told_between(0.301, 0.405) == [38, 42, 45]
+    # While the robot is made ready something happens in each cycle, then nothing: every third.
+    assert eased.told_between(-0.001, 0.101) == [0, 1, 2, 5, 8, 11]
+    # Of those that are gone through the first in each five; then every third again.
+    assert eased.told_between(0.101, 0.225) == [15, 21, 27]
+    assert eased.told_between(0.225, 0.301) == [30, 33, 36]
+    assert eased.told_between(0.301, 0.405) == [42, 45]
     assert eased.told_between(0.405, 1.0) == [51]
 
 
@@ -259,8 +262,9 @@ def test_a_command_at_ease_is_carried_out_when_it_comes_and_ends_the_ease(
         arm=Told(),
     )  # fmt: skip
     assert told_s[0] == pytest.approx(1000.203, abs=1e-9)
-    # It turns: at ease or not, nothing is left out.
-    assert eased.told_between(0.201, 0.3) == [*range(26, 38)]
+    # It turns: at ease or not, each cycle is gone through. Slow as it is every third is told.
+    assert eased.cycles_between(0.201, 0.3) == [*range(26, 38)]
+    assert eased.told_between(0.201, 0.3) == [26, 29, 32, 35]
     assert all(state.motion == "wrist" for state in eased.states if 26 <= state.cycle < 38)
 
 
@@ -301,7 +305,46 @@ def test_an_arm_that_is_moved_is_watched_in_every_cycle(daemon: Daemon, monkeypa
 
     eased = Eased(daemon, monkeypatch, (0.101, Ease(5)), (0.301, Disconnect()), arm=Moved())
     assert eased.cycles_between(0.101, 0.301) == [13, 15, 18, 21, 24, *range(27, 38)]
-    assert eased.told_between(0.101, 0.301) == [13, 15, 21, *range(27, 38)]
+    assert eased.told_between(0.101, 0.301) == [15, 21, 27, 30, 33, 36]
+
+
+@pytest.mark.parametrize(("rad_per_s", "gap"), [(0.5, 1), (0.2, 2), (0.05, 3)])
+def test_the_faster_a_wrist_turns_the_more_of_its_cycles_are_told(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, rad_per_s: float, gap: int
+) -> None:
+    eased = Eased(daemon, monkeypatch, (0.1, Enable()), (0.2, WristSpeed(rad_per_s, 4.0)), (0.5, Disconnect()))
+    # As fast as it was told, until the command has to be given anew.
+    turning = [state for state in eased.states if 1000.35 < state.t_mono_ns / 1e9 < 1000.48]
+    assert {round(state.qd_rad_per_s[5], 9) for state in turning} == {rad_per_s}
+    assert {later.cycle - earlier.cycle for earlier, later in pairwise(turning)} == {gap}
+
+
+@pytest.mark.parametrize("cycle", [30, 31, 32])
+def test_what_happens_is_told_in_the_cycle_that_sees_it(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, cycle: int
+) -> None:
+    """Of a wrist so slow that only every third is told."""
+
+    class Stopping(TimedArm):
+        def read(self) -> Reading:
+            if child.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
+                self.protective_stop()
+            return super().read()
+
+    said = (0.1, Enable()), (0.2, WristSpeed(0.01, 4.0)), (0.3, Disconnect())
+    eased = Eased(daemon, monkeypatch, *said, arm=Stopping())
+    assert next(state.cycle for state in eased.states if state.protective_stop) == cycle
+
+
+def test_refused_wrist_speed_is_answered_at_once_one_that_is_taken_with_the_next_state(daemon: Daemon) -> None:
+    flight, pace = flying(), Pace(SETTINGS, 0.0)
+    daemon.say(WristSpeed(0.1, 4.0))
+    child._obey(daemon.pipe, flight.pilot, pace, flight.state)
+    with pytest.raises(BlockingIOError):
+        daemon.hear()
+    daemon.say(WristSpeed(0.1, -4.0))
+    child._obey(daemon.pipe, flight.pilot, pace, flight.state)
+    assert [message.accepted for _, message in daemon.hear() if isinstance(message, Reply)] == [True, False]
 
 
 def test_reply_to_a_wrist_speed_comes_with_the_next_state_in_one_piece(daemon: Daemon) -> None:

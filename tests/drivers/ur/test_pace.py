@@ -107,3 +107,28 @@ def test_at_ease_most_of_the_watchdogs_patience_is_left_for_a_busy_computer(
     left_s = cycles.pace.left_s(cycles.now_s)
     assert left_s == pytest.approx(most / rate_hz)
     assert most == 1 or left_s <= 0.25 / watchdog_hz
+
+
+@pytest.mark.parametrize(("rate_hz", "every"), [(500.0, 3), (125.0, 3), (100.0, 2), (30.0, 1)])
+def test_of_states_that_say_nothing_new_one_is_told_in_time(rate_hz: float, every: int) -> None:
+    cycles = Cycles(rate_hz=rate_hz)
+    told = []
+    for _ in range(20):
+        cycles.work(rests=False)
+        if cycles.pace.tells(rests=False, news=cycles.pace.cycle == 7):
+            told.append(cycles.pace.cycle)
+        cycles.wait()
+    assert told == sorted({*range(0, 7, every), *range(7, 20, every)})
+
+
+def test_at_ease_news_are_told_though_another_state_was() -> None:
+    cycles = Cycles()
+    cycles.pace.hear(Ease(5))
+    told = []
+    for _ in range(8):
+        cycles.work()
+        if cycles.pace.tells(rests=True, news=cycles.pace.cycle == 9):
+            told.append(cycles.pace.cycle)
+        cycles.wait()
+    # Of 0, 3, 6 … the first in each five, and 9.
+    assert told == [0, 6, 9, 12, 15, 21]

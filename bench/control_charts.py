@@ -122,7 +122,7 @@ def draw_rig_faults(path: Path, faults: Sequence[Mapping[str, Any]], gaps_ms: Ma
         right.plot(gaps, longer, style, color=ink, linewidth=1.4, label=name, drawstyle="steps-post")
     right.set_xscale("log")
     right.set_yscale("log")
-    right.set_xlabel("time between two states of the robot / ms (125 a second)")
+    right.set_xlabel("time between two states of the resting robot / ms (24 are meant)")
     right.set_ylabel("share that is longer")
     right.legend(fontsize=7, frameon=False)
     figure.savefig(path)

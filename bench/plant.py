@@ -12,6 +12,8 @@ import numpy as np
 from daemon.control.creep import Creep
 from drivers.eit_format import FRAME_PERIOD_S
 from drivers.emulators.twin import Twin
+from drivers.ur.news import ANGLE_NEWS_RAD
+from drivers.ur.pace import QUIET_CYCLES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -75,6 +77,7 @@ class Plant:
     period_s: float = 0.008
     disturbance_nm: float = 0.0
     blocked: bool = False  # the robot does not turn, whatever it is sent
+    as_told: bool = False  # the loop hears only of the periods in which the robot's process would tell of something new
     t_s: float = 0.0
     angle_rad: float = 0.0
     torque_nm: float = 0.0
@@ -86,6 +89,8 @@ class Plant:
     _window_integral: float = 0.0
     _next_end_s: float = 0.0
     _samples: list[Sample] = field(default_factory=list)
+    _untold: int = QUIET_CYCLES
+    _told_rad: float = 0.0
 
     def __post_init__(self) -> None:
         """Set the sensor and the actuation delay going."""
@@ -101,6 +106,14 @@ class Plant:
         self.angle_rad += self.period_s * ((1.0 - part) * self._under_way[0] + part * earlier)
         self._load()
         self._measure()
+
+    def tells(self) -> bool:
+        """Return, once in each period, whether the loop hears of it."""
+        self._untold += 1
+        if self.as_told and self._untold < QUIET_CYCLES and abs(self.angle_rad - self._told_rad) <= ANGLE_NEWS_RAD:
+            return False
+        self._untold, self._told_rad = 0, self.angle_rad
+        return True
 
     def collect(self) -> list[Sample]:
         """Return the measurements that have become known by now, each once."""

@@ -1,5 +1,7 @@
-"""The robot's own process, `python -m drivers.ur.child`: commands on stdin, states and replies on stdout. It goes through
-125 cycles a second, or fewer while the daemon is at ease and nothing moves, and tells of those in which something is new.
+"""The robot's own process, `python -m drivers.ur.child`: commands on stdin, states and replies on stdout.
+
+It goes through 125 cycles a second, or fewer while the daemon is at ease and nothing moves, and tells of those in which
+something is new.
 
 It may hang or crash in ur-rtde at any time and holds nothing worth saving. Before every stretch that may hang it sets
 an alarm that the kernel answers by ending it, whatever holds the interpreter lock; the robot's watchdog then ends the

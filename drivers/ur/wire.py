@@ -2,8 +2,8 @@
 
 A message is a header (length of the body, number, kind) and its fields as JSON, written and checked by pydantic in one
 pass; its strict mode for JSON takes neither a missing field nor an unknown one nor a value of another type. Of what
-crosses up to 125 times a second while the wrist turns (states, wrist speeds and their replies) only the texts are JSON, and
-those are nearly always the same as the time before.
+crosses up to 125 times a second while the wrist turns (states, wrist speeds and their replies) only the texts are JSON,
+and those are nearly always the same as the time before.
 """
 
 import struct

@@ -190,7 +190,9 @@ def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
             leaving_s = time.monotonic() + FAREWELL_S
         if pilot.recovering:
             # The daemon learns beforehand that this cycle may take long.
-            pipe.send_latest(pilot.state(reading, pace.cycle))
+            state = pilot.state(reading, pace.cycle)
+            if pipe.send_latest(state):
+                news.tell(state)
             _alarm(RECOVERY_HANG_S)
         decided = pilot.tick(reading, time.monotonic_ns())
         if decided is not None:

@@ -26,6 +26,7 @@ from drivers.ur.messages import (
     WristSpeed,
 )
 from drivers.ur.pace import Pace
+from drivers.ur.pilot import Pilot
 from drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm, Flight, flying
 
@@ -334,6 +335,63 @@ def test_what_happens_is_told_in_the_cycle_that_sees_it(
     said = (0.1, Enable()), (0.2, WristSpeed(0.01, 4.0)), (0.3, Disconnect())
     eased = Eased(daemon, monkeypatch, *said, arm=Stopping())
     assert next(state.cycle for state in eased.states if state.protective_stop) == cycle
+
+
+def test_what_happened_while_the_daemon_did_not_read_is_told_as_soon_as_it_does(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the cycles that see it first two cannot be told; then the next is, and not only the third one."""
+    send, lost = daemon.pipe.send_latest, list[int]()
+
+    class Reduced(TimedArm):
+        def read(self) -> Reading:
+            super().read()
+            if self.reading.t_mono_ns > 1000.24e9 - 1e3:
+                self.be(safety_mode=2)
+            return self.reading
+
+    def send_latest(state: RobotState) -> bool:
+        if state.safety_mode == 2 and len(lost) < 2:
+            lost.append(state.cycle)
+            return False
+        return send(state)
+
+    monkeypatch.setattr(daemon.pipe, "send_latest", send_latest)
+    said = (0.1, Enable()), (0.2, WristSpeed(0.01, 4.0)), (0.4, Disconnect())
+    eased = Eased(daemon, monkeypatch, *said, arm=Reduced())
+    assert lost == [30, 31]
+    assert next(state.cycle for state in eased.states if state.safety_mode == 2) == 32
+
+
+def test_state_that_finds_others_waiting_is_not_sent_and_says_so(daemon: Daemon) -> None:
+    state = Flight().state
+    assert daemon.pipe.send_latest(state)
+    while not daemon.pipe._unsent:
+        daemon.pipe.send(state)
+    assert not daemon.pipe.send_latest(state)
+    daemon.hear()
+    assert daemon.pipe.send_latest(state)
+
+
+def test_robot_that_is_made_ready_no_more_is_told_at_once_however_soon(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Announced as being made ready, and given up in the same cycle: all is as before the announcement."""
+    arm = TimedArm()
+    arm.be(robot_mode=3)
+    given_up = Pilot.tick
+
+    def tick(pilot: Pilot, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
+        if now_ns > 1000.1e9 and pilot._recovery is not None:
+            pilot._recovery.give_up("Nobody waits for it.")
+        return given_up(pilot, reading, now_ns)
+
+    monkeypatch.setattr("drivers.ur.pilot.Pilot.tick", tick)
+    eased = Eased(daemon, monkeypatch, (0.201, Unlock()), (0.4, Disconnect()), arm=arm)
+    ready = [state for state in eased.states if 1000.195 < state.t_mono_ns / 1e9 < 1000.3]
+    announced = next(number for number, state in enumerate(ready) if state.recovering)
+    assert not ready[announced + 1].recovering
+    assert ready[announced + 1].cycle == ready[announced].cycle
 
 
 def test_refused_wrist_speed_is_answered_at_once_one_that_is_taken_with_the_next_state(daemon: Daemon) -> None:

@@ -18,6 +18,8 @@ OF_THE_WATCHDOG = 0.25
 # long after the last one: the loop decides 42 times a second on a wrist that stands or turns slowly, and at each cycle
 # of one that turns fast.
 QUIET_CYCLES, LONGEST_QUIET_S = 3, 0.025
+# Of the time for which a wrist speed holds: at a state that is told it is renewed, and one that is missed is borne.
+OF_THE_COMMANDS_TIMEOUT = 0.2
 
 
 class Pace:
@@ -27,7 +29,8 @@ class Pace:
         """Begin with a cycle that is due now, and with a daemon that needs every one."""
         self._period_s = 1.0 / settings.rate_hz
         self._most = max(1, int(OF_THE_WATCHDOG * settings.rate_hz / settings.watchdog_hz))
-        self._quiet = max(1, min(QUIET_CYCLES, int(LONGEST_QUIET_S * settings.rate_hz)))
+        quiet_s = min(LONGEST_QUIET_S, OF_THE_COMMANDS_TIMEOUT * settings.command_timeout_s)
+        self._quiet = max(1, min(QUIET_CYCLES, int(quiet_s * settings.rate_hz)))
         # How many cycles at rest the daemon needs one state of, and of which cycle it was told last.
         self._wanted, self._told = 1, -QUIET_CYCLES
         self.cycle, self._due_s = 0, now_s

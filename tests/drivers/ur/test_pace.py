@@ -132,3 +132,15 @@ def test_at_ease_news_are_told_though_another_state_was() -> None:
         cycles.wait()
     # Of 0, 3, 6 … the first in each five, and 9.
     assert told == [0, 6, 9, 12, 15, 21]
+
+
+@pytest.mark.parametrize(("timeout_s", "every"), [(0.3, 3), (0.1, 2), (0.05, 1), (0.02, 1)])
+def test_states_are_told_often_enough_to_renew_a_speed_that_holds_shortly(timeout_s: float, every: int) -> None:
+    cycles = Cycles(command_timeout_s=timeout_s)
+    told = []
+    for _ in range(12):
+        cycles.work(rests=False)
+        if cycles.pace.tells(rests=False, news=False):
+            told.append(cycles.pace.cycle)
+        cycles.wait()
+    assert told == [*range(0, 12, every)]

@@ -1,0 +1,62 @@
+"""The wrist closes in on an angle by the states that the robot's process tells, which are not those of each cycle."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import cast
+
+import pytest
+
+from daemon.config import LoopConfig
+from daemon.experiment.wishes import GoTo
+from daemon.loop.brain import Brain
+from daemon.loop.senses import Source
+from daemon.loop.wrist import Wrist, WristSettings
+from daemon.wrist_commands import WristCommands
+from drivers.ur.client import UrRobot
+from drivers.ur.messages import Command, Reply
+from drivers.ur.news import News
+from drivers.ur.pace import Pace
+from tests.drivers.ur.flight import SETTINGS, flying
+
+FASTEST_PER_S = next(
+    float(each.le) for each in LoopConfig.model_fields["angle_bandwidth_per_s"].metadata if hasattr(each, "le")
+)
+
+
+def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> list[float]:
+    """Return how far from the angle the wrist is in each cycle."""
+    flight, news, pace = flying(), News(), Pace(SETTINGS, 0.0)
+    settings = WristSettings(angle_bandwidth_per_s=bandwidth_per_s)
+    wrist = Wrist(Source(name="load_cell", period_s=0.1), settings, lambda *_: pytest.fail("no loop is closed"))
+    replies: list[Callable[[], None]] = []
+
+    def tell(command: Command, answered: Callable[[Reply], None]) -> None:
+        reply = flight.ask(command)
+        assert reply.accepted
+        # It comes with the next state that is told.
+        replies.append(lambda: answered(reply))
+
+    robot = SimpleNamespace(settings=SETTINGS, state=None, tell=tell)
+    brain = SimpleNamespace(sent=wrist.sent, note_refusal=pytest.fail)
+    commands = WristCommands(cast(UrRobot, robot), cast(Brain, brain), 4.0, pytest.fail)
+    origin_rad, errors = flight.state.wrist_rad, []
+    for pace.cycle in range(cycles):
+        flight.fly(1)
+        state = flight.state
+        errors.append(state.wrist_rad - origin_rad - angle_rad)
+        if pace.tells(rests=False, news=news.brings(state)):
+            news.tell(state)
+            robot.state = state
+            while replies:
+                replies.pop()()
+            turn = wrist.turn(GoTo(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
+            commands.turn(turn.speed_rad_per_s, flight.now_ns)
+    return errors
+
+
+@pytest.mark.parametrize("angle_rad", [0.01, 0.03, 0.1])
+@pytest.mark.parametrize("bandwidth_per_s", [5.0, FASTEST_PER_S])
+def test_wrist_comes_to_rest_at_an_angle_however_fast_it_may_be_asked_to(
+    angle_rad: float, bandwidth_per_s: float
+) -> None:
+    assert max(map(abs, errors_rad(angle_rad, bandwidth_per_s)[-150:])) < 1e-4

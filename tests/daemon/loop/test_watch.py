@@ -5,8 +5,11 @@ import pytest
 from daemon.experiment.steps import Limits
 from daemon.loop.senses import Arm, Hand, Senses, Source, Torque
 from daemon.loop.watch import ARM_STALE_S, Watched, WatchSettings, compared_for_s, troubles
+from daemon.loop_task import PUBLISH_EVERY, wrench_source
 from daemon.safety import TABLE, Event
+from drivers.ur.pace import Pace
 from drivers.ur.sample_age import SampleAge
+from tests.drivers.ur.flight import SETTINGS
 
 EIT = Source(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = Source(name="load_cell", period_s=1 / 10.9)
@@ -161,3 +164,30 @@ def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wr
         stale_s += 0.008 * (age.age_ns(made_s, round((made_s + late_s) * 1e9)) > ARM_STALE_S * 1e9)
     assert stale_s == pytest.approx(9.7, abs=0.1)
     assert stale_s > (TABLE[Event.STATE_STALE].hold_at_most_s or 0.0) + 1.0
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 125.0, 500.0])
+@pytest.mark.parametrize("slow_hz", [8.0, 10.0, 10.9])
+def test_no_sample_goes_uncompared_where_the_robot_tells_but_some_of_its_cycles(rate_hz: float, slow_hz: float) -> None:
+    """A slower sensor that disagrees does so at each of its samples: else the wrist would turn on until the next."""
+    pace = Pace(replace(SETTINGS, rate_hz=rate_hz), 0.0)
+    wrench, slow = wrench_source(rate_hz), Source(name="load_cell", period_s=1 / slow_hz)
+    senses, published, sample = Senses(), -1, 0.5
+    compared = []
+    for _ in range(round(20.0 * rate_hz)):
+        t_ns = NOW_NS + round(pace.cycle / rate_hz * 1e9)
+        senses.arm = Arm(0.0, 0.0, t_ns)
+        if pace.tells(rests=False, news=False):
+            if pace.cycle // PUBLISH_EVERY != published:
+                published = pace.cycle // PUBLISH_EVERY
+                senses.hear(Torque("wrench", 0.1, "", t_ns, t_ns))
+            measured_ns = NOW_NS + round((sample - 0.5) / slow_hz * 1e9)
+            if t_ns >= NOW_NS + round(sample / slow_hz * 1e9):
+                senses.hear(Torque("load_cell", 0.3, "", measured_ns, t_ns))
+                sample += 1.0
+                events = troubles(senses, watched(slow, (wrench,)), WatchSettings(), t_ns)
+                compared.append(Event.TORQUES_DISAGREE in {each.event for each in events})
+        pace.plan((pace.cycle + 1) / rate_hz, rests=False)
+        pace.begin()
+    assert len(compared) > 150
+    assert all(compared[1:])

@@ -13,7 +13,7 @@ from daemon.control.creep import Creep
 from drivers.eit_format import FRAME_PERIOD_S
 from drivers.emulators.twin import Twin
 from drivers.ur.news import ANGLE_NEWS_RAD
-from drivers.ur.pace import QUIET_CYCLES
+from drivers.ur.pace import EVEN_CYCLES, QUIET_CYCLES
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +89,8 @@ class Plant:
     _window_integral: float = 0.0
     _next_end_s: float = 0.0
     _samples: list[Sample] = field(default_factory=list)
-    _untold: int = QUIET_CYCLES
+    _cycle: int = -1
+    _told: int = -1
     _told_rad: float = 0.0
 
     def __post_init__(self) -> None:
@@ -109,10 +110,11 @@ class Plant:
 
     def tells(self) -> bool:
         """Return, once in each period, whether the loop hears of it."""
-        self._untold += 1
-        if self.as_told and self._untold < QUIET_CYCLES and abs(self.angle_rad - self._told_rad) <= ANGLE_NEWS_RAD:
+        self._cycle += 1
+        due = self._cycle % EVEN_CYCLES == 0 or self._cycle - self._told >= QUIET_CYCLES
+        if self.as_told and not due and abs(self.angle_rad - self._told_rad) <= ANGLE_NEWS_RAD:
             return False
-        self._untold, self._told_rad = 0, self.angle_rad
+        self._told, self._told_rad = self._cycle, self.angle_rad
         return True
 
     def collect(self) -> list[Sample]:

@@ -22,12 +22,13 @@ from daemon.wire.publisher import Publisher
 from daemon.wrist_commands import WristCommands
 from drivers.ur.client import UrRobot, unheard
 from drivers.ur.messages import Enable, RobotState, Stop, Unlock
+from drivers.ur.pace import EVEN_CYCLES
 
 WRENCH = "wrench"
 # Without a state it is asked after so long: half of the time after which the arm's is stale.
 LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
 # Of every fifth of the robot's cycles the state is published, and speaks as the torque of the wrench: 25 a second.
-PUBLISH_EVERY = 5
+PUBLISH_EVERY = EVEN_CYCLES
 # While nothing can move no other state is needed; without one the brain is asked no less often than this.
 LONGEST_REST_S = ARM_STALE_S
 # As long as states come, they are published then, and decided upon no more often than this: it is for who looks on.

@@ -15,9 +15,6 @@ HAND_STALE_S = stale_after_s("gripper.state")
 # While an experiment runs the brain is asked at each state that the robot's process tells, one of three cycles or more
 # (`drivers.ur.pace`), and is late where that takes longer than this.
 LONGEST_TICK_S = 0.03
-# How many periods two torques of a source may be apart: the wrench's are those of every fifth of the robot's cycles, or
-# of one up to two later where only every third tells (1.4), and computers are late.
-LONGEST_GAP_PERIODS = 1.5
 # Later than this, and the state that was last decided upon had become stale while the wrist turned on it.
 LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 
@@ -141,7 +138,7 @@ def _disagreement(senses: Senses, one: Source, other: Source, settings: WatchSet
     latest = senses.torques.get(slow.name)
     if latest is None or latest.torque_nm is None or t_ns - latest.t_ns > _fresh_for_s(slow, settings) * 1e9:
         return []
-    half_ns = round(max(slow.window_s, LONGEST_GAP_PERIODS * fast.period_s) * 0.5e9)
+    half_ns = round(max(slow.window_s, fast.period_s) * 0.5e9)
     beside_nm = senses.mean_torque_nm(fast.name, latest.t_mid_ns - half_ns, latest.t_mid_ns + half_ns)
     if beside_nm is None:
         return []

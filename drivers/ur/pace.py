@@ -18,6 +18,9 @@ OF_THE_WATCHDOG = 0.25
 # long after the last one: the loop decides 42 times a second on a wrist that stands or turns slowly, and at each cycle
 # of one that turns fast.
 QUIET_CYCLES, LONGEST_QUIET_S = 3, 0.025
+# Then every fifth cycle is told, whatever was told before: of these the daemon publishes the state and hears the wrench,
+# evenly, so that nothing else that measures torque goes for long without one to be compared with.
+EVEN_CYCLES = 5
 # Of the time for which a wrist speed holds: at a state that is told it is renewed, and one that is missed is borne.
 OF_THE_COMMANDS_TIMEOUT = 0.2
 
@@ -51,7 +54,7 @@ class Pace:
             # Those that are gone through are not those that are wanted: the first one in each stretch of these.
             due = self.cycle // self._wanted != self._told // self._wanted
         else:
-            due = self.cycle - self._told >= self._quiet
+            due = self.cycle % EVEN_CYCLES == 0 or self.cycle - self._told >= self._quiet
         if not (news or due):
             return False
         self._told = self.cycle

@@ -116,7 +116,8 @@ async def test_states_come_less_often_at_ease_until_someone_is_in_a_hurry(contro
             waited = end()
             if waited is not None:
                 assert (await waited).accepted
-            assert await steps() == [3] * 7
+            # Of each five now two are told.
+            assert set(await steps()) == {2, 3}
         assert not robot.losses
 
 

@@ -5,6 +5,8 @@ one purpose is the time from a frame to its estimate.
 """
 
 from pathlib import Path
+from types import ModuleType
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +14,23 @@ from scipy import fft
 from scipy.linalg import cython_blas
 
 from bank.compression import ROUNDING, SQUARE_ROUNDING, CompressedBank, FloatArray, Indices, Single
-from bank.stale import is_stale
 
 try:
     from bank import _search
 except ImportError:
     # No compiler, or none that could build it; docs/speed.md tells what that costs.
     _search = None  # type: ignore[assignment]
+
+
+def is_stale(module: ModuleType, *names: str) -> bool:
+    """Return whether a module is compiled from other sources than lie beside it, for they have changed since.
+
+    Where none lie there, as after an installation from a wheel, they have not.
+    """
+    sources = [Path(__file__).with_name(name) for name in names]
+    there = all(source.exists() for source in sources)
+    return there and crc32(b"".join(source.read_bytes() for source in sources)) != getattr(module, "SOURCES", None)
+
 
 # Rows in blocks, the numbers of what they bound, and where those of each group begin.
 Blocks = tuple[Single, NDArray[np.int32], NDArray[np.int32]]
@@ -31,8 +43,7 @@ _LENGTH = 2048
 _NEVER = -1e6
 # BLAS as scipy hands it to compiled code.
 _SGEMM = getattr(cython_blas, "__pyx_capi__", {}).get("sgemm")
-_IS_FRESH = _search is not None and not is_stale(_search, Path(__file__).parent, *_SOURCES)
-IS_COMPILED = _IS_FRESH and _search.is_sgemm(_SGEMM)
+IS_COMPILED = _search is not None and not is_stale(_search, *_SOURCES) and _search.is_sgemm(_SGEMM)
 
 
 def search_of(

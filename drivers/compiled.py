@@ -4,8 +4,8 @@ The compiled code is `_cells.c`; numpy does the same without, and the tests comp
 """
 
 from pathlib import Path
-
-from bank.stale import is_stale
+from types import ModuleType
+from zlib import crc32
 
 try:
     from drivers import _cells as cells
@@ -13,7 +13,14 @@ except ImportError:
     # No compiler, or none that could build it; docs/speed.md tells what that costs.
     cells = None  # type: ignore[assignment]
 
-if cells is not None and is_stale(cells, Path(__file__).parent, "_cells.c"):
+
+def is_stale(module: ModuleType) -> bool:
+    """Return whether a module is compiled from another source than lies beside it, for that has changed since."""
+    source = Path(__file__).with_name("_cells.c")
+    return source.exists() and crc32(source.read_bytes()) != getattr(module, "SOURCES", None)
+
+
+if cells is not None and is_stale(cells):
     cells = None  # type: ignore[assignment]
 
-__all__ = ["cells"]
+__all__ = ["cells", "is_stale"]

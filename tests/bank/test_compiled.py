@@ -1,7 +1,6 @@
 """Whether what can be compiled has been, where it could be: without that it would be slow and nobody would know."""
 
 import datetime
-import runpy
 import shutil
 import sysconfig
 from pathlib import Path
@@ -13,8 +12,8 @@ from scipy.linalg import cython_blas
 
 from bank import compiled
 from bank.channels import N_CHANNELS
-from bank.stale import is_stale
 from drivers.compiled import cells
+from drivers.compiled import is_stale as are_cells_stale
 
 
 @pytest.mark.skipif(
@@ -26,25 +25,16 @@ def test_where_there_is_a_compiler_the_compiled_parts_are_there() -> None:
     assert cells is not None
 
 
-def test_what_is_compiled_from_sources_that_have_changed_since_is_not_used(tmp_path) -> None:
+def test_what_is_compiled_from_sources_that_have_changed_since_is_not_used(tmp_path, monkeypatch) -> None:
     """As after an update that was not installed: it would be handed what it does not know."""
-    (tmp_path / "one.c").write_bytes(b"12345")
-    (tmp_path / "other.c").write_bytes(b"6789")
-    # The check value of this CRC.
-    assert not is_stale(SimpleNamespace(SOURCES=0xCBF43926), tmp_path, "one.c", "other.c")
+    if compiled.IS_COMPILED:
+        assert not are_cells_stale(cells)
     older, earliest = SimpleNamespace(SOURCES=1), SimpleNamespace()
     for module in (older, earliest):
-        assert is_stale(module, tmp_path, "one.c", "other.c")
-    # From a wheel come no sources.
-    assert not is_stale(older, tmp_path / "elsewhere", "one.c", "other.c")
-
-
-@pytest.mark.parametrize(("package", "name"), [("bank", "_search"), ("drivers", "_cells")])
-def test_compiled_parts_of_other_sources_are_left_alone_where_they_are_imported(package, name, monkeypatch) -> None:
-    part = pytest.importorskip(f"{package}.{name}")
-    monkeypatch.setattr(part, "SOURCES", 1)
-    found = runpy.run_path(str(Path(compiled.__file__).parents[1] / package / "compiled.py"))
-    assert not (found["IS_COMPILED"] if package == "bank" else found["cells"])
+        assert compiled.is_stale(module, "_search.c", "search.c")
+        assert are_cells_stale(module)
+    monkeypatch.setattr(compiled, "__file__", str(tmp_path / "compiled.py"))
+    assert not compiled.is_stale(older, "_search.c", "search.c")
 
 
 def test_only_blas_as_it_is_called_is_taken() -> None:

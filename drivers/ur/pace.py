@@ -18,8 +18,8 @@ OF_THE_WATCHDOG = 0.25
 # long after the last one: the loop decides 42 times a second on a wrist that stands or turns slowly, and at each cycle
 # of one that turns fast.
 QUIET_CYCLES, LONGEST_QUIET_S = 3, 0.025
-# Then every fifth cycle is told, whatever was told before: of these the daemon publishes the state and hears the wrench,
-# evenly, so that nothing else that measures torque goes for long without one to be compared with.
+# Then every fifth cycle is told, whatever was told before: of these the daemon publishes the state and hears the
+# wrench, evenly, so that nothing else that measures torque goes for long without one to be compared with.
 EVEN_CYCLES = 5
 # Of the time for which a wrist speed holds: at a state that is told it is renewed, and one that is missed is borne.
 OF_THE_COMMANDS_TIMEOUT = 0.2

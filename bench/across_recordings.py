@@ -59,7 +59,7 @@ def calibrations(streams: dict[str, FrameSeries]) -> Iterator[tuple[str, tuple[s
             if not set(sides) <= set(series.sides):
                 continue
             try:
-                yield name, sides, fit(DEFAULT, [series.of_sides(sides)], name)
+                yield name, sides, fit(DEFAULT, [series.of_sides(sides)], name, timed_by=[series])
             except BankError as error:
                 yield name, sides, str(error)
 

@@ -37,11 +37,12 @@ _SLOW: tuple[Name, ...] = ("paper",)
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """What is fitted and what is judged."""
+    """What is fitted and what is judged; timed_by is the past with all of its sides, where it has others."""
 
     title: str
     past: FrameSeries
     future: FrameSeries
+    timed_by: tuple[FrameSeries, ...] = ()
 
 
 def splits(recordings: Path, scratch: Path) -> Iterator[Split]:
@@ -58,11 +59,12 @@ def splits(recordings: Path, scratch: Path) -> Iterator[Split]:
     recording = scratch / "twists.mcap"
     import_mat([recordings / "streams" / "2024-12-03_16-09"], recording)
     for sides in (("right",), ("left",), ("right", "left")):
-        twists = series_of(read_recording(recording), sides)
+        whole, twists = (series_of(read_recording(recording), each) for each in (None, sides))
         yield Split(
             f"stream, {' and '.join(sides)}, first {TWIST_SHARE:.0%}",
             part_of(twists, 0, TWIST_SHARE),
             part_of(twists, TWIST_SHARE - _WARM_UP, 1),
+            (part_of(whole, 0, TWIST_SHARE),),
         )
 
 
@@ -71,7 +73,7 @@ def measured(split: Split, name: Name, physics: Physics) -> tuple[Figures, Track
     if name in _SLOW and split.past.kind == "raw":
         return None
     try:
-        calibration = fit(name, [split.past], split.title, physics)
+        calibration = fit(name, [split.past], split.title, physics, timed_by=split.timed_by)
     except BankError as error:
         print(f"{split.title}, {name}: {error}")
         return None

@@ -13,7 +13,7 @@ import numpy as np
 from bank.bank_file import Bank
 from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
-from bank.estimators.alignment import check_alignment
+from bank.estimators.alignment import check_alignment, torque_within, unchecked_s
 from bank.estimators.calibrated import (
     NEEDS_BANK,
     Calibration,
@@ -82,12 +82,14 @@ def fit(
     physics: Physics | None = None,
     *,
     trust_times: bool = False,
+    timed_by: Sequence[FrameSeries] = (),
 ) -> Calibration:
     """Calibrate an estimator on recordings of one kind, in time order; `source` says in words what they are.
 
-    Slices with torque give a torque, those with diameters a diameter. Raises CalibrationError for recordings that do
-    not determine the calibration, for torques that are clearly stamped at other times than the frames unless
-    `trust_times` is set, and for physics that the estimator needs and did not get.
+    Slices with torque give a torque, those with diameters a diameter. `timed_by` may be the same recordings with all of
+    their sides, by which the torques' times are checked where one fingertip hardly moves with the load. Raises
+    CalibrationError for recordings that do not determine the calibration, for torques that are clearly stamped at other
+    times than the frames unless `trust_times` is set, and for physics that the estimator needs and did not get.
     """
     physics = physics or Physics()
     if not recordings:
@@ -119,9 +121,12 @@ def fit(
         diameter=None,
     )
     chosen = [one.of_sides(sides) for one in recordings]
-    if blank.kind == "raw" and not trust_times:
-        check_alignment(recordings)
-    return _fit_raw(blank, chosen, physics) if blank.kind == "raw" else _fit_slices(blank, chosen, physics)
+    if blank.kind != "raw":
+        return _fit_slices(blank, chosen, physics)
+    if trust_times:
+        return _fit_raw(blank, chosen, physics, 0.0)
+    check_alignment(timed_by or recordings)
+    return _fit_raw(blank, chosen, physics, unchecked_s(timed_by or recordings))
 
 
 def _check_values(recordings: Sequence[FrameSeries]) -> None:
@@ -221,7 +226,7 @@ def _consecutive(times: list[FloatArray]) -> FloatArray:
     return np.concatenate(shifted)
 
 
-def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:
+def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics, times_unsure_s: float) -> Calibration:
     parts = [gripped_part(one) for one in recordings]
     guards = tuple(
         SideGuard.fit(side, *(_frames_of(one, part, layer) for one, part in zip(recordings, parts, strict=True)))
@@ -243,7 +248,10 @@ def _fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics
     if not rows:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
     features = np.array([row.features for row in rows])
-    calibration, reader, unexplained = _torque_reader(calibration, features, np.array([row.torque_nm for row in rows]))
+    torque_nm = np.array([row.torque_nm for row in rows])
+    calibration, reader, unexplained = _torque_reader(
+        calibration, features, torque_nm, _within(recordings, rows, times_unsure_s)
+    )
     torque, diameter = Task(reader, None, _ks(calibration.estimator, features)), _diameter_task(calibration, rows)
     if _undetermined(recordings, unexplained):
         if diameter is None:
@@ -264,7 +272,7 @@ def _frames_of(
 
 
 def _torque_reader(
-    calibration: Calibration, features: FloatArray, torque: FloatArray
+    calibration: Calibration, features: FloatArray, torque: FloatArray, within: tuple[FloatArray, FloatArray] | None
 ) -> tuple[Calibration, Reader, float]:
     """Return the torque's reader, and the calibration with the features that do better on later frames.
 
@@ -278,7 +286,9 @@ def _torque_reader(
         # the gel's drift goes into the torque: what is left out must come later, as the future will.
         limit_reach = calibration.estimator not in NEEDS_BANK
         later = later_origins(len(torque))
-        reader = fit_reader(columns, torque, head, strengths=strengths, limit_reach=limit_reach, left_out=later)
+        reader = fit_reader(
+            columns, torque, head, strengths=strengths, limit_reach=limit_reach, left_out=later, within=within
+        )
         return calibration, reader, 0.0
     head = Censored.fit if one_sided(torque) else Ridge.fit_scaled
     # Whether the gel's place tells more than its motion is for the recordings to say.
@@ -287,9 +297,18 @@ def _torque_reader(
     errors = {placed: error_on_later(one, torque, head, _MOTION_STRENGTHS) for placed, one in choices.items()}
     unexplained = errors[False] / float(torque.var())
     placed = unexplained > _MOTION_MAY_LEAVE and errors[True] < _PLACE_MUST_GAIN * errors[False]
-    reader = fit_reader(choices[placed], torque, head, strengths=_MOTION_STRENGTHS, limit_reach=True)
+    reader = fit_reader(choices[placed], torque, head, strengths=_MOTION_STRENGTHS, limit_reach=True, within=within)
     calibration = replace(calibration, motion=replace(motion, placed=placed))
     return calibration, reader, errors[placed] / float(torque.var())
+
+
+def _within(recordings: list[FrameSeries], rows: list["_Row"], unsure_s: float) -> tuple[FloatArray, FloatArray] | None:
+    """Return the least and the largest torque that each row may be of, None where times are known."""
+    if unsure_s == 0:
+        return None
+    found = [torque_within(one, unsure_s) for one in recordings]
+    least_nm, largest_nm = (np.array([found[row.recording][end][row.frame] for row in rows]) for end in (0, 1))
+    return least_nm, largest_nm
 
 
 def _diameter_task(calibration: Calibration, rows: list["_Row"]) -> Task | None:
@@ -334,12 +353,13 @@ def _tools(recordings: Sequence[FrameSeries]) -> list[Measured]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Row:
-    """One frame that is calibrated on: of which recording, how long after its first, what is seen and what is true.
+    """One frame that is calibrated on: of which recording, its number and age there, what is seen and what is true.
 
     place and held (d,) are the difference to the idle frame and its mean over the grip, in units of noise.
     """
 
     recording: int
+    frame: int
     since_s: float
     features: FloatArray
     place: FloatArray
@@ -362,7 +382,7 @@ def _replayed(
             features = features_of(calibration, locator, moment.difference, memory.places, float(t_s)).features
             since_s = float(t_s - series.t_s[0])
             place, held = ((one / calibration.scale).ravel() for one in (moment.difference, memory.held))
-            rows.append(_Row(recording, since_s, features, place, held, float(torque), float(diameter)))
+            rows.append(_Row(recording, i, since_s, features, place, held, float(torque), float(diameter)))
     return rows
 
 

@@ -53,7 +53,8 @@ class Reader:
     where that was not looked at). One that misses_loads did not see too many of those left out: of what it says, an
     interval reaches over all values that it was calibrated on. hidden_below and hidden_above are how far below and
     above what is read the truth may lie for what is foreign in a frame unseen, at a nearness of 1 (0 where that was
-    not looked at, as in older calibrations).
+    not looked at, as in older calibrations). widened is by how many times the intervals of loads are wider because
+    nobody knows when they were measured.
     """
 
     head: Head
@@ -67,6 +68,7 @@ class Reader:
     reach: FloatArray
     hidden_below: float = 0.0
     hidden_above: float = 0.0
+    widened: float = 1.0
 
     def read(
         self, features: FloatArray, usable_share: float = 1.0, widening: float = 1.0, nearness: float = 0.0
@@ -117,6 +119,7 @@ def fit_reader(
     left_out: Sequence[tuple[Rows, Rows]] = (),
     difficulty: Difficulty | None = None,
     mixed: Mixed | None = None,
+    within: tuple[FloatArray, FloatArray] | None = None,
 ) -> Reader:
     """Fit a head to (n, d) features and (n,) values in time order, and intervals to the residuals of what was left out.
 
@@ -124,6 +127,7 @@ def fit_reader(
     With `difficulty` residuals are taken in units of it, and whoever reads widens by it (normalised conformal
     prediction, Papadopoulos et al. 2002); then it is also looked at whether values beyond the range would be read as
     such. With `mixed` intervals reach as far as what passes with something foreign in it goes astray.
+    Where a value may be any from the first to the second (n,) of `within`, intervals reach as far as the further one.
     Raises CalibrationError where the data does not determine them.
     """
     if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
@@ -155,7 +159,13 @@ def fit_reader(
     centre = features.mean(axis=0)
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)
     least = LEAST_HALF_WIDTH * float(np.ptp(values))
-    intervals = Intervals.fit(predicted, residuals / hardness, edges, inflation, least)
+    intervals, widened = Intervals.fit(predicted, residuals / hardness, edges, inflation, least), 1.0
+    if within is not None:
+        rows = np.concatenate([future for _, future in blocks])
+        astray = np.max([np.abs(truth + residuals - end[rows]) for end in within], axis=0)
+        known_nm = intervals.half_widths[-1]
+        intervals = Intervals.fit(predicted, astray / hardness, edges, inflation, least)
+        widened = float(intervals.half_widths[-1] / known_nm)
     low_end, high_end = -np.inf, np.inf
     if difficulty is not None:
         low_end, high_end = (
@@ -170,7 +180,7 @@ def fit_reader(
     misses_loads = difficulty is None and _misses_loads(truth, np.abs(residuals) <= half)
     return Reader(
         head, intervals, float(values.min()), float(values.max()),
-        low_end, high_end, misses_loads, centre, reach, *hidden,
+        low_end, high_end, misses_loads, centre, reach, *hidden, widened,
     )  # fmt: skip
 
 

@@ -86,7 +86,7 @@ def estimators(split: Split, physics: Physics, names: tuple[Name, ...], sides: t
     count = f", {sides[0] if len(sides) == 1 else 'both'}" if past.kind == "raw" else ""
     for name in names:
         try:
-            calibration = fit(name, [past], split.title, physics)
+            calibration = fit(name, [past], split.title, physics, timed_by=[split.past])
         except BankError as error:
             print(f"{split.title}: {name}{count} is left out: {error}")
             continue

@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     """Fit, write, and say what was fitted."""
     from bank.bank_file import Bank
     from bank.estimators import Physics, fit
-    from bank.estimators.alignment import alignment, doubt
+    from bank.estimators.alignment import alignment, doubt, unchecked_s
     from bank.estimators.archive import ARCHIVE_MAGIC
     from bank.mesh import load_mesh
     from daemon.cli.recorded import parsed_part, parsed_sides
@@ -66,13 +66,17 @@ def run(args: argparse.Namespace) -> int:
     parts = [part_of(one, start, stop) for _, one in series]
     if late_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]
+    # A fingertip that hardly moves with the load has its times from the other one, wherever both were recorded.
+    timed_by = parts
+    if sides is not None and late_s is None:
+        timed_by = [part_of(one, start, stop) for path in args.recordings for one in read_series(path)]
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
     names = ", ".join(path.name for path in args.recordings)
     source = names if (start, stop) == (0.0, 1.0) else f"{names} from {start:g} to {stop:g}"
     source += f", load {late_s:g} s late" if late_s else ""
-    calibration = fit(args.estimator, parts, source, physics, trust_times=late_s is not None)
+    calibration = fit(args.estimator, parts, source, physics, trust_times=late_s is not None, timed_by=timed_by)
     calibration.save(args.out)
     quantities = [name for name in ("torque", "diameter") if getattr(calibration, name) is not None]
     frames = sum(len(one.t_s) for one in parts)
@@ -89,12 +93,20 @@ def run(args: argparse.Namespace) -> int:
         f"{' and '.join(calibration.sides)} side."
     ]
     if late_s is None and calibration.kind == "raw":
-        told["load_late_s"] = [found and round(found.late_s, 3) for found in map(alignment, parts)]
+        told["load_late_s"] = [found and round(found.late_s, 3) for found in map(alignment, timed_by)]
         known = ", ".join(f"{each:.2f}" for each in told["load_late_s"] if each is not None)
         sentences += [f"The load is stamped {known} s after the frames move."] if known else []
-        doubts = [f"{name}: {why}" for (name, _), one in zip(series, parts, strict=True) if (why := doubt(one))]
+        doubts = [f"{name}: {why}" for (name, _), one in zip(series, timed_by, strict=True) if (why := doubt(one))]
         told["load_doubts"] = doubts
         sentences += [f"Doubtful is {why}." for why in doubts]
+        told["load_unchecked_s"] = unsure_s = round(unchecked_s(timed_by), 3)
+        if calibration.torque is not None and unsure_s:
+            told["widened"] = widened = round(calibration.torque.reader.widened, 2)
+            sentences.append(
+                f"When the load is stamped could not be checked, for it changes too seldom: it may be {unsure_s:.2g} s "
+                f"off unseen, so the intervals of loads are {widened:.2g} times as wide. Record more changes of load, "
+                "as ten twists, or vouch for the load cell's clock with --load-late 0."
+            )
     if calibration.kind == "raw":
         known_mm = None if isnan(calibration.tool_mm) else calibration.tool_mm
         told["tool_mm"] = known_mm

@@ -9,7 +9,15 @@ import pytest
 from bank.errors import CalibrationError
 from bank.estimators import alignment as alignments
 from bank.estimators import fit
-from bank.estimators.alignment import Alignment, alignment, check_alignment, doubt, is_filtered
+from bank.estimators.alignment import (
+    Alignment,
+    alignment,
+    check_alignment,
+    doubt,
+    is_filtered,
+    torque_within,
+    unchecked_s,
+)
 from bank.estimators.gripped import gripped_part
 
 
@@ -102,3 +110,38 @@ def test_what_would_be_refused_is_doubted_and_so_is_a_clear_peak_of_few_frames(r
     assert f"though {gripped} gripped frames are too few to be sure" in doubt(late)
     monkeypatch.setattr(alignments, "_SUSPECT_EXPLAINED", 1.0)
     assert doubt(late) == "", "a peak that is less high may be chance"
+
+
+def unmoved(recorded):
+    """Return a recording whose frames say nothing of when the load changes."""
+    noise = np.random.default_rng(0).normal(0, 1e-3, recorded.channels.shape)
+    return replace(recorded, channels=recorded.channels[50] + noise)
+
+
+def test_times_are_unchecked_where_no_recording_tells_or_only_roughly(recorded, monkeypatch):
+    assert unchecked_s([recorded]) == 0.0
+    assert unchecked_s([unmoved(recorded)]) == 0.75
+    assert unchecked_s([unmoved(recorded), recorded]) == 0.0, "one clock has stamped them all"
+    for error_s, unsure_s in ((0.05, 0.0), (0.2, 0.392), (2.0, 0.75)):
+        monkeypatch.setattr(alignments, "_of_side", lambda *_, e=error_s: Alignment(0.0, e, 0.5))
+        assert unchecked_s([recorded]) == pytest.approx(unsure_s, abs=1e-3)
+
+
+def test_a_torque_within_some_time_is_any_from_the_least_to_the_largest(recorded):
+    rising = replace(recorded, torque_t_s=np.array([0.0, 100.0]), torque_nm=np.array([0.0, 1.0]))
+    least, largest = torque_within(rising, 0.5)
+    inner = (recorded.t_s > 1) & (recorded.t_s < 99)
+    np.testing.assert_allclose(least[inner], recorded.t_s[inner] / 100 - 0.005, atol=1e-9)
+    np.testing.assert_allclose(largest[inner], recorded.t_s[inner] / 100 + 0.005, atol=1e-9)
+
+
+def test_intervals_hold_what_times_that_could_not_be_checked_do_to_the_torque(recorded, monkeypatch):
+    checked = fit("fused", [recorded], "checked").torque.reader
+    monkeypatch.setattr(alignments, "_of_side", lambda *_: None)
+    unchecked = fit("fused", [recorded], "unchecked").torque.reader
+    vouched = fit("fused", [recorded], "vouched for", trust_times=True).torque.reader
+    assert checked.widened == vouched.widened == 1.0
+    assert unchecked.widened > 1.1
+    assert unchecked.intervals.half_widths[-1] == pytest.approx(unchecked.widened * checked.intervals.half_widths[-1])
+    np.testing.assert_array_equal(vouched.intervals.half_widths, checked.intervals.half_widths)
+    np.testing.assert_array_equal(unchecked.head.weights, checked.head.weights)

@@ -1,6 +1,9 @@
 """The gripper by way of its USB adapter: Modbus RTU with pymodbus, as the paper's authors drove it."""
 
+import asyncio
 import logging
+from collections.abc import Awaitable
+from typing import TypeVar
 
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.exceptions import ModbusException
@@ -10,6 +13,8 @@ from drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
 from drivers.robotiq import registers
 from drivers.robotiq.messages import GoTo, Readout, Request
 from drivers.serial_port import find_port
+
+T = TypeVar("T")
 
 # What it would say of a late or broken answer is told here, by the error that it leads to.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
@@ -50,7 +55,12 @@ class ModbusClient:
         client = AsyncModbusSerialClient(
             path, baudrate=registers.BAUD_RATE, timeout=self._deadline_s, retries=0, reconnect_delay=0
         )
-        if not await client.connect():
+        try:
+            there = await _heeded(client.connect())
+        except BaseException:
+            client.close()
+            raise
+        if not there:
             client.close()
             raise DeviceNotFoundError(f"{path} cannot be opened; is another program using the gripper?")
         self._client = client
@@ -91,15 +101,16 @@ class ModbusClient:
         whole = False
         try:
             if command is None:
-                response = await client.read_holding_registers(
+                request = client.read_holding_registers(
                     registers.FIRST_STATUS_REGISTER,
                     count=registers.N_STATUS_REGISTERS,
                     device_id=registers.DEVICE_ID,
                 )
             else:
-                response = await client.write_registers(
+                request = client.write_registers(
                     registers.FIRST_COMMAND_REGISTER, command, device_id=registers.DEVICE_ID
                 )
+            response = await _heeded(request)
             whole = not response.isError()
         except (ModbusException, OSError) as error:
             raise DeviceLostError(
@@ -112,3 +123,16 @@ class ModbusClient:
         if response.isError():
             raise ProtocolError(f"The gripper at {self.name} refused a Modbus request: {response}.")
         return response
+
+
+async def _heeded(waiting: Awaitable[T]) -> T:
+    """Return what is waited for; raises CancelledError where this task was told to end meanwhile, whatever came of it.
+
+    pymodbus waits by asyncio.wait_for, which before Python 3.12 loses a cancellation that comes with the answer.
+    """
+    task = asyncio.current_task()
+    before = task.cancelling() if task is not None else 0
+    result = await waiting
+    if task is not None and task.cancelling() > before:
+        raise asyncio.CancelledError
+    return result

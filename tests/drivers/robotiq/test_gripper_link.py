@@ -3,8 +3,11 @@
 import asyncio
 import contextlib
 from pathlib import Path
+from typing import Any
 
 import pytest
+from pymodbus.client import AsyncModbusSerialClient
+from pymodbus.pdu import ModbusPDU
 
 from drivers.emulators.robotiq.modbus_face import ModbusServer
 from drivers.emulators.robotiq.urcap_face import UrcapServer
@@ -33,6 +36,33 @@ async def test_silence_is_a_loss_and_nothing_old_is_given_as_new(way: str, tmp_p
         with pytest.raises(DeviceLostError, match="no connection"):
             await rig.driver.move(GripperCommand(10.0))
         assert (await rig.driver.connect()).seq > 0
+
+
+async def test_a_cancellation_that_comes_with_an_answer_is_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The task that reads the gripper went on for ever, and a daemon that was to end waited for it."""
+    answered = asyncio.Event()
+    read = AsyncModbusSerialClient.read_holding_registers
+
+    async def with_the_answer(*args: Any, **keys: Any) -> ModbusPDU:
+        response = await read(*args, **keys)
+        answered.set()
+        with contextlib.suppress(asyncio.CancelledError):
+            # As asyncio.wait_for does it before Python 3.12.
+            await asyncio.Event().wait()
+        return response
+
+    async with a_rig("modbus", tmp_path) as rig, asyncio.timeout(20):
+        await rig.driver.connect()
+        monkeypatch.setattr(AsyncModbusSerialClient, "read_holding_registers", with_the_answer)
+        reading = asyncio.create_task(rig.driver.read())
+        await answered.wait()
+        reading.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await reading
+        monkeypatch.undo()
+        assert (await rig.driver.connect()).seq == 1
 
 
 @WAYS

@@ -1,10 +1,12 @@
 from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 
+from daemon.control.tuning import COMMAND_PERIOD_S
 from daemon.experiment.steps import Limits
 from daemon.loop.senses import Arm, Hand, Senses, Source, Torque
-from daemon.loop.watch import ARM_STALE_S, Watched, WatchSettings, compared_for_s, troubles
+from daemon.loop.watch import ARM_STALE_S, LONGEST_TICK_S, Watched, WatchSettings, compared_for_s, troubles
 from daemon.loop_task import PUBLISH_EVERY, wrench_source
 from daemon.safety import TABLE, Event
 from drivers.ur.pace import Pace
@@ -164,6 +166,22 @@ def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wr
         stale_s += 0.008 * (age.age_ns(made_s, round((made_s + late_s) * 1e9)) > ARM_STALE_S * 1e9)
     assert stale_s == pytest.approx(9.7, abs=0.1)
     assert stale_s > (TABLE[Event.STATE_STALE].hold_at_most_s or 0.0) + 1.0
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 125.0, 500.0])
+def test_loop_is_not_late_as_long_as_states_are_told_as_agreed(rate_hz: float) -> None:
+    pace = Pace(replace(SETTINGS, rate_hz=rate_hz), 0.0)
+    told = []
+    for _ in range(100):
+        if pace.tells(rests=False, news=False):
+            told.append(pace.cycle / rate_hz)
+        pace.plan((pace.cycle + 1) / rate_hz, rests=False)
+        pace.begin()
+    longest_s = max(later - earlier for earlier, later in pairwise(told))
+    # The margins count with that of the usual rate, and no other is longer.
+    assert longest_s <= COMMAND_PERIOD_S + 1e-9
+    # Some computers are a little late all the time.
+    assert longest_s < 0.9 * LONGEST_TICK_S
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 125.0, 500.0])

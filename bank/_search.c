@@ -8,6 +8,7 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
+#include "medians.h"
 #include "search.h"
 
 #include <math.h>
@@ -122,6 +123,64 @@ static PyObject *energy(PyObject *module, PyObject *args)
 PyDoc_STRVAR(energy_doc,
 "energy(difference, noise) -> float\n\n"
 "Return the sum of the squares of difference / noise, both float64; -1 where one of them is not sound.");
+
+static PyObject *medians_of(const double *rows, const int64_t *counts, Py_ssize_t n)
+{
+    PyObject *found = PyList_New(n);
+    for (Py_ssize_t i = 0; found && i < n; i++) {
+        int count = counts[i] < 0 ? 0 : counts[i] > MOST_VALUES ? MOST_VALUES : (int)counts[i];
+        PyObject *median = PyFloat_FromDouble(median_of(rows + i * MOST_VALUES, count));
+        if (!median || PyList_SetItem(found, i, median) < 0)
+            Py_CLEAR(found);
+    }
+    return found;
+}
+
+static PyObject *medians(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer rows, counts;
+    if (!PyArg_ParseTuple(args, "y*y*", &rows, &counts))
+        return NULL;
+    PyObject *found = NULL;
+    Py_ssize_t n = counts.len / (Py_ssize_t)sizeof(int64_t);
+    if (rows.len == n * MOST_VALUES * (Py_ssize_t)sizeof(double))
+        found = medians_of(rows.buf, counts.buf, n);
+    else
+        PyErr_Format(PyExc_ValueError, "%zd counts for rows of %zd bytes", n, rows.len);
+    PyBuffer_Release(&rows);
+    PyBuffer_Release(&counts);
+    return found;
+}
+
+PyDoc_STRVAR(medians_doc,
+"medians(rows, counts) -> list of float\n\n"
+"Return the median of each of (n, 896) float64 rows, in order with NaN last, of its first counts (n,) int64 values.");
+
+static PyObject *n_largest(PyObject *module, PyObject *array)
+{
+    (void)module;
+    Py_buffer rows;
+    if (PyObject_GetBuffer(array, &rows, PyBUF_C_CONTIGUOUS) < 0)
+        return NULL;
+    Py_ssize_t row_bytes = MOST_VALUES * (Py_ssize_t)sizeof(double), n = rows.len / row_bytes;
+    PyObject *found = NULL;
+    if (rows.len == n * row_bytes)
+        found = PyList_New(n);
+    else
+        PyErr_Format(PyExc_ValueError, "%zd bytes are no rows of 896 values", rows.len);
+    for (Py_ssize_t i = 0; found && i < n; i++) {
+        PyObject *count = PyLong_FromLong(n_largest_of((const double *)rows.buf + i * MOST_VALUES));
+        if (!count || PyList_SetItem(found, i, count) < 0)
+            Py_CLEAR(found);
+    }
+    PyBuffer_Release(&rows);
+    return found;
+}
+
+PyDoc_STRVAR(n_largest_doc,
+"n_largest(rows) -> list of int\n\n"
+"Return how many of each of (n, 896) float64 rows are its largest.");
 
 /* The buffer of an array of `n` items of `size` bytes, which is held as long as the search lives; NULL with an error. */
 static const void *hold(Search *s, PyObject *array, Py_ssize_t n, size_t size)
@@ -369,13 +428,15 @@ static PyType_Spec search_spec = {
 static PyMethodDef module_functions[] = {
     {"energy", energy, METH_VARARGS, energy_doc},
     {"is_sgemm", is_sgemm, METH_O, is_sgemm_doc},
+    {"medians", medians, METH_VARARGS, medians_doc},
+    {"n_largest", n_largest, METH_O, n_largest_doc},
     {NULL, NULL, 0, NULL},
 };
 
 static struct PyModuleDef module = {
     PyModuleDef_HEAD_INIT,
     .m_name = "bank._search",
-    .m_doc = "What bank.fast_matching does with many calls of numpy, in one.",
+    .m_doc = "What matchers and estimators do with many calls of numpy, in one.",
     .m_size = -1,
     .m_methods = module_functions,
 };

@@ -13,6 +13,7 @@ from typing import Self
 import numpy as np
 
 from bank.channels import N_CHANNELS
+from bank.compiled import medians, n_largest
 from bank.errors import CalibrationError
 from bank.estimators.values import BoolArray, FloatArray, everywhere
 
@@ -137,11 +138,11 @@ class Known:
     def __init__(self, frames: FloatArray, usable: BoolArray | np.bool_ = np.True_) -> None:
         """Take the known frames, and which channels may be compared."""
         self.frames: FloatArray = np.where(usable & (frames > _WELL_ABOVE_NOISE_V), frames, np.nan)
-        self._counts: list[int] = np.isfinite(self.frames).sum(axis=-1).ravel().tolist()
+        self._counts = np.isfinite(self.frames).sum(axis=-1).ravel()
 
     def gains(self, frame: FloatArray) -> FloatArray:
         """Return the gains (…, 1) that a frame has in common with each of the known ones, NaN where there is none."""
-        found = [gain if gain > 0 else math.nan for gain in self._medians(frame / self.frames)]
+        found = [gain if gain > 0 else math.nan for gain in medians(frame / self.frames, self._counts)]
         return np.array(found).reshape(*self.frames.shape[:-1], 1)
 
     def off(self, frame: FloatArray) -> FloatArray:
@@ -152,22 +153,15 @@ class Known:
         return np.asarray(np.abs(frame / self.gains(frame) - self.frames) / self.frames)
 
     def deviations(self, off: FloatArray) -> list[float]:
-        """Return a flat list of the medians of what is `off`, which is put in order: a frame's from each known one.
+        """Return a flat list of the medians of what is `off`: a frame's from each known one.
 
         They are infinite where too few channels are compared, or there is no gain.
         """
-        found = self._medians(off)
+        found = medians(off, self._counts)
         return [
             one if n >= N_CHANNELS // 4 and not math.isnan(one) else math.inf
-            for one, n in zip(found, self._counts, strict=True)
+            for one, n in zip(found, self._counts.tolist(), strict=True)
         ]
-
-    def _medians(self, values: FloatArray) -> list[float]:
-        """Return the medians of values that nobody else needs, of all that are no NaN; 0 of none."""
-        # Sorted by the processor's wide registers: half the price of np.partition.
-        values.sort(axis=-1)
-        rows = zip(values.reshape(-1, N_CHANNELS), self._counts, strict=True)
-        return [(one.item((n - 1) // 2) + one.item(n // 2)) / 2 if n else 0.0 for one, n in rows]
 
 
 def relative_to(frame: FloatArray, idle: FloatArray) -> FloatArray:
@@ -178,11 +172,11 @@ def relative_to(frame: FloatArray, idle: FloatArray) -> FloatArray:
 def unsaturated(channels: FloatArray, usable: BoolArray) -> BoolArray:
     """Return which (m, 896) channels are usable still: too many that share a side's largest value are at the rail."""
     heights = channels if everywhere(usable) else np.where(usable, channels, -np.inf)
-    ordered = np.sort(heights, axis=-1)
-    if not any(one.item(-_FEWEST_AT_RAIL) == one.item(-1) for one in ordered):
+    counts = n_largest(heights)
+    if max(counts) < _FEWEST_AT_RAIL:
         return usable
-    at_rail = (heights == ordered[:, -1:]) & (ordered[:, -_FEWEST_AT_RAIL] == ordered[:, -1])[:, None]
-    return np.asarray(usable & ~at_rail)
+    largest = heights == heights.max(axis=-1, keepdims=True)
+    return np.asarray(usable & ~(largest & (np.array(counts) >= _FEWEST_AT_RAIL)[:, None]))
 
 
 def _discriminant(parts: list[FloatArray]) -> FloatArray:

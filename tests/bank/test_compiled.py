@@ -3,15 +3,21 @@
 import datetime
 import shutil
 import sysconfig
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
+from unittest import mock
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from scipy.linalg import cython_blas
 
 from bank import compiled
 from bank.channels import N_CHANNELS
+from bank.compression import FloatArray
 from drivers.compiled import cells
 from drivers.compiled import is_stale as are_cells_stale
 
@@ -57,3 +63,65 @@ def test_the_energy_is_the_sum_of_squares_and_none_of_what_is_not_sound() -> Non
         wrong, its_noise = difference.copy(), noise.copy()
         wrong[-1], its_noise[-1] = values, deviations
         assert compiled.energy(wrong, its_noise) is None
+
+
+# Rows as they come, all alike, in order, with ties, without some values, and of large ones.
+KINDS = ("random", "alike", "rising", "falling", "ties", "lacking", "infinite", "empty")
+
+
+def row_of(kind: str, random: np.random.Generator) -> FloatArray:
+    row = random.normal(size=N_CHANNELS)
+    match kind:
+        case "alike":
+            row[:] = row[0]
+        case "rising":
+            row.sort()
+        case "falling":
+            row = np.sort(row)[::-1]
+        case "ties":
+            row = row.round(random.integers(0, 2)) + 0.0
+        case "lacking":
+            row[random.uniform(size=N_CHANNELS) < random.uniform()] = np.nan
+        case "infinite":
+            row[random.uniform(size=N_CHANNELS) < 0.6] = random.choice([np.inf, -np.inf, np.nan])
+        case "empty":
+            row[:] = np.nan
+    return row
+
+
+@given(st.lists(st.sampled_from(KINDS), min_size=1, max_size=4), st.integers(0, 2**32 - 1), st.integers(-2, 2))
+def test_medians_are_those_of_sorted_rows_to_the_bit(kinds: list[str], seed: int, more: int) -> None:
+    """Of as many values as there are, and of a few less or more: then what is not there is in the middle or not."""
+    rows = np.array([row_of(kind, np.random.default_rng((seed, i))) for i, kind in enumerate(kinds)])
+    counts = (np.count_nonzero(~np.isnan(rows), axis=-1) + more).clip(0, N_CHANNELS)
+    with np.errstate(invalid="ignore"):
+        expected = without_compiler(compiled.medians, rows, counts)
+    np.testing.assert_array_equal(compiled.medians(rows, counts), expected)
+    if more == 0 and kinds[0] == "random":
+        assert expected[0] == np.median(rows[0])
+
+
+@given(st.lists(st.sampled_from(KINDS[:5]), min_size=1, max_size=2), st.integers(0, 2**32 - 1), st.integers(0, 20))
+def test_largest_values_are_counted(kinds: list[str], seed: int, n_at_rail: int) -> None:
+    random = np.random.default_rng(seed)
+    rows = np.array([row_of(kind, random) for kind in kinds])
+    rows[0, random.permutation(N_CHANNELS)[:n_at_rail]] = 9.0
+    found = compiled.n_largest(rows)
+    assert found == without_compiler(compiled.n_largest, rows)
+    assert found[0] == n_at_rail or n_at_rail == 0
+    assert compiled.n_largest(np.full((1, N_CHANNELS), -np.inf)) == [N_CHANNELS]
+    assert compiled.n_largest(rows.astype(np.float32)) == without_compiler(compiled.n_largest, rows.astype(np.float32))
+
+
+def test_rows_of_other_lengths_are_refused() -> None:
+    if compiled.IS_COMPILED:
+        with pytest.raises(ValueError, match="3 counts for rows of 14336 bytes"):
+            compiled.medians(np.zeros((2, N_CHANNELS)), np.array([896, 896, 896]))
+        with pytest.raises(ValueError, match="no rows of 896"):
+            compiled.n_largest(np.zeros((1, N_CHANNELS - 1)))
+
+
+def without_compiler(function: Callable[..., Any], *arguments: object) -> Any:
+    """Return what a function returns where nothing is compiled."""
+    with mock.patch.object(compiled, "IS_COMPILED", False):
+        return function(*arguments)

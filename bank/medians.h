@@ -1,0 +1,13 @@
+#ifndef MEDIANS_H
+#define MEDIANS_H
+
+enum { MOST_VALUES = 896 };
+
+/* The mean of the two in the middle of n, where the 896 values of a row are in order with all NaN behind them: NaN where
+   one of the two is, 0 of n < 1. */
+double median_of(const double *row, int n);
+
+/* How many of the 896 values of a row are its largest; NaN are none. */
+int n_largest_of(const double *row);
+
+#endif

@@ -157,6 +157,47 @@ PyDoc_STRVAR(medians_doc,
 "medians(rows, counts) -> list of float\n\n"
 "Return the median of each of (n, 896) float64 rows, in order with NaN last, of its first counts (n,) int64 values.");
 
+static PyObject *off_from_each(const double *known, const double *frame, const int64_t *counts, Py_ssize_t n,
+                               Py_ssize_t n_each, double *off)
+{
+    PyObject *found = PyList_New(n);
+    for (Py_ssize_t i = 0; found && i < n; i++) {
+        int count = counts[i] < 0 ? 0 : counts[i] > MOST_VALUES ? MOST_VALUES : (int)counts[i];
+        Py_ssize_t at = i * MOST_VALUES;
+        double deviation = off_from(known + at, frame + i / n_each * MOST_VALUES, count, off + at);
+        PyObject *item = PyFloat_FromDouble(deviation);
+        if (!item || PyList_SetItem(found, i, item) < 0)
+            Py_CLEAR(found);
+    }
+    return found;
+}
+
+static PyObject *compared(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer known, frame, counts, off;
+    if (!PyArg_ParseTuple(args, "y*y*y*w*", &known, &frame, &counts, &off))
+        return NULL;
+    PyObject *found = NULL;
+    Py_ssize_t row_bytes = MOST_VALUES * (Py_ssize_t)sizeof(double);
+    Py_ssize_t n = counts.len / (Py_ssize_t)sizeof(int64_t), n_rows = frame.len / row_bytes;
+    if (n_rows > 0 && frame.len == n_rows * row_bytes && n % n_rows == 0 && known.len == n * row_bytes
+        && off.len == known.len)
+        found = off_from_each(known.buf, frame.buf, counts.buf, n, n / n_rows, off.buf);
+    else
+        PyErr_Format(PyExc_ValueError, "a frame of %zd bytes is not compared with %zd of %zd", frame.len, n, known.len);
+    PyBuffer_Release(&known);
+    PyBuffer_Release(&frame);
+    PyBuffer_Release(&counts);
+    PyBuffer_Release(&off);
+    return found;
+}
+
+PyDoc_STRVAR(compared_doc,
+"compared(known, frame, counts, off) -> list of float\n\n"
+"Write by which shares a (m, 896) frame is off from each of (m, k, 896) known ones into `off`, all float64, and return the\n"
+"medians: of each known row so many values count as counts (m·k) int64 say, the others are NaN.");
+
 static PyObject *n_largest(PyObject *module, PyObject *array)
 {
     (void)module;
@@ -426,6 +467,7 @@ static PyType_Spec search_spec = {
 };
 
 static PyMethodDef module_functions[] = {
+    {"compared", compared, METH_VARARGS, compared_doc},
     {"energy", energy, METH_VARARGS, energy_doc},
     {"is_sgemm", is_sgemm, METH_O, is_sgemm_doc},
     {"medians", medians, METH_VARARGS, medians_doc},

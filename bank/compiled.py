@@ -101,6 +101,21 @@ def medians(rows: FloatArray, counts: NDArray[np.int64]) -> list[float]:
     ]
 
 
+def compared(known: FloatArray, frame: FloatArray, counts: NDArray[np.int64]) -> tuple[FloatArray, list[float]]:
+    """Return by which shares (…, k, 896) a (…, 896) frame is off from known ones, and a flat list of their medians.
+
+    After the gain in common: the median of the frame's ratios to a known one, of which `counts` (n,) values are
+    no NaN. All is NaN without a gain.
+    """
+    if IS_COMPILED:
+        off = np.empty(known.shape)
+        return off, _search.compared(known, np.ascontiguousarray(frame, dtype=np.float64), counts, off)
+    frame = frame[..., None, :]
+    gains = np.array([gain if gain > 0 else np.nan for gain in medians(frame / known, counts)])
+    off = np.abs(frame / gains.reshape(*known.shape[:-1], 1) - known) / known
+    return off, medians(off, counts)
+
+
 def n_largest(rows: FloatArray) -> list[int]:
     """Return how many values of each of (n, 896) rows without NaN are its largest."""
     if not IS_COMPILED:

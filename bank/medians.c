@@ -94,3 +94,15 @@ double median_of(const double *row, int n)
     }
     return (lower + (n_up_to > n / 2 ? lower : higher)) / 2;
 }
+
+double off_from(const double *known, const double *row, int n, double *off)
+{
+    for (int i = 0; i < MOST_VALUES; i++)
+        off[i] = row[i] / known[i];
+    double gain = median_of(off, n);
+    if (!(gain > 0))
+        gain = NAN;
+    for (int i = 0; i < MOST_VALUES; i++)
+        off[i] = fabs(row[i] / gain - known[i]) / known[i];
+    return median_of(off, n);
+}

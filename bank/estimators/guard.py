@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from bank.channels import N_CHANNELS
-from bank.compiled import medians, n_largest
+from bank.compiled import compared, medians, n_largest
 from bank.errors import CalibrationError
 from bank.estimators.values import BoolArray, FloatArray, everywhere
 
@@ -109,7 +109,7 @@ class SideGuard:
     def idle_like(self, frame: FloatArray) -> bool:
         """Return whether a session's first frame is idle: not clearly nearer to the calibration's gripped frame."""
         known = Known(np.array([self.idle, self.gripped]), np.isfinite(self.noise))
-        from_idle, from_gripped = known.deviations(known.off(frame))
+        _, (from_idle, from_gripped) = known.compare(frame)
         even = frame / self.gain(frame)
         if min(from_idle, from_gripped) < _SAME_HOUR and self.grip(even, self.idle) > _GRIPPED_SCORE:
             return False
@@ -145,20 +145,14 @@ class Known:
         found = [gain if gain > 0 else math.nan for gain in medians(frame / self.frames, self._counts)]
         return np.array(found).reshape(*self.frames.shape[:-1], 1)
 
-    def off(self, frame: FloatArray) -> FloatArray:
-        """Return by which shares (…, 896) of the known ones a frame is off from them after the gain in common.
+    def compare(self, frame: FloatArray) -> tuple[FloatArray, list[float]]:
+        """Return by which shares (…, k, 896) a (…, 896) frame is off from k known ones, and a flat list of the medians.
 
-        NaN at channels that are not compared, and where there is no gain.
+        After the gain in common; NaN at channels that are not compared, and where there is no gain. The medians are
+        infinite there, and where too few channels are compared.
         """
-        return np.asarray(np.abs(frame / self.gains(frame) - self.frames) / self.frames)
-
-    def deviations(self, off: FloatArray) -> list[float]:
-        """Return a flat list of the medians of what is `off`: a frame's from each known one.
-
-        They are infinite where too few channels are compared, or there is no gain.
-        """
-        found = medians(off, self._counts)
-        return [
+        off, found = compared(self.frames, frame, self._counts)
+        return off, [
             one if n >= N_CHANNELS // 4 and not math.isnan(one) else math.inf
             for one, n in zip(found, self._counts.tolist(), strict=True)
         ]

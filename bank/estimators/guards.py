@@ -48,9 +48,8 @@ class Guards:
         """
         complete = everywhere(usable)
         known = self._known if complete else Known(self._frames, usable[:, None])
-        off = known.off(frame[:, None])
+        off, deviations = known.compare(frame)
         lost = off > _LOST_SHARE
-        deviations = known.deviations(off)
         why = [_foreign(guard.side, *deviations[2 * i : 2 * i + 2]) for i, guard in enumerate(self.sides)]
         if not complete:
             why = [few or other for few, other in zip(self.too_few(usable), why, strict=True)]

@@ -113,8 +113,31 @@ def test_largest_values_are_counted(kinds: list[str], seed: int, n_at_rail: int)
     assert compiled.n_largest(rows.astype(np.float32)) == without_compiler(compiled.n_largest, rows.astype(np.float32))
 
 
+@given(
+    st.integers(1, 2), st.integers(1, 2), st.integers(0, 2**32 - 1), st.floats(0, 1), st.sampled_from([1.0, 0.0, -1.0])
+)
+def test_a_frame_is_compared_as_by_numpy_to_the_bit(m: int, k: int, seed: int, lacking: float, sign: float) -> None:
+    random = np.random.default_rng(seed)
+    known = random.uniform(0.03, 0.3, (m, k, N_CHANNELS))
+    known[random.uniform(size=known.shape) < lacking * random.integers(0, 2)] = np.nan
+    frame = sign * random.uniform(0.5, 2.0) * np.nan_to_num(known[:, 0], nan=0.1) + random.normal(
+        0, 0.02, (m, N_CHANNELS)
+    )
+    counts = np.count_nonzero(~np.isnan(known), axis=-1).ravel()
+    off, medians = compiled.compared(known, frame, counts)
+    off_too, medians_too = without_compiler(compiled.compared, known, frame, counts)
+    np.testing.assert_array_equal(off, off_too)
+    np.testing.assert_array_equal(medians, medians_too)
+    if k == 2 and m == 1:
+        np.testing.assert_array_equal(compiled.compared(known[0], frame[0], counts)[0], off[0])
+
+
 def test_rows_of_other_lengths_are_refused() -> None:
     if compiled.IS_COMPILED:
+        with pytest.raises(ValueError, match="is not compared with 2 of"):
+            compiled.compared(np.ones((1, 2, N_CHANNELS)), np.ones(N_CHANNELS - 1), np.array([896, 896]))
+        with pytest.raises(ValueError, match="is not compared with 3 of"):
+            compiled.compared(np.ones((1, 2, N_CHANNELS)), np.ones(N_CHANNELS), np.array([896, 896, 896]))
         with pytest.raises(ValueError, match="3 counts for rows of 14336 bytes"):
             compiled.medians(np.zeros((2, N_CHANNELS)), np.array([896, 896, 896]))
         with pytest.raises(ValueError, match="no rows of 896"):

@@ -120,13 +120,17 @@ def test_gain_and_deviation_are_medians_of_the_channels_that_are_compared(seed: 
     known, usable = random.uniform(0.0, 0.3, (2, 896)), random.random(896) >= left_out
     frame = random.uniform(0.5, 2.0) * known[0] + random.normal(0, 0.02, 896)
     compared = Known(known, usable)
-    deviations = compared.deviations(compared.off(frame))
-    for one, gain, deviation in zip(known, compared.gains(frame)[:, 0], deviations, strict=True):
+    off_from_each, deviations = compared.compare(frame)
+    gains = compared.gains(frame)[:, 0]
+    for one, gain, deviation, channels in zip(known, gains, deviations, off_from_each, strict=True):
         judged = usable & (one > 0.03)
         if not judged.any():
             assert np.isnan(gain)
             assert deviation == np.inf
+            assert np.isnan(channels).all()
             continue
         assert gain == np.median(frame[judged] / one[judged]), "to the bit"
-        off = np.median(np.abs(frame[judged] / gain - one[judged]) / one[judged])
-        assert deviation == (off if np.count_nonzero(judged) >= 224 else np.inf)
+        off = np.abs(frame[judged] / gain - one[judged]) / one[judged]
+        np.testing.assert_array_equal(channels[judged], off)
+        assert np.isnan(channels[~judged]).all()
+        assert deviation == (np.median(off) if np.count_nonzero(judged) >= 224 else np.inf)

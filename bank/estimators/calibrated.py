@@ -312,7 +312,7 @@ def _of_few_frames(read: tuple[float, float, float], head: Head, frames: int) ->
     """
     if not isinstance(head, Ridge):
         return read
-    noise = TWO_SIDED_95 * float(np.linalg.norm(head.weights)) / math.sqrt(frames)
+    noise = TWO_SIDED_95 * math.sqrt(head.weights @ head.weights) / math.sqrt(frames)
     return read[0], math.hypot(read[1], noise), math.hypot(read[2], noise)
 
 

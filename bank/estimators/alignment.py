@@ -105,6 +105,26 @@ def doubt(series: FrameSeries) -> str:
     )
 
 
+def telling(recordings: Sequence[FrameSeries], beside: Sequence[FrameSeries]) -> Sequence[FrameSeries]:
+    """Return by what the torques' times are told: recordings where any of them tells, else what was recorded beside.
+
+    A board beside them may have been dead, garbled or away: then it says nothing, whatever is the matter with it.
+    Raises CalibrationError for a recording without torque.
+    """
+    if any(alignment(one) is not None for one in recordings):
+        return recordings
+    return [one for one in beside if _tells(one)] or recordings
+
+
+def _tells(beside: FrameSeries) -> bool:
+    if not np.isfinite(beside.channels).all():
+        return False
+    try:
+        return alignment(beside) is not None
+    except CalibrationError:
+        return False
+
+
 def unchecked_s(recordings: Sequence[FrameSeries]) -> float:
     """Return by how many seconds the torques of raw frames may be stamped beside the frames without anybody knowing.
 
@@ -227,6 +247,9 @@ def _left_over(moves: FloatArray, changes: FloatArray) -> FloatArray:
     left = np.zeros_like(changes)
     for rest, block in left_out_blocks(len(moves)):
         gram = moves[rest].T @ moves[rest]
+        if not gram.any():  # a board that sends the same again and again
+            left[block] = changes[block]
+            continue
         penalty = _STRENGTH * float(np.trace(gram)) / len(gram) * np.eye(len(gram))
         left[block] = changes[block] - moves[block] @ np.linalg.solve(gram + penalty, moves[rest].T @ changes[rest])
     return left

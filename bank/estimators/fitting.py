@@ -13,7 +13,7 @@ import numpy as np
 from bank.bank_file import Bank
 from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
-from bank.estimators.alignment import check_alignment, torque_within, unchecked_s
+from bank.estimators.alignment import check_alignment, telling, torque_within, unchecked_s
 from bank.estimators.calibrated import (
     NEEDS_BANK,
     Calibration,
@@ -86,8 +86,8 @@ def fit(
 ) -> Calibration:
     """Calibrate an estimator on recordings of one kind, in time order; `source` says in words what they are.
 
-    Slices with torque give a torque, those with diameters a diameter. `timed_by` may be the same recordings with all of
-    their sides, by which the torques' times are checked where one fingertip hardly moves with the load. Raises
+    Slices with torque give a torque, those with diameters a diameter. `timed_by` may be what was recorded beside by
+    other fingertips, by which the torques' times are checked where these hardly move with the load. Raises
     CalibrationError for recordings that do not determine the calibration, for torques that are clearly stamped at other
     times than the frames unless `trust_times` is set, and for physics that the estimator needs and did not get.
     """
@@ -125,8 +125,9 @@ def fit(
         return _fit_slices(blank, chosen, physics)
     if trust_times:
         return _fit_raw(blank, chosen, physics, 0.0)
-    check_alignment(timed_by or recordings)
-    return _fit_raw(blank, chosen, physics, unchecked_s(timed_by or recordings))
+    timed = telling(recordings, timed_by)
+    check_alignment(timed)
+    return _fit_raw(blank, chosen, physics, unchecked_s(timed))
 
 
 def _check_values(recordings: Sequence[FrameSeries]) -> None:

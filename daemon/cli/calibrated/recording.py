@@ -44,14 +44,15 @@ def run(args: argparse.Namespace) -> int:
     """Fit, write, and say what was fitted."""
     from bank.bank_file import Bank
     from bank.estimators import Physics, fit
-    from bank.estimators.alignment import alignment, doubt, unchecked_s
+    from bank.estimators.alignment import alignment, doubt, telling, unchecked_s
     from bank.estimators.archive import ARCHIVE_MAGIC
     from bank.mesh import load_mesh
     from daemon.cli.recorded import parsed_part, parsed_sides
     from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
+    from daemon.recording.reader import read_recording
     from daemon.recording.schema import LARGEST_DIAMETER_MM
-    from daemon.recording.series import part_of, read_series
+    from daemon.recording.series import part_of, read_series, series_of
 
     start, stop = parsed_part(args.part)
     late_s = args.load_late
@@ -67,16 +68,25 @@ def run(args: argparse.Namespace) -> int:
     if late_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]
     # A fingertip that hardly moves with the load has its times from the other one, wherever both were recorded.
-    timed_by = parts
+    beside = []
     if sides is not None and late_s is None:
-        timed_by = [part_of(one, start, stop) for path in args.recordings for one in read_series(path)]
+        beside = [
+            (f"{path.name}, {side}", part_of(series_of(recording, (side,)), start, stop))
+            for path in args.recordings
+            if not path.is_dir()
+            for recording in (read_recording(path),)
+            for side in recording.sides
+            if side not in sides
+        ]
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
     names = ", ".join(path.name for path in args.recordings)
     source = names if (start, stop) == (0.0, 1.0) else f"{names} from {start:g} to {stop:g}"
     source += f", load {late_s:g} s late" if late_s else ""
-    calibration = fit(args.estimator, parts, source, physics, trust_times=late_s is not None, timed_by=timed_by)
+    calibration = fit(
+        args.estimator, parts, source, physics, trust_times=late_s is not None, timed_by=[one for _, one in beside]
+    )
     calibration.save(args.out)
     quantities = [name for name in ("torque", "diameter") if getattr(calibration, name) is not None]
     frames = sum(len(one.t_s) for one in parts)
@@ -93,13 +103,15 @@ def run(args: argparse.Namespace) -> int:
         f"{' and '.join(calibration.sides)} side."
     ]
     if late_s is None and calibration.kind == "raw":
-        told["load_late_s"] = [found and round(found.late_s, 3) for found in map(alignment, timed_by)]
+        named = [*((name, one) for (name, _), one in zip(series, parts, strict=True)), *beside]
+        timed = telling(parts, [one for _, one in beside])
+        told["load_late_s"] = [found and round(found.late_s, 3) for found in map(alignment, timed)]
         known = ", ".join(f"{each:.2f}" for each in told["load_late_s"] if each is not None)
         sentences += [f"The load is stamped {known} s after the frames move."] if known else []
-        doubts = [f"{name}: {why}" for (name, _), one in zip(series, timed_by, strict=True) if (why := doubt(one))]
+        doubts = [f"{name}: {why}" for name, one in named if one in timed and (why := doubt(one))]
         told["load_doubts"] = doubts
         sentences += [f"Doubtful is {why}." for why in doubts]
-        told["load_unchecked_s"] = unsure_s = round(unchecked_s(timed_by), 3)
+        told["load_unchecked_s"] = unsure_s = round(unchecked_s(timed), 3)
         if calibration.torque is not None and unsure_s:
             told["widened"] = widened = round(calibration.torque.reader.widened, 2)
             sentences.append(

@@ -15,6 +15,7 @@ from bank.estimators.alignment import (
     check_alignment,
     doubt,
     is_filtered,
+    telling,
     torque_within,
     unchecked_s,
 )
@@ -125,6 +126,19 @@ def test_times_are_unchecked_where_no_recording_tells_or_only_roughly(recorded, 
     for error_s, unsure_s in ((0.05, 0.0), (0.2, 0.392), (2.0, 0.75)):
         monkeypatch.setattr(alignments, "_of_side", lambda *_, e=error_s: Alignment(0.0, e, 0.5))
         assert unchecked_s([recorded]) == pytest.approx(unsure_s, abs=1e-3)
+
+
+def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
+    """One of zeros alone was a singular matrix, and of one not a number intervals were four times as wide."""
+    dead = replace(recorded, channels=np.zeros_like(recorded.channels))
+    garbled = replace(recorded, channels=np.where(np.arange(896) == 3, np.nan, recorded.channels))
+    away = recorded.between(0, 12)
+    for beside in (dead, garbled, away):
+        assert telling([recorded], [beside]) == [recorded]
+        assert fit("fused", [recorded], "beside it", timed_by=[beside]).torque.reader.widened == 1.0
+        still = unmoved(recorded)
+        assert telling([still], [beside]) == [still], "it says nothing, and is not to be blamed"
+        assert telling([still], [beside, recorded]) == [recorded]
 
 
 def test_a_torque_within_some_time_is_any_from_the_least_to_the_largest(recorded):

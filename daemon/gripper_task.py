@@ -14,7 +14,7 @@ from daemon.messages import GripperStateMessage, Scalar
 from daemon.wire.publisher import Publisher
 from drivers.errors import DriverError
 from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import ActivationStatus, GripperCommand, GripperState, ObjectStatus
+from drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
 
 RELEASE_WIDTH_MM = 140.0
 # What a stop asks for is tried for longer than a lost connection takes to be there again.
@@ -147,6 +147,7 @@ def _hand(state: GripperState) -> Hand:
         holding=state.diameter_mm is not None,
         moving=state.object is ObjectStatus.MOVING,
         fault=state.fault.sentence if state.fault.needs_activation else "",
-        # Its own word on objects counts only while it goes to a target (gGTO) or stands there.
-        unsure=state.activation is ActivationStatus.ACTIVE and state.object is ObjectStatus.UNKNOWN,
+        # Its own word on objects counts only while it goes to a target (gGTO) or stands there. A reset, by which an
+        # activation is ended, and a loss of power leave the fingers where they are, on a tool as well.
+        unsure=state.object is ObjectStatus.UNKNOWN,
     )

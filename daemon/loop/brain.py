@@ -23,7 +23,7 @@ from daemon.experiment.wishes import (
     View,
     Wish,
 )
-from daemon.loop.senses import Senses, Source, Torque
+from daemon.loop.senses import Hand, Senses, Source, Torque
 from daemon.loop.watch import Watched, WatchSettings, compared_for_s, troubles
 from daemon.loop.wrist import Wrist, WristTurn
 from daemon.safety import Event, Response, SafetyGate, Trouble, Verdict
@@ -134,14 +134,19 @@ class Brain:
 
     def _may_hold_unknown(self, file: ExperimentFile) -> str:
         """Return why an experiment may turn a tool that nobody knows of and nothing would watch, or an empty text."""
-        hand, number = self.senses.hand, turns_before_a_grip(file)
-        if "gripper" not in self._required or hand is None or number is None or not (hand.unsure or hand.moving):
+        number, hand = turns_before_a_grip(file), self._unknown_hand()
+        if number is None or hand is None:
             return ""
         return (
             f"the gripper does not say whether it holds a tool: its fingers, {hand.width_mm:.1f} mm apart, "
-            f"{'are moving' if hand.moving else 'stand where a stop or an activation has left them'}; put a `grip` or "
-            f"a `release` before step {number} ({file.steps[number - 1].do}), which turns the wrist"
+            f"{hand.stands}; put a `grip` or a `release` before step {number} ({file.steps[number - 1].do}), which "
+            "turns the wrist"
         )
+
+    def _unknown_hand(self) -> Hand | None:
+        """Return the hand where it does not say whether it holds a tool, else None."""
+        hand = self.senses.hand
+        return hand if "gripper" in self._required and hand is not None and (hand.unsure or hand.moving) else None
 
     def pause(self) -> str | None:
         """Stand still until `resume`, or return why not."""
@@ -250,6 +255,14 @@ class Brain:
         if not experiment.running:
             return self._ended(verdict)
         still = held or experiment.phase is Phase.PAUSED
+        turns = not isinstance(self._wish.wrist, Still) or isinstance(self._wish.action, MeasureTool)
+        # What is held is watched for being lost; of a stop that came just before, the gripper may tell only now.
+        if turns and not self._grips and (hand := self._unknown_hand()) is not None:
+            experiment.stop(
+                f"step {experiment.number} ({experiment.step.do}) cannot be done: the gripper does not say whether it "
+                f"holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {hand.stands}"
+            )
+            return self._ended(verdict)
         begin = None if still else self._begin(experiment, t_ns, wrist_rad)
         if not experiment.running:
             return self._ended(verdict)

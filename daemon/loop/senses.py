@@ -53,7 +53,7 @@ class Hand:
     """What the loop needs of the gripper's state.
 
     `unsure` where the gripper does not say whether it holds anything, though it may: it was not sent where its fingers
-    stand, as after a halt.
+    stand, as after a halt or without power, or it is not active.
     """
 
     t_ns: int
@@ -62,6 +62,11 @@ class Hand:
     moving: bool
     fault: str = ""
     unsure: bool = False
+
+    @property
+    def stands(self) -> str:
+        """How fingers stand that do not say whether they hold anything."""
+        return "are moving" if self.moving else "stand where a stop, an activation or a lack of power has left them"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -60,7 +60,7 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
         read = tasks.create_task(task.read())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)
-        assert not felt[-1].unsure, "one that is not active holds nothing"
+        assert felt[-1].unsure, "one without power keeps hold of a tool, and does not tell"
         await rig.driver.activate()
         for turns in range(1, 40, 3):
             assert await task.release() == ""

@@ -244,7 +244,7 @@ TWIST = {"do": "twist", "angles_rad": [0.2]}
 @pytest.mark.parametrize(
     ("sense", "what"),
     [
-        ({"unsure": True}, "stand where a stop or an activation has left them"),
+        ({"unsure": True}, "stand where a stop, an activation or a lack of power has left them"),
         ({"moving": True}, "are moving"),
     ],
 )
@@ -271,6 +271,21 @@ def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(
     assert refused({"do": "tare"}, GRIP, turning) is None
     rig.brain.stop("")
     assert refused({"do": "release"}, turning) is None
+
+
+@pytest.mark.parametrize("sense", [{"unsure": True}, {"moving": True}])
+@pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
+def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_what_turns(
+    sense: dict[str, Any], turning: dict[str, Any]
+) -> None:
+    """It is asked ten times a second: started right after a stop, an experiment was judged by what was before that."""
+    rig = started(Rig(brain()), {"do": "wait", "wait_s": 0.1}, turning, GRIP)
+    rig.hand = replace(rig.hand, **sense)
+    rig.run(1)
+    assert rig.brain.experiment is not None
+    assert not rig.brain.experiment.running
+    assert f"step 2 ({turning['do']}) cannot be done: the gripper does not say" in rig.brain.experiment.why
+    assert rig.speed == 0.0
 
 
 def test_a_pause_is_refused_with_the_reason() -> None:

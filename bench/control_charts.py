@@ -120,9 +120,9 @@ def draw_rig_faults(path: Path, faults: Sequence[Mapping[str, Any]], gaps_ms: Ma
     for (name, gaps), style, ink in zip(gaps_ms.items(), _STYLES, (_INK, _MIDDLE, _INK), strict=False):
         longer = 1.0 - np.arange(len(gaps)) / len(gaps)
         right.plot(gaps, longer, style, color=ink, linewidth=1.4, label=name, drawstyle="steps-post")
-    right.set_xscale("log")
+    right.set_xlim(0.0)
     right.set_yscale("log")
-    right.set_xlabel("time between two states of the resting robot / ms (24 are meant)")
+    right.set_xlabel("time between two states of the resting robot / ms (16 and 24 are meant)")
     right.set_ylabel("share that is longer")
     right.legend(fontsize=7, frameon=False)
     figure.savefig(path)

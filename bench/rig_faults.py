@@ -227,7 +227,7 @@ def measure_faults(bench: Bench) -> list[dict[str, Any]]:
 
 
 def measure_jitter(settings: UrSettings, busy: int) -> NDArray[np.float64]:
-    """Return the times (n,) in s between the states of a resting arm, one of three cycles, beside busy processes."""
+    """Return the times (n,) in s between the states of a resting arm, two of five cycles, beside busy processes."""
     burners = [subprocess.Popen([sys.executable, "-c", BURN]) for _ in range(busy)]
     try:
         return np.diff(asyncio.run(_arrivals(settings))) / 1e9

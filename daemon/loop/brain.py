@@ -306,9 +306,10 @@ class Brain:
         return wrist.turn(self._wish.wrist, t_ns, wrist_rad, origin_rad)
 
     def _gripped(self, grip: GripTo) -> None:
-        arm = self.senses.arm
+        arm, hand = self.senses.arm, self.senses.hand
         self._origin_rad = arm.wrist_rad if arm is not None else None
-        self._grips = grip.expect_object
+        # What was met though nobody had expected it is watched as well.
+        self._grips = grip.expect_object or (hand is not None and hand.holding)
         self._driving_wrist.forget()
         self._rest_gels()
 

@@ -43,6 +43,8 @@ class Rig:
         self.wrist_rad, self.speed = 0.3, 0.0
         self.force_n, self.width_mm = 0.0, 140.0
         self.window: deque[float] = deque(maxlen=round(EIT.window_s / TICK_S))
+        # Whether the fingers meet a tool, expected or not.
+        self.meets = False
         self.silent: set[str] = set()
         # What the load cell says too much, and whether it says nothing of use.
         self.offset_nm, self.void = 0.0, False
@@ -93,8 +95,11 @@ class Rig:
 
     def _finish(self, action: Action) -> None:
         if isinstance(action, GripTo):
-            self.force_n = action.force_n if action.expect_object else 0.0
-            self.width_mm = 30.0 if action.expect_object else action.width_mm
+            holds = action.expect_object or self.meets
+            self.force_n = action.force_n if holds else 0.0
+            self.width_mm = 30.0 if holds else action.width_mm
+            # As the gripper's task does, before it says that the fingers have closed.
+            self.brain.senses.hand = replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm)
         self.brain.action_ended()
 
     def run(self, most_s: float) -> None:
@@ -220,6 +225,19 @@ def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense: dict[st
 def test_a_tool_that_is_taken_away_is_noticed() -> None:
     rig = started(Rig(brain()), GRIP, {"do": "twist", "angles_rad": [0.2], "hold_s": 60})
     rig.run(5)
+    rig.force_n = 0.0
+    rig.step()
+    assert Event.GRIP_LOST in {trouble.event for trouble in rig.brain.standing.verdict.troubles}
+    assert phase(rig) is Phase.STOPPED
+
+
+@pytest.mark.parametrize("step", [{**GRIP, "expect_object": False}, {"do": "release", "width_mm": 20}])
+def test_a_tool_that_is_met_though_nobody_expected_it_is_watched_as_well(step: dict[str, Any]) -> None:
+    rig = Rig(brain())
+    rig.meets = True
+    started(rig, step, {"do": "twist", "angles_rad": [0.2], "hold_s": 60})
+    rig.run(5)
+    assert phase(rig) is Phase.RUNNING
     rig.force_n = 0.0
     rig.step()
     assert Event.GRIP_LOST in {trouble.event for trouble in rig.brain.standing.verdict.troubles}

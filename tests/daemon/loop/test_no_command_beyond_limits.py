@@ -189,6 +189,8 @@ class WholeRig:
         self.arm.be(moving_linearly=False)
         if isinstance(action, GripTo):
             self.force_n = action.force_n if action.expect_object else 0.0
+            if self.brain.senses.hand is not None:
+                self.brain.senses.hand = dataclasses.replace(self.brain.senses.hand, holding=action.expect_object)
         self.brain.action_ended()
 
 

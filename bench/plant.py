@@ -13,7 +13,7 @@ from daemon.control.creep import Creep
 from drivers.eit_format import FRAME_PERIOD_S
 from drivers.emulators.twin import Twin
 from drivers.ur.news import ANGLE_NEWS_RAD
-from drivers.ur.pace import EVEN_CYCLES, QUIET_CYCLES
+from drivers.ur.pace import quiet_is_due
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +111,7 @@ class Plant:
     def tells(self) -> bool:
         """Return, once in each period, whether the loop hears of it."""
         self._cycle += 1
-        due = self._cycle % EVEN_CYCLES == 0 or self._cycle - self._told >= QUIET_CYCLES
+        due = quiet_is_due(self._cycle, self._told)
         if self.as_told and not due and abs(self.angle_rad - self._told_rad) <= ANGLE_NEWS_RAD:
             return False
         self._told, self._told_rad = self._cycle, self.angle_rad

@@ -100,7 +100,10 @@ class UrRobot:
         return not self._hurried.is_set()
 
     def ease(self, cycles: int) -> None:
-        """Have a state only every so many cycles, as long as nothing moves, until `hurry` or the next command."""
+        """Have a state only every so many cycles, or where something happens, until `hurry` or the next command.
+
+        Where something moves it is as if the process had been told nothing.
+        """
         if cycles > 1 and self._stdin is not None and not self.at_ease:
             self._hurried.clear()
             self._write(self._stdin, encode(Ease(cycles)))

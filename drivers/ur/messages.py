@@ -192,7 +192,7 @@ class Heartbeat:
 
 @dataclass(frozen=True, slots=True)
 class Ease:
-    """The daemon is alive, and needs a state of every so many cycles alone while nothing moves.
+    """The daemon is alive, and while nothing moves needs a state of every so many cycles alone, and what is news.
 
     It holds until anything else comes. No signs of life are sent meanwhile: nothing moves that they would keep moving.
     """

@@ -3,7 +3,7 @@
 Each waking costs, here and in the daemon, whatever is done then. While the daemon needs few states and nothing moves,
 all that can come between two of them is a message, and that is answered when it comes. The robot needs its signs of
 life more often than the daemon needs a state: not every cycle at ease tells one. Nor does every cycle of a wrist that
-turns: those that say nothing new are told in stretches (`drivers.ur.news`).
+turns: of those that say nothing new two in five are told (`drivers.ur.news`).
 """
 
 import math
@@ -15,8 +15,8 @@ from drivers.ur.settings import UrSettings
 # too the robot's program ends once they are over, and waits for the operator.
 OF_THE_WATCHDOG = 0.25
 # Where the daemon is not at ease one state of so many cycles is told though it says nothing new, and no later than so
-# long after the last one: the loop decides 42 times a second on a wrist that stands or turns slowly, and at each cycle
-# of one that turns fast.
+# long after the last one: with the even ones below two of five, 50 a second of a wrist that stands or turns slowly, and
+# each of one that turns fast. The loop decides upon what is told.
 QUIET_CYCLES, LONGEST_QUIET_S = 3, 0.025
 # Then every fifth cycle is told, whatever was told before: of these the daemon publishes the state and hears the
 # wrench, evenly, so that nothing else that measures torque goes for long without one to be compared with.
@@ -54,7 +54,7 @@ class Pace:
             # Those that are gone through are not those that are wanted: the first one in each stretch of these.
             due = self.cycle // self._wanted != self._told // self._wanted
         else:
-            due = self.cycle % EVEN_CYCLES == 0 or self.cycle - self._told >= self._quiet
+            due = quiet_is_due(self.cycle, self._told, self._quiet)
         if not (news or due):
             return False
         self._told = self.cycle
@@ -80,3 +80,8 @@ class Pace:
     def begin(self) -> None:
         """Begin the cycle that was chosen."""
         self.cycle, self._due_s = self._next, self._next_s
+
+
+def quiet_is_due(cycle: int, told: int, most_apart: int = QUIET_CYCLES) -> bool:
+    """Whether a cycle that says nothing new is told to a daemon that is not at ease; `told` is the last that was."""
+    return cycle % EVEN_CYCLES == 0 or cycle - told >= most_apart

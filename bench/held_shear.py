@@ -129,7 +129,7 @@ class SkinLoop:
             if self._zero_begun and self.estimator.zero is not None:
                 self._zero_begun = False
                 self.brain.action_ended()
-        self.brain.senses.arm = Arm(self._angle_rad, 0.0, self.t_ns)
+        self.brain.senses.arm = Arm(self._angle_rad, self.t_ns)
         orders = self.brain.tick(self.t_ns)
         speed = 0.0 if orders.stop else orders.wrist_rad_per_s
         self.brain.sent(speed)

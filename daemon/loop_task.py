@@ -210,13 +210,11 @@ class LoopTask:
     def _sense(self, state: RobotState) -> None:
         self._brain.senses.arm = Arm(
             wrist_rad=state.wrist_rad,
-            wrist_torque_nm=state.wrist_torque_nm,
             # The moment that the controller speaks of: one that repeats itself is as stale as one that is silent.
             t_ns=state.t_mono_ns - state.age_ns,
             protective_stop=state.protective_stop,
             emergency_stop=state.emergency_stop,
             blocked=state.blocked,
-            moving_linearly=state.moving_linearly,
         )
         if (number := state.cycle // PUBLISH_EVERY) != self._published:
             self._published = number

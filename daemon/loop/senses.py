@@ -40,12 +40,10 @@ class Arm:
     """What the loop needs of the robot's state."""
 
     wrist_rad: float
-    wrist_torque_nm: float
     t_ns: int
     protective_stop: bool = False
     emergency_stop: bool = False
     blocked: str = ""
-    moving_linearly: bool = False
 
 
 @value(frozen=True, slots=True)

@@ -48,7 +48,7 @@ class Rig:
         self.silent: set[str] = set()
         # What the load cell says too much, and whether it says nothing of use.
         self.offset_nm, self.void = 0.0, False
-        self.arm = Arm(0.3, 0.0, 0)
+        self.arm = Arm(0.3, 0)
         self.hand = Hand(0, 140.0, holding=False, moving=False)
         self.pending: list[tuple[int, Action]] = []
         self.begun: list[Action] = []

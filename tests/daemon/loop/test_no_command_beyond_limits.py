@@ -167,7 +167,7 @@ class WholeRig:
     def _sense(self, torque_nm: float) -> None:
         state = self.pilot.state(self.arm.reading, self.number)
         self.brain.senses.arm = Arm(
-            state.wrist_rad, 0.0, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked
+            state.wrist_rad, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked
         )
         holding = self.force_n > 0
         self.brain.senses.hand = Hand(self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)

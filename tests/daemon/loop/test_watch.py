@@ -42,7 +42,7 @@ def watched(driving: Source, supervising: tuple[Source, ...]) -> Watched:
 def found(
     *torques: Torque, driving: Source = EIT, supervising: tuple[Source, ...] = (LOAD, WRENCH)
 ) -> dict[Event, str]:
-    senses = Senses(arm=Arm(0.0, 0.0, NOW_NS))
+    senses = Senses(arm=Arm(0.0, NOW_NS))
     for each in torques:
         senses.hear(each)
     events = troubles(senses, watched(driving, supervising), WatchSettings(), NOW_NS)
@@ -107,7 +107,7 @@ def test_a_torque_that_counts_as_new_is_held_against_its_limit() -> None:
 def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz: float) -> None:
     """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
     quick = replace(LOAD, period_s=1.0 / rate_hz)
-    senses = Senses(kept_s=compared_for_s((EIT, quick), WatchSettings()), arm=Arm(0.0, 0.0, NOW_NS))
+    senses = Senses(kept_s=compared_for_s((EIT, quick), WatchSettings()), arm=Arm(0.0, NOW_NS))
     frame = torque(EIT, 0.1, came_s=2.4 * EIT.period_s)
     senses.hear(frame)
     for number in range(round(60 * rate_hz), 0, -1):
@@ -134,7 +134,7 @@ def test_devices_that_were_never_there_are_awaited_in_one_sentence() -> None:
 
 
 def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there() -> None:
-    arm, hand = Arm(0.0, 0.0, NOW_NS), Hand(NOW_NS, 30.0, holding=False, moving=False)
+    arm, hand = Arm(0.0, NOW_NS), Hand(NOW_NS, 30.0, holding=False, moving=False)
     assert devices(LOST, arm=arm, hand=hand) == [
         (Event.DEVICE_LOST, f"robot: {LOST['robot']}"),
         (Event.DEVICE_LOST, f"gripper: {LOST['gripper']}"),
@@ -146,7 +146,7 @@ def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there() -> No
 
 
 def test_a_sensor_that_was_never_there_is_not_gone() -> None:
-    senses = Senses(arm=Arm(0.0, 0.0, NOW_NS), lost={"right": "There is no port."})
+    senses = Senses(arm=Arm(0.0, NOW_NS), lost={"right": "There is no port."})
     (trouble,) = troubles(senses, watched(EIT, ()), WatchSettings(), NOW_NS)
     assert trouble.detail == "right has not been there yet: There is no port."
     senses.hear(torque(EIT, 0.1))
@@ -194,7 +194,7 @@ def test_no_sample_goes_uncompared_where_the_robot_tells_but_some_of_its_cycles(
     compared = []
     for _ in range(round(20.0 * rate_hz)):
         t_ns = NOW_NS + round(pace.cycle / rate_hz * 1e9)
-        senses.arm = Arm(0.0, 0.0, t_ns)
+        senses.arm = Arm(0.0, t_ns)
         if pace.tells(rests=False, news=False):
             if pace.cycle // PUBLISH_EVERY != published:
                 published = pace.cycle // PUBLISH_EVERY

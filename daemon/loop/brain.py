@@ -260,7 +260,8 @@ class Brain:
         if turns and not self._grips and (hand := self._unknown_hand()) is not None:
             experiment.stop(
                 f"step {experiment.number} ({experiment.step.do}) cannot be done: the gripper does not say whether it "
-                f"holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {hand.stands}"
+                f"holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {hand.stands}; put a `grip` or a `release` "
+                "before it"
             )
             return self._ended(verdict)
         begin = None if still else self._begin(experiment, t_ns, wrist_rad)

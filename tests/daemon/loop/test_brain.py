@@ -303,6 +303,7 @@ def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_w
     assert rig.brain.experiment is not None
     assert not rig.brain.experiment.running
     assert f"step 2 ({turning['do']}) cannot be done: the gripper does not say" in rig.brain.experiment.why
+    assert rig.brain.experiment.why.endswith("; put a `grip` or a `release` before it")
     assert rig.speed == 0.0
 
 

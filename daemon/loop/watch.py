@@ -12,8 +12,8 @@ from drivers.values import value
 # 2.5 periods of their topics. The arm stands still by itself when it hears nothing for 0.3 s.
 ARM_STALE_S = stale_after_s("robot.state")
 HAND_STALE_S = stale_after_s("gripper.state")
-# While an experiment runs the brain is asked at each state that the robot's process tells, of two cycles in five or more
-# (`drivers.ur.pace`), and is late where that takes longer than this.
+# While an experiment runs the brain is asked at each state that the robot's process tells, of at least two cycles in
+# five (`drivers.ur.pace`), and is late where that takes longer than this.
 LONGEST_TICK_S = 0.03
 # Later than this, and the state that was last decided upon had become stale while the wrist turned on it.
 LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S

@@ -16,7 +16,7 @@ from daemon.safety import Response
 from drivers.emulators.twin import Twin, TwinSettings
 from drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
 from drivers.ur.pilot import Pilot
-from tests.daemon.loop.test_brain import EIT, brain
+from tests.daemon.loop.rig import EIT, brain
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm
 from tests.drivers.ur.test_limits import LIMITS
 

@@ -1,10 +1,11 @@
-"""A controller in a process of its own, at an address of its own, shared by the tests of a module."""
+"""A controller in a process of its own, shared by the tests of a module; the daemon's ends of pipes to our process."""
 
 import asyncio
 from collections.abc import Iterator
 
 import pytest
 
+from tests.drivers.ur.process import Daemon
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
 
@@ -22,3 +23,11 @@ def controller(controller_process: ControllerProcess) -> Iterator[ControllerProc
     """The module's controller without faults, before the test and after it."""
     yield controller_process
     asyncio.run(controller_process.fault("normal"))
+
+
+@pytest.fixture
+def daemon(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
+    """The daemon of a process that does not end, and sets no alarm."""
+    daemon = Daemon(monkeypatch)
+    yield daemon
+    daemon.close()

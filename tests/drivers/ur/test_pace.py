@@ -38,6 +38,16 @@ class Cycles:
             assert self.now_s == pytest.approx(100.0 + self.pace._next * PERIOD_S)
         return numbers
 
+    def told(self, count: int, *, rests: bool, news_in: int | None = None) -> list[int]:
+        """Go through so many cycles, and return the numbers of those that are told; one of them brings news."""
+        told = []
+        for _ in range(count):
+            self.work(rests=rests)
+            if self.pace.tells(rests=rests, news=self.pace.cycle == news_in):
+                told.append(self.pace.cycle)
+            self.wait()
+        return told
+
 
 def test_cycles_come_at_the_rate() -> None:
     assert Cycles().numbers(4) == [0, 1, 2, 3]
@@ -119,37 +129,18 @@ EVERY = {
 
 @pytest.mark.parametrize(("rate_hz", "every"), [(500.0, 3), (125.0, 3), (100.0, 2), (30.0, 1)])
 def test_of_states_that_say_nothing_new_one_is_told_in_time(rate_hz: float, every: int) -> None:
-    cycles = Cycles(rate_hz=rate_hz)
-    told = []
-    for _ in range(20):
-        cycles.work(rests=False)
-        if cycles.pace.tells(rests=False, news=cycles.pace.cycle == 7):
-            told.append(cycles.pace.cycle)
-        cycles.wait()
-    assert told == EVERY[every]
+    assert Cycles(rate_hz=rate_hz).told(20, rests=False, news_in=7) == EVERY[every]
 
 
 def test_at_ease_news_are_told_though_another_state_was() -> None:
     cycles = Cycles()
     cycles.pace.hear(Ease(5))
-    told = []
-    for _ in range(8):
-        cycles.work()
-        if cycles.pace.tells(rests=True, news=cycles.pace.cycle == 9):
-            told.append(cycles.pace.cycle)
-        cycles.wait()
     # Of 0, 3, 6 … the first in each five, and 9.
-    assert told == [0, 6, 9, 12, 15, 21]
+    assert cycles.told(8, rests=True, news_in=9) == [0, 6, 9, 12, 15, 21]
 
 
 @pytest.mark.parametrize(("timeout_s", "every"), [(0.3, 3), (0.1, 2), (0.05, 1), (0.02, 1)])
 def test_states_are_told_often_enough_to_renew_a_speed_that_holds_shortly(timeout_s: float, every: int) -> None:
-    cycles = Cycles(command_timeout_s=timeout_s)
-    told = []
-    for _ in range(12):
-        cycles.work(rests=False)
-        if cycles.pace.tells(rests=False, news=False):
-            told.append(cycles.pace.cycle)
-        cycles.wait()
+    told = Cycles(command_timeout_s=timeout_s).told(12, rests=False)
     # Every fifth is told in any case.
     assert told == {1: [*range(12)], 2: [0, 2, 4, 5, 7, 9, 10], 3: [0, 3, 5, 8, 10]}[every]

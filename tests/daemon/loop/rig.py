@@ -1,0 +1,120 @@
+"""The brain on a simulated rig, stepped in the loop's own ticks."""
+
+from collections import deque
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from daemon.experiment.machine import Phase
+from daemon.experiment.steps import ExperimentFile
+from daemon.experiment.wishes import Action, GripTo
+from daemon.loop.brain import Brain, Orders
+from daemon.loop.senses import Arm, Hand, Source, Torque
+from daemon.loop.tune import TuneSettings, tuned
+from daemon.loop.watch import WatchSettings
+from daemon.loop.wrist import Wrist, WristSettings
+from drivers.emulators.twin import Twin, TwinSettings
+
+TICK_S = 0.008
+EIT = Source(name="right", period_s=0.5412, window_s=0.5412)
+LOAD = Source(name="load_cell", period_s=1 / 10.9)
+GRIP = {"do": "grip", "width_mm": 10.0, "force_n": 60.0}
+TUNE = TuneSettings()
+
+
+def brain(watch: WatchSettings | None = None) -> Brain:
+    wrists = {source.name: Wrist(source, WristSettings(), partial(tuned, TUNE)) for source in (EIT, LOAD)}
+    return Brain(wrists, watch or WatchSettings(), {"right": EIT, "load_cell": LOAD}, ("gripper", "right"))
+
+
+class Rig:
+    """The twin with sensors and devices around it, stepped in the loop's own ticks: no I/O, no waiting."""
+
+    def __init__(self, subject: Brain, seed: int = 0, noise_nm: float = 0.012) -> None:
+        self.brain = subject
+        self.twin = Twin(TwinSettings(gel_stiffness_nm_per_rad=0.3))
+        self.random = np.random.default_rng(seed)
+        self.noise_nm = noise_nm
+        self.tick = 0
+        self.wrist_rad, self.speed = 0.3, 0.0
+        self.force_n, self.width_mm = 0.0, 140.0
+        self.window: deque[float] = deque(maxlen=round(EIT.window_s / TICK_S))
+        # Whether the fingers meet a tool, expected or not.
+        self.meets = False
+        self.silent: set[str] = set()
+        # What the load cell says too much, and whether it says nothing of use.
+        self.offset_nm, self.void = 0.0, False
+        self.arm = Arm(0.3, 0)
+        self.hand = Hand(0, 140.0, holding=False, moving=False)
+        self.pending: list[tuple[int, Action]] = []
+        self.begun: list[Action] = []
+        self.orders = Orders()
+        self.true_nm: list[float] = []
+
+    @property
+    def t_ns(self) -> int:
+        return round(self.tick * TICK_S * 1e9)
+
+    def step(self) -> None:
+        self.tick += 1
+        self.wrist_rad += self.speed * TICK_S
+        state = self.twin.step(TICK_S, self.wrist_rad, self.force_n)
+        self.true_nm.append(state.torque_nm)
+        self.window.append(state.shear_torque_nm)
+        self._sense(state.torque_nm)
+        for due, action in list(self.pending):
+            if self.tick >= due:
+                self.pending.remove((due, action))
+                self._finish(action)
+        orders = self.orders = self.brain.tick(self.t_ns)
+        self.speed = 0.0 if orders.stop else orders.wrist_rad_per_s
+        self.brain.sent(self.speed)
+        if orders.release:
+            self.force_n = 0.0
+        if orders.begin is not None:
+            self.begun.append(orders.begin)
+            self.pending.append((self.tick + 100, orders.begin))
+
+    def _sense(self, torque_nm: float) -> None:
+        now = self.t_ns
+        if "arm" not in self.silent:
+            self.brain.senses.arm = replace(self.arm, wrist_rad=self.wrist_rad, t_ns=now)
+        if "hand" not in self.silent:
+            self.brain.senses.hand = replace(self.hand, t_ns=now, holding=self.force_n > 0, width_mm=self.width_mm)
+        if self.tick % 68 == 0 and "right" not in self.silent:
+            middle = now - round(EIT.window_s * 0.5e9)
+            value = float(np.mean(self.window) + self.random.normal(0.0, self.noise_nm))
+            self.brain.hear(Torque("right", value, "", middle, now))
+        if self.tick % 11 == 0 and "load_cell" not in self.silent:
+            value = torque_nm + self.offset_nm + float(self.random.normal(0.0, 0.0005))
+            self.brain.hear(Torque("load_cell", None if self.void else value, "", now - 1_000_000, now))
+
+    def _finish(self, action: Action) -> None:
+        if isinstance(action, GripTo):
+            holds = action.expect_object or self.meets
+            self.force_n = action.force_n if holds else 0.0
+            self.width_mm = 30.0 if holds else action.width_mm
+            # As the gripper's task does, before it says that the fingers have closed.
+            self.brain.senses.hand = replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm)
+        self.brain.action_ended()
+
+    def run(self, most_s: float) -> None:
+        for _ in range(round(most_s / TICK_S)):
+            self.step()
+            if self.brain.experiment is not None and not self.brain.experiment.running:
+                return
+
+
+def started(rig: Rig, *steps: dict[str, Any], **keys: Any) -> Rig:
+    for _ in range(70):
+        rig.step()
+    file = ExperimentFile.model_validate({"name": "test", "steps": list(steps), **keys})
+    assert rig.brain.start(file, rig.t_ns) is None
+    return rig
+
+
+def phase(rig: Rig) -> Phase:
+    assert rig.brain.experiment is not None
+    return rig.brain.experiment.phase

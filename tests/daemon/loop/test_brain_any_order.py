@@ -1,0 +1,72 @@
+"""The brain whatever goes wrong, whenever and however often: what moves, and for how long it is held."""
+
+from dataclasses import replace
+
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from daemon.experiment.machine import Phase
+from daemon.safety import Response
+from tests.daemon.loop.rig import GRIP, TICK_S, Rig, brain, phase, started
+
+FAULTS = st.sampled_from(["right", "load_cell", "arm", "hand", "protective", "pause", "resume", "stop", "kick", "ack"])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 200), FAULTS), max_size=8), st.integers(0, 1000))
+def test_no_fault_at_any_time_makes_the_wrist_faster_than_its_limit_or_move_after_a_stop(
+    story: list[tuple[int, str]], seed: int
+) -> None:
+    rig = started(Rig(brain(), seed), GRIP, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.08, "hold_s": 5})
+    for ticks, fault in [*story, (100, "right")]:
+        for _ in range(ticks):
+            rig.step()
+            assert abs(rig.speed) <= 0.5
+            if rig.brain.standing.verdict.response >= Response.HOLD or phase(rig) is not Phase.RUNNING:
+                assert rig.speed == 0.0
+        match fault:
+            case "protective":
+                rig.arm = replace(rig.arm, protective_stop=not rig.arm.protective_stop)
+            case "pause":
+                rig.brain.pause()
+            case "resume":
+                rig.brain.resume()
+            case "stop":
+                rig.brain.stop("the operator said so")
+            case "ack":
+                rig.brain.acknowledge()
+            case "kick":
+                rig.twin.kick_nm = 0.1 - rig.twin.kick_nm
+            case name:
+                rig.silent ^= {name}
+
+
+WRONG = st.sampled_from(["right", "load_cell", "arm", "hand", "void", "late", "apart"])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.tuples(st.lists(WRONG, max_size=2), st.integers(10, 250)), max_size=30), st.integers(0, 1000))
+@example([([name], 60) for name in ("void", "apart", "late", "arm") * 6], 0)
+def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
+    story: list[tuple[list[str], int]], seed: int
+) -> None:
+    """Held counts whole, free counts half against it: never more than 5 s, and nothing moves while it is held."""
+    rig = started(
+        Rig(brain(), seed), GRIP, {"do": "twist", "angles_rad": [0.3, -0.3], "speed_rad_per_s": 0.05}, drive="load_cell"
+    )
+    rig.run(2)
+    held_s = 0.0
+    for wrong, ticks in story:
+        rig.silent = {*wrong} & {"right", "load_cell", "arm", "hand"}
+        rig.offset_nm = 0.2 if "apart" in wrong else 0.0
+        rig.void = "void" in wrong
+        rig.brain.senses.late_s = 0.15 if "late" in wrong else 0.0
+        for _ in range(ticks):
+            rig.step()
+            if phase(rig) is not Phase.RUNNING:
+                assert rig.speed == 0.0
+                continue
+            held = rig.brain.standing.verdict.response is Response.HOLD
+            assert not (held and rig.speed)
+            assert not held or held_s <= 5.0 + 2 * TICK_S
+            held_s = held_s + TICK_S if held else max(0.0, held_s - 0.5 * TICK_S)

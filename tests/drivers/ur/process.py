@@ -1,0 +1,128 @@
+"""The robot's own process in the test's own process: the daemon's ends of its pipes, arms for it, and its time."""
+
+import os
+from typing import NoReturn
+
+import pytest
+
+from drivers.ur import child
+from drivers.ur.messages import Configure, Message, Reading, RobotState
+from drivers.ur.wire import Decoder, encode
+from tests.drivers.ur.flight import SETTINGS, FakeArm
+
+
+class LeftError(Exception):
+    """The process would have ended here."""
+
+
+class Daemon:
+    """The daemon's ends of the two pipes."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        its_stdin, self._stdin = os.pipe()
+        self._stdout, its_stdout = os.pipe()
+        os.set_blocking(self._stdout, False)
+        self._all = [its_stdin, self._stdin, self._stdout, its_stdout]
+        self.pipe = child.Pipe(its_stdin, its_stdout)
+        monkeypatch.setattr(child, "_alarm", lambda _seconds: None)
+        monkeypatch.setattr(child, "_leave", self._left)
+
+    @staticmethod
+    def _left(_status: int) -> NoReturn:
+        raise LeftError
+
+    def say(self, *messages: Message) -> None:
+        for number, message in enumerate(messages, 1):
+            os.write(self._stdin, encode(message, number))
+
+    def hear(self) -> list[tuple[int, Message]]:
+        return Decoder().feed(os.read(self._stdout, 1 << 20))
+
+    def close(self) -> None:
+        for descriptor in self._all:
+            os.close(descriptor)
+
+
+class CyclingArm(FakeArm):
+    """An arm that goes through a cycle whenever it is read."""
+
+    def read(self) -> Reading:
+        self.cycle()
+        return super().read()
+
+    def end_program(self) -> None:
+        self.calls.append("end_program")
+        super().end_program()
+
+
+def fly(daemon: Daemon, arm: CyclingArm) -> None:
+    with pytest.raises(LeftError):
+        child._fly(daemon.pipe, Configure(SETTINGS), arm)  # type: ignore[arg-type]  # an arm in all that counts
+
+
+class Time:
+    """A clock that only waiting moves on."""
+
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def monotonic(self) -> float:
+        return self.now_s
+
+    def monotonic_ns(self) -> int:
+        return round(self.now_s * 1e9)
+
+    def sleep(self, seconds: float) -> None:
+        self.now_s += seconds
+
+
+class TimedArm(CyclingArm):
+    """An arm that is read in the process's own time; `read_s` keeps when."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.read_s: list[float] = []
+
+    def read(self) -> Reading:
+        super().read()
+        self.read_s.append(child.time.monotonic() - 1000.0)
+        self.be(t_mono_ns=child.time.monotonic_ns())
+        return self.reading
+
+
+class Eased:
+    """A flight in a time of its own: at some times the daemon says something; what was done when is kept."""
+
+    def __init__(
+        self,
+        daemon: Daemon,
+        monkeypatch: pytest.MonkeyPatch,
+        *script: tuple[float, Message],
+        arm: "TimedArm | None" = None,
+    ) -> None:
+        self.time = Time()
+        self.arm = arm or TimedArm()
+        self._daemon = daemon
+        self._script = [(1000.0 + at_s, message) for at_s, message in script]
+        monkeypatch.setattr(child, "time", self.time)
+        monkeypatch.setattr(daemon.pipe, "wait", self._wait)
+        fly(daemon, self.arm)
+        self.states = [message for _, message in daemon.hear() if isinstance(message, RobotState)]
+
+    def _wait(self, timeout_s: float) -> bool:
+        if self._script and self._script[0][0] <= self.time.now_s + timeout_s:
+            at_s, message = self._script.pop(0)
+            self.time.now_s = max(self.time.now_s, at_s)
+            self._daemon.say(message)
+            return True
+        self.time.now_s += timeout_s
+        return False
+
+    def cycles_between(self, from_s: float, to_s: float) -> list[int]:
+        """Return the numbers of the cycles that were gone through in that time, as the readings tell."""
+        periods = [read_s * SETTINGS.rate_hz for read_s in self.arm.read_s if from_s < read_s < to_s]
+        return sorted({round(period) for period in periods if abs(period - round(period)) < 1e-6})
+
+    def told_between(self, from_s: float, to_s: float) -> list[int]:
+        """Return the numbers of the cycles whose states were told in that time."""
+        return sorted({state.cycle for state in self.states if from_s < state.t_mono_ns / 1e9 - 1000.0 < to_s})

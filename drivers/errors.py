@@ -13,6 +13,10 @@ class DeviceLostError(DriverError):
     """The device was there and is gone: unplugged, or the connection dropped."""
 
 
+class DeviceSilentError(DeviceLostError):
+    """The device has not answered; whether it is still there is not known."""
+
+
 class ProtocolError(DriverError):
     """The device answers, but not in its own language."""
 

@@ -5,7 +5,7 @@ from collections import Counter
 from dataclasses import dataclass
 from time import monotonic_ns
 
-from drivers.errors import DeviceLostError, ProtocolError
+from drivers.errors import DeviceLostError, DeviceSilentError, ProtocolError
 from drivers.lines import LineCutter
 from drivers.raw_input import InputKind, RawInput, Tap, no_tap
 from drivers.serial_port import Link, Port
@@ -128,7 +128,7 @@ class ScpiSession:
             await self._port.write(f"{command}\n".encode())
 
     async def ask(self, query: str) -> Reply:
-        """Return the answer to a query; DeviceLostError when none comes."""
+        """Return the answer to a query; DeviceSilentError when none comes, DeviceLostError when the port has gone."""
         # What comes without having been asked for must not be taken for the answer.
         self.lines.unasked += len(self._waiting)
         self._waiting.clear()
@@ -141,7 +141,7 @@ class ScpiSession:
         return reply
 
     async def ask_until(self, query: str, answer: str, deadline_s: float) -> None:
-        """Read past replies to older questions until a query is answered so; DeviceLostError when that never comes."""
+        """Read past replies to older questions until a query is answered so, DeviceSilentError when it never is."""
         await self.tell(query)
         deadline_ns = monotonic_ns() + int(deadline_s * 1e9)
         while (await self._next(0, query, deadline_ns)).text != answer:
@@ -182,7 +182,7 @@ class ScpiSession:
                 ) from error
             if received is None:
                 waited_s = (deadline_ns - begin_ns) / 1e9
-                raise DeviceLostError(
+                raise DeviceSilentError(
                     f"{self._what} at {self._port.path} has not answered {query!r} within {waited_s:.2g} s; "
                     "see that it is on, and that baud rate and line end are as configured."
                 )

@@ -6,7 +6,7 @@ Voltage and current are both measured: the current of a source that sits in comp
 
 from dataclasses import dataclass
 
-from drivers.errors import DeviceLostError, DriverError, ProtocolError
+from drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
 from drivers.raw_input import RawInput, Tap, no_tap
 from drivers.serial_port import Link
 from drivers.shear_skin.polled import Polled
@@ -130,7 +130,7 @@ class Keithley6430(Polled[SourceReading]):
             return off
         try:
             reply = await self._session.ask(READ)
-        except DeviceLostError:
+        except DeviceSilentError:
             # With its output off it answers READ with an error, which is silence: so where somebody switched it off
             # since it was asked. It must not be opened anew for that, and thereby switched on again.
             off = read_reply(OUTPUT, await self._session.ask(OUTPUT))

@@ -287,7 +287,8 @@ async def test_a_source_that_breaks_off_in_the_middle_of_an_answer_is_named_coun
         bench.played.face.feed = broken_off_at_the_query  # type: ignore[method-assign]
         await bench.until(lambda: bench.skin.source_facts()["openings"] == 2)
         await bench.next_says()
-        (told,) = (event.sentence for event in bench.events if not event.up)
+        # On a busy machine the converter board may be late too, which is no news here.
+        (told,) = (event.sentence for event in bench.events if event.sentence.startswith("The current source"))
         assert told.startswith(f"The current source broke off in the middle of its answer to {query!r}: ")
         assert bench.source_errors == {"lost": 1, "unfinished": 1}
         assert bench.skin.source_facts()["last_loss"] == told

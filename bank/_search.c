@@ -124,15 +124,18 @@ PyDoc_STRVAR(energy_doc,
 "energy(difference, noise) -> float\n\n"
 "Return the sum of the squares of difference / noise, both float64; -1 where one of them is not sound.");
 
+/* Put an item, NULL where none could be made, into a list, which is given up where that fails. */
+static void put(PyObject **list, Py_ssize_t i, PyObject *item)
+{
+    if (!item || PyList_SetItem(*list, i, item) < 0)
+        Py_CLEAR(*list);
+}
+
 static PyObject *medians_of(const double *rows, const int64_t *counts, Py_ssize_t n)
 {
     PyObject *found = PyList_New(n);
-    for (Py_ssize_t i = 0; found && i < n; i++) {
-        int count = counts[i] < 0 ? 0 : counts[i] > MOST_VALUES ? MOST_VALUES : (int)counts[i];
-        PyObject *median = PyFloat_FromDouble(median_of(rows + i * MOST_VALUES, count));
-        if (!median || PyList_SetItem(found, i, median) < 0)
-            Py_CLEAR(found);
-    }
+    for (Py_ssize_t i = 0; found && i < n; i++)
+        put(&found, i, PyFloat_FromDouble(median_of(rows + i * MOST_VALUES, counts[i])));
     return found;
 }
 
@@ -162,12 +165,9 @@ static PyObject *off_from_each(const double *known, const double *frame, const i
 {
     PyObject *found = PyList_New(n);
     for (Py_ssize_t i = 0; found && i < n; i++) {
-        int count = counts[i] < 0 ? 0 : counts[i] > MOST_VALUES ? MOST_VALUES : (int)counts[i];
+        const double *row = frame + i / n_each * MOST_VALUES;
         Py_ssize_t at = i * MOST_VALUES;
-        double deviation = off_from(known + at, frame + i / n_each * MOST_VALUES, count, off + at);
-        PyObject *item = PyFloat_FromDouble(deviation);
-        if (!item || PyList_SetItem(found, i, item) < 0)
-            Py_CLEAR(found);
+        put(&found, i, PyFloat_FromDouble(off_from(known + at, row, counts[i], off + at)));
     }
     return found;
 }
@@ -210,11 +210,8 @@ static PyObject *n_largest(PyObject *module, PyObject *array)
         found = PyList_New(n);
     else
         PyErr_Format(PyExc_ValueError, "%zd bytes are no rows of 896 values", rows.len);
-    for (Py_ssize_t i = 0; found && i < n; i++) {
-        PyObject *count = PyLong_FromLong(n_largest_of((const double *)rows.buf + i * MOST_VALUES));
-        if (!count || PyList_SetItem(found, i, count) < 0)
-            Py_CLEAR(found);
-    }
+    for (Py_ssize_t i = 0; found && i < n; i++)
+        put(&found, i, PyLong_FromLong(n_largest_of((const double *)rows.buf + i * MOST_VALUES)));
     PyBuffer_Release(&rows);
     return found;
 }

@@ -71,7 +71,7 @@ int n_largest_of(const double *row)
     return n;
 }
 
-double median_of(const double *row, int n)
+double median_of(const double *row, int64_t n)
 {
     double values[MOST_VALUES], below[MOST_VALUES], above[MOST_VALUES];
     int n_values = 0, n_up_to = 0;
@@ -83,7 +83,7 @@ double median_of(const double *row, int n)
         return 0.0;
     if (n / 2 >= n_values)
         return NAN;
-    double lower = nth_in_order(values, n_values, (n - 1) / 2, below, above), higher = INFINITY;
+    double lower = nth_in_order(values, n_values, (int)((n - 1) / 2), below, above), higher = INFINITY;
     if (n % 2)
         return lower;
     /* The next one is as large where there are more of them than come before it. */
@@ -95,7 +95,7 @@ double median_of(const double *row, int n)
     return (lower + (n_up_to > n / 2 ? lower : higher)) / 2;
 }
 
-double off_from(const double *known, const double *row, int n, double *off)
+double off_from(const double *known, const double *row, int64_t n, double *off)
 {
     for (int i = 0; i < MOST_VALUES; i++)
         off[i] = row[i] / known[i];

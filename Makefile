@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 # What is compiled when it is installed, where there is a C compiler; everything works without, up to a millisecond later.
-COMPILED := setup.py bank/_search.c bank/search.c bank/search.h drivers/_cells.c
+COMPILED := setup.py $(wildcard bank/*.[ch] drivers/*.[ch])
 # Many small solves: one BLAS thread each, on every machine.
 export OPENBLAS_NUM_THREADS := 1
 # Some containers forbid Python to keep what it compiled; every process of the tests would then compile all of them anew.

@@ -24,9 +24,10 @@ setup(
     ext_modules=[
         compiled(
             "bank._search",
-            ["bank/_search.c", "bank/candidates.c", "bank/lags.c", "bank/medians.c", "bank/search.c"],
-            ["bank/eight.h", "bank/medians.h", "bank/search.h"],
+            ["bank/_search.c", "bank/candidates.c", "bank/lags.c", "bank/search.c"],
+            ["bank/eight.h", "bank/search.h"],
         ),
+        compiled("bank._frames", ["bank/_frames.c", "bank/medians.c"], ["bank/medians.h"]),
         compiled("drivers._cells", ["drivers/_cells.c"], []),
     ]
 )

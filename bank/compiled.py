@@ -1,7 +1,7 @@
 """What is compiled of the bank's work, where there was a C compiler when this was installed.
 
-The compiled code is `search.c` and what that calls; numpy does the same without, and the tests compare the two. Its
-one purpose is the time from a frame to its estimate.
+The compiled code is `search.c`, for matchers, and `medians.c`, for what estimators ask of a frame; numpy does the same
+without, and the tests compare the two. Its one purpose is the time from a frame to its estimate.
 """
 
 from pathlib import Path
@@ -17,10 +17,10 @@ from bank.channels import N_CHANNELS
 from bank.compression import ROUNDING, SQUARE_ROUNDING, CompressedBank, FloatArray, Indices, Single
 
 try:
-    from bank import _search
+    from bank import _frames, _search
 except ImportError:
     # No compiler, or none that could build it; docs/speed.md tells what that costs.
-    _search = None  # type: ignore[assignment]
+    _frames = _search = None  # type: ignore[assignment]
 
 
 def is_stale(module: ModuleType, *names: str) -> bool:
@@ -36,7 +36,8 @@ def is_stale(module: ModuleType, *names: str) -> bool:
 # Rows in blocks, the numbers of what they bound, and where those of each group begin.
 Blocks = tuple[Single, NDArray[np.int32], NDArray[np.int32]]
 # In the order of setup.py.
-_SOURCES = ("_search.c", "candidates.c", "lags.c", "medians.c", "search.c", "eight.h", "medians.h", "search.h")
+_SEARCH = ("_search.c", "candidates.c", "lags.c", "search.c", "eight.h", "search.h")
+_FRAMES = ("_frames.c", "medians.c", "medians.h")
 # Numbers that compiled code takes side by side, and the length of its transforms.
 _LANES = 8
 _LENGTH = 2048
@@ -44,7 +45,8 @@ _LENGTH = 2048
 _NEVER = -1e6
 # BLAS as scipy hands it to compiled code.
 _SGEMM = getattr(cython_blas, "__pyx_capi__", {}).get("sgemm")
-IS_COMPILED = _search is not None and not is_stale(_search, *_SOURCES) and _search.is_sgemm(_SGEMM)
+_FRESH = _search is not None and not is_stale(_search, *_SEARCH) and not is_stale(_frames, *_FRAMES)
+IS_COMPILED = _FRESH and _search.is_sgemm(_SGEMM)
 
 
 def search_of(
@@ -92,7 +94,7 @@ def medians(rows: FloatArray, counts: NDArray[np.int64]) -> list[float]:
     nothing is compiled a median costs twice to five times as much, cold and hot.
     """
     if IS_COMPILED:
-        return _search.medians(np.ascontiguousarray(rows, dtype=np.float64), counts)
+        return _frames.medians(np.ascontiguousarray(rows, dtype=np.float64), counts)
     # Half the price of np.partition.
     ordered = np.sort(rows, axis=-1).reshape(-1, N_CHANNELS)
     return [
@@ -109,7 +111,7 @@ def compared(known: FloatArray, frame: FloatArray, counts: NDArray[np.int64]) ->
     """
     if IS_COMPILED:
         off = np.empty(known.shape)
-        return off, _search.compared(known, np.ascontiguousarray(frame, dtype=np.float64), counts, off)
+        return off, _frames.compared(known, np.ascontiguousarray(frame, dtype=np.float64), counts, off)
     frame = frame[..., None, :]
     gains = np.array([gain if gain > 0 else np.nan for gain in medians(frame / known, counts)])
     off = np.abs(frame / gains.reshape(*known.shape[:-1], 1) - known) / known
@@ -120,7 +122,7 @@ def n_largest(rows: FloatArray) -> list[int]:
     """Return how many values of each of (n, 896) rows without NaN are its largest."""
     if not IS_COMPILED:
         return [int(np.count_nonzero(one == one.max())) for one in rows]
-    return _search.n_largest(np.ascontiguousarray(rows, dtype=np.float64))
+    return _frames.n_largest(np.ascontiguousarray(rows, dtype=np.float64))
 
 
 def _levels_of(bank: CompressedBank) -> tuple[Blocks, ...]:

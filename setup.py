@@ -27,7 +27,9 @@ setup(
             ["bank/_search.c", "bank/candidates.c", "bank/lags.c", "bank/search.c"],
             ["bank/eight.h", "bank/search.h"],
         ),
-        compiled("bank._frames", ["bank/_frames.c", "bank/medians.c"], ["bank/medians.h"]),
+        compiled(
+            "bank._frames", ["bank/_frames.c", "bank/look.c", "bank/medians.c"], ["bank/look.h", "bank/medians.h"]
+        ),
         compiled("drivers._cells", ["drivers/_cells.c"], []),
     ]
 )

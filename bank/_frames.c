@@ -1,4 +1,4 @@
-/* bank/medians.c for Python: what estimators that know their fingertip ask of each frame.
+/* bank/look.c and bank/medians.c for Python: what estimators that know their fingertip ask of each frame.
 
    The arrays that are handed in come of bank/compiled.py; their sizes are checked, for they decide where is read. */
 
@@ -6,7 +6,21 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
-#include "medians.h"
+#include "look.h"
+
+#include <string.h>
+
+enum { ROW_BYTES = MOST_VALUES * sizeof(double), MOST = 1024 };
+
+typedef struct {
+    PyObject_HEAD
+    Py_ssize_t n_sides;
+    Fingertip *tips;
+    double *values; /* what they point to */
+    int is_whole;   /* all of it is there */
+    Limits limits;
+    double small_v;
+} Fingertips;
 
 /* Put an item, NULL where none could be made, into a list, which is given up where that fails. */
 static void put(PyObject **list, Py_ssize_t i, PyObject *item)
@@ -51,7 +65,8 @@ static PyObject *off_from_each(const double *known, const double *frame, const i
     for (Py_ssize_t i = 0; found && i < n; i++) {
         const double *row = frame + i / n_each * MOST_VALUES;
         Py_ssize_t at = i * MOST_VALUES;
-        put(&found, i, PyFloat_FromDouble(off_from(known + at, row, counts[i], off + at)));
+        compare(known + at, row, counts[i], off + at);
+        put(&found, i, PyFloat_FromDouble(median_of(off + at, counts[i])));
     }
     return found;
 }
@@ -104,6 +119,208 @@ PyDoc_STRVAR(n_largest_doc,
 "n_largest(rows) -> list of int\n\n"
 "Return how many of each of (n, 896) float64 rows are its largest.");
 
+/* Arrays that are looked at, until they are given back. */
+typedef struct {
+    Py_buffer buffers[6];
+    int n;
+} Taken;
+
+/* The bytes of one more array; NULL for one of another size or format (NULL: whatever it is), or not in one piece. */
+static void *take(Taken *taken, PyObject *array, const char *format, Py_ssize_t n_bytes, int flags)
+{
+    Py_buffer *buffer = &taken->buffers[taken->n];
+    if (PyObject_GetBuffer(array, buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | flags) < 0) {
+        PyErr_Clear();
+        return NULL;
+    }
+    taken->n++;
+    return buffer->len == n_bytes && (!format || strcmp(buffer->format, format) == 0) ? buffer->buf : NULL;
+}
+
+static void give_back(Taken *taken)
+{
+    while (taken->n)
+        PyBuffer_Release(&taken->buffers[--taken->n]);
+}
+
+static Fingertips *fingertips_of(PyObject *self)
+{
+    if (((Fingertips *)self)->is_whole)
+        return (Fingertips *)self;
+    PyErr_SetString(PyExc_ValueError, "these are no fingertips");
+    return NULL;
+}
+
+static int are_ordinary(const Fingertips *f, const double *frame)
+{
+    for (Py_ssize_t i = 0; i < f->n_sides; i++)
+        if (!is_ordinary(f->tips + i, &f->limits, frame + i * MOST_VALUES))
+            return 0;
+    return 1;
+}
+
+static PyObject *jumping(const Fingertips *f, const double *frame, const double *before)
+{
+    PyObject *found = PyList_New(f->n_sides);
+    for (Py_ssize_t i = 0; found && i < f->n_sides; i++) {
+        Py_ssize_t at = i * MOST_VALUES;
+        put(&found, i, PyLong_FromLong(n_jumping(f->tips + i, frame + at, before + at)));
+    }
+    return found;
+}
+
+static PyObject *check(PyObject *self, PyObject *args)
+{
+    const Fingertips *f = fingertips_of(self);
+    PyObject *arrays[3], *found;
+    if (!f || !PyArg_ParseTuple(args, "OOO", &arrays[0], &arrays[1], &arrays[2]))
+        return NULL;
+    Taken taken = {.n = 0};
+    const double *frame = take(&taken, arrays[0], "d", f->n_sides * ROW_BYTES, 0);
+    const char *usable = take(&taken, arrays[1], "?", f->n_sides * MOST_VALUES, 0);
+    const double *before = take(&taken, arrays[2], "d", f->n_sides * ROW_BYTES, 0);
+    if (frame && usable && before && !memchr(usable, 0, (size_t)f->n_sides * MOST_VALUES) && are_ordinary(f, frame))
+        found = jumping(f, frame, before);
+    else
+        found = Py_NewRef(Py_None);
+    give_back(&taken);
+    return found;
+}
+
+PyDoc_STRVAR(check_doc,
+"check(frame, usable, before) -> list of int | None\n\n"
+"Return how many channels of each side jump since the frame before; all (m, 896). None of a frame that is not ordinary.");
+
+static PyObject *all_placed(const Fingertips *f, const double *frame, const double *idle, const double *gains,
+                            double *difference, double *places)
+{
+    PyObject *found = PyList_New(f->n_sides);
+    for (Py_ssize_t i = 0; found && i < f->n_sides; i++) {
+        Py_ssize_t at = i * MOST_VALUES;
+        const Fingertip *tip = f->tips + i;
+        double *its_places = places + i * tip->n_directions;
+        put(&found, i, PyFloat_FromDouble(place(tip, f->small_v, frame + at, idle + at, gains[i], difference + at,
+                                                its_places, its_places + f->n_sides * tip->n_directions)));
+    }
+    return found;
+}
+
+static PyObject *placed(PyObject *self, PyObject *args)
+{
+    const Fingertips *f = fingertips_of(self);
+    PyObject *arrays[6], *found;
+    if (!f || !PyArg_ParseTuple(args, "OOOOOO", &arrays[0], &arrays[1], &arrays[2], &arrays[3], &arrays[4], &arrays[5]))
+        return NULL;
+    Taken taken = {.n = 0};
+    Py_ssize_t n_bytes = f->n_sides * ROW_BYTES, n_places = 2 * f->n_sides * f->tips->n_directions;
+    const double *frame = take(&taken, arrays[0], "d", n_bytes, 0);
+    const char *usable = take(&taken, arrays[1], "?", f->n_sides * MOST_VALUES, 0);
+    const double *idle = take(&taken, arrays[2], "d", n_bytes, 0);
+    const double *gains = take(&taken, arrays[3], "d", f->n_sides * (Py_ssize_t)sizeof(double), 0);
+    double *difference = take(&taken, arrays[4], "d", n_bytes, PyBUF_WRITABLE);
+    double *places = take(&taken, arrays[5], "d", n_places * (Py_ssize_t)sizeof(double), PyBUF_WRITABLE);
+    if (frame && usable && idle && gains && difference && places && !memchr(usable, 0, (size_t)f->n_sides * MOST_VALUES))
+        found = all_placed(f, frame, idle, gains, difference, places);
+    else
+        found = Py_NewRef(Py_None);
+    give_back(&taken);
+    return found;
+}
+
+PyDoc_STRVAR(placed_doc,
+"placed(frame, usable, idle, gains, difference, places) -> list of float | None\n\n"
+"Return the score of each side's grip, and write the (m, 896) difference to the idle frame at the calibration's gain, and\n"
+"where the frame at that gain, and the difference, lie along the directions, (2, m, p). None where not all is usable.");
+
+/* Copy what is known of the fingertips; 0 with an error where that is not of their number, or there is no memory. */
+static int copy(Fingertips *f, Py_ssize_t n_directions, PyObject *const *arrays, Taken *taken)
+{
+    const Py_ssize_t rows[] = {2 * f->n_sides, f->n_sides, f->n_sides, n_directions * f->n_sides};
+    const int64_t *n_known = take(taken, arrays[4], NULL, rows[0] * (Py_ssize_t)sizeof(int64_t), 0);
+    double *copies[4], *to;
+    f->values = to = PyMem_Malloc((size_t)(rows[0] + rows[1] + rows[2] + rows[3]) * ROW_BYTES);
+    f->tips = PyMem_Calloc((size_t)f->n_sides, sizeof(Fingertip));
+    if (!f->values || !f->tips) {
+        PyErr_NoMemory();
+        return 0;
+    }
+    for (int i = 0; i < 4; i++) {
+        const double *from = take(taken, arrays[i], "d", rows[i] * ROW_BYTES, 0);
+        if (!from || !n_known) {
+            PyErr_SetString(PyExc_ValueError, "what is known of the fingertips does not fit together");
+            return 0;
+        }
+        copies[i] = memcpy(to, from, (size_t)rows[i] * ROW_BYTES);
+        to += rows[i] * MOST_VALUES;
+    }
+    for (Py_ssize_t i = 0; i < f->n_sides; i++) {
+        Fingertip *tip = f->tips + i;
+        for (int j = 0; j < 2; j++) {
+            tip->known[j] = copies[0] + (2 * i + j) * MOST_VALUES;
+            tip->n_known[j] = n_known[2 * i + j];
+        }
+        tip->jumps_v = copies[1] + i * MOST_VALUES;
+        tip->weights = copies[2] + i * MOST_VALUES;
+        tip->directions = copies[3] + i * n_directions * MOST_VALUES;
+        tip->n_directions = n_directions;
+    }
+    return f->is_whole = 1;
+}
+
+static int fingertips_init(PyObject *self, PyObject *args, PyObject *named)
+{
+    Fingertips *f = (Fingertips *)self;
+    PyObject *arrays[5];
+    Py_ssize_t n_directions;
+    if (f->values || f->tips || (named && PyDict_Size(named))) {
+        PyErr_SetString(PyExc_TypeError, "fingertips are made once, and their arguments have no names");
+        return -1;
+    }
+    if (!PyArg_ParseTuple(args, "nnOOOOOnnddd", &f->n_sides, &n_directions, &arrays[0], &arrays[1], &arrays[2], &arrays[3],
+                          &arrays[4], &f->limits.fewest_at_rail, &f->limits.fewest_compared, &f->limits.largest_deviation,
+                          &f->limits.lost_share, &f->small_v))
+        return -1;
+    if (f->n_sides < 1 || f->n_sides > MOST || n_directions < 0 || n_directions > MOST) {
+        PyErr_Format(PyExc_ValueError, "%zd fingertips with %zd directions each", f->n_sides, n_directions);
+        return -1;
+    }
+    Taken taken = {.n = 0};
+    int sound = copy(f, n_directions, arrays, &taken);
+    give_back(&taken);
+    return sound ? 0 : -1;
+}
+
+static void fingertips_dealloc(PyObject *self)
+{
+    PyTypeObject *type = Py_TYPE(self);
+    PyMem_Free(((Fingertips *)self)->tips);
+    PyMem_Free(((Fingertips *)self)->values);
+    freefunc release = (freefunc)PyType_GetSlot(type, Py_tp_free);
+    release(self);
+    Py_DECREF(type);
+}
+
+static PyMethodDef fingertips_methods[] = {
+    {"check", check, METH_VARARGS, check_doc},
+    {"placed", placed, METH_VARARGS, placed_doc},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyType_Slot fingertips_slots[] = {
+    {Py_tp_doc, "What frames are compared with; see bank/compiled.py."},
+    {Py_tp_init, fingertips_init},
+    {Py_tp_dealloc, fingertips_dealloc},
+    {Py_tp_methods, fingertips_methods},
+    {0, NULL},
+};
+
+static PyType_Spec fingertips_spec = {
+    .name = "bank._frames.Fingertips",
+    .basicsize = sizeof(Fingertips),
+    .flags = Py_TPFLAGS_DEFAULT,
+    .slots = fingertips_slots,
+};
+
 static PyMethodDef module_functions[] = {
     {"compared", compared, METH_VARARGS, compared_doc},
     {"medians", medians, METH_VARARGS, medians_doc},
@@ -122,7 +339,10 @@ static struct PyModuleDef module = {
 PyMODINIT_FUNC PyInit__frames(void)
 {
     PyObject *found = PyModule_Create(&module);
-    if (found && PyModule_AddIntConstant(found, "SOURCES", SOURCES) < 0)
+    PyObject *type = found ? PyType_FromSpec(&fingertips_spec) : NULL;
+    if (!type || PyModule_AddObjectRef(found, "Fingertips", type) < 0
+        || PyModule_AddIntConstant(found, "SOURCES", SOURCES) < 0)
         Py_CLEAR(found);
+    Py_XDECREF(type);
     return found;
 }

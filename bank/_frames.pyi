@@ -3,6 +3,37 @@ from numpy.typing import NDArray
 
 SOURCES: int
 
+class Fingertips:
+    def __init__(
+        self,
+        n_sides: int,
+        n_directions: int,
+        known: NDArray[np.float64],
+        jumps_v: NDArray[np.float64],
+        weights: NDArray[np.float64],
+        directions: NDArray[np.float64],
+        counts: NDArray[np.int64],
+        fewest_at_rail: int,
+        fewest_compared: int,
+        largest_deviation: float,
+        lost_share: float,
+        small_v: float,
+        /,
+    ) -> None: ...
+    def check(
+        self, frame: NDArray[np.float64], usable: NDArray[np.bool_], before: NDArray[np.float64], /
+    ) -> list[int] | None: ...
+    def placed(
+        self,
+        frame: NDArray[np.float64],
+        usable: NDArray[np.bool_],
+        idle: NDArray[np.float64],
+        gains: NDArray[np.float64],
+        difference: NDArray[np.float64],
+        places: NDArray[np.float64],
+        /,
+    ) -> list[float] | None: ...
+
 def compared(
     known: NDArray[np.float64], frame: NDArray[np.float64], counts: NDArray[np.int64], off: NDArray[np.float64], /
 ) -> list[float]: ...

@@ -1,7 +1,7 @@
 """What is compiled of the bank's work, where there was a C compiler when this was installed.
 
-The compiled code is `search.c`, for matchers, and `medians.c`, for what estimators ask of a frame; numpy does the same
-without, and the tests compare the two. Its one purpose is the time from a frame to its estimate.
+The compiled code is `search.c`, for matchers, and `look.c` and `medians.c`, for what estimators ask of a frame; numpy
+does the same without, and the tests compare the two. Its one purpose is the time from a frame to its estimate.
 """
 
 from pathlib import Path
@@ -37,7 +37,7 @@ def is_stale(module: ModuleType, *names: str) -> bool:
 Blocks = tuple[Single, NDArray[np.int32], NDArray[np.int32]]
 # In the order of setup.py.
 _SEARCH = ("_search.c", "candidates.c", "lags.c", "search.c", "eight.h", "search.h")
-_FRAMES = ("_frames.c", "medians.c", "medians.h")
+_FRAMES = ("_frames.c", "look.c", "medians.c", "look.h", "medians.h")
 # Numbers that compiled code takes side by side, and the length of its transforms.
 _LANES = 8
 _LENGTH = 2048
@@ -123,6 +123,34 @@ def n_largest(rows: FloatArray) -> list[int]:
     if not IS_COMPILED:
         return [int(np.count_nonzero(one == one.max())) for one in rows]
     return _frames.n_largest(np.ascontiguousarray(rows, dtype=np.float64))
+
+
+def fingertips_of(
+    known: FloatArray,
+    jumps_v: FloatArray,
+    weights: FloatArray,
+    directions: FloatArray,
+    counts: NDArray[np.int64],
+    *,
+    fewest_at_rail: int,
+    fewest_compared: int,
+    largest_deviation: float,
+    lost_share: float,
+    small_v: float,
+) -> "_frames.Fingertips | None":
+    """Return what looks at frames of m fingertips in two calls; None where nothing is compiled.
+
+    known (m, 2, 896) frames, of which counts (m·2,) values are no NaN; jumps_v and weights (m, 896) of a jump and of
+    the grip's score; directions (m, p, 896). An ordinary frame has fewer than fewest_at_rail channels at its largest
+    value, none off by more than lost_share from both known frames, and of one of them, where at least fewest_compared
+    are compared, more than half off by no more than largest_deviation. The score divides by voltages + small_v.
+    """
+    if not IS_COMPILED:
+        return None
+    m, p = directions.shape[:2]
+    arrays = (np.ascontiguousarray(one, dtype=np.float64) for one in (known, jumps_v, weights, directions))
+    limits = fewest_at_rail, fewest_compared, largest_deviation, lost_share, small_v
+    return _frames.Fingertips(m, p, *arrays, counts, *limits)  # type: ignore[call-arg, arg-type]  # in this order
 
 
 def _levels_of(bank: CompressedBank) -> tuple[Blocks, ...]:

@@ -95,7 +95,7 @@ double median_of(const double *row, int64_t n)
     return (lower + (n_up_to > n / 2 ? lower : higher)) / 2;
 }
 
-double off_from(const double *known, const double *row, int64_t n, double *off)
+void compare(const double *known, const double *row, int64_t n, double *off)
 {
     for (int i = 0; i < MOST_VALUES; i++)
         off[i] = row[i] / known[i];
@@ -104,5 +104,4 @@ double off_from(const double *known, const double *row, int64_t n, double *off)
         gain = NAN;
     for (int i = 0; i < MOST_VALUES; i++)
         off[i] = fabs(row[i] / gain - known[i]) / known[i];
-    return median_of(off, n);
 }

@@ -10,8 +10,8 @@ enum { MOST_VALUES = 896 };
 double median_of(const double *row, int64_t n);
 
 /* By which shares of a known row's values a row is off from them after the gain in common, the median of its n first ratios to
-   them, and the median of that: NaN where the known one is, and all NaN without a gain. */
-double off_from(const double *known, const double *row, int64_t n, double *off);
+   them: NaN where the known one is, and all NaN without a gain. */
+void compare(const double *known, const double *row, int64_t n, double *off);
 
 /* How many of the 896 values of a row are its largest; NaN are none. */
 int n_largest_of(const double *row);

@@ -127,16 +127,16 @@ class Seen:
 
 
 def features_of(
-    calibration: Calibration, locator: Locator | None, difference: FloatArray, places: FloatArray | None, t_s: float
+    calibration: Calibration, locator: Locator | None, difference: FloatArray, moved: FloatArray | None, t_s: float
 ) -> Seen:
-    """Return the features of (m, 896) differences at t_s, or of the last frames' places where motion is read.
+    """Return the features of (m, 896) differences at t_s, or those of the last frames' motion where that is read.
 
     A slice is followed by its time: how it is read drifts with it.
     """
     if calibration.motion is not None:
-        if places is None:
-            raise ValueError("features of motion need the last frames' places")
-        return Seen(calibration.motion.features(places, difference))
+        if moved is None:
+            raise ValueError("features of motion need the last frames")
+        return Seen(moved)
     if locator is not None:
         cells = [locator.locate(layer) for layer in difference]
         if calibration.estimator == "paper":
@@ -235,9 +235,9 @@ class Tracker:
         if moment.why:
             return Estimate(valid=False, why=moment.why)
         self._difference = moment.difference
-        return self._read(moment.difference, self._memory.places, moment.usable, frame.t_s)
+        return self._read(moment.difference, self._memory.moved, moment.usable, frame.t_s)
 
-    def _read(self, difference: FloatArray, places: FloatArray | None, usable: BoolArray, t_s: float) -> Estimate:
+    def _read(self, difference: FloatArray, moved: FloatArray | None, usable: BoolArray, t_s: float) -> Estimate:
         calibration = self.calibration
         refused: list[str] = []
         tasks = {"torque": (calibration.torque, "N·m"), "diameter": (calibration.diameter, "mm")}
@@ -265,7 +265,7 @@ class Tracker:
             curve = calibration.estimator == "fused"
             said = np.full(N_CHANNELS, np.nan) if curve else guard.filled(difference[0], usable[0])
             difference = np.where(usable, difference, said)
-        seen = features_of(calibration, self._locator, difference, places, t_s)
+        seen = features_of(calibration, self._locator, difference, moved, t_s)
         held = self._memory.held if self._memory is not None else difference
         if seen.place is not None and seen.place.ambiguous:
             return _with_place(

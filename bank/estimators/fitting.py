@@ -380,7 +380,7 @@ def _replayed(
     ):
         moment = memory.see(TactileFrame.of(float(t_s), channels))
         if not moment.why and np.isfinite(torque) and i % every == 0:
-            features = features_of(calibration, locator, moment.difference, memory.places, float(t_s)).features
+            features = features_of(calibration, locator, moment.difference, memory.moved, float(t_s)).features
             since_s = float(t_s - series.t_s[0])
             place, held = ((one / calibration.scale).ravel() for one in (moment.difference, memory.held))
             rows.append(_Row(recording, i, since_s, features, place, held, float(torque), float(diameter)))

@@ -24,15 +24,15 @@ LEAST_NOISE_V = float(_CONVERTER_STEP_V / np.sqrt(12.0))
 # Median relative deviation, after the common gain, beyond which this is not the fingertip of the calibration.
 LARGEST_DEVIATION = 0.12
 # Added to voltages that others are divided by: below it a channel's relative change is noise.
-_SMALL_V = 0.01
-# Channels whose shape a fingertip is known by.
-_WELL_ABOVE_NOISE_V = 0.03
+SMALL_V = 0.01
+# Channels whose shape a fingertip is known by, and how many of them at least.
+_WELL_ABOVE_NOISE_V, FEWEST_COMPARED = 0.03, N_CHANNELS // 4
 LARGEST_JUMPING_SHARE = 0.12
 LARGEST_UNUSABLE_SHARE = 0.25
 # Directions in which frames move while gripped or idle, which the grip's discriminant looks away from.
 _N_NUISANCE = 2
 # No recorded frame has more than two channels at its largest value: so many are at an amplifier's rail.
-_FEWEST_AT_RAIL = 9
+FEWEST_AT_RAIL = 9
 # Closing and opening take this many frames, and move the frame so much further than twisting under load.
 STEP_FRAMES, _STEP_MARGIN = 4, 1.25
 # A grip scores more than the idle frames did, by this many times their scatter, and at least by this share of the
@@ -77,7 +77,7 @@ class SideGuard:
         bases = [np.median(idle, axis=0) for idle, _, _ in recordings]
         noise = np.sqrt(np.mean([channel_noise(gripped) ** 2 for _, gripped, _ in recordings], axis=0))
         base = np.mean(bases, axis=0)
-        scale = np.where(np.isfinite(noise), noise, 1.0) / (base + _SMALL_V)
+        scale = np.where(np.isfinite(noise), noise, 1.0) / (base + SMALL_V)
         floor = 0.3 * float(np.median(scale))
         scale = np.where(np.isfinite(noise), np.maximum(scale, floor), np.inf)
         relative = [tuple(relative_to(part, own) for part in one) for own, one in zip(bases, recordings, strict=True)]
@@ -138,11 +138,11 @@ class Known:
     def __init__(self, frames: FloatArray, usable: BoolArray | np.bool_ = np.True_) -> None:
         """Take the known frames, and which channels may be compared."""
         self.frames: FloatArray = np.where(usable & (frames > _WELL_ABOVE_NOISE_V), frames, np.nan)
-        self._counts = np.isfinite(self.frames).sum(axis=-1).ravel()
+        self.counts = np.isfinite(self.frames).sum(axis=-1).ravel()
 
     def gains(self, frame: FloatArray) -> FloatArray:
         """Return the gains (…, 1) that a frame has in common with each of the known ones, NaN where there is none."""
-        found = [gain if gain > 0 else math.nan for gain in medians(frame / self.frames, self._counts)]
+        found = [gain if gain > 0 else math.nan for gain in medians(frame / self.frames, self.counts)]
         return np.array(found).reshape(*self.frames.shape[:-1], 1)
 
     def compare(self, frame: FloatArray) -> tuple[FloatArray, list[float]]:
@@ -151,26 +151,26 @@ class Known:
         After the gain in common; NaN at channels that are not compared, and where there is no gain. The medians are
         infinite there, and where too few channels are compared.
         """
-        off, found = compared(self.frames, frame, self._counts)
+        off, found = compared(self.frames, frame, self.counts)
         return off, [
-            one if n >= N_CHANNELS // 4 and not math.isnan(one) else math.inf
-            for one, n in zip(found, self._counts.tolist(), strict=True)
+            one if n >= FEWEST_COMPARED and not math.isnan(one) else math.inf
+            for one, n in zip(found, self.counts.tolist(), strict=True)
         ]
 
 
 def relative_to(frame: FloatArray, idle: FloatArray) -> FloatArray:
     """Return how far (…, 896) channels are from idle, relative to it."""
-    return np.asarray((frame - idle) / (idle + _SMALL_V))
+    return np.asarray((frame - idle) / (idle + SMALL_V))
 
 
 def unsaturated(channels: FloatArray, usable: BoolArray) -> BoolArray:
     """Return which (m, 896) channels are usable still: too many that share a side's largest value are at the rail."""
     heights = channels if everywhere(usable) else np.where(usable, channels, -np.inf)
     counts = n_largest(heights)
-    if max(counts) < _FEWEST_AT_RAIL:
+    if max(counts) < FEWEST_AT_RAIL:
         return usable
     largest = heights == heights.max(axis=-1, keepdims=True)
-    return np.asarray(usable & ~(largest & (np.array(counts) >= _FEWEST_AT_RAIL)[:, None]))
+    return np.asarray(usable & ~(largest & (np.array(counts) >= FEWEST_AT_RAIL)[:, None]))
 
 
 def _discriminant(parts: list[FloatArray]) -> FloatArray:

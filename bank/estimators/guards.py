@@ -5,11 +5,22 @@ than what it computes: so all sides are compared in the same calls.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from bank.channels import N_CHANNELS
-from bank.estimators.guard import LARGEST_DEVIATION, LARGEST_UNUSABLE_SHARE, Known, SideGuard, relative_to
+from bank.compiled import fingertips_of
+from bank.estimators.guard import (
+    FEWEST_AT_RAIL,
+    FEWEST_COMPARED,
+    LARGEST_DEVIATION,
+    LARGEST_UNUSABLE_SHARE,
+    SMALL_V,
+    Known,
+    SideGuard,
+    relative_to,
+)
 from bank.estimators.values import BoolArray, FloatArray, everywhere
 
 # A channel that jumps from frame to frame by more than this many times its noise, and this much, is disturbed.
@@ -19,11 +30,23 @@ JUMP_NOISES, JUMP_V = 6.0, 0.008
 _LOST_SHARE = 0.6
 
 
+class Placed(NamedTuple):
+    """Where a frame lies: the score of each side's grip, and the (m, 896) difference to the idle frame.
+
+    At the calibration's gain, as are the (m·p,) places of the frame and of its difference along the directions.
+    """
+
+    grips: list[float]
+    difference: FloatArray
+    place: FloatArray
+    from_idle: FloatArray
+
+
 class Guards:
     """All that is known of the m sides' fingertips; frames are (m, 896) in volts."""
 
-    def __init__(self, sides: tuple[SideGuard, ...]) -> None:
-        """Take the guards in the order of a frame's sides."""
+    def __init__(self, sides: tuple[SideGuard, ...], directions: FloatArray | None = None) -> None:
+        """Take the guards in the order of a frame's sides, and the (m, p, 896) directions that `place` goes along."""
         self.sides = sides
         self.idle: FloatArray = np.array([guard.idle for guard in sides])
         self.gripped: FloatArray = np.array([guard.gripped for guard in sides])
@@ -33,8 +56,34 @@ class Guards:
         self._jump_limits_v = np.maximum(JUMP_NOISES * np.sqrt(2.0) * noise, JUMP_V)
         self._frames = np.stack([self.idle, self.gripped], axis=1)
         self._known = Known(self._frames)
+        weights = np.array([guard.grip_weights for guard in sides])
+        self.directions: FloatArray = directions if directions is not None else np.zeros((len(sides), 0, N_CHANNELS))
+        self._compiled = fingertips_of(
+            *(self._known.frames, self._jump_limits_v, weights, self.directions, self._known.counts),
+            fewest_at_rail=FEWEST_AT_RAIL,
+            fewest_compared=FEWEST_COMPARED,
+            largest_deviation=LARGEST_DEVIATION,
+            lost_share=_LOST_SHARE,
+            small_v=SMALL_V,
+        )
         # The numbers of the sides at which a step in the frames tells a release.
         self.stepping = [i for i, one in enumerate(sides) if max(one.step_limit, one.fall_limit) < math.inf]
+
+    def jumping_if_ordinary(self, frame: FloatArray, usable: BoolArray, before: FloatArray) -> list[float] | None:
+        """Return `jumping_shares` of an ordinary frame in one call; None of others, and where nothing is compiled.
+
+        A frame is ordinary where all is usable, nothing at a rail, and `seen` finds no reason and nothing lost.
+        """
+        counts = self._compiled.check(frame, usable, before) if self._compiled is not None else None
+        return None if counts is None else [count / N_CHANNELS for count in counts]
+
+    def place(self, frame: FloatArray, usable: BoolArray, idle: FloatArray, gains: FloatArray) -> "Placed | None":
+        """Return where a frame lies in one call; None where not all is usable, and where nothing is compiled."""
+        if self._compiled is None:
+            return None
+        difference, places = np.empty(frame.shape), np.empty((2, self.directions.size // N_CHANNELS))
+        grips = self._compiled.placed(frame, usable, idle, gains, difference, places)
+        return None if grips is None else Placed(grips, difference, *places)
 
     def too_few(self, usable: BoolArray) -> list[str]:
         """Return for each side why it has too few usable channels, empty texts where it has enough."""

@@ -8,6 +8,7 @@ for long is told by.
 """
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -16,7 +17,7 @@ import numpy as np
 from bank.channels import N_CHANNELS
 from bank.estimators.grip import Grip
 from bank.estimators.guard import LARGEST_JUMPING_SHARE, STEP_FRAMES, SideGuard, unsaturated
-from bank.estimators.guards import Guards
+from bank.estimators.guards import Guards, Placed
 from bank.estimators.values import BoolArray, FloatArray, TactileFrame, everywhere
 
 # Frames that an idle baseline is averaged over at the most recent end.
@@ -87,13 +88,13 @@ class Motion:
     def _shapes(self, layer: int, noise: FloatArray) -> FloatArray:
         return np.asarray(self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2)
 
-    def features(self, places: FloatArray, difference: FloatArray) -> FloatArray:
-        """Return the features of the (n_lags + 1, m·p) last places and of the newest (m, 896) difference from idle.
+    def features(self, places: FloatArray, from_idle: FloatArray) -> FloatArray:
+        """Return the features of the (n_lags + 1, m·p) last places and of the newest one's (m·p,) from idle.
 
         n_lags · m·p of motion, the nearest lag first, and m·p of place after them where `placed` is true.
         """
         motion = (places[-1] - places[-2::-1]).ravel()
-        return np.concatenate([motion, self.places(difference)]) if self.placed else np.asarray(motion)
+        return np.concatenate([motion, from_idle]) if self.placed else np.asarray(motion)
 
 
 def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
@@ -109,7 +110,7 @@ class Memory:
         self, guards: tuple[SideGuard, ...], motion: Motion | None, period_s: float = np.inf, idle_frames: int = 0
     ) -> None:
         """Begin a session; its first `idle_frames` usable frames are, on somebody's word, of untouched fingertips."""
-        self._guards = Guards(guards)
+        self._guards = Guards(guards, motion.directions if motion is not None else None)
         # The board's, where it is known beforehand: of one that leaves out half of its frames it cannot be learned.
         self._period_s = period_s
         self._motion = motion
@@ -117,6 +118,8 @@ class Memory:
         # Where the last frames were along the directions, and the last of these frames.
         self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
         self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
+        # Where the last of them is from idle.
+        self._from_idle: FloatArray = np.zeros(0)
         # How many frames in a row were left out until now.
         self._left_out = 0
         self._idle: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in guards]
@@ -137,7 +140,7 @@ class Memory:
         self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
         self._let_go = [False for _ in guards]
         self._grips = [Grip(guard.grip_threshold) for guard in guards]
-        self._lost = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
+        self._lost = self._none_lost = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
         # Frames that are to be taken for idle ones, and those taken.
         self._idle_wanted = idle_frames
         self._idle_taken: list[FloatArray] = []
@@ -154,12 +157,11 @@ class Memory:
         return all(self._idle)
 
     @property
-    def places(self) -> FloatArray | None:
-        """The (n_lags + 1, m·p) places of the last frames at the calibration's gain, the newest last.
-
-        None while incomplete.
-        """
-        return np.array(self._recent) if len(self._recent) == self._recent.maxlen else None
+    def moved(self) -> FloatArray | None:
+        """The features of the last frames' motion, None while these are not complete, or no motion is read."""
+        if self._motion is None or len(self._recent) < self._motion.n_lags + 1:
+            return None
+        return self._motion.features(np.array(self._recent), self._from_idle)
 
     @property
     def held(self) -> FloatArray:
@@ -177,16 +179,8 @@ class Memory:
     def see(self, frame: TactileFrame) -> Moment:
         """Take a frame in and return what it looks like with what speaks against it."""
         self._pass_time(frame.t_s)
-        usable = unsaturated(frame.channels, frame.usable)
-        channels = self._filled(frame.channels, usable)
-        why, lost = self._guards.seen(channels, usable)
-        # Channels that are lost for longer are left out; while they are being lost they count as jumping.
-        disturbed = self._disturbed(channels, usable & ~(lost & self._lost))
-        self._lost = lost
-        if np.count_nonzero(lost):
-            usable = usable & ~lost
-            why = why if any(why) else self._guards.too_few(usable)
-            channels = self._filled(frame.channels, usable)
+        channels, usable, why, jumping_shares = self._looked_at(frame)
+        disturbed = self._disturbed(jumping_shares)
         if any(why):
             # One garbled frame is no other fingertip: it is left out like one that is disturbed.
             self._refused = None
@@ -204,6 +198,30 @@ class Memory:
         self._notice_release(channels)
         return self._judged(channels, usable)
 
+    def _looked_at(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, Sequence[str], Sequence[float]]:
+        """Return the channels, which are usable, why a side says nothing, and which share of each side's jumps.
+
+        Of an ordinary frame one call says it all. Without a frame before there are no shares.
+        """
+        shares: Sequence[float] | None = None
+        if self._before is not None:
+            shares = self._guards.jumping_if_ordinary(frame.channels, frame.usable, self._before)
+        if shares is not None:
+            self._lost = self._none_lost
+            return frame.channels, frame.usable, (), shares
+        usable = unsaturated(frame.channels, frame.usable)
+        channels = self._filled(frame.channels, usable)
+        why, lost = self._guards.seen(channels, usable)
+        # Channels that are lost for longer are left out; while they are being lost they count as jumping.
+        judged = usable & ~(lost & self._lost)
+        shares = self._guards.jumping_shares(channels, self._before, judged) if self._before is not None else ()
+        self._lost = lost
+        if np.count_nonzero(lost):
+            usable = usable & ~lost
+            why = why if any(why) else self._guards.too_few(usable)
+            channels = self._filled(frame.channels, usable)
+        return channels, usable, why, shares
+
     def _pass_time(self, t_s: float) -> None:
         step_s, self._t_s, self._missing = t_s - self._t_s, t_s, False
         learned_s = sorted(self._steps_s)[_STEPS // 2] if len(self._steps_s) == _STEPS else np.inf
@@ -219,11 +237,11 @@ class Memory:
             return
         self._missing = step_s > _MISSING_SHARE * period_s
 
-    def _remember(self, channels: FloatArray) -> None:
-        """Add a frame to the last ones; those that were left out or are missing before it lie on the way to it."""
+    def _remember(self, place: FloatArray) -> None:
+        """Add a place to the last ones; those that were left out or are missing before it lie on the way to it."""
         if self._missing and self._recent:
             self._stand_in()
-        place, between = self._placed(channels), 0
+        between = 0
         while between < len(self._bridged) and self._bridged[-1 - between]:
             between += 1
         if 0 < between < len(self._recent):
@@ -248,9 +266,15 @@ class Memory:
             for _ in range(1 + self._missing):
                 self._stand_in()
 
-    def _placed(self, channels: FloatArray) -> FloatArray:
-        """Return the (m·p,) places of a frame at the calibration's gain, which does not change while it is gripped."""
-        return self._motion.places(channels / self._gains) if self._motion is not None else np.zeros(0)
+    def _placed(self, channels: FloatArray, usable: BoolArray) -> Placed:
+        """Return where a frame lies at the calibration's gain, which does not change while it is gripped."""
+        placed = self._guards.place(channels, usable, self._baselines, self._gains)
+        if placed is not None:
+            return placed
+        grips, difference = self._guards.grips(channels, self._baselines), self._difference(channels, usable)
+        at_gain = np.array([channels, difference]) / self._gains
+        places = self._motion.places(at_gain) if self._motion is not None else np.zeros((2, 0))
+        return Placed(grips, at_gain[1], *places)
 
     def _taken_for_idle(self, channels: FloatArray, usable: BoolArray) -> Moment:
         self._refused, self._before = None, channels
@@ -275,13 +299,14 @@ class Memory:
         return difference
 
     def _judged(self, channels: FloatArray, usable: BoolArray) -> Moment:
-        held = [self._holds(layer, score) for layer, score in enumerate(self._guards.grips(channels, self._baselines))]
+        grips, difference, place, from_idle = self._placed(channels, usable)
+        held = [self._holds(layer, score) for layer, score in enumerate(grips)]
         loose = [one.side for layer, one in enumerate(self._guards.sides) if self._let_go[layer] or not held[layer]]
-        difference = self._difference(channels, usable) / self._gains
         if loose:
             self._forget_grip()
             return Moment(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
-        self._remember(channels)
+        self._remember(place)
+        self._from_idle = from_idle
         missing = (self._recent.maxlen or 0) - len(self._recent)
         if missing:
             return Moment(channels, difference, (f"gripped too lately: {missing} more frames are needed",), usable)
@@ -326,11 +351,8 @@ class Memory:
             self._leave_out()
         return Moment(channels, np.zeros_like(channels), (disturbed,), usable)
 
-    def _disturbed(self, channels: FloatArray, usable: BoolArray) -> str | None:
-        if self._before is None:
-            return None
-        shares = self._guards.jumping_shares(channels, self._before, usable)
-        for guard, share in zip(self._guards.sides, shares, strict=True):
+    def _disturbed(self, jumping_shares: Sequence[float]) -> str | None:
+        for guard, share in zip(self._guards.sides, jumping_shares, strict=False):
             if share > LARGEST_JUMPING_SHARE:
                 return (
                     f"{guard.side} fingertip: {100 * share:.0f} % of the channels jumped since the frame before; "

@@ -118,12 +118,13 @@ class TactileFrame:
     @classmethod
     def of(cls, t_s: float, channels: FloatArray, usable: BoolArray | None = None) -> "TactileFrame":
         """Return a frame; channels that are not finite are never usable."""
+        # One after the other in memory, so that a sum over channels is the same to the bit whoever made the frame.
+        channels = np.ascontiguousarray(channels)
         finite = np.isfinite(channels)
         if not everywhere(finite):
             channels = np.where(finite, channels, 0.0)
             usable = finite if usable is None else finite & usable
-        # One after the other in memory, so that a sum over channels is the same to the bit whoever made the frame.
-        return cls(t_s, np.ascontiguousarray(channels), finite if usable is None else usable)
+        return cls(t_s, channels, finite if usable is None else usable)
 
 
 def everywhere(mask: BoolArray) -> bool:

@@ -1,0 +1,70 @@
+/* What a frame looks like to who knows its fingertip: whether it is an ordinary one, and where it lies.
+
+   Sums are taken in four parts, in the same order on every machine. */
+
+#include "look.h"
+
+#include <math.h>
+
+enum { PARTS = 4 };
+
+static int are_finite(const double *row)
+{
+    int n = 0;
+    for (int i = 0; i < MOST_VALUES; i++)
+        n += isfinite(row[i]) != 0;
+    return n == MOST_VALUES;
+}
+
+static double product(const double *a, const double *b)
+{
+    double sums[PARTS] = {0};
+    for (int i = 0; i < MOST_VALUES; i += PARTS)
+        for (int j = 0; j < PARTS; j++)
+            sums[j] += a[i + j] * b[i + j];
+    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+}
+
+int is_ordinary(const Fingertip *tip, const Limits *limits, const double *frame)
+{
+    double off[2][MOST_VALUES];
+    int n_lost = 0, is_known = 0;
+    if (!are_finite(frame) || n_largest_of(frame) >= limits->fewest_at_rail)
+        return 0;
+    for (int i = 0; i < 2; i++) {
+        int64_t n_compared = tip->n_known[i];
+        int n_near = 0;
+        compare(tip->known[i], frame, n_compared, off[i]);
+        for (int j = 0; j < MOST_VALUES; j++)
+            n_near += off[i][j] <= limits->largest_deviation;
+        is_known |= n_compared >= limits->fewest_compared && n_near > n_compared / 2;
+    }
+    for (int i = 0; i < MOST_VALUES; i++)
+        n_lost += (off[0][i] > limits->lost_share) & (off[1][i] > limits->lost_share);
+    return is_known && n_lost == 0;
+}
+
+int n_jumping(const Fingertip *tip, const double *frame, const double *before)
+{
+    int n = 0;
+    for (int i = 0; i < MOST_VALUES; i++)
+        n += fabs(frame[i] - before[i]) > tip->jumps_v[i];
+    return n;
+}
+
+double place(const Fingertip *tip, double small_v, const double *frame, const double *idle, double gain, double *difference,
+             double *places, double *placed)
+{
+    double scaled[MOST_VALUES], relative[MOST_VALUES];
+    for (int i = 0; i < MOST_VALUES; i++) {
+        double moved = frame[i] - idle[i];
+        relative[i] = moved / (idle[i] + small_v);
+        difference[i] = moved / gain;
+        scaled[i] = frame[i] / gain;
+    }
+    for (ptrdiff_t i = 0; i < tip->n_directions; i++) {
+        places[i] = product(scaled, tip->directions + i * MOST_VALUES);
+        placed[i] = product(difference, tip->directions + i * MOST_VALUES);
+    }
+    return product(relative, tip->weights);
+}

@@ -1,7 +1,8 @@
 """Estimators: `fit` makes a calibration from recordings, a `Tracker` turns frames into estimates with it."""
 
 from bank.estimators.calibrated import NAMES, Calibration, Name, Tracker
-from bank.estimators.fitting import Physics, fit
+from bank.estimators.fitting import fit
+from bank.estimators.fitting_choices import Physics
 from bank.estimators.values import Estimate, FrameSeries, Measured, TactileFrame, fused
 
 __all__ = [

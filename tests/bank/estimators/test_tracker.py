@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bank.errors import CalibrationError
-from bank.estimators import Estimate, FrameSeries, Measured, TactileFrame, Tracker, fit, fitting
+from bank.estimators import Estimate, FrameSeries, Measured, TactileFrame, Tracker, fit, fitting, fitting_raw
 
 
 def changed(series, **content):
@@ -221,7 +221,7 @@ def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(fused_calibratio
 
 def test_the_tool_of_a_calibration_is_the_one_that_the_gripper_held(recorded, monkeypatch):
     """Two grips of one tool differ by less than the gripper can tell; two tools are not one."""
-    monkeypatch.setattr(fitting, "_fit_raw", lambda blank, *_: blank)
+    monkeypatch.setattr(fitting, "fit_raw", lambda blank, *_: blank)
 
     def named(*held):
         series = [replace(recorded, gripped_mm=tool) for tool in held]
@@ -233,7 +233,7 @@ def test_the_tool_of_a_calibration_is_the_one_that_the_gripper_held(recorded, mo
 
 
 def test_tools_that_turn_differently_give_no_torque_where_their_diameters_are_only_felt(twisting, monkeypatch):
-    monkeypatch.setattr(fitting, "_TOOLS_MAY_LEAVE", 0.0)
+    monkeypatch.setattr(fitting_raw, "_TOOLS_MAY_LEAVE", 0.0)
     short = [replace(twisting(cycles=3, tips=(0,)), gripped_mm=Measured(mm, 1.0)) for mm in (10.0, 20.0)]
     with pytest.raises(CalibrationError, match="the tools of 10 and 20 mm turn so differently"):
         fit("fused", short, "a played rig", trust_times=True)

@@ -1,0 +1,97 @@
+"""Fitting an estimator to slices: differences of one fingertip, each with a torque or a diameter."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from bank.errors import CalibrationError
+from bank.estimators.calibrated import Calibration, Task, columns_for, features_of
+from bank.estimators.familiar import DifferenceGuard
+from bank.estimators.fitting_choices import Physics, ks_of, locator_of, ridge_for, strengths_for
+from bank.estimators.heads import Curve, later_origins
+from bank.estimators.mixtures import Mixtures
+from bank.estimators.physics import Locator
+from bank.estimators.reader import Head, fit_reader
+from bank.estimators.values import FloatArray, FrameSeries
+
+# The curve of frames over torque and over diameter: degree, directions of drift, and whether there is a trend. Of the
+# torque's the mean error over six origins (19 to 44 of 49 slices, judged on all that follow) was least for these
+# (docs/decisions/0042).
+_TORQUE_CURVE, _DIAMETER_CURVE = (3, 3, True), (1, 1, False)
+# With a block left out, as many are left as it takes to know what is familiar.
+_LEAST_TORQUE_SLICES = 10
+
+
+def fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:
+    """Return a blank calibration with what slices in time order tell of torque and diameter.
+
+    Raises CalibrationError for slices of several fingertips, and for too few.
+    """
+    if len(blank.sides) > 1:
+        raise CalibrationError(
+            f"slices of {len(blank.sides)} fingertips ({', '.join(blank.sides)}) do not go into one calibration; make "
+            "one for each"
+        )
+    frames = np.concatenate([one.channels for one in recordings])
+    times = _consecutive([one.t_s for one in recordings])
+    torque = np.concatenate([one.torque_at_frames() for one in recordings])
+    diameter = np.concatenate([one.diameter_mm for one in recordings])
+    registered = locator_of(blank, physics)
+    tasks = {}
+    for name, values in (("torque", torque), ("diameter", diameter)):
+        # Cylinders were twisted too, at one torque each: that does not determine a torque.
+        known = np.isfinite(values) & (np.isfinite(diameter) if name == "diameter" else ~np.isfinite(diameter))
+        if not known.any():
+            continue
+        if name == "torque" and known.sum() < _LEAST_TORQUE_SLICES:
+            raise CalibrationError(
+                f"{known.sum()} slices with a torque are too few to calibrate on; record {_LEAST_TORQUE_SLICES} or more"
+            )
+        differences = np.abs(frames[known])
+        features = np.array(
+            [
+                features_of(blank, registered, one, None, t).features
+                for one, t in zip(differences, times[known].tolist(), strict=True)
+            ]
+        )
+        columns = columns_for(blank.estimator, name, features)
+        later = _mixtures(blank, registered, differences[:, 0], times[known]) if name == "torque" else None
+        curve = _TORQUE_CURVE if name == "torque" else _DIAMETER_CURVE
+        reader = fit_reader(
+            columns,
+            values[known],
+            _curve(curve) if blank.estimator == "fused" else ridge_for(blank.estimator),
+            strengths=strengths_for(blank.estimator),
+            left_out=later_origins(int(known.sum())) if name == "torque" else (),
+            difficulty=later.difficulty if later is not None else None,
+            mixed=later.passing if later is not None else None,
+        )
+        tasks[name] = Task(reader, DifferenceGuard.fit(differences[:, 0]), ks_of(blank.estimator, features))
+    if not tasks:
+        raise CalibrationError("the slices come with neither torque nor diameter")
+    return replace(blank, torque=tasks.get("torque"), diameter=tasks.get("diameter"))
+
+
+def _mixtures(blank: Calibration, locator: Locator | None, differences: FloatArray, t_s: FloatArray) -> Mixtures:
+    """Return (n, 896) differences at (n,) times with what may be hidden in them, as the torque is read from it."""
+
+    def features(difference: FloatArray, row: int) -> FloatArray:
+        seen = features_of(blank, locator, difference[None], None, float(t_s[row]))
+        return columns_for(blank.estimator, "torque", seen.features)
+
+    return Mixtures(differences, features)
+
+
+def _curve(shape: tuple[int, int, bool]) -> Callable[[FloatArray, FloatArray, float], Head]:
+    degree, n_drift, trend = shape
+    return lambda features, values, _: Curve.fit(features, values, degree, n_drift, trend=trend)
+
+
+def _consecutive(times: list[FloatArray]) -> FloatArray:
+    """Return the times of several series one after another, each beginning one later than the one before has ended."""
+    shifted: list[FloatArray] = []
+    for one in times:
+        begins_early = bool(shifted) and one[0] <= shifted[-1][-1]
+        shifted.append(one - one[0] + shifted[-1][-1] + 1.0 if begins_early else one)
+    return np.concatenate(shifted)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from bank.errors import CalibrationError
-from bank.estimators.values import FloatArray
+from bank.estimators.values import BoolArray, FloatArray
 
 # Readings below this share of the largest torque count as "the lever does not touch".
 CENSORED_SHARE = 0.02
@@ -183,17 +183,25 @@ class Curve:
         )  # fmt: skip
 
     def predict(self, features: FloatArray) -> FloatArray:
-        """Return the (n,) values of (n, d + 1) frames, the last column being their times."""
-        return np.array([self.estimate(frame[:-1], float(frame[-1])) for frame in features])
-
-    def estimate(self, frame: FloatArray, t: float) -> float:
-        """Return a (d,) frame's value at the time t; channels that are NaN are left out.
+        """Return the (n,) values of (n, d + 1) frames, the last column being their times; NaN channels are left out.
 
         A time before the last one that was fitted to is taken for that one: somebody counts from the beginning again.
         """
-        x = frame[self.channels] / self.spread
-        keep = np.isfinite(x)
-        b, v, x = self.coefficients[:, keep], self.drift[:, keep], x[keep]
+        costs: dict[tuple[float, bytes], _Cost] = {}
+        values = []
+        for frame in features:
+            x, t = frame[self.channels] / self.spread, float(frame[-1])
+            keep = np.isfinite(x)
+            # Mixtures are of a few times, with hundreds of frames each.
+            key = t, keep.tobytes()
+            if key not in costs:
+                costs[key] = self._cost(keep, t)
+            values.append(costs[key].least(x[keep]))
+        return np.array(values)
+
+    def _cost(self, keep: BoolArray, t: float) -> "_Cost":
+        """Return what a value costs at the time t, by a frame's (q,) channels to keep."""
+        b, v = self.coefficients[:, keep], self.drift[:, keep]
         later = float(_age(np.array([max(t, self.last_t)]), self.first_t, self.last_t)[0])
         b[: len(self.trend)] += later * self.trend[:, keep]
         inner = np.linalg.inv(np.diag(self.noise**2 / self.drift_variance) + v @ v.T)
@@ -201,11 +209,24 @@ class Curve:
         def whitened(rows: FloatArray) -> FloatArray:
             return np.asarray((rows - (rows @ v.T) @ inner @ v) / self.noise**2)
 
-        gram, projection = whitened(b) @ b.T, whitened(b) @ x
         grid = np.linspace(self.low, self.high, 401)
         powers = np.vander((grid - self.centre) / self.scale, len(b), increasing=True)
-        cost = np.einsum("ij,jk,ik->i", powers, gram, powers) - 2 * powers @ projection
-        return _refined(grid, cost)
+        weights = whitened(b)
+        return _Cost(grid, powers, weights, np.einsum("ij,jk,ik->i", powers, weights @ b.T, powers))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Cost:
+    """What values on a grid (g,) cost: of themselves (g,), and by powers (g, p) with weights (p, q) of a frame."""
+
+    grid: FloatArray
+    powers: FloatArray
+    weights: FloatArray
+    of_itself: FloatArray
+
+    def least(self, x: FloatArray) -> float:
+        """Return the value of a scaled frame (q,), which costs least."""
+        return _refined(self.grid, self.of_itself - 2 * self.powers @ (self.weights @ x))
 
 
 def _age(t: FloatArray, first_t: float, last_t: float) -> FloatArray:

@@ -195,10 +195,11 @@ def _hidden(
     for head, passing in seen:
         if not len(passing.rows):
             continue
+        own, which = np.unique(passing.rows, return_inverse=True)
         pure, mixed = (
-            np.array([_shown(head, one) for one in head.predict(rows)])
-            for rows in (features[passing.rows], passing.features)
+            np.array([_shown(head, one) for one in head.predict(rows)]) for rows in (features[own], passing.features)
         )
+        pure = pure[which]
         # More slices mend the error of the slices, and not what is mixed in.
         astray.append((inflation * (pure - values[passing.rows]) + mixed - pure) / passing.nearness)
     found = np.concatenate(astray)

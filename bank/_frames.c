@@ -125,7 +125,7 @@ typedef struct {
     int n;
 } Taken;
 
-/* The bytes of one more array; NULL for one of another size or format (NULL: whatever it is), or not in one piece. */
+/* The bytes of one more array; NULL for one of another size or format (below 0, NULL: whatever it is), or in pieces. */
 static void *take(Taken *taken, PyObject *array, const char *format, Py_ssize_t n_bytes, int flags)
 {
     Py_buffer *buffer = &taken->buffers[taken->n];
@@ -134,7 +134,7 @@ static void *take(Taken *taken, PyObject *array, const char *format, Py_ssize_t 
         return NULL;
     }
     taken->n++;
-    return buffer->len == n_bytes && (!format || strcmp(buffer->format, format) == 0) ? buffer->buf : NULL;
+    return (n_bytes < 0 || buffer->len == n_bytes) && (!format || strcmp(buffer->format, format) == 0) ? buffer->buf : NULL;
 }
 
 static void give_back(Taken *taken)
@@ -232,6 +232,132 @@ PyDoc_STRVAR(placed_doc,
 "Return the score of each side's grip, and write the (m, 896) difference to the idle frame at the calibration's gain, and\n"
 "where the frame at that gain, and the difference, lie along the directions, (2, m, p). None where not all is usable.");
 
+/* Take arrays of as many values as the first, the first to be written to or not; their number, −1 where they are not. */
+static Py_ssize_t take_alike(Taken *taken, PyObject *const *arrays, double **values, int n_arrays, int first_flags)
+{
+    Py_ssize_t n_bytes = -1;
+    for (int i = 0; i < n_arrays; i++) {
+        if (!(values[i] = take(taken, arrays[i], "d", n_bytes, i ? 0 : first_flags)))
+            return -1;
+        n_bytes = taken->buffers[0].len;
+    }
+    return n_bytes / (Py_ssize_t)sizeof(double);
+}
+
+static PyObject *all_finite(PyObject *module, PyObject *array)
+{
+    (void)module;
+    Taken taken = {.n = 0};
+    double *values;
+    Py_ssize_t n = take_alike(&taken, &array, &values, 1, 0);
+    PyObject *found = n < 0 ? Py_NewRef(Py_None) : PyBool_FromLong(are_finite(values, n));
+    give_back(&taken);
+    return found;
+}
+
+PyDoc_STRVAR(all_finite_doc,
+"all_finite(values) -> bool | None\n\n"
+"Return whether all of an array are finite; None of one that is not float64, or in pieces, as the others here.");
+
+static PyObject *deviation(PyObject *module, PyObject *args)
+{
+    (void)module;
+    PyObject *arrays[3];
+    Taken taken = {.n = 0};
+    double *values[3];
+    if (!PyArg_ParseTuple(args, "OOO", &arrays[0], &arrays[1], &arrays[2]))
+        return NULL;
+    Py_ssize_t n = take_alike(&taken, arrays, values, 3, 0);
+    PyObject *found = n < 0 ? Py_NewRef(Py_None) : PyFloat_FromDouble(weighed(values[0], values[1], values[2], n));
+    give_back(&taken);
+    return found;
+}
+
+PyDoc_STRVAR(deviation_doc,
+"deviation(values, mean, weights) -> float | None\n\n"
+"Return (values − mean) · weights of arrays of equal length.");
+
+static PyObject *beyond(PyObject *module, PyObject *args)
+{
+    (void)module;
+    PyObject *arrays[3];
+    Taken taken = {.n = 0};
+    double *values[3], times;
+    if (!PyArg_ParseTuple(args, "OOOd", &arrays[0], &arrays[1], &arrays[2], &times))
+        return NULL;
+    Py_ssize_t n = take_alike(&taken, arrays, values, 3, 0);
+    PyObject *found = n < 0 ? Py_NewRef(Py_None) : PyLong_FromSsize_t(n_beyond(values[0], values[1], values[2], times, n));
+    give_back(&taken);
+    return found;
+}
+
+PyDoc_STRVAR(beyond_doc,
+"beyond(values, centre, reach, times) -> int | None\n\n"
+"Return how many values are further from the centre than so many times their reach.");
+
+static PyObject *follow(PyObject *module, PyObject *args)
+{
+    (void)module;
+    PyObject *arrays[2];
+    Taken taken = {.n = 0};
+    double *values[2], n_rows;
+    if (!PyArg_ParseTuple(args, "OOd", &arrays[0], &arrays[1], &n_rows))
+        return NULL;
+    Py_ssize_t n = take_alike(&taken, arrays, values, 2, PyBUF_WRITABLE);
+    if (n >= 0)
+        add_to_mean(values[0], values[1], n_rows, n);
+    give_back(&taken);
+    return PyBool_FromLong(n >= 0);
+}
+
+PyDoc_STRVAR(follow_doc,
+"follow(mean, values, n) -> bool\n\n"
+"Make `mean`, in its place, that of n rows of which `values` are the last; False where it was left alone.");
+
+/* Write how far the last of the places is from each before it, the nearest first, and then `at`; 0 where they do not fit. */
+static int write_motion(PyObject *places, PyObject *at, PyObject *features)
+{
+    Taken taken = {.n = 0};
+    Py_ssize_t n_places = PyTuple_Size(places), n_lags = n_places - 1, n;
+    int sound = 0, has_tail = at != Py_None;
+    const double *newest = n_places < 1 ? NULL : take(&taken, PyTuple_GetItem(places, n_lags), "d", -1, 0), *tail = NULL;
+    if (!newest)
+        goto end;
+    n = taken.buffers[0].len / (Py_ssize_t)sizeof(double);
+    double *to = take(&taken, features, "d", (n_lags + has_tail) * taken.buffers[0].len, PyBUF_WRITABLE);
+    if (!to || (has_tail && !(tail = take(&taken, at, "d", taken.buffers[0].len, 0))))
+        goto end;
+    for (Py_ssize_t lag = 1; lag <= n_lags; lag++, to += n) {
+        Taken one = {.n = 0};
+        const double *place = take(&one, PyTuple_GetItem(places, n_lags - lag), "d", taken.buffers[0].len, 0);
+        for (Py_ssize_t i = 0; place && i < n; i++)
+            to[i] = newest[i] - place[i];
+        give_back(&one);
+        if (!place)
+            goto end;
+    }
+    if (tail)
+        memcpy(to, tail, (size_t)n * sizeof(double));
+    sound = 1;
+end:
+    give_back(&taken);
+    return sound;
+}
+
+static PyObject *motion(PyObject *module, PyObject *args)
+{
+    (void)module;
+    PyObject *places, *at, *features;
+    if (!PyArg_ParseTuple(args, "O!OO", &PyTuple_Type, &places, &at, &features))
+        return NULL;
+    return PyBool_FromLong(write_motion(places, at, features));
+}
+
+PyDoc_STRVAR(motion_doc,
+"motion(places, at, features) -> bool\n\n"
+"Write into `features` how far the last of a tuple of places is from each before it, the nearest first, and `at`, where that\n"
+"is not None. False where that was not done.");
+
 /* Copy what is known of the fingertips; 0 with an error where that is not of their number, or there is no memory. */
 static int copy(Fingertips *f, Py_ssize_t n_directions, PyObject *const *arrays, Taken *taken)
 {
@@ -322,8 +448,13 @@ static PyType_Spec fingertips_spec = {
 };
 
 static PyMethodDef module_functions[] = {
+    {"all_finite", all_finite, METH_O, all_finite_doc},
+    {"beyond", beyond, METH_VARARGS, beyond_doc},
     {"compared", compared, METH_VARARGS, compared_doc},
+    {"deviation", deviation, METH_VARARGS, deviation_doc},
+    {"follow", follow, METH_VARARGS, follow_doc},
     {"medians", medians, METH_VARARGS, medians_doc},
+    {"motion", motion, METH_VARARGS, motion_doc},
     {"n_largest", n_largest, METH_O, n_largest_doc},
     {NULL, NULL, 0, NULL},
 };

@@ -125,6 +125,40 @@ def n_largest(rows: FloatArray) -> list[int]:
     return _frames.n_largest(np.ascontiguousarray(rows, dtype=np.float64))
 
 
+def all_finite(values: FloatArray) -> bool:
+    """Return whether all values are finite."""
+    found = _frames.all_finite(values) if IS_COMPILED else None
+    return bool(np.count_nonzero(np.isfinite(values)) == values.size) if found is None else found
+
+
+def deviation(values: FloatArray, mean: FloatArray, weights: FloatArray) -> float:
+    """Return (values − mean) · weights of (n,) arrays."""
+    found = _frames.deviation(values, mean, weights) if IS_COMPILED else None
+    return float((values - mean) @ weights) if found is None else found
+
+
+def n_beyond(values: FloatArray, centre: FloatArray, reach: FloatArray, times: float) -> int:
+    """Return how many of (n,) values are further from the centre than so many times their reach."""
+    found = _frames.beyond(values, centre, reach, times) if IS_COMPILED else None
+    return int(np.count_nonzero(np.abs(values - centre) > times * reach)) if found is None else found
+
+
+def follow(mean: FloatArray, values: FloatArray, n: int) -> None:
+    """Make a mean, in its place, that of n arrays of which `values` are the last."""
+    if not (IS_COMPILED and _frames.follow(mean, values, n)):
+        mean += (values - mean) / n
+
+
+def motion(places: tuple[FloatArray, ...], at: FloatArray | None) -> FloatArray:
+    """Return how far the last of (n,) places is from each before it, the nearest first, and then `at` (n,), flat."""
+    features = np.empty((len(places) - (at is None)) * len(places[-1]))
+    if IS_COMPILED and _frames.motion(places, at, features):
+        return features
+    rows = np.array(places)
+    moved = (rows[-1] - rows[-2::-1]).ravel()
+    return moved if at is None else np.concatenate([moved, at])
+
+
 def fingertips_of(
     known: FloatArray,
     jumps_v: FloatArray,

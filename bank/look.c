@@ -8,12 +8,12 @@
 
 enum { PARTS = 4 };
 
-static int are_finite(const double *row)
+int are_finite(const double *values, ptrdiff_t n)
 {
-    int n = 0;
-    for (int i = 0; i < MOST_VALUES; i++)
-        n += isfinite(row[i]) != 0;
-    return n == MOST_VALUES;
+    ptrdiff_t n_finite = 0;
+    for (ptrdiff_t i = 0; i < n; i++)
+        n_finite += isfinite(values[i]) != 0;
+    return n_finite == n;
 }
 
 static double product(const double *a, const double *b)
@@ -29,7 +29,7 @@ int is_ordinary(const Fingertip *tip, const Limits *limits, const double *frame)
 {
     double off[2][MOST_VALUES];
     int n_lost = 0, is_known = 0;
-    if (!are_finite(frame) || n_largest_of(frame) >= limits->fewest_at_rail)
+    if (!are_finite(frame, MOST_VALUES) || n_largest_of(frame) >= limits->fewest_at_rail)
         return 0;
     for (int i = 0; i < 2; i++) {
         int64_t n_compared = tip->n_known[i];
@@ -67,4 +67,26 @@ double place(const Fingertip *tip, double small_v, const double *frame, const do
         placed[i] = product(difference, tip->directions + i * MOST_VALUES);
     }
     return product(relative, tip->weights);
+}
+
+double weighed(const double *values, const double *mean, const double *weights, ptrdiff_t n)
+{
+    double sums[PARTS] = {0};
+    for (ptrdiff_t i = 0; i < n; i++)
+        sums[i % PARTS] += (values[i] - mean[i]) * weights[i];
+    return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+}
+
+ptrdiff_t n_beyond(const double *values, const double *centre, const double *reach, double times, ptrdiff_t n)
+{
+    ptrdiff_t found = 0;
+    for (ptrdiff_t i = 0; i < n; i++)
+        found += fabs(values[i] - centre[i]) > times * reach[i];
+    return found;
+}
+
+void add_to_mean(double *mean, const double *values, double n_rows, ptrdiff_t n)
+{
+    for (ptrdiff_t i = 0; i < n; i++)
+        mean[i] += (values[i] - mean[i]) / n_rows;
 }

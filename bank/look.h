@@ -35,4 +35,16 @@ int n_jumping(const Fingertip *tip, const double *frame, const double *before);
 double place(const Fingertip *tip, double small_v, const double *frame, const double *idle, double gain, double *difference,
              double *places, double *placed);
 
+/* Of n values. Whether all are finite. */
+int are_finite(const double *values, ptrdiff_t n);
+
+/* Their deviations from a mean, each times its weight, in sum. */
+double weighed(const double *values, const double *mean, const double *weights, ptrdiff_t n);
+
+/* How many are further from the centre than so many times their reach. */
+ptrdiff_t n_beyond(const double *values, const double *centre, const double *reach, double times, ptrdiff_t n);
+
+/* Make a mean of n_rows − 1 rows that of n_rows, of which these values are the last. */
+void add_to_mean(double *mean, const double *values, double n_rows, ptrdiff_t n);
+
 #endif

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from bank.compiled import deviation
 from bank.errors import CalibrationError
 from bank.estimators.values import BoolArray, FloatArray
 
@@ -64,6 +65,10 @@ class Ridge:
         """Return the (n,) values of (n, d) features."""
         return np.asarray(self.offset + (features - self.mean) @ self.weights)
 
+    def value(self, features: FloatArray) -> float:
+        """Return the value of (d,) features."""
+        return self.offset + deviation(features, self.mean, self.weights)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Censored:
@@ -108,6 +113,10 @@ class Censored:
     def predict(self, features: FloatArray) -> FloatArray:
         """Return the (n,) latent values of (n, d) features, in the direction of the lever's push."""
         return np.asarray(self.offset + (features - self.mean) @ self.weights)
+
+    def value(self, features: FloatArray) -> float:
+        """Return the latent value of (d,) features."""
+        return self.offset + deviation(features, self.mean, self.weights)
 
 
 def _below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
@@ -198,6 +207,10 @@ class Curve:
                 costs[key] = self._cost(keep, t)
             values.append(costs[key].least(x[keep]))
         return np.array(values)
+
+    def value(self, features: FloatArray) -> float:
+        """Return the value of a (d + 1,) frame, its time last; NaN channels are left out."""
+        return float(self.predict(features[None])[0])
 
     def _cost(self, keep: BoolArray, t: float) -> "_Cost":
         """Return what a value costs at the time t, by a frame's (q,) channels to keep."""

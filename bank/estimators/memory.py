@@ -15,6 +15,7 @@ from typing import Self
 import numpy as np
 
 from bank.channels import N_CHANNELS
+from bank.compiled import follow, motion
 from bank.estimators.grip import Grip
 from bank.estimators.guard import LARGEST_JUMPING_SHARE, STEP_FRAMES, SideGuard, unsaturated
 from bank.estimators.guards import Guards, Placed
@@ -88,13 +89,12 @@ class Motion:
     def _shapes(self, layer: int, noise: FloatArray) -> FloatArray:
         return np.asarray(self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2)
 
-    def features(self, places: FloatArray, from_idle: FloatArray) -> FloatArray:
-        """Return the features of the (n_lags + 1, m·p) last places and of the newest one's (m·p,) from idle.
+    def features(self, places: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
+        """Return the features of the n_lags + 1 last (m·p,) places and of the newest one's from idle.
 
         n_lags · m·p of motion, the nearest lag first, and m·p of place after them where `placed` is true.
         """
-        motion = (places[-1] - places[-2::-1]).ravel()
-        return np.concatenate([motion, from_idle]) if self.placed else np.asarray(motion)
+        return motion(tuple(places), from_idle if self.placed else None)
 
 
 def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
@@ -161,13 +161,14 @@ class Memory:
         """The features of the last frames' motion, None while these are not complete, or no motion is read."""
         if self._motion is None or len(self._recent) < self._motion.n_lags + 1:
             return None
-        return self._motion.features(np.array(self._recent), self._from_idle)
+        return self._motion.features(self._recent, self._from_idle)
 
     @property
     def held(self) -> FloatArray:
         """The (m, 896) mean difference to the idle frame of this grip's last frames that nothing spoke against.
 
-        What does not change while a tool is held is read from it: a single frame has several times the noise.
+        It goes on changing, in its place. What does not change while a tool is held is read from it: a single frame
+        has several times the noise.
         """
         return self._held
 
@@ -317,7 +318,10 @@ class Memory:
 
     def _hold(self, difference: FloatArray) -> None:
         self._n_held = min(self._n_held + 1, _HELD_FRAMES)
-        self._held = difference if self._n_held == 1 else self._held + (difference - self._held) / self._n_held
+        if self._n_held == 1:
+            self._held = difference.copy()
+        else:
+            follow(self._held, difference, self._n_held)
 
     def _holds(self, layer: int, score: float) -> bool:
         """Return whether a fingertip is gripped; with a baseline of a few frames only an outright grip is one."""

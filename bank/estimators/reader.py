@@ -7,6 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from bank.compiled import n_beyond
 from bank.errors import CalibrationError
 from bank.estimators.heads import Censored, Curve, Ridge, Rows, best_strength, later_splits, left_out_blocks
 from bank.estimators.intervals import LEVEL, Intervals
@@ -80,7 +81,7 @@ class Reader:
         Where the lever of the calibration did not touch, the tool may have been twisted the other way as far as the
         frames say: nothing that was read then denies it.
         """
-        raw = float(self.head.predict(features[None])[0])
+        raw = self.head.value(features)
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
         value, beyond = _shown(self.head, raw), _UNSEEN * (self.high - self.low)
@@ -104,7 +105,7 @@ class Reader:
                 f"the {name} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to "
                 f"{self.high:.3g} {unit}",
             )
-        if len(self.reach) and np.count_nonzero(np.abs(features - self.mean_feature) > _LARGEST_REACH * self.reach):
+        if len(self.reach) and n_beyond(features, self.mean_feature, self.reach, _LARGEST_REACH):
             return ("the frame moves further or faster than any at calibration",)
         return ()
 

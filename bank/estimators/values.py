@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bank.channels import N_CHANNELS
+from bank.compiled import all_finite
 from bank.errors import CalibrationError
 from bank.gaussian import TWO_SIDED_95
 
@@ -120,11 +121,11 @@ class TactileFrame:
         """Return a frame; channels that are not finite are never usable."""
         # One after the other in memory, so that a sum over channels is the same to the bit whoever made the frame.
         channels = np.ascontiguousarray(channels)
-        finite = np.isfinite(channels)
-        if not everywhere(finite):
+        if not all_finite(channels):
+            finite = np.isfinite(channels)
             channels = np.where(finite, channels, 0.0)
             usable = finite if usable is None else finite & usable
-        return cls(t_s, channels, finite if usable is None else usable)
+        return cls(t_s, channels, np.ones(channels.shape, dtype=np.bool_) if usable is None else usable)
 
 
 def everywhere(mask: BoolArray) -> bool:

@@ -132,6 +132,59 @@ def test_a_frame_is_compared_as_by_numpy_to_the_bit(m: int, k: int, seed: int, l
         np.testing.assert_array_equal(compiled.compared(known[0], frame[0], counts)[0], off[0])
 
 
+# Sizes of arrays, and what one of their values is.
+SIZES, ODD = (
+    st.sampled_from([1, 2, 3, 4, 5, 52, N_CHANNELS]),
+    st.sampled_from([1.0, 0.0, 5e-324, -1e300, np.inf, np.nan]),
+)
+
+
+@given(SIZES, st.integers(1, 3), ODD, st.integers(0, 2**32 - 1), st.sampled_from(["<f8", ">f8", "<f4", "<i8"]))
+def test_what_is_said_of_a_few_arrays_is_what_numpy_says(n: int, apart: int, odd: float, seed: int, kind: str) -> None:
+    """Arrays in pieces, or of other numbers, are left to numpy."""
+    random = np.random.default_rng(seed)
+    values, mean, weights, reach = 3.0 * random.normal(size=(4, n * apart))[:, ::apart]
+    values[random.integers(n)] = odd
+    with np.errstate(all="ignore"):
+        values = values.astype(kind)
+        assert compiled.all_finite(values) == np.isfinite(values).all()
+        expected = np.count_nonzero(np.abs(values - mean) > 1.6 * reach)
+        assert compiled.n_beyond(values, mean, reach, 1.6) == expected
+        found, expected = compiled.deviation(values, mean, weights), (values - mean) @ weights
+        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * (np.abs(values - mean) @ np.abs(weights)))
+        followed = mean.copy() if apart == 1 else mean
+        expected = mean + (values - mean) / 7
+        compiled.follow(followed, values, 7)
+        np.testing.assert_array_equal(followed, expected)
+
+
+@given(SIZES, st.integers(1, 13), st.booleans(), st.integers(0, 2**32 - 1), st.sampled_from(["<f8", "<f4"]))
+def test_motion_is_how_far_the_last_place_is_from_those_before(n, n_places, with_tail, seed, kind) -> None:
+    random = np.random.default_rng(seed)
+    places, tail = tuple(random.normal(size=(n_places, n)).astype(kind)), random.normal(size=n) if with_tail else None
+    found = compiled.motion(places, tail)
+    moved = [places[-1] - places[-1 - lag] for lag in range(1, n_places)]
+    np.testing.assert_array_equal(found, np.concatenate([np.zeros(0), *moved, *([tail] if with_tail else [])]))
+    np.testing.assert_array_equal(found, without_compiler(compiled.motion, places, tail))
+
+
+def test_at_its_reach_a_value_is_not_beyond() -> None:
+    for values, expected in (([2.0, -2.0], 0), ([2.0, -2.1], 1)):
+        assert compiled.n_beyond(np.array(values), np.zeros(2), np.ones(2), 2.0) == expected
+
+
+def test_places_of_several_lengths_are_no_motion() -> None:
+    places = np.zeros(4), np.zeros(3), np.zeros(4)
+    with pytest.raises(ValueError, match="inhomogeneous"):
+        compiled.motion(places, None)
+    with pytest.raises(ValueError, match="broadcast"):
+        compiled.deviation(np.zeros(3), np.zeros(4), np.zeros(4))
+    if compiled.IS_COMPILED:
+        assert not compiled._frames.motion((), None, np.zeros(0))
+        assert not compiled._frames.motion(places[:1], np.zeros(5), np.zeros(5))
+        assert not compiled._frames.motion(places[:1], np.zeros(4), np.zeros(5))
+
+
 def test_rows_of_other_lengths_are_refused() -> None:
     if compiled.IS_COMPILED:
         with pytest.raises(ValueError, match="is not compared with 2 of"):

@@ -175,7 +175,7 @@ def test_a_session_is_the_same_as_by_numpy_but_for_rounding(fused_calibration, t
     memory = Memory(fused_calibration.guards, motion, period_s=0.54)
     with BY_NUMPY:
         other = Memory(fused_calibration.guards, motion, period_s=0.54)
-    n_valid = 0
+    n_valid, first, told = 0, None, None
     with mock.patch.object(memory._guards, "seen", wraps=memory._guards.seen) as looked_long:
         for frame in with_fault(fault, twisting(seed=7)):
             moment = memory.see(frame)
@@ -187,6 +187,7 @@ def test_a_session_is_the_same_as_by_numpy_but_for_rounding(fused_calibration, t
             np.testing.assert_allclose(moment.difference, expected.difference, rtol=0, atol=1e-12)
             if not moment.why:
                 n_valid += 1
+                first, told = (moment, expected) if n_valid == 1 else (first, told)
                 np.testing.assert_allclose(memory.held, other.held, rtol=0, atol=1e-12)
                 assert (memory.moved is not None) == with_motion
                 if memory.moved is not None:
@@ -194,6 +195,10 @@ def test_a_session_is_the_same_as_by_numpy_but_for_rounding(fused_calibration, t
                     from_idle = motion.places(moment.difference)
                     np.testing.assert_allclose(memory.moved[-len(from_idle) :], from_idle, rtol=0, atol=1e-9)
     assert n_valid > 100
+    np.testing.assert_allclose(
+        first.difference, told.difference, rtol=0, atol=1e-12, err_msg="moments stay as they were"
+    )
+    assert not np.array_equal(first.difference, memory.held)
     if fault == "none":
         assert looked_long.call_count == 1, "only the first frame has none before it"
 

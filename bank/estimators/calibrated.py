@@ -18,7 +18,7 @@ from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Ridge
 from bank.estimators.memory import Memory, Motion
 from bank.estimators.physics import BestCell, Locator, NearestCell, Place, Registration
-from bank.estimators.reader import Head, Reader
+from bank.estimators.reader import Reader
 from bank.estimators.values import BoolArray, Estimate, FloatArray, Kind, Measured, TactileFrame
 from bank.gaussian import TWO_SIDED_95
 
@@ -171,6 +171,7 @@ class Tracker:
         self._period_s = period_s
         self.hold(None if np.isnan(tool_mm) else Measured(tool_mm, 0.0))
         self._locator = calibration.locator(bank)
+        self._place_noise_mm = _noise_of_a_place(calibration)
         self.tare()
 
     def hold(self, tool: Measured | None) -> None:
@@ -278,8 +279,8 @@ class Tracker:
             if task.guard is not None:
                 widening, nearness = (of(difference[0], usable[0]) for of in (task.guard.widening, task.guard.nearness))
             read = task.reader.read(features, usable_share, widening, nearness)
-            if name == "diameter" and self._memory is not None and calibration.motion is not None:
-                read = _of_few_frames(read, task.reader.head, self._memory.held_frames)
+            if name == "diameter" and self._memory is not None:
+                read = _widened(read, self._place_noise_mm / math.sqrt(self._memory.held_frames))
             why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])
             refused += [reason for reason in why if reason not in refused]
             if not why:
@@ -305,14 +306,21 @@ def read_from(calibration: Calibration, quantity: str, features: FloatArray, hel
     return columns_for(calibration.estimator, quantity, features)
 
 
-def _of_few_frames(read: tuple[float, float, float], head: Head, frames: int) -> tuple[float, float, float]:
-    """Widen the interval of what is read from the mean of so many frames by what these add, each with a noise of 1.
+def _noise_of_a_place(calibration: Calibration) -> float:
+    """Return by how much the place of one frame, each feature with a noise of 1, puts a diameter wrong at 95 %.
 
-    How far grips go astray was seen on means of all their frames, nearly all of which have little noise left.
+    A mean of n frames does by a root of n less. That much its interval has to be widened: how far grips go astray was
+    seen on means of all their frames, nearly all of which have little noise left. 0 where none is read of places.
     """
-    if not isinstance(head, Ridge):
-        return read
-    noise = TWO_SIDED_95 * math.sqrt(head.weights @ head.weights) / math.sqrt(frames)
+    task = calibration.diameter
+    if task is None or calibration.motion is None or not isinstance(task.reader.head, Ridge):
+        return 0.0
+    weights = task.reader.head.weights
+    return TWO_SIDED_95 * math.sqrt(weights @ weights)
+
+
+def _widened(read: tuple[float, float, float], noise: float) -> tuple[float, float, float]:
+    """Return a value with an interval that holds so much independent noise beside its own."""
     return read[0], math.hypot(read[1], noise), math.hypot(read[2], noise)
 
 

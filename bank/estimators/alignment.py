@@ -9,8 +9,9 @@ cell's converter, whose output settles within 0.4 s (HX711 at ten samples a seco
 say −0.08 to 0.05 s.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -66,10 +67,20 @@ class Alignment:
     explained: float
 
 
-def check_alignment(recordings: Sequence[FrameSeries]) -> None:
+def alignment(series: FrameSeries) -> Alignment | None:
+    """Return how late the torques of raw frames are; None where no shift stands out, as with few changes of load."""
+    part = gripped_part(series)[1]
+    return _clearest(series, part) if len(series.t_s[part]) >= _SURE_FRAMES else None
+
+
+# `alignment`, or the same with a memory of what it has found: for a recording it takes up to some tenths of a second.
+Aligned: TypeAlias = Callable[[FrameSeries], Alignment | None]
+
+
+def check_alignment(recordings: Sequence[FrameSeries], aligned: Aligned = alignment) -> None:
     """Raise CalibrationError for a recording whose torques are clearly stamped at other times than its frames."""
     for one in recordings:
-        found = alignment(one)
+        found = aligned(one)
         if found is not None and (beside := _beside(one, found)):
             order, usual_s = beside
             raise CalibrationError(
@@ -80,7 +91,7 @@ def check_alignment(recordings: Sequence[FrameSeries]) -> None:
             )
 
 
-def doubt(series: FrameSeries) -> str:
+def doubt(series: FrameSeries, aligned: Aligned = alignment) -> str:
     """Return what speaks against the times of a recording's torques, where there is anything; an empty text else.
 
     That may be too little to refuse it: with few gripped frames a peak elsewhere can be chance.
@@ -92,7 +103,7 @@ def doubt(series: FrameSeries) -> str:
     except CalibrationError:
         return ""
     n = len(series.t_s[part])
-    found = _clearest(series, part) if n >= _SUSPECT_FRAMES else None
+    found = _clearest(series, part) if _SUSPECT_FRAMES <= n < _SURE_FRAMES else aligned(series)
     if found is None or (n < _SURE_FRAMES and found.explained < _SUSPECT_EXPLAINED):
         return ""
     if not (beside := _beside(series, found)):
@@ -105,33 +116,35 @@ def doubt(series: FrameSeries) -> str:
     )
 
 
-def telling(recordings: Sequence[FrameSeries], beside: Sequence[FrameSeries]) -> Sequence[FrameSeries]:
+def telling(
+    recordings: Sequence[FrameSeries], beside: Sequence[FrameSeries], aligned: Aligned = alignment
+) -> Sequence[FrameSeries]:
     """Return by what the torques' times are told: recordings where any of them tells, else what was recorded beside.
 
     A board beside them may have been dead, garbled or away: then it says nothing, whatever is the matter with it.
     Raises CalibrationError for a recording without torque.
     """
-    if any(alignment(one) is not None for one in recordings):
+    if any(aligned(one) is not None for one in recordings):
         return recordings
-    return [one for one in beside if _tells(one)] or recordings
+    return [one for one in beside if _tells(one, aligned)] or recordings
 
 
-def _tells(beside: FrameSeries) -> bool:
+def _tells(beside: FrameSeries, aligned: Aligned) -> bool:
     if not np.isfinite(beside.channels).all():
         return False
     try:
-        return alignment(beside) is not None
+        return aligned(beside) is not None
     except CalibrationError:
         return False
 
 
-def unchecked_s(recordings: Sequence[FrameSeries]) -> float:
+def unchecked_s(recordings: Sequence[FrameSeries], aligned: Aligned = alignment) -> float:
     """Return by how many seconds the torques of raw frames may be stamped beside the frames without anybody knowing.
 
     0 where the loads of any of the recordings, which one clock has stamped, tell. Raises CalibrationError for a
     recording without torque.
     """
-    errors_s = [found.error_s for one in recordings if (found := alignment(one)) is not None]
+    errors_s = [found.error_s for one in recordings if (found := aligned(one)) is not None]
     if not errors_s:
         return _UNCHECKED_S
     least_s = min(errors_s)
@@ -180,12 +193,6 @@ def is_filtered(torque_nm: FloatArray) -> bool | None:
     if next_one > -0.25 and -0.6 < one_after < -0.15:  # a lever that rings takes back more than half
         return True
     return False if next_one < -0.35 and one_after > -0.15 else None
-
-
-def alignment(series: FrameSeries) -> Alignment | None:
-    """Return how late the torques of raw frames are; None where no shift stands out, as with few changes of load."""
-    part = gripped_part(series)[1]
-    return _clearest(series, part) if len(series.t_s[part]) >= _SURE_FRAMES else None
 
 
 def _clearest(series: FrameSeries, part: slice) -> Alignment | None:

@@ -5,12 +5,13 @@ calibration will be judged on.
 """
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
 from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
-from bank.estimators.alignment import check_alignment, telling, unchecked_s
+from bank.estimators.alignment import Aligned, alignment, check_alignment, telling, unchecked_s
 from bank.estimators.calibrated import NEEDS_BANK, Calibration, Name
 from bank.estimators.fitting_choices import Physics
 from bank.estimators.fitting_raw import fit_raw, tools_of
@@ -27,13 +28,15 @@ def fit(
     *,
     trust_times: bool = False,
     timed_by: Sequence[FrameSeries] = (),
+    aligned: Aligned | None = None,
 ) -> Calibration:
     """Calibrate an estimator on recordings of one kind, in time order; `source` says in words what they are.
 
     Slices with torque give a torque, those with diameters a diameter. `timed_by` may be what was recorded beside by
-    other fingertips, by which the torques' times are checked where these hardly move with the load. Raises
-    CalibrationError for recordings that do not determine the calibration, for torques that are clearly stamped at other
-    times than the frames unless `trust_times` is set, and for physics that the estimator needs and did not get.
+    other fingertips, by which the torques' times are checked where these hardly move with the load; `aligned` may be
+    `alignment` with what it has found for whoever asks it too. Raises CalibrationError for recordings that do not
+    determine the calibration, for torques that are clearly stamped at other times than the frames unless `trust_times`
+    is set, and for physics that the estimator needs and did not get.
     """
     physics = physics or Physics()
     if not recordings:
@@ -69,9 +72,10 @@ def fit(
         return fit_slices(blank, chosen, physics)
     if trust_times:
         return fit_raw(blank, chosen, physics, 0.0)
-    timed = telling(recordings, timed_by)
-    check_alignment(timed)
-    return fit_raw(blank, chosen, physics, unchecked_s(timed))
+    aligned = aligned or cache(alignment)
+    timed = telling(recordings, timed_by, aligned)
+    check_alignment(timed, aligned)
+    return fit_raw(blank, chosen, physics, unchecked_s(timed, aligned))
 
 
 def _check_values(recordings: Sequence[FrameSeries]) -> None:

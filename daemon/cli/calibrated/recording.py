@@ -2,6 +2,7 @@
 
 import argparse
 from dataclasses import replace
+from functools import cache
 from math import isnan
 from pathlib import Path
 
@@ -84,8 +85,15 @@ def run(args: argparse.Namespace) -> int:
     names = ", ".join(path.name for path in args.recordings)
     source = names if (start, stop) == (0.0, 1.0) else f"{names} from {start:g} to {stop:g}"
     source += f", load {late_s:g} s late" if late_s else ""
+    aligned = cache(alignment)
     calibration = fit(
-        args.estimator, parts, source, physics, trust_times=late_s is not None, timed_by=[one for _, one in beside]
+        args.estimator,
+        parts,
+        source,
+        physics,
+        trust_times=late_s is not None,
+        timed_by=[one for _, one in beside],
+        aligned=aligned,
     )
     calibration.save(args.out)
     quantities = [name for name in ("torque", "diameter") if getattr(calibration, name) is not None]
@@ -104,14 +112,14 @@ def run(args: argparse.Namespace) -> int:
     ]
     if late_s is None and calibration.kind == "raw":
         named = [*((name, one) for (name, _), one in zip(series, parts, strict=True)), *beside]
-        timed = telling(parts, [one for _, one in beside])
-        told["load_late_s"] = [found and round(found.late_s, 3) for found in map(alignment, timed)]
+        timed = telling(parts, [one for _, one in beside], aligned)
+        told["load_late_s"] = [found and round(found.late_s, 3) for found in map(aligned, timed)]
         known = ", ".join(f"{each:.2f}" for each in told["load_late_s"] if each is not None)
         sentences += [f"The load is stamped {known} s after the frames move."] if known else []
-        doubts = [f"{name}: {why}" for name, one in named if one in timed and (why := doubt(one))]
+        doubts = [f"{name}: {why}" for name, one in named if one in timed and (why := doubt(one, aligned))]
         told["load_doubts"] = doubts
         sentences += [f"Doubtful is {why}." for why in doubts]
-        told["load_unchecked_s"] = unsure_s = round(unchecked_s(timed), 3)
+        told["load_unchecked_s"] = unsure_s = round(unchecked_s(timed, aligned), 3)
         if calibration.torque is not None and unsure_s:
             told["widened"] = widened = round(calibration.torque.reader.widened, 2)
             sentences.append(

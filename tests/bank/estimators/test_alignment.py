@@ -2,6 +2,7 @@
 
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -139,6 +140,21 @@ def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
         still = unmoved(recorded)
         assert telling([still], [beside]) == [still], "it says nothing, and is not to be blamed"
         assert telling([still], [beside, recorded]) == [recorded]
+
+
+def test_each_recording_is_looked_at_once(recorded, monkeypatch):
+    looked, of_side = [], alignments._of_side
+    monkeypatch.setattr(alignments, "_of_side", lambda *a: (looked.append((a[0], a[2])), of_side(*a))[1])
+    fit("regression", [recorded], "alone")
+    assert len(looked) == len(set(looked)) == len(recorded.sides)
+    looked.clear()
+    aligned = cache(alignment)
+    fit("regression", [recorded], "and asked again", aligned=aligned)
+    still = unmoved(recorded)
+    assert telling([still], [recorded], aligned) == [recorded]
+    assert (doubt(still, aligned), doubt(recorded, aligned)) == ("", "")
+    assert unchecked_s([still, recorded], aligned) == 0.0
+    assert len(looked) == len(set(looked)) == 2 * len(recorded.sides)
 
 
 def test_a_torque_within_some_time_is_any_from_the_least_to_the_largest(recorded):

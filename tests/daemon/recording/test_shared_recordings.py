@@ -14,6 +14,7 @@ import pytest
 
 from bank.errors import CalibrationError
 from bank.estimators import Calibration, FrameSeries, fit
+from bank.estimators import alignment as alignments
 from bank.estimators.alignment import alignment, doubt, is_filtered
 from bank.estimators.familiar import DifferenceGuard
 from bench.charts.stability import balanced
@@ -230,7 +231,7 @@ def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_on
         fit("fused", [late.of_sides(("left",))], "beside the right one", timed_by=[late])
 
 
-def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, capsys):
+def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, capsys, monkeypatch):
     calibrate = ["calibrate", str(twists_file), "--part", f"0:{THIRD}", "--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
     told = capsys.readouterr().out
@@ -238,10 +239,13 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
     assert re.search(r"intervals of loads are \d\.\d times as wide\. Record more changes of load", told)
     assert main([*calibrate, "--load-late", "0"]) == 0
     assert "could not be checked" not in capsys.readouterr().out
+    looked, of_side = [], alignments._of_side
+    monkeypatch.setattr(alignments, "_of_side", lambda *a: (looked.append(a[0]), of_side(*a))[1])
     assert main(["calibrate", str(twists_file), "--sides", "left", "--out", str(tmp_path / "a.cal"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["load_unchecked_s"] == 0
     assert told["load_late_s"] == [pytest.approx(0.25, abs=0.03)]
+    assert len(looked) == len(set(looked)), "each recording once"
 
 
 @pytest.mark.parametrize("name", ["20241202_153632", "glitch_20241202_173837"])

@@ -4,6 +4,8 @@ The tasks are the same functions of the same values everywhere, so the numbers a
 with it when it died is given to another one; only where tasks kill one worker after the other is it given up.
 """
 
+import asyncio
+import logging
 import socket
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -24,6 +26,8 @@ R = TypeVar("R")
 # What `--cluster` alone means: a cluster of this machine's own.
 LOCAL = "local"
 CONNECT_S = 20
+# A worker takes some seconds to start.
+FIRST_WORKER_S = 30
 
 
 class Workers(Protocol):
@@ -74,7 +78,7 @@ class Cluster:
 
     def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
         """Yield results as they are finished; the tasks of a worker that dies go to the others."""
-        from distributed import KilledWorker, as_completed
+        from distributed import CancelledError, KilledWorker, as_completed
 
         # The result of a task, which is made anew where the workers that had it are gone; what is scattered is lost.
         kept = self._client.submit(_itself, shared, pure=False)
@@ -86,6 +90,12 @@ class Cluster:
             raise UserError(
                 "one task killed one worker after the other, perhaps for want of memory; give the workers more, or "
                 "run without --cluster"
+            ) from error
+        except CancelledError as error:
+            # Nobody here cancels what is still waited for: the scheduler is gone, and with it all that it knew.
+            raise UserError(
+                "the connection to the Dask scheduler was lost; start it and its workers, and run the same command "
+                "again"
             ) from error
         finally:
             self._client.cancel(list(tasks))
@@ -117,24 +127,54 @@ def workers(cluster: str | None, jobs: int = 1) -> "Iterator[Workers]":
             yield Processes(max(jobs, 1))
             return
         raise UserError(f"--cluster needs {error.name}: `pip install 'shearloop[cluster]'`") from error
+    # It logs each connection that it lost with a traceback; what that means for us, `Cluster.map` says.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if cluster == LOCAL:
+        # Port 8787, which it would take for a page that nobody opens, may be another cluster's.
+        anywhere = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
         with (
-            LocalCluster(n_workers=max(jobs, 1), threads_per_worker=1, dashboard_address=None) as local,
+            LocalCluster(n_workers=max(jobs, 1), threads_per_worker=1, scheduler_kwargs=anywhere) as local,
             Client(local) as client,
         ):
             yield Cluster(client)
         return
     _reach(cluster)
     with Client(cluster, timeout=CONNECT_S) as client:
+        _wait_for_a_worker(client, cluster)
         yield Cluster(client)
 
 
 def _reach(address: str) -> None:
-    """Raise UserError unless something listens at an address: a client that finds nothing leaves a thread behind."""
+    """Raise UserError unless a scheduler greets at an address: for what listens and is none a client waits for ever."""
     from distributed.comm import get_address_host_port
 
     try:
+        # A refusal is told at once here; dask asks again until the time is over.
         with socket.create_connection(get_address_host_port(address), timeout=CONNECT_S):
-            return
-    except (OSError, ValueError) as error:
+            pass
+        asyncio.run(_greet(address))
+    except TimeoutError as error:
+        raise UserError(
+            f"no Dask scheduler answers at {address} within {CONNECT_S} s; start one with `dask scheduler`"
+        ) from error
+    except (OSError, TypeError, ValueError) as error:
         raise UserError(f"no Dask scheduler answers at {address}: {error}; start one with `dask scheduler`") from error
+
+
+async def _greet(address: str) -> None:
+    from distributed.comm import connect
+    from distributed.security import Security
+
+    arguments = Security().get_connection_args("client")
+    greeted = await asyncio.wait_for(connect(address, timeout=CONNECT_S, **arguments), CONNECT_S)
+    greeted.abort()
+
+
+def _wait_for_a_worker(client: "Client", address: str) -> None:
+    """Raise UserError where a scheduler has no worker: tasks would wait for one without a word."""
+    try:
+        client.wait_for_workers(1, timeout=FIRST_WORKER_S)
+    except TimeoutError as error:
+        raise UserError(
+            f"the Dask scheduler at {address} has no worker; start some with `dask worker {address}`"
+        ) from error

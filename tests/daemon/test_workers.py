@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
@@ -225,6 +226,51 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixt
     command = ["bank", "build", "--config", str(tmp_path / "bank.yaml"), "--out", str(tmp_path / "a.bank")]
     assert main([*command, "--cluster", "tcp://127.0.0.1:9"]) == 2
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
+
+
+def test_what_listens_and_is_no_scheduler_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.workers.CONNECT_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
+        with pytest.raises(UserError, match=f"no Dask scheduler answers at {address} within 0.5 s"), workers(address):
+            pass
+
+
+@pytest.fixture
+def lonely(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """Start a scheduler without workers, and return its process and its address."""
+    from distributed import Client
+
+    found = tmp_path / "scheduler.json"
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(found)]
+    with (tmp_path / "log").open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "distributed.cli.dask_scheduler", *options], cwd=ROOT, stdout=output, stderr=output
+        )
+    try:
+        with Client(scheduler_file=str(found), timeout=STARTED_S) as client:
+            address = str(client.scheduler.address)
+        yield process, address
+    finally:
+        process.kill()
+        process.wait(STARTED_S)
+
+
+def test_a_scheduler_without_workers_and_one_that_ends_are_one_sentence_each(
+    lonely: tuple[subprocess.Popen[bytes], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import distributed
+
+    process, address = lonely
+    monkeypatch.setattr("daemon.workers.FIRST_WORKER_S", 0.5)
+    with pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"), workers(address):
+        pass
+    monkeypatch.setattr("daemon.workers._wait_for_a_worker", lambda *_: None)
+    # As soon as the tasks are waited for.
+    begun = distributed.as_completed
+    monkeypatch.setattr(distributed, "as_completed", lambda tasks: (process.kill(), begun(tasks))[1])
+    with workers(address) as cluster, pytest.raises(UserError, match="the connection to the Dask scheduler was lost"):
+        list(cluster.map(square, {"factor": 1.0}, range(3)))
 
 
 def test_without_the_extra_an_address_is_refused_and_a_local_cluster_is_processes(monkeypatch) -> None:

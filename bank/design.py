@@ -42,6 +42,8 @@ _FINE_CM = (0.05, 0.035)
 _RANKED = 17
 _N_DRIFT = 2
 _LEAST_FRAMES = 8
+# What is less than this share of a frame is rounding: a board's converter alone makes thousands of times as much.
+_LEAST_NOISE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,10 +55,18 @@ class Scene:
     torque_nm: Floats | None
 
     def __post_init__(self) -> None:
-        """Refuse too little."""
+        """Refuse too little, and what no board makes."""
         if len(self.differences) < _LEAST_FRAMES:
             raise CalibrationError(
                 f"{len(self.differences)} gripped frames are too few to judge a model by; record {_LEAST_FRAMES}"
+            )
+        # Sizes that overflow as a square, or vanish, are no number here.
+        with np.errstate(all="ignore"):
+            noise = self.noise_v / np.sqrt((self.differences**2).mean())
+        if not _LEAST_NOISE <= noise < np.inf:
+            raise CalibrationError(
+                "the gripped frames have no noise to design for: they are all alike, multiples of a few, or none a "
+                "board sends; record frames as they come"
             )
 
     @property

@@ -40,10 +40,10 @@ def scene_of(series: FrameSeries) -> Scene:
     # A recording that begins gripped has no idle frame: its first frame stands in.
     before = series.channels[idle, 0] if idle.stop > 0 else series.channels[:1, 0]
     noise = channel_noise(frames)
-    known = np.isfinite(torque[gripped])
-    return Scene(
-        (frames - np.median(before, axis=0))[known], float(np.median(noise[np.isfinite(noise)])), torque[gripped][known]
-    )
+    differences = frames - np.median(before, axis=0)
+    # A frame that stands in for the idle one has no difference of its own.
+    used = np.isfinite(torque[gripped]) & differences.any(axis=1)
+    return Scene(differences[used], float(np.median(noise[np.isfinite(noise)])), torque[gripped][used])
 
 
 def residual_noise(frames: NDArray[np.float64]) -> float:

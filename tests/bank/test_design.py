@@ -210,3 +210,15 @@ def test_what_is_good_enough_by_luck_is_not_chosen() -> None:
 def test_too_few_frames_are_refused(clean) -> None:
     with pytest.raises(CalibrationError, match="too few to judge a model by"):
         Scene(clean[:5], 1e-4, None)
+
+
+@pytest.mark.parametrize("noise_v", [0.0, 1e-20, np.inf, np.nan])
+def test_frames_without_noise_are_refused_in_a_sentence(clean, noise_v: float) -> None:
+    with pytest.raises(CalibrationError, match="no noise to design for"):
+        Scene(clean, noise_v, None)
+
+
+@pytest.mark.parametrize("scale", [0.0, 1e-200, 1e200])
+def test_frames_of_no_size_are_refused_in_a_sentence(clean, scale: float) -> None:
+    with pytest.raises(CalibrationError, match="no noise to design for"):
+        Scene(scale * clean, scale * 1e-5, None)

@@ -7,15 +7,17 @@ import pytest
 
 from bank.bank_file import Bank
 from bank.build import build_bank
+from bank.channels import N_CHANNELS
 from bank.design import Scene, designed
 from bank.estimators.physics import NOT_TURNED, NearestCell
+from bank.estimators.values import FrameSeries
 from bank.forward import ForwardModel
 from bank.models import conductivity
 from daemon.bank_config import FingertipConfig, load_bank_plan, load_geometry
 from daemon.cli import main
 from daemon.config_file import load_yaml_model
 from daemon.reproduce.banks import OWN_FINGERTIP
-from daemon.scene import design_yaml
+from daemon.scene import design_yaml, scene_of
 
 
 @pytest.fixture(scope="session")
@@ -61,3 +63,11 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Pat
 def test_a_recording_that_is_none_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bank", "design", str(tmp_path)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_stands_in_for_the_idle_one() -> None:
+    rng = np.random.default_rng(4)
+    t_s, frames = np.arange(12.0), rng.normal(0.3, 0.01, (12, 1, N_CHANNELS))
+    series = FrameSeries("raw", ("right",), t_s, frames, t_s, np.full(12, 0.1), np.full(12, np.nan))
+    found = scene_of(series)
+    np.testing.assert_array_equal(found.differences, frames[1:, 0] - frames[0, 0])

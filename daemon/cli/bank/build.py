@@ -123,7 +123,7 @@ def _is_built(path: Path, plan: "BankPlan") -> bool:
         return False
     definition = BankDefinition(plan.mesh.digest, plan.model, plan.k_grid, plan.sigma_grid, plan.variation)
     try:
-        return Bank.open(path).identity == definition.identity
+        return Bank.open(path, verify=True).identity == definition.identity
     except BankFileError:
         print(f"{path}: it cannot be used, and is built anew", file=sys.stderr)
         return False

@@ -41,7 +41,7 @@ class Level:
 
 @dataclass(frozen=True, slots=True)
 class Curve:
-    """One estimator through one sweep; breaks_at is the first level at which it is silently wrong too often."""
+    """One estimator through one sweep; breaks_at is the mildest level at which it is silently wrong too often."""
 
     fault: str
     unit: str
@@ -53,8 +53,10 @@ class Curve:
 def curve(fault: str, unit: str, estimator: str, levels: Iterable[Level]) -> Curve:
     """Return a sweep with its breaking point."""
     found = tuple(levels)
-    broken = next((one.level for one in found if one.false_valid > BROKEN_SHARE), None)
-    return Curve(fault, unit, estimator, found, broken)
+    broken = [one.level for one in found if one.false_valid > BROKEN_SHARE]
+    # Levels go from mild to grave, or, where a fault has two directions, through 0.
+    mildest = min(broken, key=abs, default=None) if any(one.level < 0 for one in found) else next(iter(broken), None)
+    return Curve(fault, unit, estimator, found, mildest)
 
 
 def judged(estimates: Sequence[Estimate], truth_nm: Floats, level: float) -> Level:

@@ -16,7 +16,7 @@ from bench.charts.detectability import detectability_figure, detected
 from bench.charts.faults import FAULTS, lost_channels
 from bench.charts.rims import at_rims
 from bench.charts.sources import Split, bank_of, own_fingertip, splits
-from bench.charts.stability import balanced, curve, fitted, judged, scene_for, sweep
+from bench.charts.stability import Level, balanced, curve, fitted, judged, scene_for, sweep
 from bench.charts.stability_picture import continuity_figure, sweeps_figure
 from daemon.reproduce.banks import Grid
 
@@ -48,6 +48,14 @@ def test_figures_count_what_is_valid_and_wrong() -> None:
     assert found.false_valid == 0.25
     assert found.bias_nm == pytest.approx(0.05 / 3)
     assert curve("fault", "unit", "fused", [judged([estimate(0.1)], truth[:1], 0.0), found]).breaks_at == 2.0
+
+
+@pytest.mark.parametrize(
+    ("levels", "expected"), [((-0.5, -0.2, 0.0, 0.1, 0.5), 0.1), ((0.6, 0.4, 0.2), 0.6), ((1.0, 2.0), 1.0)]
+)
+def test_an_estimator_breaks_at_the_mildest_level_in_either_direction(levels, expected) -> None:
+    wrong = [Level(level, 0.0, 0.0, 1.0, 0.5 if level else 0.0) for level in levels]
+    assert curve("fault", "unit", "fused", wrong).breaks_at == expected
 
 
 def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones() -> None:

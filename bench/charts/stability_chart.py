@@ -15,6 +15,7 @@ from bench.charts.rims import at_rims
 from bench.charts.sources import Split, splits
 from bench.charts.stability import BROKEN_SHARE, Curve, fitted, misaligned, sweeps
 from bench.charts.stability_picture import continuity_figure, sweeps_figure
+from daemon.errors import UserError
 from daemon.workers import Workers
 
 SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
@@ -30,6 +31,8 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
         curves = sweeps(split, made_for[split.past.kind], physics, bank, pool)
         if split.past.kind == "raw":
             curves += misaligned(split, STREAM_NAMES, physics, SHIFTS_S)
+        if not curves:
+            raise UserError(f"{split.title}: no estimator can be calibrated on it, as told above; chart a longer one")
         written += _written(f"stability-{_slug(split.title)}", split.title, curves, out)
         if split.past.kind == "difference":
             found = walks(split, bank, fitted(split, ("regression", "fused"), physics))

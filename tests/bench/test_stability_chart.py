@@ -17,8 +17,11 @@ from bench.charts.faults import FAULTS, lost_channels
 from bench.charts.rims import at_rims
 from bench.charts.sources import Split, bank_of, own_fingertip, splits
 from bench.charts.stability import Level, balanced, curve, fitted, judged, scene_for, sweep
+from bench.charts.stability_chart import chart
 from bench.charts.stability_picture import continuity_figure, sweeps_figure
+from daemon.errors import UserError
 from daemon.reproduce.banks import Grid
+from daemon.workers import InTurn
 
 
 @pytest.fixture(scope="module")
@@ -147,3 +150,13 @@ def test_the_share_of_a_foreign_frame_that_passes_is_the_one_that_its_size_allow
     assert {one.passing for one in own if one.share >= 0.2} == {0.0}
     assert {one.passing_best for one in own if one.share >= 0.2} == {0.0}
     assert len(detectability_figure("slices", found).axes) == 2
+
+
+def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
+    bank: Bank, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slices = next(one for one in splits([], 0.6, tmp_path) if one.past.kind == "difference")
+    one = Split(slices.title, slices.past.between(0, 1), slices.future, slices.whole)
+    with pytest.raises(UserError, match="no estimator can be calibrated on it"):
+        chart([one], bank, own_fingertip(0.4).mesh(), tmp_path, tmp_path, InTurn())
+    assert "fused is left out" in capsys.readouterr().out

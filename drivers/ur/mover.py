@@ -16,6 +16,7 @@ from drivers.ur.messages import (
     WristSpeed,
 )
 from drivers.ur.motion import is_close, longest_move_s, longest_stop_s
+from drivers.ur.pace import OF_THE_WATCHDOG
 from drivers.ur.ports import PilotArm
 from drivers.ur.settings import Six, UrSettings
 
@@ -46,6 +47,11 @@ class Mover:
         self.puzzled = False
         self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
         self._speed_thread = self._just_sent = False
+        # What the speed thread was told last; when the robot was told anything, and after how long it is again at the
+        # latest, the next cycle being one period away.
+        self._turned = WristSpeed(0.0, 0.0)
+        self._said_ns = 0
+        self._unsaid_ns = int(1e9 * (OF_THE_WATCHDOG / settings.watchdog_hz - 1.0 / settings.rate_hz))
         self._asked_ns = self._rested_ns = now_ns
         self._deadline_ns = self._move_ns = 0
         self._move_seen = False
@@ -58,7 +64,7 @@ class Mover:
         self._begin("wrist", number)
         self._asked, self._asked_ns = asked, now_ns
         self._just_sent = True
-        return self._send_wrist(reading)
+        return self._send_wrist(reading, now_ns)
 
     def move(self, number: int, asked: MoveLinear, reading: Reading, now_ns: int) -> bool:
         """Begin a linear move of an arm that rests; return whether the robot took it."""
@@ -140,7 +146,7 @@ class Mover:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
             self.stop_now(reading, now_ns, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
         elif not self._just_sent:
-            self._send_wrist(reading)
+            self._send_wrist(reading, now_ns)
         # One that was given since the last cycle was sent then, within the limits of a reading as new as that; the loop
         # gives one in every cycle.
         self._just_sent = False
@@ -156,7 +162,7 @@ class Mover:
         elif why:
             self.stop(reading, now_ns, why)
             return
-        self._arm.kick()
+        self._kick(now_ns)
 
     def _is_there(self, reading: Reading, now_ns: int) -> bool:
         waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
@@ -167,11 +173,11 @@ class Mover:
             self.let_go(sentences.NOT_STOPPING)
         elif self._speed_thread:
             braking = clip_stop(self._braking, reading, self._limits, self._settings.reaction_s)
-            if self._speed(WristSpeed(0.0, braking.deceleration_rad_per_s2)) and reading.rests:
+            if self._speed(WristSpeed(0.0, braking.deceleration_rad_per_s2), now_ns) and reading.rests:
                 self._end_speed_thread()
                 self.kind = "idle"
         else:
-            self._arm.kick()
+            self._kick(now_ns)
             if not reading.moving_linearly and reading.rests:
                 self.kind = "idle"
 
@@ -180,19 +186,28 @@ class Mover:
             self.ended = "it moved although nothing was asked of it"
             self.let_go(sentences.ASTRAY)
         else:
-            self._arm.kick()
+            self._kick(now_ns)
 
     # ---- calls on the arm -----------------------------------------------------------------------------------------
 
     def _begin(self, kind: MotionKind, number: int) -> None:
         self.kind, self.number, self.ended = kind, number, ""
 
-    def _send_wrist(self, reading: Reading) -> bool:
+    def _send_wrist(self, reading: Reading, now_ns: int) -> bool:
         self.sent, self.clipped = clip_wrist(self._asked, reading, self._limits, self._settings.reaction_s)
-        return self._speed(self.sent)
+        if self._speed_thread and self.sent == self._turned and now_ns - self._said_ns < self._unsaid_ns:
+            # The program on the robot reads its registers in each of its own cycles: it turns on just so by itself.
+            return True
+        return self._speed(self.sent, now_ns)
 
-    def _speed(self, command: WristSpeed) -> bool:
+    def _kick(self, now_ns: int) -> None:
+        if now_ns - self._said_ns >= self._unsaid_ns:
+            self._said_ns = now_ns
+            self._arm.kick()
+
+    def _speed(self, command: WristSpeed, now_ns: int) -> bool:
         self._speed_thread = True
+        self._turned, self._said_ns = command, now_ns
         taken = self._arm.wrist(command)
         if not taken:
             # An earlier speed may still hold.

@@ -17,17 +17,15 @@ TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}
 TURN = WristSpeed(0.3, 4.0)
 
 
-async def test_a_wrist_speed_that_stays_the_same_is_told_again_now_and_then_and_sent_in_each_cycle() -> None:
+async def test_a_wrist_speed_that_stays_the_same_is_told_again_now_and_then() -> None:
     async with driven() as cell:
         await cell.start(TWIST)
         await cell.cycles(20)
         cell.robot.commands.clear()
-        cell.robot.flight.arm.calls.clear()
         await cell.cycles(200)
         assert set(cell.robot.commands) == {TURN}
         renewed_s = RENEWED_AFTER * SETTINGS.command_timeout_s
         assert len(cell.robot.commands) == pytest.approx(200 * 0.008 / renewed_s, rel=0.2)
-        assert cell.robot.flight.arm.calls.count("wrist") >= 200
         assert cell.robot.flight.wrist_speed == pytest.approx(0.3)
 
 

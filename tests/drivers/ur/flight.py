@@ -206,8 +206,8 @@ class Flight:
         return self.arm.reading.qd_rad_per_s[5]
 
 
-def flying() -> Flight:
-    flight = Flight()
+def flying(settings: UrSettings = SETTINGS) -> Flight:
+    flight = Flight(settings)
     flight.fly(5)
     assert flight.ask(Enable()).accepted
     flight.arm.calls.clear()

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_json
 
 from daemon.messages import EitFrame
 from drivers.raw_input import InputKind, RawInput
@@ -16,7 +17,7 @@ _DECIMALS = 6
 # So few are quicker without numpy: a robot's state has three arrays of six.
 _FEW_BYTES = 4 * 32
 _SHAPE = "_shape"
-# Made once: `json.dumps` makes one for each text that is not written in its own style.
+# For what pydantic does not write; it takes a fifth to a tenth of the time.
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 
 
@@ -50,10 +51,10 @@ def input_of(content: Mapping[str, Any]) -> RawInput:
 def as_json(content: Mapping[str, Any]) -> bytes:
     """Return compact JSON of what has a JSON form, with null for the numbers that have none."""
     try:
-        text = _ENCODER.encode(content)
+        return to_json(content, inf_nan_mode="null")
     except ValueError:
-        text = _ENCODER.encode(_finite(content))
-    return text.encode()
+        # A mapping that is no dict, or half of a surrogate pair, as in the name of a file that is no UTF-8.
+        return _ENCODER.encode(_finite(content)).encode()
 
 
 def _numbers(data: bytes) -> list[float | None]:

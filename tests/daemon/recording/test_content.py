@@ -1,0 +1,52 @@
+"""What stands in a recording as JSON reads as what it was."""
+
+import json
+import math
+import struct
+from types import MappingProxyType
+from typing import Any, NoReturn
+
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from daemon.recording.content import as_json, input_json, input_of
+from drivers.raw_input import InputKind, RawInput
+
+# Half of a surrogate pair too: Python has that for each byte of a file's name that is no UTF-8.
+texts = st.text(st.characters())
+scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats() | texts
+values = st.recursive(scalars, lambda inner: st.lists(inner) | st.dictionaries(texts, inner), max_leaves=20)
+
+
+def not_json(name: str) -> NoReturn:
+    raise AssertionError(f"{name} is not JSON, though Python reads it")
+
+
+def read(value: Any) -> Any:
+    """Return a value as JSON has it: null for what is no finite number."""
+    if isinstance(value, dict):
+        return {key: read(one) for key, one in value.items()}
+    if isinstance(value, list):
+        return [read(one) for one in value]
+    if isinstance(value, float):
+        # Of a float each bit counts: a replay is to be the same.
+        return struct.pack("<d", value) if math.isfinite(value) else None
+    return value
+
+
+@given(st.dictionaries(texts, values))
+@example({"name": "caf\udce9", "torque_nm": math.nan})
+@example({"whole": [math.inf, -0.0, 5e-324, 0.1 + 0.2, 1e22]})
+def test_what_is_written_reads_the_same(content: dict[str, Any]) -> None:
+    assert read(json.loads(as_json(content), parse_constant=not_json)) == read(content)
+
+
+def test_mapping_that_is_no_dict_is_written_as_one() -> None:
+    assert as_json(MappingProxyType({"tasks": MappingProxyType({"loop": (1, math.nan)})})) == (
+        b'{"tasks":{"loop":[1,null]}}'
+    )
+
+
+def test_raw_input_reads_the_same_byte_for_byte() -> None:
+    told = RawInput(InputKind.DATA, 123456789012345678, bytes(range(256)))
+    assert input_of(json.loads(input_json(told))) == told

@@ -54,8 +54,8 @@ class WristCommands:
     def _turns_so(self, command: WristSpeed, now_ns: int) -> bool:
         """Whether the robot's process turns the wrist just so, and will go on without being told again for now.
 
-        It sends that speed in each of its cycles, within the limits of what it reads in it. What it has clipped is told
-        again in each of ours: it would be taken up by itself as soon as the limits allow.
+        It holds that speed against the limits in each of its cycles, by what it reads in it. What it has clipped is
+        told again in each of ours: it would be taken up by itself as soon as the limits allow.
         """
         state = self._robot.state
         return (

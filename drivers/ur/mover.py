@@ -1,7 +1,8 @@
 """The motion under way: begun, kept within the limits cycle by cycle, and ended. Which may begin is the pilot's to say.
 
 No clock and no ur-rtde: the arm is a port and the time an argument. A motion that does not end as it should ends by the
-robot's watchdog: nothing is sent to the program any more, and only another one may move the arm again.
+robot's watchdog: nothing is sent to the program any more, and only another one may move the arm again. What is sent is
+looked at in each cycle, and where it is the same as before sent again just often enough to keep the watchdog quiet.
 """
 
 from drivers.ur import sentences
@@ -47,8 +48,8 @@ class Mover:
         self.puzzled = False
         self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
         self._speed_thread = self._just_sent = False
-        # What the speed thread was told last; when the robot was told anything, and after how long it is again at the
-        # latest, the next cycle being one period away.
+        # What the speed thread was told last, and when the robot was told anything; it is again once so much has
+        # passed, for the next cycle is one period away.
         self._turned = WristSpeed(0.0, 0.0)
         self._said_ns = 0
         self._unsaid_ns = int(1e9 * (OF_THE_WATCHDOG / settings.watchdog_hz - 1.0 / settings.rate_hz))

@@ -11,8 +11,8 @@ import math
 from drivers.ur.messages import Ease, Message
 from drivers.ur.settings import UrSettings
 
-# Of the robot's patience with a silent client (1/watchdog_hz): the three quarters left are for a busy computer. At rest
-# too the robot's program ends once they are over, and waits for the operator.
+# Of the robot's patience with a silent client (1/watchdog_hz), at rest and while it turns on as before: the three
+# quarters left are for a busy computer. Once they are over the robot's program ends, and waits for the operator.
 OF_THE_WATCHDOG = 0.25
 # Where the daemon is not at ease one state of so many cycles is told though it says nothing new, and no later than so
 # long after the last one: with the even ones below two of five, 50 a second of a wrist that stands or turns slowly, and

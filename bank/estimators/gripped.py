@@ -26,10 +26,15 @@ def gripped_part(series: FrameSeries) -> tuple[slice, slice, slice]:
     torque.
     """
     known = series.torque_at_frames()
+    if len(known) == 0:
+        sides = f"the side {series.sides[0]}" if len(series.sides) == 1 else f"{' and '.join(series.sides)} at one time"
+        raise CalibrationError(f"the recording holds no frames of {sides}; record some frames")
+    if not np.isfinite(known).any():
+        raise CalibrationError("the torque is known at none of these frames; record the load cell beside them")
     torque = np.abs(np.nan_to_num(known))
     loaded = np.flatnonzero(torque > 0.1 * torque.max(initial=np.finfo(np.float64).tiny))
     if len(loaded) == 0:
-        raise CalibrationError("the recording holds no torque to calibrate on; record the load cell beside the frames")
+        raise CalibrationError("the torque is 0 at all of these frames; record twists that the load cell feels")
     n, span = len(series.t_s), slice(int(loaded[0]), int(loaded[-1]) + 1)
     if span.stop - span.start < _LEAST_SPAN:
         raise CalibrationError(

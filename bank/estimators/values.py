@@ -85,7 +85,7 @@ class FrameSeries:
         if missing:
             raise CalibrationError(
                 f"the recording has the sides {', '.join(self.sides)}, and not {' and '.join(missing)}; "
-                "calibrate on the sides that are there"
+                "choose among those that are there"
             )
         layers = [self.sides.index(side) for side in sides]
         return replace(self, sides=sides, channels=self.channels[:, layers])

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -106,12 +108,17 @@ def test_too_little_is_said_to_be(recorded):
         SideGuard.fit("right", (frames[:2], frames[50:250], frames[:0]))
     with pytest.raises(CalibrationError, match="cannot be told from idle"):
         SideGuard.fit("right", (frames[:12], frames[6:34], frames[:0]))
-    silent = type(recorded)(
-        "raw", recorded.sides, recorded.t_s, recorded.channels, recorded.torque_t_s,
-        np.zeros_like(recorded.torque_nm), recorded.diameter_mm,
-    )  # fmt: skip
-    with pytest.raises(CalibrationError, match="no torque to calibrate on"):
-        gripped_part(silent)
+    n = len(recorded.torque_nm)
+    for changed, told in (
+        ({"torque_nm": np.zeros(n)}, "is 0 at all of these frames; record twists"),
+        ({"torque_t_s": recorded.torque_t_s + 1e4}, "known at none of these frames; record the load cell beside them"),
+        (
+            {"t_s": np.empty(0), "channels": recorded.channels[:0], "diameter_mm": np.empty(0)},
+            "holds no frames of right and left at one time; record some frames",
+        ),
+    ):
+        with pytest.raises(CalibrationError, match=told):
+            gripped_part(replace(recorded, **changed))
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.4, 0.75, 0.76, 1.0]))

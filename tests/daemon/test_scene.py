@@ -4,11 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from bank.bank_file import Bank
 from bank.build import build_bank
 from bank.channels import N_CHANNELS
 from bank.design import Scene, designed
+from bank.errors import CalibrationError
 from bank.estimators.physics import NOT_TURNED, NearestCell
 from bank.estimators.values import FrameSeries
 from bank.forward import ForwardModel
@@ -58,6 +60,33 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Pat
     build_bank(plan.mesh, plan.model, plan.k_grid, plan.sigma_grid, tmp_path / "step.bank")
     place = NearestCell(Bank.open(tmp_path / "step.bank"), NOT_TURNED).locate(frames[4])
     assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.k_grid)[0]
+
+
+@pytest.mark.parametrize(("noise_v", "mixed_up"), [(1e-4, False), (5e-3, True)])
+def test_frames_that_no_model_explains_are_called_so_on_the_screen_and_in_the_configuration(
+    noise_v: float, mixed_up: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = load_geometry(OWN_FINGERTIP)
+    forward = ForwardModel(mesh)
+    cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
+    frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+    rng = np.random.default_rng(0)
+    frames = frames[:, rng.permutation(N_CHANNELS)] if mixed_up else frames
+    frames += rng.normal(0.0, noise_v, frames.shape)
+    for number, frame in enumerate(frames, 1):
+        savemat(tmp_path / f"Data_Slice_{number}.mat", {"data_diff": frame[None], "torque_value": 0.01 * number})
+    config = tmp_path / "design.yaml"
+    assert main(["bank", "design", str(tmp_path), "--out", str(config)]) == 0
+    told, text = capsys.readouterr().err, config.read_text()
+    for words in ("even the best model leaves ", "the noise is "):
+        assert (f"shearloop bank: {words}" in told) == (f"# NOTE: {words}" in text) == mixed_up
+    assert load_bank_plan(config).model in text
+
+
+def test_sizes_that_overflow_are_refused_without_a_warning() -> None:
+    t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 1e200, (12, 1, N_CHANNELS))
+    with pytest.raises(CalibrationError, match="no noise to design for"):
+        scene_of(FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan)))
 
 
 def test_a_recording_that_is_none_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,12 +19,14 @@ def run(args: argparse.Namespace) -> int:
     """Design, and print or write what `bank build --config` takes."""
     from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
-    from daemon.scene import design_yaml, designed_for
+    from daemon.scene import design_yaml, designed_for, doubts
 
     if args.out is not None:
         check_writes_over(args.out, "a configuration")
     fingertip, design = designed_for(args.recording, args.fingertip, args.side)
     text = design_yaml(design, fingertip, args.recording)
+    for sentence in doubts(design):
+        print(f"shearloop bank: {sentence}", file=sys.stderr)
     if args.out is None:
         print(text, end="")
         return 0

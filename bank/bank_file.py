@@ -13,6 +13,7 @@ Layout, all numbers little-endian:
 The header and the small arrays are checked each time a bank is opened, the signals when asked for.
 """
 
+import errno
 import hashlib
 import json
 import math
@@ -214,7 +215,17 @@ def write_bank(
                 file.write(b"\0" * (offsets[key] - file.tell()))
                 file.write(array.data)
     except OSError as error:
-        raise BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out") from error
+        raise unwritable(path, error) from error
+
+
+def unwritable(path: Path, error: OSError) -> BankFileError:
+    """Return what to say of a bank, or its journal, that the disk refuses: where it is full, the solved rows stay."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return BankFileError(
+            f"{path}: the bank cannot be written: {error.strerror}, and the rows solved so far are kept; make room and "
+            "give the same command again"
+        )
+    return BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out")
 
 
 def _told(variation: Variation) -> dict[str, Any]:

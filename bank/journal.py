@@ -18,7 +18,7 @@ from typing import BinaryIO, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.bank_file import BankDefinition
+from bank.bank_file import BankDefinition, unwritable
 from bank.channels import N_CHANNELS
 from bank.errors import BankFileError
 
@@ -58,7 +58,7 @@ class RowJournal:
             # Neither truncated nor created exclusively: what is there is judged when the lock is ours.
             handle = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise unwritable(self.path, error) from error
         file = os.fdopen(handle, "r+b")
         with ExitStack() as on_error:
             on_error.callback(file.close)
@@ -70,7 +70,7 @@ class RowJournal:
                     f"{self._target}: another build is at work on this bank; wait for it or choose another --out"
                 ) from error
             except OSError as error:
-                raise self._unwritable(error) from error
+                raise unwritable(self.path, error) from error
             on_error.pop_all()
         self._file = file
         return self
@@ -95,7 +95,7 @@ class RowJournal:
             self._file.flush()
             os.fsync(self._file.fileno())
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise unwritable(self.path, error) from error
         self.rows[row] = cells
 
     def remove(self) -> None:
@@ -142,9 +142,6 @@ class RowJournal:
             np.frombuffer(body, "|b1", n, offset=8 * n),
             np.frombuffer(body, "<f4", n * N_CHANNELS, offset=9 * n).reshape(n, N_CHANNELS),
         )
-
-    def _unwritable(self, error: OSError) -> BankFileError:
-        return BankFileError(f"{self.path}: the bank cannot be written: {error.strerror}; choose another --out")
 
 
 def _checksum(row: int, body: bytes) -> bytes:

@@ -1,5 +1,6 @@
 """Building banks: the same bytes however it is done, nothing lost when killed, nothing damaged when it fails."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bank import bank_file
 from bank.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
 from bank.build import RowSolver, build_bank
 from bank.errors import BankFileError, ConductivityError
@@ -185,8 +187,29 @@ def test_a_build_that_fails_leaves_the_old_bank_as_it_was(finished, fingertip, t
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(BankFileError, match="cannot be written: No space left on device"):
+    with pytest.raises(
+        BankFileError,
+        match="cannot be written: No space left on device, and the rows solved so far are kept; make room",
+    ):
         build(fingertip, path, sigma=SIGMA + 0.1)
+    assert path.read_bytes() == finished.read_bytes()
+
+
+def test_a_bank_that_the_disk_has_no_room_for_is_written_from_its_journal_when_there_is(
+    finished, fingertip, tmp_path, monkeypatch
+):
+    path = tmp_path / "full.bank"
+
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(bank_file, "replaced", full)
+        with pytest.raises(BankFileError, match=r"full\.bank: the bank .*; make room and give the same command again"):
+            build(fingertip, path)
+    # Nothing is solved again.
+    monkeypatch.setattr(RowSolver, "solve", None)
+    build(fingertip, path)
     assert path.read_bytes() == finished.read_bytes()
 
 

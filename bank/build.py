@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bank.bank_file import MIN_SIGNAL_NORM, BankDefinition, write_bank
 from bank.batch_forward import BatchForwardModel
 from bank.channels import N_CHANNELS
-from bank.errors import BankFileError
+from bank.errors import BankFileError, EmptyBankError
 from bank.journal import BankRow, RowJournal
 from bank.mesh import Mesh
 from bank.models import PLAIN, Conductivities, Variation
@@ -73,13 +73,16 @@ def build_bank(
 
     `on_row(done, total)` is called once at the start and after each row that is safely on the disk; `on_notice` gets
     a sentence when there is something to say. Rows are solved by `elsewhere` where that is given, else in `jobs`
-    threads: with the same bytes. Raises ModelError, GeometryError, and BankFileError where the bank
-    cannot be written or another build is at work on it. A bank that was there before is replaced only by a finished
-    one.
+    threads: with the same bytes. Raises ModelError, GeometryError, EmptyBankError where no cell is valid, and
+    BankFileError where the bank cannot be written or another build is at work on it. A bank that was there before is
+    replaced only by a finished one.
     """
     definition = BankDefinition(mesh.digest, model, k_grid, sigma_grid, variation)
     if path.is_dir():
         raise BankFileError(f"{path} is a directory; give the name of a file in it to --out")
+    # A device or a pipe cannot be opened as a bank once all is solved.
+    if path.exists() and not path.is_file():
+        raise BankFileError(f"{path} is no file, and cannot hold a bank; give the name of a file to --out")
     solver = RowSolver(mesh, definition)
     with RowJournal(path, definition, on_notice or _ignore) as journal:
         total = len(definition.k_grid)
@@ -91,6 +94,13 @@ def build_bank(
             journal.append(row, cells)
             tell(len(journal.rows), total)
         rows = [journal.rows[row] for row in range(total)]
+        if not any(cells.valid.any() for cells in rows):
+            journal.remove()
+            highest = max(float(cells.min_conductivity.max()) for cells in rows)
+            raise EmptyBankError(
+                f"{path}: no cell of this bank is valid: {_why_empty(highest)}; choose other values of k and sigma, "
+                "and of what it is `over`"
+            )
         write_bank(
             path,
             definition,
@@ -123,6 +133,13 @@ def _solve(solver: RowSolver, rows: Sequence[int], jobs: int) -> Iterator[tuple[
                 yield tasks.pop(task), task.result()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _why_empty(highest: float) -> str:
+    """Return why no cell is valid, by the highest of their smallest conductivities."""
+    if highest > 0:
+        return f"no signal has a norm of {MIN_SIGNAL_NORM:g} or more"
+    return f"the conductivity of each falls to {highest:.3g} or below, and must be above 0"
 
 
 def _ignore(*_: object) -> None:

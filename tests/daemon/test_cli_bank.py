@@ -121,6 +121,21 @@ def test_banks_over_more_parameters_lie_in_a_folder_and_a_second_build_solves_on
     assert "amplitude 0.5, offset 0, tilt_deg 0" in capsys.readouterr().out
 
 
+def test_a_bank_without_a_valid_cell_is_left_out_of_a_folder_and_a_folder_of_such_banks_is_refused(
+    folder, tmp_path, capsys
+):
+    capsys.readouterr()
+    build = ["bank", "build", "--config", f"{folder}/weak.yaml", "--out", f"{tmp_path}", "--jobs", "1"]
+    (folder / "weak.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0, high: 1, count: 2}}}}\n")
+    assert main(build) == 0
+    told = capsys.readouterr()
+    assert "amplitude=0.bank: no cell of this bank is valid: no signal has a norm of 0.001 or more" in told.err
+    assert told.out.startswith(f"{tmp_path}/amplitude=1.bank: 6 of ")
+    assert [path.name for path in tmp_path.iterdir()] == ["amplitude=1.bank"]
+    (folder / "weak.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0, high: 0, count: 1}}}}\n")
+    assert "amplitude=0.bank: no cell of this bank is valid" in refused(capsys, *build[1:])
+
+
 def test_info_checks_the_bank_and_says_what_it_is_of(folder, capsys):
     assert main(["bank", "info", f"{folder}/a.bank", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -224,6 +239,8 @@ def test_plot_draws_signals_and_models(pictures):
         (["--model", "square"], "there is no basis model 'square'; choose one of step, linear"),
         (["--jobs", "0"], "--jobs must be 1 or more, not 0"),
         (["--out", "{folder}"], "is a directory; give the name of a file"),
+        (["--out", "/dev/null"], "/dev/null is no file, and cannot hold a bank; give the name of a file"),
+        (["--model", "linear", "--sigma", "0.01:0.02:2"], "no cell of this bank is valid: the conductivity of each"),
         (["--out", "{folder}/none/a.bank"], "the bank cannot be written: No such file or directory"),
         (["--out", "{folder}/tip.yaml/a.bank"], "the bank cannot be written: Not a directory"),
         (["--config", "{folder}/none.yaml"], "none.yaml: the configuration cannot be read"),

@@ -37,7 +37,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def add_overrides(parser: argparse.ArgumentParser) -> None:
     """Add the options that take the place of what the configuration says."""
     parser.add_argument("--model", metavar="M", help="basis model, in place of the configured one")
-    parser.add_argument("--k", metavar="LO:HI:N", help="N values of k from LO to HI, in place of the configured ones")
+    parser.add_argument(
+        "--k",
+        metavar="LO:HI:N",
+        help="N values of k from LO to HI, in place of the configured ones; --k=-5:-4:2 where LO is below 0",
+    )
     parser.add_argument("--sigma", metavar="LO:HI:N", help="N values of sigma from LO to HI, likewise")
 
 
@@ -57,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
 def _build(args: argparse.Namespace) -> int:
     from bank.bank_file import BANK_MAGIC
     from bank.build import build_bank, solve_row
+    from bank.errors import EmptyBankError
     from daemon.bank_config import load_bank_plans
     from daemon.cli.writing_over import check_writes_over
     from daemon.workers import workers
@@ -70,6 +75,7 @@ def _build(args: argparse.Namespace) -> int:
     # In a folder the names are the banks' own, and what cannot be used of an earlier build is built anew.
     if paths == [args.out]:
         check_writes_over(args.out, "a bank", BANK_MAGIC)
+    built = []
     with workers(args.cluster, jobs) as pool:
 
         def on_cluster(
@@ -80,21 +86,29 @@ def _build(args: argparse.Namespace) -> int:
 
         for path, plan in zip(paths, plans.values(), strict=True):
             if len(paths) > 1 and _is_built(path, plan):
+                built.append(path)
                 continue
-            with _Progress(path.name) as progress:
-                build_bank(
-                    plan.mesh,
-                    plan.model,
-                    plan.k_grid,
-                    plan.sigma_grid,
-                    path,
-                    variation=plan.variation,
-                    jobs=jobs,
-                    elsewhere=on_cluster if args.cluster is not None else None,
-                    on_row=progress.show,
-                    on_notice=lambda sentence: print(sentence, file=sys.stderr),
-                )
-    results = [_result(path) for path in paths]
+            try:
+                with _Progress(path.name) as progress:
+                    build_bank(
+                        plan.mesh,
+                        plan.model,
+                        plan.k_grid,
+                        plan.sigma_grid,
+                        path,
+                        variation=plan.variation,
+                        jobs=jobs,
+                        elsewhere=on_cluster if args.cluster is not None else None,
+                        on_row=progress.show,
+                        on_notice=lambda sentence: print(sentence, file=sys.stderr),
+                    )
+                built.append(path)
+            except EmptyBankError as error:
+                # Others of a folder can be matched with; where all are empty, the last one says so and fails.
+                if path == paths[-1] and not built:
+                    raise
+                print(f"{error}. It is left out", file=sys.stderr)
+    results = [_result(path) for path in built]
     if args.json:
         print(json.dumps(results[0] if args.out == paths[0] else {"banks": results}))
     else:

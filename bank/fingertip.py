@@ -25,6 +25,8 @@ SIDES: tuple[Side, ...] = ("left", "top", "right", "bottom")
 _BOUNDARY_HALVINGS = 2
 # Two lines nearer than this are one: below any measure that a maker could mean.
 _SAME_CM = 1e-6
+# 10 µm: no electrode is made as narrow, and a line at each end of it is still a line of its own.
+_LEAST_ELECTRODE_CM = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +58,11 @@ class Fingertip:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise GeometryError(f"the fingertip's {name} must be above 0, not {value:g}")
+        if self.electrode_width_cm < _LEAST_ELECTRODE_CM:
+            raise GeometryError(
+                f"the fingertip's electrode_width_cm must be {_LEAST_ELECTRODE_CM:g} or more, not "
+                f"{self.electrode_width_cm:g}"
+            )
         if len(self.electrodes) != N_ELECTRODES:
             raise GeometryError(f"the fingertip has {len(self.electrodes)} electrodes, expected {N_ELECTRODES}")
         for side in SIDES:

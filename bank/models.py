@@ -20,6 +20,8 @@ Values = NDArray[np.float64]
 _SUBDIVISIONS = 5
 # Triangles whose points are computed in one go.
 _AT_ONCE = 1300
+# An axis turned as far as this lies across: no height is along it.
+QUARTER_DEG = 90.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +49,13 @@ class Variation:
 
     def __post_init__(self) -> None:
         """Refuse what describes no conductivity."""
-        if not np.isfinite([self.amplitude, self.offset, self.tilt_deg]).all() or abs(self.tilt_deg) >= _QUARTER_DEG:
+        if not np.isfinite([self.amplitude, self.offset, self.tilt_deg]).all() or abs(self.tilt_deg) >= QUARTER_DEG:
             raise ModelError(
-                f"amplitude, offset and tilt must be finite, and the tilt within ±{_QUARTER_DEG:g}°, not {self}"
+                f"amplitude, offset and tilt must be finite, and the tilt less than ±{QUARTER_DEG:g}°, not "
+                f"{self.amplitude:g}, {self.offset:g} and {self.tilt_deg:g}°"
             )
 
 
-_QUARTER_DEG = 90.0
 PLAIN = Variation()
 
 

@@ -7,12 +7,12 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from bank.errors import GeometryError
 from bank.fingertip import ElectrodePlace, Fingertip, Side
 from bank.mesh import Mesh, load_mesh
-from bank.models import PLAIN, Variation
+from bank.models import PLAIN, QUARTER_DEG, Variation
 from daemon.config_file import ConfigModel, load_yaml_model, mistakes
 from daemon.errors import UserError
 
@@ -61,6 +61,16 @@ class OverConfig(ConfigModel):
     height_cm: GridConfig | None = None
     electrode_width_cm: GridConfig | None = None
     contact_impedance: GridConfig | None = None
+
+    @field_validator("tilt_deg")
+    @classmethod
+    def _turns_less_than_a_quarter(cls, tilt_deg: GridConfig | None) -> GridConfig | None:
+        if tilt_deg is not None and not -QUARTER_DEG < tilt_deg.low <= tilt_deg.high < QUARTER_DEG:
+            raise ValueError(
+                f"must be above -{QUARTER_DEG:g} and below {QUARTER_DEG:g} degrees, not from {tilt_deg.low:g} to "
+                f"{tilt_deg.high:g}"
+            )
+        return tilt_deg
 
     def values(self) -> list[dict[str, float]]:
         """Return every combination by name, the last parameter changing first."""

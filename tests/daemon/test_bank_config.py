@@ -152,6 +152,14 @@ def test_a_configuration_over_more_parameters_is_a_bank_for_each_combination(con
             "two banks of `over` would be named amplitude=0.5",
         ),
         ("over: {height_cm: {low: -1, high: 1, count: 2}}", r"tip\.yaml, with height_cm=-1.*: `height_cm` should be"),
+        (
+            "over: {tilt_deg: {low: 0, high: 90, count: 2}}",
+            r"bank\.yaml: `over.tilt_deg` must be above -90 and below 90 degrees, not from 0 to 90",
+        ),
+        (
+            "over: {electrode_width_cm: {low: 1.0e-9, high: 1.0e-9, count: 1}}",
+            r"tip\.yaml, with electrode_width_cm=1e-09: .* electrode_width_cm must be 0\.001 or more",
+        ),
         ("over: {height_cm: {low: 1, high: 2, count: 2}}", r"tip\.yaml, with height_cm=1"),
     ],
 )

@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -84,6 +84,11 @@ class Matcher(ABC):
         # Not as a memory map, whose indexing is slow.
         self._signals = np.asarray(signals).reshape(-1, N_CHANNELS)
         self._cells = np.flatnonzero(valid)
+
+    def __reduce__(self) -> tuple[type[Self], tuple[NDArray[Any], ...]]:
+        """Copy or send it as what it is made of: what is compiled for it cannot be copied, and is made anew."""
+        signals = self._signals.reshape(*self.valid.shape, N_CHANNELS)
+        return type(self), (signals, self.valid, self.k_grid, self.sigma_grid)
 
     @classmethod
     def from_bank(cls, bank: Bank) -> Self:

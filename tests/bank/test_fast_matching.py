@@ -1,5 +1,6 @@
 """Fast matching: the same cell, score and runner-up as the slow matcher finds, whatever the frame and the bank."""
 
+import copy
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -42,6 +43,16 @@ def test_a_bank_of_few_cells_is_not_searched_and_matches_the_same() -> None:
     assert fast.match(frame) == fast.match_quickly(frame) == slow.match(frame)
     assert fast.match(frame, runner_up=False) == without_runner_up(slow.match(frame))
     assert fast.matches([frame])[0].cell == slow.match(frame).cell
+
+
+@both
+def test_a_matcher_that_was_copied_matches_the_same(slow: Matcher, fast: FastMatcher) -> None:
+    frame = np.random.default_rng(5).normal(size=N_CHANNELS)
+    for one in (slow, fast):
+        # As pickling does, which sends it to another process.
+        again = copy.deepcopy(one)
+        assert type(again) is type(one)
+        assert again.match(frame) == one.match(frame)
 
 
 @both

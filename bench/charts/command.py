@@ -60,6 +60,9 @@ def run(args: argparse.Namespace) -> int:
         import matplotlib as _  # noqa: F401 - so that its absence is told before anything is measured
     except ModuleNotFoundError as error:
         raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
+    from bench.charts.picture import check_takes_pictures
+
+    check_takes_pictures(args.out)
     charts: dict[str, Callable[[argparse.Namespace], list[Path]]] = {
         "speed-accuracy": _speed_accuracy,
         "stability": _stability,

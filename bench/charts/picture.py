@@ -3,6 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,16 @@ def _plain_ticks(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def check_takes_pictures(directory: Path) -> None:
+    """Make a directory for charts, before anything is measured; UserError where nothing can be written into it."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        with TemporaryFile(dir=directory):
+            pass
+    except OSError as error:
+        raise _unwritable(directory, error) from error
+
+
 def save(made: Figure, content: Mapping[str, Any], directory: Path, name: str) -> list[Path]:
     """Write NAME.json, .svg and .png into a directory, and return the paths; UserError where that fails."""
     paths = [directory / f"{name}.{suffix}" for suffix in ("json", "svg", "png")]
@@ -132,8 +143,12 @@ def save(made: Figure, content: Mapping[str, Any], directory: Path, name: str) -
         for path in paths[1:]:
             made.savefig(path, dpi=130)
     except OSError as error:
-        raise UserError(f"{directory}: the chart cannot be written: {error.strerror}") from error
+        raise _unwritable(directory, error) from error
     return paths
+
+
+def _unwritable(directory: Path, error: OSError) -> UserError:
+    return UserError(f"{directory}: the chart cannot be written: {error.strerror}; choose another --out")
 
 
 def _plain(value: object) -> object:

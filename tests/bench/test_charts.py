@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bank.mesh import Mesh
+from bench.charts.command import NAMES
 from bench.charts.forwards import CELLS, converged, direct, error_of, forwards
 from bench.charts.picture import figure, frontier, plain_log, write_names
 from bench.charts.sources import bank_of, own_fingertip, splits, synthetic_stream
@@ -91,6 +92,17 @@ def test_a_mistake_is_one_sentence(
     said = capsys.readouterr().err
     assert complaint in said
     assert said.count("\n") == 1
+
+
+def test_a_place_that_takes_no_chart_is_told_before_anything_is_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Were anything read, it would be what fails.
+    monkeypatch.setattr("bench.charts.sources.splits", None)
+    for name in NAMES:
+        assert main(["chart", name, "--out", "/dev/null"]) == 2
+        said = capsys.readouterr().err
+        assert said == "shearloop chart: /dev/null: the chart cannot be written: File exists; choose another --out\n"
 
 
 @pytest.mark.parametrize("there", [True, False])

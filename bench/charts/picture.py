@@ -49,12 +49,12 @@ def frontier(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
     return found
 
 
-def draw_frontier(axes: Axes, costs: Sequence[float], errors: Sequence[float]) -> list[int]:
-    """Mark the frontier of points by a broad pale step: what lies above and right of it, something beats."""
+def draw_frontier(axes: Axes, costs: Sequence[float], errors: Sequence[float], reach: float) -> list[int]:
+    """Mark the frontier of points by a broad pale step, up to the cost `reach`: something beats what lies above it."""
     best = frontier(costs, errors)
     x, y = [costs[i] for i in best], [errors[i] for i in best]
     axes.plot(
-        [*x, max(costs)], [*y, y[-1]], drawstyle="steps-post", color="#c8c8c8", linewidth=6, zorder=0,
+        [*x, reach], [*y, y[-1]], drawstyle="steps-post", color="#c8c8c8", linewidth=6, zorder=0,
         solid_capstyle="round", label="frontier: nothing is faster and as accurate",
     )  # fmt: skip
     return best

@@ -4,7 +4,7 @@ import platform
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from matplotlib.axes import Axes
 
@@ -17,10 +17,15 @@ from bench.charts.picture import LINES, MARKS, SHADES, draw_frontier, figure, pl
 from bench.charts.sources import Split
 from bench.charts.windows import GAIN, LOOPS, Followed, followed
 
+Fill = Literal["none", "left", "full"]
 # Noise that the loop's identification copes with; a sensor worse than that never closes the loop.
 _LARGEST_LOOP_NOISE_NM = 0.02
 _SLICE_ESTIMATORS: tuple[Name, ...] = ("bank", "regression", "reconstruction", "fused")
-_MOST_VALID = 0.9
+# An error is that of the frames called valid: of fewer than this share of what others call valid it is told beside the
+# name, and not compared with theirs.
+_OFTEN_VALID = 0.9
+# How the mark of a single window is filled, from the smallest noise to the largest.
+_FILLS: tuple[Fill, ...] = ("none", "left", "full")
 # Families whose points are one thing at several settings are joined by a line.
 _JOINED = {"zero lag, bank of rank r": "rank", "regression on the best n channels": "channels"}
 
@@ -81,8 +86,10 @@ def write(
         panel.set_axis_off()
     made.suptitle("Speed against accuracy: below and to the left is better", fontsize=14)
     for one, panel in zip(compared, axes, strict=False):
-        most = max(method.valid_fraction for method in one.methods)
-        write_names(panel, [(method.latency_ms, method.rmse_nm, _short(method, most)) for method in one.methods])
+        often = often_valid(one.methods)
+        names = [_short(method, i in often) for i, method in enumerate(one.methods)]
+        points = zip(one.methods, names, strict=True)
+        write_names(panel, [(method.latency_ms, method.rmse_nm, name) for method, name in points])
     named = [(one.cell_ms, one.error, f"{one.name}\n{one.triangles} triangles") for one in solved if one.error]
     write_names(axes[len(compared)], named)
     return save(made, content, out, "speed-accuracy")
@@ -97,7 +104,9 @@ def _rows(methods: Sequence[Measured]) -> list[dict[str, Any]]:
 def _draw_methods(axes: Axes, compared: Compared) -> None:
     methods = compared.methods
     plain_log(axes)
-    best = draw_frontier(axes, [one.latency_ms for one in methods], [one.rmse_nm for one in methods])
+    often = often_valid(methods)
+    costs, errors = ([getattr(methods[i], name) for i in often] for name in ("latency_ms", "rmse_nm"))
+    best = [often[i] for i in draw_frontier(axes, costs, errors, max(one.latency_ms for one in methods))]
     families = list(dict.fromkeys(one.family for one in methods))
     for number, family in enumerate(families):
         shade, mark = SHADES[number % len(SHADES)], MARKS[number % len(MARKS)]
@@ -128,17 +137,24 @@ def _draw_methods(axes: Axes, compared: Compared) -> None:
     axes.legend(fontsize=8, loc="lower right", title="filled: on the frontier", title_fontsize=8, ncols=2)
 
 
-def _short(one: Measured, most_valid: float) -> str:
+def often_valid(methods: Sequence[Measured]) -> list[int]:
+    """Return the numbers of the methods that call about as many frames valid as the one that calls most so."""
+    most = max(one.valid_fraction for one in methods)
+    return [i for i, one in enumerate(methods) if one.valid_fraction >= _OFTEN_VALID * most]
+
+
+def _short(one: Measured, is_often_valid: bool) -> str:
     """Return a label, with the valid share where that is clearly less than the others': the error is of those alone."""
     short = one.name.removeprefix("rank ").removesuffix(" channels").replace("zero lag, ", "").replace("all lags, ", "")
     short = short.replace("paper: reference", "paper").replace("fast and exact", "fast").replace(", right", "")
-    return short if one.valid_fraction > _MOST_VALID * most_valid else f"{short} ({one.valid_fraction:.0%} valid)"
+    return short if is_often_valid else f"{short} ({one.valid_fraction:.0%} valid)"
 
 
 def _draw_forward(axes: Axes, solved: Sequence[Solved]) -> None:
     plain_log(axes)
     known = [(one.cell_ms, one.error) for one in solved if one.error is not None]
-    draw_frontier(axes, [cost for cost, _ in known], [error for _, error in known])
+    costs = [cost for cost, _ in known]
+    draw_frontier(axes, costs, [error for _, error in known], max(costs))
     families = list(dict.fromkeys(one.family for one in solved))
     axes.margins(x=0.12, y=0.12)
     for number, family in enumerate(families):
@@ -172,14 +188,16 @@ def _draw_loop(axes: Axes, loop: Sequence[Followed]) -> None:
     axes.set(yscale="log")
     noises = sorted({one.noise_nm for one in loop})
     for number, name in enumerate(LOOPS):
-        for noise, line in zip(noises, LINES, strict=False):
+        for noise, line, fill in zip(noises, LINES, _FILLS, strict=False):
             runs = [one for one in loop if one.loop == name and one.noise_nm == noise]
             rms = [one.rms_nm for one in runs]
             bars = [[one.rms_nm - one.rms_low_nm for one in runs], [one.rms_high_nm - one.rms_nm for one in runs]]
+            # What has no line to tell its noise by tells it by how its mark is filled.
             axes.errorbar(
                 [one.delay_s for one in runs], rms, yerr=bars, marker=MARKS[number], color=SHADES[number],
-                linestyle=line if len(runs) > 1 else "none", linewidth=1.2, markersize=6, elinewidth=0.7,
-                markerfacecolor="white" if number == 2 else SHADES[number],
+                linestyle=line if len(runs) > 1 else "none", linewidth=1.2, elinewidth=0.7,
+                markersize=6 if len(runs) > 1 else 8, fillstyle="full" if len(runs) > 1 else fill,
+                markerfacecoloralt="white", zorder=3 if len(runs) == 1 else 2,
                 label=f"{name}, noise {1e3 * noise:g} mN·m",
             )  # fmt: skip
             least = rms.index(min(rms))

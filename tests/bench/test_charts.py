@@ -10,10 +10,11 @@ import pytest
 from bank.mesh import Mesh
 from bench.charts.command import NAMES
 from bench.charts.forwards import CELLS, converged, direct, error_of, forwards
+from bench.charts.methods import Measured
 from bench.charts.picture import figure, frontier, plain_log, write_names
 from bench.charts.sources import bank_of, own_fingertip, splits, synthetic_stream
-from bench.charts.speed_accuracy import measured, write
-from bench.charts.windows import followed
+from bench.charts.speed_accuracy import Compared, _draw_loop, _draw_methods, _short, measured, often_valid, write
+from bench.charts.windows import LOOPS, Followed, followed
 from daemon.cli import main
 from daemon.reproduce.banks import Grid
 
@@ -30,6 +31,39 @@ def test_the_frontier_is_what_nothing_beats_in_both() -> None:
 
 def test_of_equally_fast_points_the_more_accurate_is_on_the_frontier() -> None:
     assert frontier([1.0, 1.0], [2.0, 1.0]) == [1]
+
+
+def test_what_calls_few_frames_valid_is_not_on_the_frontier_however_fast_and_exact(scratch: Path) -> None:
+    split = splits([], 0.6, scratch)[0]
+    methods = [
+        Measured(name, name, cost, cost, cost, error, None, valid)
+        for name, cost, error, valid in (
+            ("rare", 1.0, 0.001, 0.32),
+            ("often", 2.0, 0.01, 0.60),
+            ("most", 3.0, 0.005, 0.65),
+        )
+    ]
+    axes = figure(5, 5).add_subplot()
+    _draw_methods(axes, Compared(split, methods))
+    filled = [mark.lines[0].get_markerfacecolor() != "white" for mark in axes.containers]
+    assert filled == [False, True, True]
+    assert [_short(one, i in often_valid(methods)) for i, one in enumerate(methods)] == [
+        "rare (32% valid)",
+        "often",
+        "most",
+    ]
+
+
+def test_loops_at_one_window_tell_their_noises_apart_by_their_marks() -> None:
+    axes = figure(5, 5).add_subplot()
+    runs = [(loop, noise, n) for loop in LOOPS[:2] for noise in (0.002, 0.01, 0.02) for n in (1, 2)]
+    runs += [(LOOPS[2], noise, 1) for noise in (0.002, 0.01, 0.02)]
+    _draw_loop(axes, [Followed(loop, noise, n, n, noise, noise, noise) for loop, noise, n in runs])
+    looks = [
+        (line.get_marker(), line.get_linestyle() if len(line.get_xdata()) > 1 else "", line.get_fillstyle())
+        for line in (mark.lines[0] for mark in axes.containers)
+    ]
+    assert len(looks) == len(set(looks)) == 9
 
 
 def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch: Path) -> None:

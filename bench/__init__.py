@@ -1,4 +1,4 @@
-"""Measurements: each script writes its numbers as JSON and draws its chart."""
+"""Measurements: scripts that write their numbers as JSON and draw their charts; without a `main`, parts of those."""
 
 import os
 

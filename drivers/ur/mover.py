@@ -2,7 +2,8 @@
 
 No clock and no ur-rtde: the arm is a port and the time an argument. A motion that does not end as it should ends by the
 robot's watchdog: nothing is sent to the program any more, and only another one may move the arm again. What is sent is
-looked at in each cycle, and where it is the same as before sent again just often enough to keep the watchdog quiet.
+looked at in each cycle, and where something moves and it is the same as before sent again just often enough to keep the
+watchdog quiet.
 """
 
 from drivers.ur import sentences
@@ -47,7 +48,7 @@ class Mover:
         # Whether the robot did not take something since this was last set back.
         self.puzzled = False
         self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
-        self._speed_thread = self._just_sent = False
+        self._speed_thread = False
         # What the speed thread was told last, and when the robot was told anything; it is again once so much has
         # passed, for the next cycle is one period away.
         self._turned = WristSpeed(0.0, 0.0)
@@ -64,7 +65,6 @@ class Mover:
         """Turn the wrist so from now on; return whether the robot took it."""
         self._begin("wrist", number)
         self._asked, self._asked_ns = asked, now_ns
-        self._just_sent = True
         return self._send_wrist(reading, now_ns)
 
     def move(self, number: int, asked: MoveLinear, reading: Reading, now_ns: int) -> bool:
@@ -146,11 +146,8 @@ class Mover:
         if now_ns - self._asked_ns > self._settings.command_timeout_s * 1e9:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
             self.stop_now(reading, now_ns, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
-        elif not self._just_sent:
+        else:
             self._send_wrist(reading, now_ns)
-        # One that was given since the last cycle was sent then, within the limits of a reading as new as that; the loop
-        # gives one in every cycle.
-        self._just_sent = False
 
     def _keep_moving(self, reading: Reading, now_ns: int) -> None:
         self._move_seen = self._move_seen or reading.moving_linearly
@@ -178,9 +175,9 @@ class Mover:
                 self._end_speed_thread()
                 self.kind = "idle"
         else:
-            self._kick(now_ns)
             if not reading.moving_linearly and reading.rests:
                 self.kind = "idle"
+            self._kick(now_ns)
 
     def _keep_resting(self, now_ns: int) -> None:
         if now_ns - self._rested_ns > ASTRAY_S * 1e9:
@@ -202,7 +199,8 @@ class Mover:
         return self._speed(self.sent, now_ns)
 
     def _kick(self, now_ns: int) -> None:
-        if now_ns - self._said_ns >= self._unsaid_ns:
+        # The cycle after one at rest may be all of that time away (`drivers.ur.pace`).
+        if self.kind == "idle" or now_ns - self._said_ns >= self._unsaid_ns:
             self._said_ns = now_ns
             self._arm.kick()
 

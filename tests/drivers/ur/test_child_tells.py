@@ -5,7 +5,18 @@ from itertools import pairwise
 import pytest
 
 from drivers.ur import child
-from drivers.ur.messages import Disconnect, Ease, Enable, Heartbeat, Reading, Reply, RobotState, Unlock, WristSpeed
+from drivers.ur.messages import (
+    Disconnect,
+    Ease,
+    Enable,
+    Heartbeat,
+    Reading,
+    Reply,
+    RobotState,
+    Stop,
+    Unlock,
+    WristSpeed,
+)
 from drivers.ur.pilot import Pilot
 from tests.drivers.ur.process import Daemon, Eased, TimedArm
 
@@ -61,6 +72,23 @@ def test_for_a_command_soon_after_a_cycle_the_arm_is_not_read_again(
 ) -> None:
     eased = Eased(daemon, monkeypatch, (0.041, Enable()), (0.051, Enable()), (0.065, Disconnect()))
     assert eased.arm.read_s[5:9] == pytest.approx([0.04, 0.048, 0.051, 0.056])
+
+
+@pytest.mark.parametrize("eased_s", [0.301 + 0.008 * number for number in range(6)])
+def test_at_ease_the_robot_is_told_something_within_a_quarter_of_its_watchdogs_patience(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, eased_s: float
+) -> None:
+    """Whichever cycle was the last one before: the next that is gone through may be three away."""
+    told_s: list[float] = []
+
+    class Told(TimedArm):
+        def hear(self, call: str) -> None:
+            told_s.append(child.time.monotonic())
+            super().hear(call)
+
+    said = (0.1, Enable()), (0.105, WristSpeed(0.1, 4.0)), (0.2, Stop(4.0)), (eased_s, Ease(5)), (0.6, Disconnect())
+    Eased(daemon, monkeypatch, *said, arm=Told())
+    assert max(later - earlier for earlier, later in pairwise(told_s)) < 0.0241
 
 
 @pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])

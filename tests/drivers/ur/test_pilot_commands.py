@@ -11,7 +11,7 @@ from tests.drivers.ur.flight import POSE, Flight, flying, turning
 def test_start_clears_the_last_command_uploads_and_arms_the_watchdog_in_this_order() -> None:
     flight = Flight()
     flight.fly(5)
-    assert flight.arm.calls == ["clear_command", "upload", "arm_watchdog", "kick"]
+    assert flight.arm.calls == ["clear_command", "upload", "arm_watchdog", "kick", "kick"]
 
 
 def test_nothing_moves_before_it_is_enabled() -> None:

@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.ur.messages import Disconnect, MoveLinear, Stop, WristSpeed
-from tests.drivers.ur.flight import POSE, SETTINGS, Flight, flying, turning
+from drivers.ur.messages import Disconnect, MoveLinear, Reply, Stop, WristSpeed
+from tests.drivers.ur.flight import POSE, SETTINGS, WATCHDOG_NS, Flight, flying, turning
 from tests.drivers.ur.test_limits import LIMITS
 
 
@@ -38,13 +38,32 @@ def test_what_stays_the_same_is_told_again_within_a_quarter_of_the_watchdogs_pat
 ) -> None:
     settings = replace(SETTINGS, watchdog_hz=watchdog_hz)
     flight = flying(settings)
-    rested = said_in(flight, 30)
     assert flight.ask(WristSpeed(0.1, 4.0)).accepted
     turned = said_in(flight, 30)
     assert flight.arm.calls[-1] == "wrist"
-    for said in (rested, turned):
+    assert flight.ask(Stop(4.0)).accepted
+    flight.fly_until(lambda state: state.motion == "idle")
+    assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
+    moved = said_in(flight, 30)
+    assert flight.arm.calls[-1] == "kick"
+    for said in (turned, moved):
         assert {later - earlier for earlier, later in pairwise(said)} == {every}
     assert every == 1 or every / settings.rate_hz <= 0.25 / watchdog_hz
+
+
+@pytest.mark.parametrize("late_ns", [500_000, 4_000_000, 7_500_000])
+def test_speed_that_is_given_anew_between_cycles_is_told_the_robot_as_often(late_ns: int) -> None:
+    """Given just before it would be told again, it does not put that off by a cycle more."""
+    flight, told_ns = flying(), list[int]()
+    hear, given = flight.arm.hear, WristSpeed(0.1, 4.0)
+    flight.arm.hear = lambda call: (told_ns.append(now_ns), hear(call))[1]  # type: ignore[method-assign]
+    for cycle in range(60):
+        now_ns = flight.now_ns
+        flight.fly(1)
+        if cycle % 2:
+            now_ns += late_ns
+            assert flight.pilot.request(cycle, given, flight.arm.reading, now_ns) == Reply(sent=given)
+    assert max(later - earlier for earlier, later in pairwise(told_ns)) <= WATCHDOG_NS / 4
 
 
 @pytest.mark.parametrize("given_anew", [False, True])

@@ -161,6 +161,9 @@ def fit_reader(
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)
     least = LEAST_HALF_WIDTH * float(np.ptp(values))
     intervals, widened = Intervals.fit(predicted, residuals / hardness, edges, inflation, least), 1.0
+    # Before they are widened for times that are not known: a load that is not seen is none at any time.
+    half = np.array([intervals.half_width(one) for one in predicted])
+    misses_loads = difficulty is None and _misses_loads(truth, np.abs(residuals) <= half)
     if within is not None:
         rows = np.concatenate([future for _, future in blocks])
         astray = np.max([np.abs(truth + residuals - end[rows]) for end in within], axis=0)
@@ -177,8 +180,6 @@ def fit_reader(
     if mixed is not None:
         heads = ((head_of(features[past], values[past], strength), mixed(past, future)) for past, future in blocks)
         hidden = _hidden(features, values, heads, inflation)
-    half = np.array([intervals.half_width(one) for one in predicted])
-    misses_loads = difficulty is None and _misses_loads(truth, np.abs(residuals) <= half)
     return Reader(
         head, intervals, float(values.min()), float(values.max()),
         low_end, high_end, misses_loads, centre, reach, *hidden, widened,

@@ -97,6 +97,24 @@ def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
     assert not fit_reader(seeing, torque, Ridge.fit).misses_loads
 
 
+def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
+    """Intervals that hold what is measured beside a frame cover more loads, by which a blind reader passed for none."""
+    rng = np.random.default_rng(3)
+    torque = np.where(np.arange(600) % 40 < 5, rng.uniform(0.02, 0.06, 600), 0.0)
+    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
+    beside = np.array([np.roll(torque, shift) for shift in range(-6, 7)])
+    reader = fit_reader(blind, torque, Ridge.fit, within=(beside.min(axis=0), beside.max(axis=0)))
+    assert reader.widened > 1.2
+    loaded = torque > 0.01
+    read = np.array([reader.read(one) for one in blind[loaded]])
+    half = np.array([reader.intervals.half_width(one) for one in read[:, 0]])
+    assert (np.abs(torque[loaded] - read[:, 0]) <= half).mean() > 0.75, "as wide as that they would hold these loads"
+    assert reader.misses_loads
+    seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
+    sighted = fit_reader(seeing, torque, Ridge.fit, within=(beside.min(axis=0), beside.max(axis=0)))
+    assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
+
+
 def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced):
     from dataclasses import replace
 

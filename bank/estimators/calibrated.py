@@ -13,7 +13,7 @@ from bank.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from bank.errors import CalibrationError
 from bank.estimators.archive import read_archive, write_archive
 from bank.estimators.cylinders import is_line
-from bank.estimators.familiar import DifferenceGuard
+from bank.estimators.familiar import FAMILIAR, DifferenceGuard
 from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Ridge
 from bank.estimators.memory import Memory, Motion
@@ -246,7 +246,8 @@ class Tracker:
         for name, (task, _) in tasks.items():
             if task is None:
                 continue
-            why = task.guard.refuse(difference[0], usable[0]) if task.guard is not None else ()
+            judged = task.guard.judge(difference[0], usable[0]) if task.guard is not None else FAMILIAR
+            why = judged.why
             if name == "torque":
                 why = (*why, *self._other_tool)
             if name == "diameter" and self._memory is not None and not self._memory.own_baseline:
@@ -256,10 +257,10 @@ class Tracker:
                 continue
             refused += [reason for reason in why if reason not in refused]
             if not why:
-                wanted[name] = task
+                wanted[name] = task, judged
         if not wanted:
             return Estimate(valid=False, why=tuple(refused))
-        guard = next((task.guard for task in wanted.values() if task.guard is not None), None)
+        guard = next((task.guard for task, _ in wanted.values() if task.guard is not None), None)
         usable_share = np.count_nonzero(usable) / usable.size
         if guard is not None and usable_share < 1.0:
             # A curve does without dead channels; all else has to be told what they would have said.
@@ -273,12 +274,9 @@ class Tracker:
                 Estimate(valid=False, why=("two places of the bank far apart fit the frame equally well",)), seen.place
             )
         values: dict[str, tuple[float, float, float]] = {}
-        for name, task in wanted.items():
+        for name, (task, judged) in wanted.items():
             features = read_from(calibration, name, seen.features, held)
-            widening, nearness = 1.0, 0.0
-            if task.guard is not None:
-                widening, nearness = (of(difference[0], usable[0]) for of in (task.guard.widening, task.guard.nearness))
-            read = task.reader.read(features, usable_share, widening, nearness)
+            read = task.reader.read(features, usable_share, judged.widening, judged.nearness)
             if name == "diameter" and self._memory is not None:
                 read = _widened(read, self._place_noise_mm / math.sqrt(self._memory.held_frames))
             why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])

@@ -33,6 +33,23 @@ _POWER = 2
 _ALL = np.ones(N_CHANNELS, dtype=np.bool_)
 
 
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """The reasons against a difference, none for a familiar one, and what its interval has to hold.
+
+    widening is by how much that grows because the difference is explained less well than is typical. nearness is how
+    near it is to being refused by what it says twice: 1 at the limit, 0 without twins. What is foreign in it moves this
+    by the square of its share; up to the limit most of that may be hidden.
+    """
+
+    why: tuple[str, ...]
+    widening: float = 1.0
+    nearness: float = 0.0
+
+
+FAMILIAR = Judgement(())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DifferenceGuard:
     """The mean (896,) in volts, each channel's spread (896,) in volts, and directions (r, 896) in units of spread.
@@ -107,42 +124,46 @@ class DifferenceGuard:
 
     def widening(self, difference: FloatArray, usable: BoolArray) -> float:
         """Return by how much an interval grows because a difference is explained less well than is typical."""
-        return max(self.misfit(difference, usable)[0] / self.typical_misfit, 1.0) ** _POWER
+        return self._widening(self.misfit(difference, usable)[0])
 
-    def nearness(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return how near a difference is to being refused by what it says twice: 1 at the limit, 0 without twins.
+    def _widening(self, misfit: float) -> float:
+        return max(misfit / self.typical_misfit, 1.0) ** _POWER
 
-        What is foreign in it moves this by the square of its share; up to the limit most of that may be hidden.
-        """
-        return self.twins.misfit(difference, usable) / self.twins.largest_misfit if self.twins is not None else 0.0
-
-    def refuse(self, difference: FloatArray, usable: BoolArray) -> tuple[str, ...]:
-        """Return the reasons against a (896,) difference, judged by its usable channels."""
+    def judge(self, difference: FloatArray, usable: BoolArray) -> Judgement:
+        """Return what is to be thought of a (896,) difference, by its usable channels."""
         if 1.0 - usable.mean() > LARGEST_UNUSABLE_SHARE:
-            return (
-                f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; look at the ribbon cable",
+            return _refused(
+                f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; look at the ribbon cable"
             )
         size = float(np.sqrt((difference[usable] ** 2).mean()))
         if size < self.least_norm:
-            return (
+            return _refused(
                 f"no grip: the difference to the homogeneous frame is {1e3 * size:.1f} mV a channel, and gripping "
-                f"makes at least {1e3 * self.least_norm:.1f} mV",
+                f"makes at least {1e3 * self.least_norm:.1f} mV"
             )
         misfit, outlying = self.misfit(difference, usable)
         if misfit > self.largest_misfit or outlying > self.largest_outlying:
-            return (
+            return _refused(
                 f"outside of the calibration: the misfit is {misfit:.1f} (at most {self.largest_misfit:.1f}), with "
-                f"{100 * outlying:.0f} % of the channels far off (at most {100 * self.largest_outlying:.0f} %)",
+                f"{100 * outlying:.0f} % of the channels far off (at most {100 * self.largest_outlying:.0f} %)"
             )
-        if self.twins is not None and (twins := self.twins.misfit(difference, usable)) > self.twins.largest_misfit:
-            return (
-                f"outside of the calibration: what opposite injections say twice is off by {twins:.2f} (at most "
-                f"{self.twins.largest_misfit:.2f}); part of the frame may be another fingertip's",
-            )
+        nearness = 0.0
+        if self.twins is not None:
+            twins = self.twins.misfit(difference, usable)
+            if twins > self.twins.largest_misfit:
+                return _refused(
+                    f"outside of the calibration: what opposite injections say twice is off by {twins:.2f} (at most "
+                    f"{self.twins.largest_misfit:.2f}); part of the frame may be another fingertip's"
+                )
+            nearness = twins / self.twins.largest_misfit
         reach = self.reach(difference, usable)
         if reach > self.largest_reach:
-            return (
+            return _refused(
                 f"outside of the calibration: the frame lies {np.sqrt(reach):.1f} standard deviations from those "
-                f"calibrated on (at most {np.sqrt(self.largest_reach):.1f})",
+                f"calibrated on (at most {np.sqrt(self.largest_reach):.1f})"
             )
-        return ()
+        return Judgement((), self._widening(misfit), nearness)
+
+
+def _refused(why: str) -> Judgement:
+    return Judgement((why,))

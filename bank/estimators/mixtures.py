@@ -64,10 +64,11 @@ class Mixtures:
             for number, foreign in enumerate(self._foreign):
                 for share in _SHARES:
                     mixed = (1 - share) * self._differences[row] + share * foreign
-                    if guard.refuse(mixed, _ALL):
+                    judged = guard.judge(mixed, _ALL)
+                    if judged.why:
                         break
                     rows.append(row)
-                    nearness.append(guard.nearness(mixed, _ALL))
+                    nearness.append(judged.nearness)
                     key = row, number, share
                     if key not in self._features:
                         self._features[key] = self._features_of(mixed, row)

@@ -66,7 +66,7 @@ def detected(series: FrameSeries, origins: Sequence[float] = ORIGINS, seed: int 
                 found.append(
                     Detected(
                         origin, kind, share, tuple(misfits),
-                        float(np.mean([not guard.refuse(frame, usable) for frame in spoilt])),
+                        float(np.mean([not guard.judge(frame, usable).why for frame in spoilt])),
                         float((misfits <= good.max()).mean()),
                         float((misfits[:, None] > good).mean() + 0.5 * (misfits[:, None] == good).mean()),
                     )

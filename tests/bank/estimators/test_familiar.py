@@ -1,5 +1,7 @@
 """What a calibration of slices can speak of, and what it says of a frame at the rim of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.heads import Ridge
 from bank.estimators.physics import Place
 from bank.estimators.reader import Reader, fit_reader
+from bank.estimators.twins import Twins
 
 ALL = np.ones(896, dtype=np.bool_)
 
@@ -28,10 +31,10 @@ def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced
     series = sliced()
     guard = DifferenceGuard.fit(series.channels[:, 0])
     near, far = (beyond(series, nm)[0] for nm in (0.01, 0.15))
-    assert guard.refuse(near, ALL) == ()
+    assert guard.judge(near, ALL).why == ()
     # Its misfit is as small as any: only how far it lies out tells of it.
     assert guard.misfit(far, ALL)[0] < guard.largest_misfit
-    assert "standard deviations from those calibrated on" in guard.refuse(far, ALL)[0]
+    assert "standard deviations from those calibrated on" in guard.judge(far, ALL).why[0]
 
 
 @pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
@@ -49,8 +52,8 @@ def test_channels_that_vary_much_do_not_drown_the_others():
     guard = DifferenceGuard.fit(frames)
     # Ten times its own spread on every quiet channel is nothing beside one spread of the loud ones, in volts.
     odd = frames[3] + np.where(np.arange(896) < 90, 0.0, 1e-3) * np.where(np.arange(896) % 2, 1, -1)
-    assert guard.refuse(odd, ALL)
-    assert not guard.refuse(frames[3], ALL)
+    assert guard.judge(odd, ALL).why
+    assert not guard.judge(frames[3], ALL).why
 
 
 def saturating(value):
@@ -115,9 +118,29 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
 
 
-def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced):
-    from dataclasses import replace
+def test_a_slice_is_measured_against_the_calibration_once(sliced, monkeypatch):
+    """What lets it pass and its interval go by the same misfits: looked for twice they were a third of the time."""
+    series, looked = sliced(), []
+    calibration = fit("fused", [series], "all")
+    for kind in (DifferenceGuard, Twins):
+        found = kind.misfit
+        monkeypatch.setattr(kind, "misfit", lambda *args, found=found: (looked.append(type(args[0])), found(*args))[1])
+    assert all(one.valid for one in follow(calibration, series.channels[20:23]))
+    assert looked == [DifferenceGuard, Twins] * 3
 
+
+def test_a_judgement_holds_what_intervals_go_by(sliced):
+    frames = sliced().channels[:, 0]
+    guard = DifferenceGuard.fit(frames[:30])
+    for frame in frames[30:]:
+        judged = guard.judge(frame, ALL)
+        assert judged.why == ()
+        assert judged.widening == guard.widening(frame, ALL) >= 1.0
+        assert judged.nearness == guard.twins.misfit(frame, ALL) / guard.twins.largest_misfit <= 1.0
+    assert replace(guard, twins=None).judge(frames[35], ALL).nearness == 0.0, "a calibration from before there were any"
+
+
+def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced):
     task = replace(fit("fused", [sliced()], "all").torque, ks=np.array([3.12, 3.17]))
     place = Place(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
     assert task.refuse_place(place) == ()

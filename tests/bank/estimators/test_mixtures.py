@@ -87,8 +87,8 @@ def test_mixtures_are_those_that_the_guard_of_the_earlier_slices_lets_pass():
     assert 0 < len(passing.rows) < 20 * 15 * 3
     for row, features, nearness in zip(passing.rows, passing.features, passing.nearness, strict=True):
         assert features[-1] == row
-        assert not guard.refuse(features[:-1], usable)
-        assert nearness == guard.nearness(features[:-1], usable) <= 1.0
+        assert not guard.judge(features[:-1], usable).why
+        assert nearness == guard.judge(features[:-1], usable).nearness <= 1.0
     np.testing.assert_array_equal(
         mixtures.difficulty(past, future), [guard.widening(one, usable) for one in differences[future]]
     )

@@ -285,5 +285,5 @@ def test_no_later_slice_is_strange_and_a_third_of_a_foreign_one_is(shared, n):
     guard = DifferenceGuard.fit(frames[:n])
     later = frames[n:]
     foreign = later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
-    assert not any(guard.refuse(one, usable) for one in later)
-    assert all(guard.refuse(0.65 * one + 0.35 * foreign, usable) for one in later)
+    assert not any(guard.judge(one, usable).why for one in later)
+    assert all(guard.judge(0.65 * one + 0.35 * foreign, usable).why for one in later)

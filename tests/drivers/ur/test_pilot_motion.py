@@ -90,6 +90,30 @@ def test_speed_that_is_given_anew_is_sent_at_once_where_it_is_another() -> None:
     assert flight.arm.target == 0.25
 
 
+def test_same_speed_with_another_acceleration_is_sent_at_once() -> None:
+    flight = flying()
+    for acceleration in (4.0, 1.0, 2.0):
+        assert flight.ask(WristSpeed(0.1, acceleration)).accepted
+        assert flight.arm.acceleration == acceleration
+
+
+@pytest.mark.parametrize("cycles", [3, 4, 5])
+@pytest.mark.parametrize("stopped", [False, True])
+def test_cycle_in_which_a_straight_move_comes_to_rest_gives_a_sign_of_life(cycles: int, stopped: bool) -> None:
+    """However old the last one: the next cycle may be three away."""
+    flight = flying()
+    assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
+    flight.fly(cycles)
+    if stopped:
+        assert flight.ask(Stop(4.0)).accepted
+    else:
+        flight.arm.be(moving_linearly=False)
+    flight.arm.calls.clear()
+    flight.fly(1)
+    assert flight.state.motion == "idle"
+    assert flight.arm.calls == ["kick"]
+
+
 def test_speed_that_is_the_one_before_another_motion_is_sent_after_it() -> None:
     flight = flying()
     assert flight.ask(WristSpeed(0.0, 4.0)).accepted

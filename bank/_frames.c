@@ -395,21 +395,25 @@ static int copy(Fingertips *f, Py_ssize_t n_directions, PyObject *const *arrays,
 
 static int fingertips_init(PyObject *self, PyObject *args, PyObject *named)
 {
-    Fingertips *f = (Fingertips *)self;
+    Fingertips *f = (Fingertips *)self, told = {.n_sides = 0};
     PyObject *arrays[5];
     Py_ssize_t n_directions;
+    if (!PyArg_ParseTuple(args, "nnOOOOOnnddd", &told.n_sides, &n_directions, &arrays[0], &arrays[1], &arrays[2],
+                          &arrays[3], &arrays[4], &told.limits.fewest_at_rail, &told.limits.fewest_compared,
+                          &told.limits.largest_deviation, &told.limits.lost_share, &told.small_v))
+        return -1;
+    /* Only now: a number that is told may be an object whose own code has made them meanwhile. */
     if (f->values || f->tips || (named && PyDict_Size(named))) {
         PyErr_SetString(PyExc_TypeError, "fingertips are made once, and their arguments have no names");
         return -1;
     }
-    if (!PyArg_ParseTuple(args, "nnOOOOOnnddd", &f->n_sides, &n_directions, &arrays[0], &arrays[1], &arrays[2], &arrays[3],
-                          &arrays[4], &f->limits.fewest_at_rail, &f->limits.fewest_compared, &f->limits.largest_deviation,
-                          &f->limits.lost_share, &f->small_v))
-        return -1;
-    if (f->n_sides < 1 || f->n_sides > MOST || n_directions < 0 || n_directions > MOST) {
-        PyErr_Format(PyExc_ValueError, "%zd fingertips with %zd directions each", f->n_sides, n_directions);
+    if (told.n_sides < 1 || told.n_sides > MOST || n_directions < 0 || n_directions > MOST) {
+        PyErr_Format(PyExc_ValueError, "%zd fingertips with %zd directions each", told.n_sides, n_directions);
         return -1;
     }
+    f->n_sides = told.n_sides;
+    f->limits = told.limits;
+    f->small_v = told.small_v;
     Taken taken = {.n = 0};
     int sound = copy(f, n_directions, arrays, &taken);
     give_back(&taken);

@@ -232,3 +232,21 @@ def test_fingertips_that_do_not_fit_together_are_refused() -> None:
     empty = compiled._frames.Fingertips.__new__(compiled._frames.Fingertips)
     with pytest.raises(ValueError, match="no fingertips"):
         empty.check(rows, rows, rows)
+
+
+def test_fingertips_whose_arguments_make_them_stay_as_they_were_made() -> None:
+    """A number that makes them while it is read for another making: what was made is kept, and its size with it."""
+    rows, limits = np.ones((2, N_CHANNELS)), (9, 224, 0.12, 0.6, 0.01)
+    arrays = np.ones((2, 2, N_CHANNELS)), rows, rows, rows[:, None], np.full(4, N_CHANNELS)
+    made = compiled._frames.Fingertips.__new__(compiled._frames.Fingertips)
+
+    class Meddling:
+        def __index__(self) -> int:
+            made.__init__(2, 1, *arrays, *limits)
+            return 1000
+
+    usable = np.ones((2, N_CHANNELS), dtype=np.bool_)
+    with pytest.raises(TypeError, match="made once"):
+        made.__init__(2, Meddling(), *arrays, *limits)
+    frame = np.random.default_rng(0).uniform(0.95, 1.05, (2, N_CHANNELS))
+    assert made.check(frame, usable, frame) == [0, 0]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from bank import compiled
 from bank.channels import N_CHANNELS
 from bank.estimators.guard import unsaturated
-from bank.estimators.guards import Guards
+from bank.estimators.guards import JUMP_V, Guards
 from bank.estimators.memory import Memory
 from bank.estimators.values import FloatArray, FrameSeries, TactileFrame, everywhere
 
@@ -108,6 +108,21 @@ def test_a_frame_at_a_rail_is_not_ordinary(guards, recorded, at_rail) -> None:
     frame = spoilt(recorded.channels[50], "clipped", at_rail, np.random.default_rng(0))
     found = guards.jumping_if_ordinary(frame, np.ones(frame.shape, dtype=np.bool_), frame)
     assert (found is None) == (at_rail == 9)
+
+
+def test_a_channel_that_moves_just_as_far_as_is_explained_does_not_jump(fused_calibration) -> None:
+    first = fused_calibration.guards[0]
+    # Too low to be compared, so that it may read anything; of little noise, so that its limit is the least there is.
+    idle, gripped, noise = (np.array([low, *one[1:]]) for low, one in (
+        (0.01, first.idle), (0.01, first.gripped), (1e-4, first.noise)
+    ))  # fmt: skip
+    guards, usable = Guards((replace(first, idle=idle, gripped=gripped, noise=noise),)), np.ones((1, N_CHANNELS), bool)
+    before, frame = idle[None].copy(), idle[None].copy()
+    before[0, 0] = 0.0
+    for moved_v, share in ((JUMP_V, 0.0), (np.nextafter(JUMP_V, 1.0), 1 / N_CHANNELS)):
+        frame[0, 0] = moved_v
+        assert guards.jumping_shares(frame, before, usable) == [share]
+        assert guards.jumping_if_ordinary(frame, usable, before) == [share]
 
 
 @settings(deadline=None, max_examples=200)

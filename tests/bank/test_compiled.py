@@ -4,6 +4,7 @@ import datetime
 import shutil
 import sysconfig
 from collections.abc import Callable
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import cython_blas
 
+import bank
 from bank import compiled
 from bank.channels import N_CHANNELS
 from bank.compression import FloatArray
@@ -41,6 +43,15 @@ def test_what_is_compiled_from_sources_that_have_changed_since_is_not_used(tmp_p
         assert are_cells_stale(module)
     monkeypatch.setattr(compiled, "__file__", str(tmp_path / "compiled.py"))
     assert not compiled.is_stale(older, "_search.c", "search.c")
+
+
+@pytest.mark.parametrize("name", ["_frames", "_search"])
+def test_one_stale_part_leaves_all_to_numpy(name, monkeypatch) -> None:
+    monkeypatch.setattr(bank, name, SimpleNamespace(SOURCES=1, is_sgemm=bool), raising=False)
+    spec = spec_from_file_location("compiled_anew", compiled.__file__)
+    anew = module_from_spec(spec)
+    spec.loader.exec_module(anew)
+    assert not anew.IS_COMPILED
 
 
 def test_only_blas_as_it_is_called_is_taken() -> None:

@@ -108,3 +108,11 @@ def test_values_that_are_not_finite_are_not_usable():
     assert not frame.usable[0, 5]
     assert frame.usable.sum() == 895
     assert np.isfinite(frame.channels).all()
+
+
+def test_values_that_are_not_finite_are_not_usable_under_a_told_mask_either():
+    channels, told = np.zeros((1, 896)), np.ones((1, 896), dtype=np.bool_)
+    channels[0, 5], told[0, 7] = np.inf, False
+    frame = TactileFrame.of(0.0, channels, told)
+    assert list(np.flatnonzero(~frame.usable)) == [5, 7]
+    assert told[0, 5], "the caller's mask is left as it is"

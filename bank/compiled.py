@@ -182,9 +182,11 @@ def fingertips_of(
     if not IS_COMPILED:
         return None
     m, p = directions.shape[:2]
-    arrays = (np.ascontiguousarray(one, dtype=np.float64) for one in (known, jumps_v, weights, directions))
+    known, jumps_v, weights, directions = (
+        np.ascontiguousarray(one, dtype=np.float64) for one in (known, jumps_v, weights, directions)
+    )
     limits = fewest_at_rail, fewest_compared, largest_deviation, lost_share, small_v
-    return _frames.Fingertips(m, p, *arrays, counts, *limits)  # type: ignore[call-arg, arg-type]  # in this order
+    return _frames.Fingertips(m, p, known, jumps_v, weights, directions, counts, *limits)
 
 
 def _levels_of(bank: CompressedBank) -> tuple[Blocks, ...]:

@@ -356,7 +356,10 @@ class Memory:
         return Moment(channels, np.zeros_like(channels), (disturbed,), usable)
 
     def _disturbed(self, jumping_shares: Sequence[float]) -> str | None:
-        for guard, share in zip(self._guards.sides, jumping_shares, strict=False):
+        if not jumping_shares:
+            # There is no frame before to jump from.
+            return None
+        for guard, share in zip(self._guards.sides, jumping_shares, strict=True):
             if share > LARGEST_JUMPING_SHARE:
                 return (
                     f"{guard.side} fingertip: {100 * share:.0f} % of the channels jumped since the frame before; "

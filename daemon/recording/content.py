@@ -21,6 +21,10 @@ _SHAPE = "_shape"
 _ENCODER = json.JSONEncoder(separators=(",", ":"), allow_nan=False)
 
 
+class NoJsonError(ValueError):
+    """Something has no JSON form."""
+
+
 def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
     """Return a message's map, as it goes on the wire, as JSON: arrays as flat lists, without what has no value."""
     plain: dict[str, Any] = {}
@@ -49,12 +53,23 @@ def input_of(content: Mapping[str, Any]) -> RawInput:
 
 
 def as_json(content: Mapping[str, Any]) -> bytes:
-    """Return compact JSON of what has a JSON form, with null for the numbers that have none."""
+    """Return compact JSON, with null for the numbers that have none.
+
+    Raises NoJsonError for what has no JSON form, or is nested deeper than Python goes: some hundreds of levels.
+    """
     try:
         return to_json(content, inf_nan_mode="null")
     except ValueError:
         # A mapping that is no dict, or half of a surrogate pair, as in the name of a file that is no UTF-8.
+        return _by_python(content)
+
+
+def _by_python(content: Mapping[str, Any]) -> bytes:
+    try:
         return _ENCODER.encode(_finite(content)).encode()
+    except (RecursionError, TypeError, ValueError) as error:
+        too_deep = isinstance(error, RecursionError)
+        raise NoJsonError("it is nested too deep" if too_deep else str(error)) from error
 
 
 def _numbers(data: bytes) -> list[float | None]:

@@ -19,7 +19,7 @@ from typing import Any, TypeAlias
 from daemon.clock import Clock
 from daemon.errors import UserError
 from daemon.messages import Scalar
-from daemon.recording.content import as_json, input_json, message_json
+from daemon.recording.content import NoJsonError, as_json, input_json, message_json
 from daemon.recording.identity import Attached, Identity
 from daemon.recording.mcap_file import McapFile
 from daemon.recording.schema import (
@@ -101,8 +101,11 @@ class Recorder:
         self._taken_bytes = 0
         self._done_bytes = 0
         self._dropped = 0
-        # How many of them before the file being written began.
-        self._dropped_before = 0
+        # What has no JSON form, and why the last one had none.
+        self._unwritable = 0
+        self._last_unwritable = ""
+        # How many of both before the file being written began.
+        self._lost_before = 0
         # Which tool each source was told of last.
         self._tools: dict[str, RawInput] = {}
         # One thread at a time writes: a flush that was cancelled may still be under way when the end comes.
@@ -161,8 +164,8 @@ class Recorder:
             "file_messages": self._file.messages,
             "file_bytes": self._file.bytes_written,
             "waiting_bytes": self._waiting_bytes,
-            "errors": {"dropped": self._dropped} if self._dropped else {},
-            "trouble": self.failure,
+            "errors": {kind: n for kind, n in (("dropped", self._dropped), ("unwritable", self._unwritable)) if n},
+            "trouble": self.failure or self._last_unwritable,
         }
 
     def write(self) -> None:
@@ -183,7 +186,7 @@ class Recorder:
 
     def _end(self) -> None:
         if self._file.messages or self._experiment:
-            self._finish(self._file, self._experiment, self._dropped - self._dropped_before)
+            self._finish(self._file, self._experiment, self._dropped + self._unwritable - self._lost_before)
         else:
             # A daemon that did not get as far as its first message has nothing to keep.
             try:
@@ -232,13 +235,14 @@ class Recorder:
         """Go on in another file; where none can be begun, in the same one. So many were dropped until now."""
         if not self._flush():
             return
-        finished = self._file, self._experiment, dropped - self._dropped_before
+        lost = dropped + self._unwritable
+        finished = self._file, self._experiment, lost - self._lost_before
         try:
             self._begin()
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
             return
-        self._dropped_before = dropped
+        self._lost_before = lost
         self._finish(*finished)
         for source, told in self._tools.items():
             # It is held on, and a replay of this file has heard of it nowhere else.
@@ -269,13 +273,13 @@ class Recorder:
                 name = f"{name.partition('Z')[0]}Z-{number}"
         raise FileExistsError(17, f"there are {_MOST_ALIKE} files of this second")
 
-    def _finish(self, file: McapFile, experiment: str, dropped: int) -> None:
+    def _finish(self, file: McapFile, experiment: str, lost: int) -> None:
         """Close a file, under a name that tells its experiment; what cannot be closed stays PARTIAL, to be repaired."""
         slug = re.sub(r"[^a-z0-9.]+", "-", experiment.lower()).strip("-.")
         if slug:
             file.path = file.path.with_name(f"{file.path.stem}_{slug}.mcap")
         try:
-            file.metadata(END_METADATA, {"dropped": str(dropped)})
+            file.metadata(END_METADATA, {"dropped": str(lost)})
             self.finished.append(file.close())
         except OSError as error:
             self.failure = f"{file.partial}: {error.strerror}"
@@ -285,7 +289,12 @@ class Recorder:
             case _Message(topic, content, offset_ns, now_ns):
                 self._put_clock(now_ns, offset_ns)
                 name = recorded_topic(topic, content["source"])
-                data = message_json(topic, content, offset_ns)
+                try:
+                    data = message_json(topic, content, offset_ns)
+                except NoJsonError as error:
+                    self._unwritable += 1
+                    self._last_unwritable = f"a message of {name} is left out, for it has no JSON form: {error}"
+                    return
                 self._file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
             case _Input(source, told, offset_ns):
                 if told.kind is InputKind.TOOL:

@@ -199,16 +199,57 @@ def test_a_killed_recorder_loses_at_most_the_last_second(tmp_path: Path) -> None
     assert with_messages > 20
 
 
-def test_what_cannot_be_written_as_json_does_not_keep_the_file_from_being_closed(tmp_path: Path) -> None:
+def nested(depth: int) -> dict:
+    content: dict = {}
+    for _ in range(depth):
+        content = {"inner": content}
+    return content
+
+
+ENDLESS: dict = {}
+ENDLESS["itself"] = ENDLESS
+
+
+@pytest.mark.parametrize(
+    ("raw", "why"),
+    [
+        (object(), "Object of type object is not JSON serializable"),
+        (nested(500), "it is nested too deep"),
+        (nested(5000), "it is nested too deep"),
+        (ENDLESS, "it is nested too deep"),
+    ],
+    ids=["object", "500", "5000", "endless"],
+)
+def test_a_message_without_a_json_form_is_left_out_and_counted_and_the_recorder_goes_on(
+    raw: object, why: str, tmp_path: Path
+) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
+    recorder.experiment("first")
     recorder.record("load.torque", torque(clock, 0))
-    recorder.record("load.torque", {**torque(clock, 1), "raw": object()})
-    with pytest.raises(TypeError, match="not JSON serializable"):
-        recorder.close()
-    (path,) = recorder.finished
-    assert len(topics(path)["load.torque"]) == 1
-    assert recorder.facts()["waiting_bytes"] == 0
+    recorder.record("load.torque", {**torque(clock, 1), "raw": raw})
+    recorder.record("load.torque", torque(clock, 2))
+    # In a thread, as it is live: its stack is what nesting takes up.
+    asyncio.run(asyncio.to_thread(recorder.write))
+    facts = recorder.facts()
+    assert facts["errors"] == {"unwritable": 1}
+    assert facts["trouble"] == f"a message of load.torque is left out, for it has no JSON form: {why}"
+    assert facts["waiting_bytes"] == 0
+    assert recorder.failure == "", "nothing is wrong with the disk"
+    recorder.experiment("second")
+    recorder.record("load.torque", torque(clock, 3))
+    recorder.close()
+    first, second = recorder.finished
+    assert [one["seq"] for one in topics(first)["load.torque"]] == [0, 2]
+    assert [summarise(path).dropped for path in (first, second)] == [1, 0]
+
+
+def test_what_is_nested_a_hundred_times_is_recorded(tmp_path: Path) -> None:
+    clock = Clock()
+    recorder = Recorder(tmp_path, IDENTITY, clock)
+    recorder.record("load.torque", {**torque(clock, 0), "raw": nested(100)})
+    recorder.close()
+    assert topics(recorder.finished[0])["load.torque"][0]["raw"] == nested(100)
 
 
 async def test_a_recording_that_cannot_be_closed_leaves_no_socket_open(

@@ -28,10 +28,13 @@ _MOST_NOISE = 1.0 / 3.0
 def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> tuple[Path, Design]:
     """Return the fingertip's file and the design; raises UserError and BankError for what cannot be used."""
     path = fingertip or OWN_FINGERTIP
-    series = [one for one in read_series(recording) if one.torque_t_s.size]
+    # A side that is named is read alone: frames that the other one lacks are no reason to do without its own.
+    sides = None if side is None else (side,)
+    series = [one for one in read_series(recording, sides) if one.torque_t_s.size]
     if not series:
         raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
-    one = series[0] if side is None else series[0].of_sides((side,))
+    # Slices do not tell their side, and are not asked for it above.
+    one = series[0] if sides is None else series[0].of_sides(sides)
     return path, designed(scene_of(one), load_yaml_model(path, FingertipConfig).fingertip())
 
 

@@ -95,9 +95,11 @@ def _stability(args: argparse.Namespace) -> list[Path]:
     from daemon.workers import workers
 
     scratch, mesh = args.out / "banks", mesh_of(args.mesh)
+    # Before a bank is built there: what cannot be read leaves nothing behind.
+    parts = splits(args.recordings, args.split, scratch)
     bank = bank_of(args.bank, mesh, scratch)
     with workers(args.cluster, args.jobs) as pool:
-        return chart(splits(args.recordings, args.split, scratch), bank, mesh, scratch, args.out, pool)
+        return chart(parts, bank, mesh, scratch, args.out, pool)
 
 
 def _scene(args: argparse.Namespace) -> list[Path]:
@@ -105,5 +107,6 @@ def _scene(args: argparse.Namespace) -> list[Path]:
     from bench.charts.sources import splits
     from daemon.workers import workers
 
+    parts = splits(args.recordings, args.split, args.out / "banks")
     with workers(args.cluster, args.jobs) as pool:
-        return chart(splits(args.recordings, args.split, args.out / "banks"), args.out, pool)
+        return chart(parts, args.out, pool)

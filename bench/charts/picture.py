@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -125,13 +126,22 @@ def _plain_ticks(axis: Axis) -> None:
 
 
 def check_takes_pictures(directory: Path) -> None:
-    """Make a directory for charts, before anything is measured; UserError where nothing can be written into it."""
+    """Raise UserError, before anything is measured, where no chart can be written into a directory.
+
+    One that has to be made for that is removed again: a recording that cannot be read leaves nothing behind.
+    """
+    absent = [one for one in (directory, *directory.parents) if not one.exists()]
     try:
         directory.mkdir(parents=True, exist_ok=True)
         with TemporaryFile(dir=directory):
             pass
     except OSError as error:
         raise _unwritable(directory, error) from error
+    finally:
+        for one in absent:
+            # What somebody else has put into it meanwhile is theirs.
+            with suppress(OSError):
+                one.rmdir()
 
 
 def save(made: Figure, content: Mapping[str, Any], directory: Path, name: str) -> list[Path]:

@@ -1,5 +1,6 @@
 """`shearloop chart scene`: how much model a scene needs, by the recording's own noise."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,7 +12,7 @@ from bank.design import ALLOWED, Choice, Design, Scene, designed
 from bank.fingertip import Fingertip
 from bench.charts.picture import SHADES, figure, save
 from bench.charts.sources import Split, own_fingertip
-from daemon.scene import choices_of, scene_of
+from daemon.scene import choices_of, doubts, scene_of
 from daemon.workers import Workers, in_order
 
 _MESH_SIZE_CM = 0.07
@@ -19,14 +20,19 @@ _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
 
 
 def chart(parts: Sequence[Split], out: Path, pool: Workers) -> list[Path]:
-    """Design for the whole of each recording, draw and write; each recording is a task of its own."""
+    """Design for the whole of each recording, draw and write; each recording is a task of its own.
+
+    Why a design may not be worth building is told on stderr, as `bank design` tells it.
+    """
     scenes = [scene_of(split.whole) for split in parts]
     found = in_order(pool.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
-    return [
-        path
-        for split, design in zip(parts, found, strict=True)
-        for path in write(split.title.split(",", maxsplit=1)[0], design, out)
-    ]
+    written = []
+    for split, design in zip(parts, found, strict=True):
+        title = split.title.split(",", maxsplit=1)[0]
+        for sentence in doubts(design):
+            print(f"shearloop chart: {title}: {sentence}", file=sys.stderr)
+        written += write(title, design, out)
+    return written
 
 
 def designed_on(fingertip: Fingertip, scene: Scene) -> Design:

@@ -3,20 +3,25 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from bank.channels import N_CHANNELS
+from bank.estimators import FrameSeries
 from bank.mesh import Mesh
+from bench.charts import scene
 from bench.charts.command import NAMES
 from bench.charts.forwards import CELLS, converged, direct, error_of, forwards
 from bench.charts.methods import Measured
-from bench.charts.picture import figure, frontier, plain_log, write_names
-from bench.charts.sources import bank_of, own_fingertip, splits, synthetic_stream
+from bench.charts.picture import check_takes_pictures, figure, frontier, plain_log, write_names
+from bench.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
 from bench.charts.speed_accuracy import Compared, _draw_loop, _draw_methods, _short, measured, often_valid, write
 from bench.charts.windows import LOOPS, Followed, followed
 from daemon.cli import main
 from daemon.reproduce.banks import Grid
+from daemon.workers import InTurn
 
 
 @pytest.fixture(scope="module")
@@ -119,13 +124,21 @@ def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Pat
         (["no-such.mcap"], "no-such.mcap"),
     ],
 )
-def test_a_mistake_is_one_sentence(
-    arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("name", NAMES)
+def test_a_mistake_is_one_sentence_and_leaves_no_folder(
+    name: str, arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["chart", "speed-accuracy", *arguments, "--out", str(tmp_path / "out")]) == 2
+    assert main(["chart", name, *arguments, "--out", str(tmp_path / "some" / "out")]) == 2
     said = capsys.readouterr().err
     assert complaint in said
     assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_was_there_is_left_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    check_takes_pictures(tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_a_place_that_takes_no_chart_is_told_before_anything_is_measured(
@@ -137,6 +150,27 @@ def test_a_place_that_takes_no_chart_is_told_before_anything_is_measured(
         assert main(["chart", name, "--out", "/dev/null"]) == 2
         said = capsys.readouterr().err
         assert said == "shearloop chart: /dev/null: the chart cannot be written: File exists; choose another --out\n"
+
+
+def test_why_a_design_may_not_be_worth_building_is_told_with_the_chart_of_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 0.01, (12, 1, N_CHANNELS))
+    series = FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan))
+    parts = [Split(f"{name}, slices, first 60%", series, series, series) for name in ("good", "bad")]
+    # Each recording is designed for in turn; of a design its doubts ask no more.
+    found = iter([(0.6, 0.16), (0.9, 0.5)])
+
+    def designed_on(*_: object) -> SimpleNamespace:
+        penalised, noise = next(found)
+        return SimpleNamespace(models=[SimpleNamespace(penalised=penalised)], relative_noise=noise)
+
+    monkeypatch.setattr(scene, "designed_on", designed_on)
+    monkeypatch.setattr(scene, "write", lambda title, _, out: [out / title])
+    assert scene.chart(parts, tmp_path, InTurn()) == [tmp_path / "good", tmp_path / "bad"]
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("shearloop chart: bad: even the best model leaves 90.0% of a frame unexplained")
+    assert second.startswith("shearloop chart: bad: the noise is 50.0% of a difference frame")
 
 
 @pytest.mark.parametrize("there", [True, False])

@@ -8,7 +8,7 @@ from scipy.io import savemat
 
 from bank.bank_file import Bank
 from bank.build import build_bank
-from bank.channels import N_CHANNELS
+from bank.channels import N_CHANNELS, N_LINE_VALUES
 from bank.design import Scene, designed
 from bank.errors import CalibrationError
 from bank.estimators.physics import NOT_TURNED, NearestCell
@@ -18,8 +18,9 @@ from bank.models import conductivity
 from daemon.bank_config import FingertipConfig, load_bank_plan, load_geometry
 from daemon.cli import main
 from daemon.config_file import load_yaml_model
+from daemon.recording.writer import RecordingWriter
 from daemon.reproduce.banks import OWN_FINGERTIP
-from daemon.scene import design_yaml, scene_of
+from daemon.scene import design_yaml, designed_for, scene_of
 
 
 @pytest.fixture(scope="session")
@@ -100,3 +101,22 @@ def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_
     series = FrameSeries("raw", ("right",), t_s, frames, t_s, np.full(12, 0.1), np.full(12, np.nan))
     found = scene_of(series)
     np.testing.assert_array_equal(found.differences, frames[1:, 0] - frames[0, 0])
+
+
+def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, period_ns = np.random.default_rng(5), 540_800_000
+    with RecordingWriter(tmp_path / "one.mcap", "a test") as writer:
+        for number in range(12):
+            t_ns = number * period_ns
+            writer.frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+            writer.torque(t_ns, 0.1)
+        # A board that was lost soon, and whose frames lie beside the other's.
+        for t_ns in (6 * period_ns, 20 * period_ns):
+            writer.frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+    scenes: list[Scene] = []
+    monkeypatch.setattr("daemon.scene.designed", lambda scene, _: scenes.append(scene))
+    designed_for(tmp_path / "one.mcap", None, "left")
+    # Of the twelve the first stands in for the idle one.
+    assert scenes[0].differences.shape == (11, N_CHANNELS)

@@ -21,9 +21,11 @@ from drivers.ur.sample_age import SampleAge
 from drivers.ur.settings import UrSettings
 
 # A thread of the client asks its socket for data, sleeps for 0.1 ms, and asks again: 5 % of a core. Woken up to so much
-# later it asks once in a cycle. A call to it waits so much longer for the end of what it began, which none of those is
-# that turn the wrist or keep the watchdog quiet.
-_POLL_SLACK_NS = 8_000_000
+# later it takes two samples at a time. What is sent over and over (a wrist speed, a sign of life) does not wait for it.
+# What is done once (beginning or stopping a straight move, ending the turning of a wrist at rest, zeroing the wrench,
+# setting the watchdog) waits until it has seen that done, and what comes next until it has seen the robot ready again:
+# each so much longer at most, and a robot that hears nothing meanwhile has patience for six of them.
+_LONGEST_POLL_SLACK_NS, _SLACKS_IN_PATIENCE = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
 
 
@@ -44,7 +46,8 @@ class Arm:
         self._settings = settings
         self._receiver = Receiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
         kind = rtde_control.RTDEControlInterface
-        with _woken_late(_POLL_SLACK_NS):
+        patience_ns = 1e9 / settings.watchdog_hz
+        with _woken_late(min(_LONGEST_POLL_SLACK_NS, int(patience_ns / _SLACKS_IN_PATIENCE))):
             self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
         # Whether a straight move may be under way: one was begun, and the wrist has not been turned since.
         self._may_move_linearly = False

@@ -1,6 +1,7 @@
 """Connecting, with a client of the test's own in place of ur-rtde."""
 
 import ctypes
+import dataclasses
 import importlib
 import sys
 from collections.abc import Iterator
@@ -58,6 +59,22 @@ def test_kernel_that_does_not_let_threads_be_woken_late_does_not_prevent_connect
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
     assert arm.Arm(SETTINGS)._control.connected
     assert "woken more often than needed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("watchdog_hz", "slack_ms"), [(2.0, 16), (10.0, 16), (40.0, 4)])
+def test_threads_of_the_client_are_woken_late_but_not_for_long_of_the_watchdogs_patience(
+    arm: ModuleType, monkeypatch: pytest.MonkeyPatch, watchdog_hz: float, slack_ms: int
+) -> None:
+    asked: list[int] = []
+
+    def prctl(_option: int, slack: ctypes.c_ulong, *_: int) -> int:
+        asked.append(slack.value // 1_000_000)
+        return 0
+
+    monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=prctl))
+    arm.Arm(dataclasses.replace(SETTINGS, watchdog_hz=watchdog_hz))
+    # 0 is the default again, for what this thread starts later.
+    assert asked == [slack_ms, 0]
 
 
 class Controlled(Client):

@@ -180,11 +180,11 @@ class Daemon:
         health.add("commands", self._command_facts)
         return health
 
-    async def run(self) -> None:
-        """Run until `stop` is called, then end every task and close the sockets."""
+    async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
+        """Run until `stop` is called, then end every task and close the sockets; `on_ready` when all is made."""
         try:
             with self.publisher.told():
-                await self._run_tasks()
+                await self._run_tasks(on_ready)
             if self._experiment is not None:
                 self._experiment.end()
         finally:
@@ -198,10 +198,11 @@ class Daemon:
                 self._tell_of_recordings()
         structlog.get_logger().info("stopped")
 
-    async def _run_tasks(self) -> None:
+    async def _run_tasks(self, on_ready: Callable[[], None]) -> None:
         async with asyncio.TaskGroup() as group:
             running = [group.create_task(task, name=name) for name, task in self._tasks()]
             structlog.get_logger().info("running", fingertips=list(self._fingertips))
+            on_ready()
             sd_notify.notify("READY=1")
             await self._stop.wait()
             sd_notify.notify("STOPPING=1")
@@ -349,11 +350,12 @@ async def run_daemon(
     config: DaemonConfig,
     listeners: tuple[Listener, ...] = (),
     facts: Mapping[str, Callable[[], TaskFacts]] = MappingProxyType({}),
+    on_ready: Callable[[], None] = lambda: None,
 ) -> bool:
     """Run a daemon until SIGINT, SIGTERM or the command `stop`; return whether nothing was left undone.
 
     SIGTERM is how a service manager ends a service: what that leaves undone was to be left. `listeners` hear every
-    message; `facts` are what health tells of them, by name.
+    message; `facts` are what health tells of them, by name; `on_ready` is called once all that lasts has been made.
     """
     loop, terminated = asyncio.get_running_loop(), False
 
@@ -371,7 +373,7 @@ async def run_daemon(
         loop.add_signal_handler(signal.SIGINT, daemon.stop)
         loop.add_signal_handler(signal.SIGTERM, terminate)
         try:
-            await daemon.run()
+            await daemon.run(on_ready)
         finally:
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.remove_signal_handler(number)

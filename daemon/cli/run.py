@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext, suppress
 from itertools import pairwise
 from pathlib import Path
@@ -46,16 +46,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until SIGINT, SIGTERM or `shearloop command stop`, or until the experiment has ended (`stop_when_done`)."""
+    from daemon.collector import kept_from_lasting_objects
     from daemon.logs import logging_to_stderr
     from daemon.outlet import Outlet
 
     # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    with logging_to_stderr(json_lines=args.json_log) as log, closing(Outlet(sys.stdout)) as out:
-        return _run(args, log, out)
+    with (
+        kept_from_lasting_objects() as collect_what_comes,
+        logging_to_stderr(json_lines=args.json_log) as log,
+        closing(Outlet(sys.stdout)) as out,
+    ):
+        return _run(args, log, out, collect_what_comes)
 
 
-def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
+def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet", on_ready: Callable[[], None]) -> int:
     from structlog import get_logger
 
     from daemon.app import run_daemon
@@ -103,7 +108,7 @@ def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet") -> int:
             listeners = (Deaths(config.emulators, processes), happenings, *listeners)
             facts = {"log": log.facts, "shown": out.facts, **({"slices": slices.facts} if slices is not None else {})}
             shown = (Show(out), summary) if args.show else ()
-            finished = asyncio.run(run_daemon(config, (*listeners, *shown), facts))
+            finished = asyncio.run(run_daemon(config, (*listeners, *shown), facts, on_ready))
     finally:
         truth.close()
         if slices is not None:

@@ -61,6 +61,12 @@ def draw_frontier(axes: Axes, costs: Sequence[float], errors: Sequence[float], r
     return best
 
 
+def lay_out(made: Figure) -> None:
+    """Give everything in a figure its place for good: it takes a second, and would be done for each file anew."""
+    made.draw_without_rendering()
+    made.set_layout_engine("none")
+
+
 # Where a name may stand beside its point, in points, the first ones liked best.
 _BESIDE = [
     (dx, dy) for far in (7, 16, 26, 38) for dx, dy in ((far, 4), (far, -4), (-far, 4), (-far, -4), (0, far), (0, -far))
@@ -73,12 +79,8 @@ _GAP_PX = 4.0
 def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize: float = 7) -> None:
     """Write a name beside each point (x, y, name), where it covers neither other names nor marks nor the legend.
 
-    To be done when limits, marks and legend are final.
+    To be done when limits, marks and legend are final, and `lay_out` has been.
     """
-    made = axes.figure
-    if not isinstance(made, Figure):
-        raise TypeError("axes with names are those of a figure")
-    made.draw_without_rendering()
     centres = [axes.transData.transform((x, y)) for x, y, _ in points]
     taken = [Bbox([centre - _MARK_PX, centre + _MARK_PX]) for centre in centres]
     legend = axes.get_legend()

@@ -13,7 +13,7 @@ from bank.estimators import Name, Physics
 from bank.mesh import Mesh
 from bench.charts.forwards import CELLS, Solved, forwards
 from bench.charts.methods import Measured, estimators, fewer_channels, matchers, measure
-from bench.charts.picture import LINES, MARKS, SHADES, draw_frontier, figure, plain_log, save, write_names
+from bench.charts.picture import LINES, MARKS, SHADES, draw_frontier, figure, lay_out, plain_log, save, write_names
 from bench.charts.sources import Split
 from bench.charts.windows import GAIN, LOOPS, Followed, followed
 
@@ -85,6 +85,7 @@ def write(
     for panel in axes[panels:]:
         panel.set_axis_off()
     made.suptitle("Speed against accuracy: below and to the left is better", fontsize=14)
+    lay_out(made)
     for one, panel in zip(compared, axes, strict=False):
         often = often_valid(one.methods)
         names = [_short(method, i in often) for i, method in enumerate(one.methods)]

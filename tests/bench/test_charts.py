@@ -15,7 +15,7 @@ from bench.charts import scene
 from bench.charts.command import NAMES
 from bench.charts.forwards import CELLS, converged, direct, error_of, forwards
 from bench.charts.methods import Measured
-from bench.charts.picture import check_takes_pictures, figure, frontier, plain_log, write_names
+from bench.charts.picture import check_takes_pictures, figure, frontier, lay_out, plain_log, write_names
 from bench.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
 from bench.charts.speed_accuracy import Compared, _draw_loop, _draw_methods, _short, measured, often_valid, write
 from bench.charts.windows import LOOPS, Followed, followed
@@ -213,6 +213,7 @@ def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark(points: 
     plain_log(axes)
     axes.plot(*zip(*[point[:2] for point in points], strict=True), "o")
     axes.set(xlim=(0.5, 2), ylim=(0.5, 2))
+    lay_out(made)
     write_names(axes, points)
     # Two that stand closer together read as one.
     boxes = [note.get_window_extent().padded(1.9) for note in axes.texts]

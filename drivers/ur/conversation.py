@@ -5,9 +5,9 @@ import contextlib
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, Literal
+from typing import Final, Literal, Protocol
 
 from drivers.errors import DeviceLostError, DriverError, ProtocolError
 from drivers.ur import sentences
@@ -21,10 +21,8 @@ from drivers.ur.messages import (
     Phase,
     RobotState,
 )
+from drivers.ur.settings import UrSettings
 from drivers.ur.wire import Decoder, encode
-
-if TYPE_CHECKING:
-    from drivers.ur.client import UrRobot
 
 LossKind = FailureKind | Literal["crashed", "hung", "garbled"]
 
@@ -49,10 +47,38 @@ class LostError(DeviceLostError):
         self.kind: LossKind = kind
 
 
+class Outliving(Protocol):
+    """Who holds conversations one after the other, and outlives each."""
+
+    # When the process was told anything last, by time.monotonic.
+    told_s: float
+
+    @property
+    def settings(self) -> UrSettings:
+        """The robot's settings, as a process is given them at its beginning."""
+
+    @property
+    def takes_over(self) -> bool:
+        """Whether the process before this one may have left a program of ours on the robot."""
+
+    @property
+    def state(self) -> RobotState | None:
+        """The latest state of this process, None before its first."""
+
+    def connected(self, stdin: asyncio.StreamWriter) -> None:
+        """Take the pipe for commands: the process controls the robot from now on."""
+
+    def take_all(self, messages: Sequence[tuple[int, Message]]) -> None:
+        """Act on what was read of the process at once, in order."""
+
+    async def hurried(self) -> None:
+        """Wait until signs of life are needed."""
+
+
 class Conversation:
     """The pipe to one process."""
 
-    def __init__(self, robot: "UrRobot", process: asyncio.subprocess.Process, stdout: int) -> None:
+    def __init__(self, robot: Outliving, process: asyncio.subprocess.Process, stdout: int) -> None:
         if process.stdin is None or process.stderr is None:
             raise DriverError("The robot's process was started without pipes.")
         self._robot = robot

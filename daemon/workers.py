@@ -6,12 +6,13 @@ with it when it died is given to another one; only where tasks kill one worker a
 
 import asyncio
 import logging
+import signal
 import socket
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import get_context
+from contextlib import ExitStack, contextmanager
+from multiprocessing import get_context, resource_tracker
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from daemon.errors import UserError
@@ -98,7 +99,9 @@ class Cluster:
                 "again"
             ) from error
         finally:
-            self._client.cancel(list(tasks))
+            # An iterator that was interrupted where its results are used ends when it is thrown away: maybe later.
+            if self._client.status == "running":
+                self._client.cancel(list(tasks))
 
 
 def _itself(shared: S) -> S:
@@ -132,16 +135,37 @@ def workers(cluster: str | None, jobs: int = 1) -> "Iterator[Workers]":
     if cluster == LOCAL:
         # Port 8787, which it would take for a page that nobody opens, may be another cluster's.
         anywhere = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
-        with (
-            LocalCluster(n_workers=max(jobs, 1), threads_per_worker=1, scheduler_kwargs=anywhere) as local,
-            Client(local) as client,
-        ):
+        with ExitStack() as closed:
+            with _uninterrupted():
+                local = LocalCluster(
+                    n_workers=max(jobs, 1),
+                    threads_per_worker=1,
+                    scheduler_kwargs=anywhere,
+                    # Tasks that an end calls off are no news either.
+                    silence_logs=logging.CRITICAL,
+                )
+                client = closed.enter_context(Client(closed.enter_context(local)))
             yield Cluster(client)
         return
     _reach(cluster)
     with Client(cluster, timeout=CONNECT_S) as client:
         _wait_for_a_worker(client, cluster)
         yield Cluster(client)
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Keep Ctrl-C from the threads and processes that are begun here, and from this one until it is done.
+
+    A terminal interrupts all of its processes: each worker would print where it was.
+    """
+    # Its process is spawned with the first other one, in a thread that lets interrupts in again then.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _reach(address: str) -> None:

@@ -1,14 +1,16 @@
 """The same tasks in turn, in processes, and on a real Dask cluster of two workers, one of which may be killed."""
 
 import json
+import logging
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
-from multiprocessing import resource_tracker
+from contextlib import ExitStack, nullcontext
+from multiprocessing import get_context, resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +115,59 @@ def test_a_worker_killed_in_the_middle_costs_only_its_tasks(scheduler: str, tmp_
     # Twice ran the task that it died of, and what it had done but not yet handed over; all else once.
     assert runs.count(4) == 2
     assert len(runs) < 2 * 12 - 3
+
+
+def test_results_that_nobody_goes_on_with_are_let_go_after_the_end_of_the_cluster(scheduler: str) -> None:
+    """So ends what is interrupted where a result is used; a traceback told of it after the sentence."""
+    with workers(scheduler) as cluster:
+        found = cluster.map(square, {"factor": 0.37}, range(3))
+        next(found)
+    # As Python does when it throws the iterator away.
+    found.close()  # type: ignore[attr-defined]
+
+
+def interrupts_blocked(tell: Any) -> None:
+    """Tell whether this process hears of Ctrl-C."""
+    tell.send(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))
+
+
+@pytest.mark.usefixtures("scheduler")
+def test_a_local_cluster_is_quiet_and_ctrl_c_reaches_none_of_its_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal interrupts all processes: each worker printed a traceback before the one sentence."""
+    told: dict[str, Any] = {}
+    begun: list[str] = []
+    ours, its = get_context("spawn").Pipe(duplex=False)
+
+    class Local:
+        """Begins a process as the real one does: in a thread of its own."""
+
+        def __init__(self, **options: Any) -> None:
+            begun.append("cluster")
+            told.update(options)
+            process = get_context("spawn").Process(target=interrupts_blocked, args=(its,))
+            thread = threading.Thread(target=process.start)
+            thread.start()
+            thread.join()
+            process.join(STARTED_S)
+
+        def __enter__(self) -> "Local":
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            told["closed"] = True
+
+    # Were it begun with the first process, it would let interrupts in again there; here it runs since `scheduler`.
+    monkeypatch.setattr(resource_tracker, "ensure_running", lambda: begun.append("tracker"))
+    monkeypatch.setattr("distributed.LocalCluster", Local)
+    monkeypatch.setattr("distributed.Client", nullcontext)
+    with workers("local", 2):
+        assert ours.recv()
+        assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    assert begun[:2] == ["tracker", "cluster"]
+    assert told["closed"]
+    assert told["silence_logs"] == logging.CRITICAL
+    ours.close()
+    its.close()
 
 
 @pytest.fixture(scope="module")

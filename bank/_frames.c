@@ -1,6 +1,6 @@
 /* bank/look.c and bank/medians.c for Python: what estimators that know their fingertip ask of each frame.
 
-   The arrays that are handed in come of bank/compiled.py; their sizes are checked, for they decide where is read. */
+   Kinds and sizes of the arrays that are handed in are checked, for they decide where is read. */
 
 #define Py_LIMITED_API 0x030B0000
 #define PY_SSIZE_T_CLEAN
@@ -10,17 +10,85 @@
 
 #include <string.h>
 
-enum { ROW_BYTES = MOST_VALUES * sizeof(double), MOST = 1024 };
+enum { MOST = 1024, MOST_ARRAYS = 9, ROW = MOST_VALUES };
 
 typedef struct {
     PyObject_HEAD
     Py_ssize_t n_sides;
     Fingertip *tips;
     double *values; /* what they point to */
+    int some_lost;  /* of at least one of them */
     int is_whole;   /* all of it is there */
     Limits limits;
     double small_v;
 } Fingertips;
+
+/* Arrays that are looked at, until they are given back, and a number told with them. */
+typedef struct {
+    Py_buffer buffers[MOST_ARRAYS];
+    void *values[MOST_ARRAYS];
+    Py_ssize_t n_values[MOST_ARRAYS];
+    int n;
+    double number;
+} Taken;
+
+/* Sizes of arrays: as many values as the first, and whatever it is. */
+enum { AS_FIRST = -1, ANY = -2 };
+#define SIZES (const Py_ssize_t[])
+
+/* Take one more array of float64 (kind d), the same to be written to (w), bool (b) or int64 (i, whose letter is its platform's)
+   of so many values; 0 for another one, or one in pieces. */
+static int take(Taken *taken, PyObject *array, char kind, Py_ssize_t size)
+{
+    Py_buffer *buffer = &taken->buffers[taken->n];
+    const char *letters = kind == 'i' ? "lq" : kind == 'b' ? "?" : "d";
+    Py_ssize_t n_bytes = kind == 'b' ? 1 : 8;
+    if (PyObject_GetBuffer(array, buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (kind == 'w' ? PyBUF_WRITABLE : 0)) < 0) {
+        PyErr_Clear();
+        return 0;
+    }
+    Py_ssize_t n = taken->n_values[taken->n] = buffer->len / n_bytes;
+    taken->values[taken->n++] = buffer->buf;
+    const char *format = buffer->format;
+    return format && format[0] && strchr(letters, format[0]) && !format[1] && buffer->itemsize == n_bytes
+        && (size == ANY || n == (size == AS_FIRST ? taken->n_values[0] : size));
+}
+
+/* Take all arguments, each an array but for a last one of kind f, a number; 0 where they are others, with an error only where
+   there are more or fewer, or that is none. */
+static int take_all(Taken *taken, PyObject *args, const char *kinds, const Py_ssize_t *sizes)
+{
+    taken->n = 0;
+    if (PyTuple_Size(args) != (Py_ssize_t)strlen(kinds)) {
+        PyErr_Format(PyExc_TypeError, "%zd arguments instead of %zu", PyTuple_Size(args), strlen(kinds));
+        return 0;
+    }
+    for (int i = 0; kinds[i]; i++)
+        if (kinds[i] == 'f') {
+            taken->number = PyFloat_AsDouble(PyTuple_GetItem(args, i));
+            if (PyErr_Occurred())
+                return 0;
+        } else if (!take(taken, PyTuple_GetItem(args, i), kinds[i], sizes[i])) {
+            return 0;
+        }
+    return 1;
+}
+
+/* Give all arrays back and return what was found; with an error where they were not what they should have been. */
+static PyObject *done(Taken *taken, PyObject *found, const char *wrong)
+{
+    while (taken->n)
+        PyBuffer_Release(&taken->buffers[--taken->n]);
+    if (!found && !PyErr_Occurred())
+        PyErr_SetString(PyExc_ValueError, wrong);
+    return found;
+}
+
+/* The same, with None where there is nothing: numpy does it, or says what is wrong. */
+static PyObject *done_or_none(Taken *taken, PyObject *found)
+{
+    return done(taken, found || PyErr_Occurred() ? found : Py_NewRef(Py_None), NULL);
+}
 
 /* Put an item, NULL where none could be made, into a list, which is given up where that fails. */
 static void put(PyObject **list, Py_ssize_t i, PyObject *item)
@@ -29,29 +97,19 @@ static void put(PyObject **list, Py_ssize_t i, PyObject *item)
         Py_CLEAR(*list);
 }
 
-static PyObject *medians_of(const double *rows, const int64_t *counts, Py_ssize_t n)
-{
-    PyObject *found = PyList_New(n);
-    for (Py_ssize_t i = 0; found && i < n; i++)
-        put(&found, i, PyFloat_FromDouble(median_of(rows + i * MOST_VALUES, counts[i])));
-    return found;
-}
-
 static PyObject *medians(PyObject *module, PyObject *args)
 {
     (void)module;
-    Py_buffer rows, counts;
-    if (!PyArg_ParseTuple(args, "y*y*", &rows, &counts))
-        return NULL;
     PyObject *found = NULL;
-    Py_ssize_t n = counts.len / (Py_ssize_t)sizeof(int64_t);
-    if (rows.len == n * MOST_VALUES * (Py_ssize_t)sizeof(double))
-        found = medians_of(rows.buf, counts.buf, n);
-    else
-        PyErr_Format(PyExc_ValueError, "%zd counts for rows of %zd bytes", n, rows.len);
-    PyBuffer_Release(&rows);
-    PyBuffer_Release(&counts);
-    return found;
+    Taken taken;
+    if (take_all(&taken, args, "di", SIZES{ANY, ANY}) && taken.n_values[0] == taken.n_values[1] * ROW) {
+        const double *rows = taken.values[0];
+        const int64_t *counts = taken.values[1];
+        found = PyList_New(taken.n_values[1]);
+        for (Py_ssize_t i = 0; found && i < taken.n_values[1]; i++)
+            put(&found, i, PyFloat_FromDouble(median_of(rows + i * ROW, counts[i])));
+    }
+    return done(&taken, found, "medians are taken of (n, 896) float64 rows, of as many values of each as n int64 counts say");
 }
 
 PyDoc_STRVAR(medians_doc,
@@ -63,10 +121,8 @@ static PyObject *off_from_each(const double *known, const double *frame, const i
 {
     PyObject *found = PyList_New(n);
     for (Py_ssize_t i = 0; found && i < n; i++) {
-        const double *row = frame + i / n_each * MOST_VALUES;
-        Py_ssize_t at = i * MOST_VALUES;
-        compare(known + at, row, counts[i], off + at);
-        put(&found, i, PyFloat_FromDouble(median_of(off + at, counts[i])));
+        compare(known + i * ROW, frame + i / n_each * ROW, counts[i], off + i * ROW);
+        put(&found, i, PyFloat_FromDouble(median_of(off + i * ROW, counts[i])));
     }
     return found;
 }
@@ -74,22 +130,16 @@ static PyObject *off_from_each(const double *known, const double *frame, const i
 static PyObject *compared(PyObject *module, PyObject *args)
 {
     (void)module;
-    Py_buffer known, frame, counts, off;
-    if (!PyArg_ParseTuple(args, "y*y*y*w*", &known, &frame, &counts, &off))
-        return NULL;
     PyObject *found = NULL;
-    Py_ssize_t row_bytes = MOST_VALUES * (Py_ssize_t)sizeof(double);
-    Py_ssize_t n = counts.len / (Py_ssize_t)sizeof(int64_t), n_rows = frame.len / row_bytes;
-    if (n_rows > 0 && frame.len == n_rows * row_bytes && n % n_rows == 0 && known.len == n * row_bytes
-        && off.len == known.len)
-        found = off_from_each(known.buf, frame.buf, counts.buf, n, n / n_rows, off.buf);
-    else
-        PyErr_Format(PyExc_ValueError, "a frame of %zd bytes is not compared with %zd of %zd", frame.len, n, known.len);
-    PyBuffer_Release(&known);
-    PyBuffer_Release(&frame);
-    PyBuffer_Release(&counts);
-    PyBuffer_Release(&off);
-    return found;
+    Taken taken;
+    if (take_all(&taken, args, "ddiw", SIZES{ANY, ANY, ANY, AS_FIRST})) {
+        Py_ssize_t n_rows = taken.n_values[1] / ROW, n = taken.n_values[2];
+        if (n_rows > 0 && taken.n_values[1] == n_rows * ROW && n % n_rows == 0 && taken.n_values[0] == n * ROW)
+            found = off_from_each(taken.values[0], taken.values[1], taken.values[2], n, n / n_rows, taken.values[3]);
+    }
+    return done(&taken, found,
+                "a frame is (m, 896) float64 values, and compared with (m, k, 896), of which m·k int64 counts tell how many "
+                "are known; as many are written");
 }
 
 PyDoc_STRVAR(compared_doc,
@@ -100,48 +150,21 @@ PyDoc_STRVAR(compared_doc,
 static PyObject *n_largest(PyObject *module, PyObject *array)
 {
     (void)module;
-    Py_buffer rows;
-    if (PyObject_GetBuffer(array, &rows, PyBUF_C_CONTIGUOUS) < 0)
-        return NULL;
-    Py_ssize_t row_bytes = MOST_VALUES * (Py_ssize_t)sizeof(double), n = rows.len / row_bytes;
     PyObject *found = NULL;
-    if (rows.len == n * row_bytes)
+    Taken taken = {.n = 0};
+    if (take(&taken, array, 'd', ANY) && taken.n_values[0] % ROW == 0) {
+        const double *rows = taken.values[0];
+        Py_ssize_t n = taken.n_values[0] / ROW;
         found = PyList_New(n);
-    else
-        PyErr_Format(PyExc_ValueError, "%zd bytes are no rows of 896 values", rows.len);
-    for (Py_ssize_t i = 0; found && i < n; i++)
-        put(&found, i, PyLong_FromLong(n_largest_of((const double *)rows.buf + i * MOST_VALUES)));
-    PyBuffer_Release(&rows);
-    return found;
+        for (Py_ssize_t i = 0; found && i < n; i++)
+            put(&found, i, PyLong_FromLong(n_largest_of(rows + i * ROW)));
+    }
+    return done(&taken, found, "the largest are counted in (n, 896) float64 rows");
 }
 
 PyDoc_STRVAR(n_largest_doc,
 "n_largest(rows) -> list of int\n\n"
 "Return how many of each of (n, 896) float64 rows are its largest.");
-
-/* Arrays that are looked at, until they are given back. */
-typedef struct {
-    Py_buffer buffers[6];
-    int n;
-} Taken;
-
-/* The bytes of one more array; NULL for one of another size or format (below 0, NULL: whatever it is), or in pieces. */
-static void *take(Taken *taken, PyObject *array, const char *format, Py_ssize_t n_bytes, int flags)
-{
-    Py_buffer *buffer = &taken->buffers[taken->n];
-    if (PyObject_GetBuffer(array, buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | flags) < 0) {
-        PyErr_Clear();
-        return NULL;
-    }
-    taken->n++;
-    return (n_bytes < 0 || buffer->len == n_bytes) && (!format || strcmp(buffer->format, format) == 0) ? buffer->buf : NULL;
-}
-
-static void give_back(Taken *taken)
-{
-    while (taken->n)
-        PyBuffer_Release(&taken->buffers[--taken->n]);
-}
 
 static Fingertips *fingertips_of(PyObject *self)
 {
@@ -151,10 +174,27 @@ static Fingertips *fingertips_of(PyObject *self)
     return NULL;
 }
 
+/* Whether masks are those that the fingertips were made for. */
+static int are_told(const Fingertips *f, const unsigned char *told, const unsigned char *lost)
+{
+    for (Py_ssize_t i = 0; i < f->n_sides; i++)
+        if (memcmp(told + i * ROW, f->tips[i].told, ROW) || (f->some_lost && memcmp(lost + i * ROW, f->tips[i].lost, ROW)))
+            return 0;
+    return 1;
+}
+
+static int are_usable(const Fingertips *f, const unsigned char *usable)
+{
+    for (Py_ssize_t i = 0; i < f->n_sides; i++)
+        if (memcmp(usable + i * ROW, f->tips[i].usable, ROW))
+            return 0;
+    return 1;
+}
+
 static int are_ordinary(const Fingertips *f, const double *frame)
 {
     for (Py_ssize_t i = 0; i < f->n_sides; i++)
-        if (!is_ordinary(f->tips + i, &f->limits, frame + i * MOST_VALUES))
+        if (!is_ordinary(f->tips + i, &f->limits, frame + i * ROW))
             return 0;
     return 1;
 }
@@ -162,45 +202,54 @@ static int are_ordinary(const Fingertips *f, const double *frame)
 static PyObject *jumping(const Fingertips *f, const double *frame, const double *before)
 {
     PyObject *found = PyList_New(f->n_sides);
-    for (Py_ssize_t i = 0; found && i < f->n_sides; i++) {
-        Py_ssize_t at = i * MOST_VALUES;
-        put(&found, i, PyLong_FromLong(n_jumping(f->tips + i, frame + at, before + at)));
-    }
+    for (Py_ssize_t i = 0; found && i < f->n_sides; i++)
+        put(&found, i, PyLong_FromLong(n_jumping(f->tips + i, frame + i * ROW, before + i * ROW)));
     return found;
 }
 
 static PyObject *check(PyObject *self, PyObject *args)
 {
     const Fingertips *f = fingertips_of(self);
-    PyObject *arrays[3], *found;
-    if (!f || !PyArg_ParseTuple(args, "OOO", &arrays[0], &arrays[1], &arrays[2]))
+    PyObject *found = NULL;
+    Taken taken;
+    if (!f)
         return NULL;
-    Taken taken = {.n = 0};
-    const double *frame = take(&taken, arrays[0], "d", f->n_sides * ROW_BYTES, 0);
-    const char *usable = take(&taken, arrays[1], "?", f->n_sides * MOST_VALUES, 0);
-    const double *before = take(&taken, arrays[2], "d", f->n_sides * ROW_BYTES, 0);
-    if (frame && usable && before && !memchr(usable, 0, (size_t)f->n_sides * MOST_VALUES) && are_ordinary(f, frame))
-        found = jumping(f, frame, before);
-    else
-        found = Py_NewRef(Py_None);
-    give_back(&taken);
-    return found;
+    if (take_all(&taken, args, "dbbd", SIZES{f->n_sides * ROW, AS_FIRST, AS_FIRST, AS_FIRST})
+        && are_told(f, taken.values[1], taken.values[2]) && are_ordinary(f, taken.values[0]))
+        found = jumping(f, taken.values[0], taken.values[3]);
+    return done_or_none(&taken, found);
 }
 
 PyDoc_STRVAR(check_doc,
-"check(frame, usable, before) -> list of int | None\n\n"
-"Return how many channels of each side jump since the frame before; all (m, 896). None of a frame that is not ordinary.");
+"check(frame, told, lost, before) -> list of int | None\n\n"
+"Return how many usable channels of each side jump since the frame before; all (m, 896). None of a frame that is not ordinary,\n"
+"or is told to be usable elsewhere; and of one before which others were lost, where any are.");
 
-static PyObject *all_placed(const Fingertips *f, const double *frame, const double *idle, const double *gains,
-                            double *difference, double *places)
+static PyObject *fill_in(PyObject *self, PyObject *args)
+{
+    const Fingertips *f = fingertips_of(self);
+    Taken taken;
+    if (!f)
+        return NULL;
+    int sound = take_all(&taken, args, "wd", SIZES{f->n_sides * ROW, AS_FIRST});
+    for (Py_ssize_t i = 0; sound && i < f->n_sides; i++)
+        fill(f->tips + i, (double *)taken.values[0] + i * ROW, (const double *)taken.values[1] + i * ROW);
+    return done(&taken, sound ? Py_NewRef(Py_None) : NULL, "channels and those before are (m, 896) float64 values");
+}
+
+PyDoc_STRVAR(fill_in_doc,
+"fill_in(channels, before)\n\n"
+"Move those of (m, 896) channels that are not usable on from where they were before, as the usable ones say.");
+
+static PyObject *all_placed(const Fingertips *f, const Taken *taken)
 {
     PyObject *found = PyList_New(f->n_sides);
+    const double *frame = taken->values[0], *idle = taken->values[2], *gains = taken->values[3];
+    double *difference = taken->values[4], *places = taken->values[5];
     for (Py_ssize_t i = 0; found && i < f->n_sides; i++) {
-        Py_ssize_t at = i * MOST_VALUES;
-        const Fingertip *tip = f->tips + i;
-        double *its_places = places + i * tip->n_directions;
-        put(&found, i, PyFloat_FromDouble(place(tip, f->small_v, frame + at, idle + at, gains[i], difference + at,
-                                                its_places, its_places + f->n_sides * tip->n_directions)));
+        Py_ssize_t at = i * ROW, n = f->tips->n_directions;
+        put(&found, i, PyFloat_FromDouble(place(f->tips + i, f->small_v, frame + at, idle + at, gains[i], difference + at,
+                                                places + i * n, places + (f->n_sides + i) * n)));
     }
     return found;
 }
@@ -208,51 +257,30 @@ static PyObject *all_placed(const Fingertips *f, const double *frame, const doub
 static PyObject *placed(PyObject *self, PyObject *args)
 {
     const Fingertips *f = fingertips_of(self);
-    PyObject *arrays[6], *found;
-    if (!f || !PyArg_ParseTuple(args, "OOOOOO", &arrays[0], &arrays[1], &arrays[2], &arrays[3], &arrays[4], &arrays[5]))
+    PyObject *found = NULL;
+    Taken taken;
+    if (!f)
         return NULL;
-    Taken taken = {.n = 0};
-    Py_ssize_t n_bytes = f->n_sides * ROW_BYTES, n_places = 2 * f->n_sides * f->tips->n_directions;
-    const double *frame = take(&taken, arrays[0], "d", n_bytes, 0);
-    const char *usable = take(&taken, arrays[1], "?", f->n_sides * MOST_VALUES, 0);
-    const double *idle = take(&taken, arrays[2], "d", n_bytes, 0);
-    const double *gains = take(&taken, arrays[3], "d", f->n_sides * (Py_ssize_t)sizeof(double), 0);
-    double *difference = take(&taken, arrays[4], "d", n_bytes, PyBUF_WRITABLE);
-    double *places = take(&taken, arrays[5], "d", n_places * (Py_ssize_t)sizeof(double), PyBUF_WRITABLE);
-    if (frame && usable && idle && gains && difference && places && !memchr(usable, 0, (size_t)f->n_sides * MOST_VALUES))
-        found = all_placed(f, frame, idle, gains, difference, places);
-    else
-        found = Py_NewRef(Py_None);
-    give_back(&taken);
-    return found;
+    Py_ssize_t n_places = 2 * f->n_sides * f->tips->n_directions;
+    if (take_all(&taken, args, "dbddww", SIZES{f->n_sides * ROW, AS_FIRST, AS_FIRST, f->n_sides, AS_FIRST, n_places})
+        && are_usable(f, taken.values[1]))
+        found = all_placed(f, &taken);
+    return done_or_none(&taken, found);
 }
 
 PyDoc_STRVAR(placed_doc,
 "placed(frame, usable, idle, gains, difference, places) -> list of float | None\n\n"
 "Return the score of each side's grip, and write the (m, 896) difference to the idle frame at the calibration's gain, and\n"
-"where the frame at that gain, and the difference, lie along the directions, (2, m, p). None where not all is usable.");
-
-/* Take arrays of as many values as the first, the first to be written to or not; their number, −1 where they are not. */
-static Py_ssize_t take_alike(Taken *taken, PyObject *const *arrays, double **values, int n_arrays, int first_flags)
-{
-    Py_ssize_t n_bytes = -1;
-    for (int i = 0; i < n_arrays; i++) {
-        if (!(values[i] = take(taken, arrays[i], "d", n_bytes, i ? 0 : first_flags)))
-            return -1;
-        n_bytes = taken->buffers[0].len;
-    }
-    return n_bytes / (Py_ssize_t)sizeof(double);
-}
+"where the frame at that gain, and the difference, lie along the directions, (2, m, p). None where others are usable.");
 
 static PyObject *all_finite(PyObject *module, PyObject *array)
 {
     (void)module;
+    PyObject *found = NULL;
     Taken taken = {.n = 0};
-    double *values;
-    Py_ssize_t n = take_alike(&taken, &array, &values, 1, 0);
-    PyObject *found = n < 0 ? Py_NewRef(Py_None) : PyBool_FromLong(are_finite(values, n));
-    give_back(&taken);
-    return found;
+    if (take(&taken, array, 'd', ANY))
+        found = PyBool_FromLong(are_finite(taken.values[0], taken.n_values[0]));
+    return done_or_none(&taken, found);
 }
 
 PyDoc_STRVAR(all_finite_doc,
@@ -262,15 +290,11 @@ PyDoc_STRVAR(all_finite_doc,
 static PyObject *deviation(PyObject *module, PyObject *args)
 {
     (void)module;
-    PyObject *arrays[3];
-    Taken taken = {.n = 0};
-    double *values[3];
-    if (!PyArg_ParseTuple(args, "OOO", &arrays[0], &arrays[1], &arrays[2]))
-        return NULL;
-    Py_ssize_t n = take_alike(&taken, arrays, values, 3, 0);
-    PyObject *found = n < 0 ? Py_NewRef(Py_None) : PyFloat_FromDouble(weighed(values[0], values[1], values[2], n));
-    give_back(&taken);
-    return found;
+    PyObject *found = NULL;
+    Taken taken;
+    if (take_all(&taken, args, "ddd", SIZES{ANY, AS_FIRST, AS_FIRST}))
+        found = PyFloat_FromDouble(weighed(taken.values[0], taken.values[1], taken.values[2], taken.n_values[0]));
+    return done_or_none(&taken, found);
 }
 
 PyDoc_STRVAR(deviation_doc,
@@ -280,15 +304,12 @@ PyDoc_STRVAR(deviation_doc,
 static PyObject *beyond(PyObject *module, PyObject *args)
 {
     (void)module;
-    PyObject *arrays[3];
-    Taken taken = {.n = 0};
-    double *values[3], times;
-    if (!PyArg_ParseTuple(args, "OOOd", &arrays[0], &arrays[1], &arrays[2], &times))
-        return NULL;
-    Py_ssize_t n = take_alike(&taken, arrays, values, 3, 0);
-    PyObject *found = n < 0 ? Py_NewRef(Py_None) : PyLong_FromSsize_t(n_beyond(values[0], values[1], values[2], times, n));
-    give_back(&taken);
-    return found;
+    PyObject *found = NULL;
+    Taken taken;
+    if (take_all(&taken, args, "dddf", SIZES{ANY, AS_FIRST, AS_FIRST}))
+        found = PyLong_FromSsize_t(
+            n_beyond(taken.values[0], taken.values[1], taken.values[2], taken.number, taken.n_values[0]));
+    return done_or_none(&taken, found);
 }
 
 PyDoc_STRVAR(beyond_doc,
@@ -298,49 +319,27 @@ PyDoc_STRVAR(beyond_doc,
 static PyObject *follow(PyObject *module, PyObject *args)
 {
     (void)module;
-    PyObject *arrays[2];
-    Taken taken = {.n = 0};
-    double *values[2], n_rows;
-    if (!PyArg_ParseTuple(args, "OOd", &arrays[0], &arrays[1], &n_rows))
-        return NULL;
-    Py_ssize_t n = take_alike(&taken, arrays, values, 2, PyBUF_WRITABLE);
-    if (n >= 0)
-        add_to_mean(values[0], values[1], n_rows, n);
-    give_back(&taken);
-    return PyBool_FromLong(n >= 0);
+    PyObject *found = NULL;
+    Taken taken;
+    if (take_all(&taken, args, "wdf", SIZES{ANY, AS_FIRST})) {
+        add_to_mean(taken.values[0], taken.values[1], taken.number, taken.n_values[0]);
+        found = Py_NewRef(Py_True);
+    }
+    return done_or_none(&taken, found);
 }
 
 PyDoc_STRVAR(follow_doc,
-"follow(mean, values, n) -> bool\n\n"
-"Make `mean`, in its place, that of n rows of which `values` are the last; False where it was left alone.");
+"follow(mean, values, n) -> True | None\n\n"
+"Make `mean`, in its place, that of n rows of which `values` are the last; None where it was left alone.");
 
-/* Write how far the last of the places is from each before it, the nearest first, and then `at`; 0 where they do not fit. */
-static int write_motion(PyObject *places, PyObject *at, PyObject *features)
+/* Write how far the last of the places is from one before it; 0 where that one is not as long. */
+static int write_moved(const double *newest, Py_ssize_t n, PyObject *place, double *to)
 {
     Taken taken = {.n = 0};
-    Py_ssize_t n_places = PyTuple_Size(places), n_lags = n_places - 1, n;
-    int sound = 0, has_tail = at != Py_None;
-    const double *newest = n_places < 1 ? NULL : take(&taken, PyTuple_GetItem(places, n_lags), "d", -1, 0), *tail = NULL;
-    if (!newest)
-        goto end;
-    n = taken.buffers[0].len / (Py_ssize_t)sizeof(double);
-    double *to = take(&taken, features, "d", (n_lags + has_tail) * taken.buffers[0].len, PyBUF_WRITABLE);
-    if (!to || (has_tail && !(tail = take(&taken, at, "d", taken.buffers[0].len, 0))))
-        goto end;
-    for (Py_ssize_t lag = 1; lag <= n_lags; lag++, to += n) {
-        Taken one = {.n = 0};
-        const double *place = take(&one, PyTuple_GetItem(places, n_lags - lag), "d", taken.buffers[0].len, 0);
-        for (Py_ssize_t i = 0; place && i < n; i++)
-            to[i] = newest[i] - place[i];
-        give_back(&one);
-        if (!place)
-            goto end;
-    }
-    if (tail)
-        memcpy(to, tail, (size_t)n * sizeof(double));
-    sound = 1;
-end:
-    give_back(&taken);
+    int sound = take(&taken, place, 'd', n);
+    for (Py_ssize_t i = 0; sound && i < n; i++)
+        to[i] = newest[i] - ((const double *)taken.values[0])[i];
+    Py_XDECREF(done_or_none(&taken, NULL));
     return sound;
 }
 
@@ -348,9 +347,22 @@ static PyObject *motion(PyObject *module, PyObject *args)
 {
     (void)module;
     PyObject *places, *at, *features;
+    Taken taken = {.n = 0};
     if (!PyArg_ParseTuple(args, "O!OO", &PyTuple_Type, &places, &at, &features))
         return NULL;
-    return PyBool_FromLong(write_motion(places, at, features));
+    Py_ssize_t n_lags = PyTuple_Size(places) - 1;
+    int has_tail = at != Py_None;
+    int sound = n_lags >= 0 && take(&taken, PyTuple_GetItem(places, n_lags), 'd', ANY)
+        && take(&taken, features, 'w', (n_lags + has_tail) * taken.n_values[0]) && (!has_tail || take(&taken, at, 'd', AS_FIRST));
+    if (sound) {
+        Py_ssize_t n = taken.n_values[0];
+        double *to = taken.values[1];
+        for (Py_ssize_t lag = 1; sound && lag <= n_lags; lag++, to += n)
+            sound = write_moved(taken.values[0], n, PyTuple_GetItem(places, n_lags - lag), to);
+        if (sound && has_tail)
+            memcpy(to, taken.values[2], (size_t)n * sizeof(double));
+    }
+    return done(&taken, PyBool_FromLong(sound), NULL);
 }
 
 PyDoc_STRVAR(motion_doc,
@@ -358,37 +370,47 @@ PyDoc_STRVAR(motion_doc,
 "Write into `features` how far the last of a tuple of places is from each before it, the nearest first, and `at`, where that\n"
 "is not None. False where that was not done.");
 
-/* Copy what is known of the fingertips; 0 with an error where that is not of their number, or there is no memory. */
-static int copy(Fingertips *f, Py_ssize_t n_directions, PyObject *const *arrays, Taken *taken)
+/* What is told of a fingertip's channels, as 0 and 1. */
+static void note_masks(Fingertip *tip, const unsigned char *told, const unsigned char *lost)
 {
-    const Py_ssize_t rows[] = {2 * f->n_sides, f->n_sides, f->n_sides, n_directions * f->n_sides};
-    const int64_t *n_known = take(taken, arrays[4], NULL, rows[0] * (Py_ssize_t)sizeof(int64_t), 0);
-    double *copies[4], *to;
-    f->values = to = PyMem_Malloc((size_t)(rows[0] + rows[1] + rows[2] + rows[3]) * ROW_BYTES);
+    for (int i = 0; i < ROW; i++) {
+        tip->told[i] = told[i] != 0;
+        tip->lost[i] = lost[i] != 0;
+        tip->usable[i] = tip->told[i] && !tip->lost[i];
+        tip->unusable[tip->n_unusable] = i;
+        tip->n_unusable += !tip->usable[i];
+    }
+}
+
+/* Copy what is known of the fingertips, in arrays as `fingertips_init` takes them; 0 without memory for it. */
+static int copy(Fingertips *f, Py_ssize_t n_directions, Py_ssize_t n_moves, const Taken *taken)
+{
+    double *copies[6], *to;
+    Py_ssize_t n_values = 0;
+    for (int i = 0; i < 6; i++)
+        n_values += taken->n_values[i];
+    f->values = to = PyMem_Malloc((size_t)n_values * sizeof(double));
     f->tips = PyMem_Calloc((size_t)f->n_sides, sizeof(Fingertip));
-    if (!f->values || !f->tips) {
-        PyErr_NoMemory();
+    if (!f->values || !f->tips)
         return 0;
-    }
-    for (int i = 0; i < 4; i++) {
-        const double *from = take(taken, arrays[i], "d", rows[i] * ROW_BYTES, 0);
-        if (!from || !n_known) {
-            PyErr_SetString(PyExc_ValueError, "what is known of the fingertips does not fit together");
-            return 0;
-        }
-        copies[i] = memcpy(to, from, (size_t)rows[i] * ROW_BYTES);
-        to += rows[i] * MOST_VALUES;
-    }
+    for (int i = 0; i < 6; to += taken->n_values[i++])
+        copies[i] = memcpy(to, taken->values[i], (size_t)taken->n_values[i] * sizeof(double));
     for (Py_ssize_t i = 0; i < f->n_sides; i++) {
         Fingertip *tip = f->tips + i;
+        const double *reads = copies[4] + i * n_moves * ROW, *shapes = copies[5] + i * n_moves * ROW;
+        Py_ssize_t n_steps = n_moves / 2;
         for (int j = 0; j < 2; j++) {
-            tip->known[j] = copies[0] + (2 * i + j) * MOST_VALUES;
-            tip->n_known[j] = n_known[2 * i + j];
+            tip->known[j] = copies[0] + (2 * i + j) * ROW;
+            tip->n_known[j] = ((const int64_t *)taken->values[6])[2 * i + j];
         }
-        tip->jumps_v = copies[1] + i * MOST_VALUES;
-        tip->weights = copies[2] + i * MOST_VALUES;
-        tip->directions = copies[3] + i * n_directions * MOST_VALUES;
+        tip->jumps_v = copies[1] + i * ROW;
+        tip->weights = copies[2] + i * ROW;
+        tip->directions = copies[3] + i * n_directions * ROW;
         tip->n_directions = n_directions;
+        tip->steps = (Moves){reads, shapes, n_steps};
+        tip->grips = (Moves){reads + n_steps * ROW, shapes + n_steps * ROW, n_moves - n_steps};
+        note_masks(tip, (const unsigned char *)taken->values[7] + i * ROW, (const unsigned char *)taken->values[8] + i * ROW);
+        f->some_lost |= memchr(tip->lost, 1, ROW) != NULL;
     }
     return f->is_whole = 1;
 }
@@ -396,28 +418,32 @@ static int copy(Fingertips *f, Py_ssize_t n_directions, PyObject *const *arrays,
 static int fingertips_init(PyObject *self, PyObject *args, PyObject *named)
 {
     Fingertips *f = (Fingertips *)self, told = {.n_sides = 0};
-    PyObject *arrays[5];
-    Py_ssize_t n_directions;
-    if (!PyArg_ParseTuple(args, "nnOOOOOnnddd", &told.n_sides, &n_directions, &arrays[0], &arrays[1], &arrays[2],
-                          &arrays[3], &arrays[4], &told.limits.fewest_at_rail, &told.limits.fewest_compared,
-                          &told.limits.largest_deviation, &told.limits.lost_share, &told.small_v))
+    PyObject *arrays, *made = NULL;
+    Py_ssize_t n_directions, n_moves;
+    if (!PyArg_ParseTuple(args, "nnnO!nnddd", &told.n_sides, &n_directions, &n_moves, &PyTuple_Type, &arrays,
+                          &told.limits.fewest_at_rail, &told.limits.fewest_compared, &told.limits.largest_deviation,
+                          &told.limits.lost_share, &told.small_v))
         return -1;
-    /* Only now: a number that is told may be an object whose own code has made them meanwhile. */
+    if (told.n_sides < 1 || told.n_sides > MOST || n_directions < 0 || n_directions > MOST || n_moves < 0 || n_moves > MOST) {
+        PyErr_Format(PyExc_ValueError, "%zd fingertips with %zd directions and %zd moves each", told.n_sides, n_directions,
+                     n_moves);
+        return -1;
+    }
+    Taken taken;
+    Py_ssize_t n = told.n_sides * ROW;
+    int sound = take_all(&taken, arrays, "ddddddibb",
+                         SIZES{2 * n, n, n, n_directions * n, n_moves * n, n_moves * n, 2 * told.n_sides, n, n});
+    /* Only now: what is told may be an object whose own code has made them meanwhile. */
     if (f->values || f->tips || (named && PyDict_Size(named))) {
         PyErr_SetString(PyExc_TypeError, "fingertips are made once, and their arguments have no names");
-        return -1;
+    } else if (sound) {
+        f->n_sides = told.n_sides;
+        f->limits = told.limits;
+        f->small_v = told.small_v;
+        made = copy(f, n_directions, n_moves, &taken) ? Py_NewRef(Py_None) : PyErr_NoMemory();
     }
-    if (told.n_sides < 1 || told.n_sides > MOST || n_directions < 0 || n_directions > MOST) {
-        PyErr_Format(PyExc_ValueError, "%zd fingertips with %zd directions each", told.n_sides, n_directions);
-        return -1;
-    }
-    f->n_sides = told.n_sides;
-    f->limits = told.limits;
-    f->small_v = told.small_v;
-    Taken taken = {.n = 0};
-    int sound = copy(f, n_directions, arrays, &taken);
-    give_back(&taken);
-    return sound ? 0 : -1;
+    Py_XDECREF(done(&taken, made, "what is known of the fingertips does not fit together, or is of another kind"));
+    return made ? 0 : -1;
 }
 
 static void fingertips_dealloc(PyObject *self)
@@ -432,6 +458,7 @@ static void fingertips_dealloc(PyObject *self)
 
 static PyMethodDef fingertips_methods[] = {
     {"check", check, METH_VARARGS, check_doc},
+    {"fill_in", fill_in, METH_VARARGS, fill_in_doc},
     {"placed", placed, METH_VARARGS, placed_doc},
     {NULL, NULL, 0, NULL},
 };

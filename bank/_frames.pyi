@@ -1,3 +1,5 @@
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -8,11 +10,8 @@ class Fingertips:
         self,
         n_sides: int,
         n_directions: int,
-        known: NDArray[np.float64],
-        jumps_v: NDArray[np.float64],
-        weights: NDArray[np.float64],
-        directions: NDArray[np.float64],
-        counts: NDArray[np.int64],
+        n_moves: int,
+        arrays: tuple[NDArray[Any], ...],
         fewest_at_rail: int,
         fewest_compared: int,
         largest_deviation: float,
@@ -21,8 +20,14 @@ class Fingertips:
         /,
     ) -> None: ...
     def check(
-        self, frame: NDArray[np.float64], usable: NDArray[np.bool_], before: NDArray[np.float64], /
+        self,
+        frame: NDArray[np.float64],
+        told: NDArray[np.bool_],
+        lost: NDArray[np.bool_],
+        before: NDArray[np.float64],
+        /,
     ) -> list[int] | None: ...
+    def fill_in(self, channels: NDArray[np.float64], before: NDArray[np.float64], /) -> None: ...
     def placed(
         self,
         frame: NDArray[np.float64],
@@ -41,7 +46,7 @@ def beyond(
 def deviation(
     values: NDArray[np.float64], mean: NDArray[np.float64], weights: NDArray[np.float64], /
 ) -> float | None: ...
-def follow(mean: NDArray[np.float64], values: NDArray[np.float64], n: int, /) -> bool: ...
+def follow(mean: NDArray[np.float64], values: NDArray[np.float64], n: int, /) -> bool | None: ...
 def compared(
     known: NDArray[np.float64], frame: NDArray[np.float64], counts: NDArray[np.int64], off: NDArray[np.float64], /
 ) -> list[float]: ...

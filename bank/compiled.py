@@ -165,6 +165,8 @@ def fingertips_of(
     weights: FloatArray,
     directions: FloatArray,
     counts: NDArray[np.int64],
+    masks: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    moves: tuple[FloatArray, FloatArray],
     *,
     fewest_at_rail: int,
     fewest_compared: int,
@@ -172,21 +174,23 @@ def fingertips_of(
     lost_share: float,
     small_v: float,
 ) -> "_frames.Fingertips | None":
-    """Return what looks at frames of m fingertips in two calls; None where nothing is compiled.
+    """Return what looks at frames of m fingertips in a few calls while the same channels are usable.
 
-    known (m, 2, 896) frames, of which counts (m·2,) values are no NaN; jumps_v and weights (m, 896) of a jump and of
-    the grip's score; directions (m, p, 896). An ordinary frame has fewer than fewest_at_rail channels at its largest
-    value, none off by more than lost_share from both known frames, and of one of them, where at least fewest_compared
-    are compared, more than half off by no more than largest_deviation. The score divides by voltages + small_v.
+    None where nothing is compiled. known (m, 2, 896) frames, of which counts (m·2,) values are no NaN; jumps_v and
+    weights (m, 896) of a jump and of the grip's score; directions (m, p, 896). masks are which (m, 896) channels are
+    told to be usable, and which are lost; moves are `Motion.readings` (m, 2p + 1, 896), of nothing (m, 0, 896) where
+    nothing is to be filled in. An ordinary frame has fewer than fewest_at_rail usable channels at their largest value,
+    off by more than lost_share from both known frames those that are lost and no others, and of one of them, where at
+    least fewest_compared are compared, more than half off by no more than largest_deviation. The score divides by
+    voltages + small_v.
     """
     if not IS_COMPILED:
         return None
-    m, p = directions.shape[:2]
-    known, jumps_v, weights, directions = (
-        np.ascontiguousarray(one, dtype=np.float64) for one in (known, jumps_v, weights, directions)
-    )
+    values = [np.ascontiguousarray(one, dtype=np.float64) for one in (known, jumps_v, weights, directions, *moves)]
     limits = fewest_at_rail, fewest_compared, largest_deviation, lost_share, small_v
-    return _frames.Fingertips(m, p, known, jumps_v, weights, directions, counts, *limits)
+    m, p = directions.shape[:2]
+    arrays = (*values, counts, *map(np.ascontiguousarray, masks))
+    return _frames.Fingertips(m, p, moves[0].shape[1], arrays, *limits)
 
 
 def _levels_of(bank: CompressedBank) -> tuple[Blocks, ...]:

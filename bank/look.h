@@ -5,14 +5,25 @@
 
 #include <stddef.h>
 
-/* What is known of one fingertip: arrays of 896 values. */
+/* Directions (n, 896) that a frame moves along, and what each channel that is usable tells of how far it moved along them. */
+typedef struct {
+    const double *reads, *shapes;
+    ptrdiff_t n;
+} Moves;
+
+/* What is known of one fingertip while the same of its channels are usable: arrays of 896 values. */
 typedef struct {
     const double *known[2];   /* its frames, idle and gripped; NaN where none is compared */
     int64_t n_known[2];       /* how many of each are no NaN */
-    const double *jumps_v;    /* a channel that moves further from frame to frame is disturbed */
+    const double *jumps_v;    /* a channel that moves further from frame to frame is disturbed; infinite where unusable */
     const double *weights;    /* of the grip's score */
     const double *directions; /* (n_directions, 896), along which motion is measured */
     ptrdiff_t n_directions;
+    Moves steps, grips; /* from frame to frame, and from the idle frame; of none nothing is told of what is unusable */
+    unsigned char told[MOST_VALUES];   /* 1 at channels that are told to be usable */
+    unsigned char lost[MOST_VALUES];   /* 1 at those that are lost all the same */
+    unsigned char usable[MOST_VALUES]; /* told and not lost */
+    int unusable[MOST_VALUES], n_unusable; /* the numbers of the others */
 } Fingertip;
 
 /* Beyond these a frame is no ordinary one. */
@@ -23,15 +34,19 @@ typedef struct {
     double lost_share;         /* by which a channel is off from both known frames */
 } Limits;
 
-/* Whether nothing speaks against a frame but what may have happened since the frame before: it is finite, none of its channels
-   is at the rail or lost, and it is surely of this fingertip. */
+/* Whether nothing speaks against a frame but what may have happened since the frame before: it is finite, none of the channels
+   that are told to be usable is at the rail, no others are lost than are known to be, and it is surely of this fingertip. */
 int is_ordinary(const Fingertip *tip, const Limits *limits, const double *frame);
 
-/* How many channels jump from the frame before. */
+/* How many usable channels jump from the frame before. */
 int n_jumping(const Fingertip *tip, const double *frame, const double *before);
 
+/* Move the channels that are not usable on from where they were in the frame before, as the usable ones say. */
+void fill(const Fingertip *tip, double *channels, const double *before);
+
 /* The grip's score, where `small_v` is added to voltages that others are divided by, the 896 differences to the idle frame at
-   the calibration's gain, and where the frame at that gain, and its difference, lie along each of the directions. */
+   the calibration's gain, where the usable ones say what the others are, and where the frame at that gain, and its difference,
+   lie along each of the directions. */
 double place(const Fingertip *tip, double small_v, const double *frame, const double *idle, double gain, double *difference,
              double *places, double *placed);
 

@@ -16,7 +16,8 @@ from bank.estimators.cylinders import is_line
 from bank.estimators.familiar import FAMILIAR, DifferenceGuard
 from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Ridge
-from bank.estimators.memory import Memory, Motion
+from bank.estimators.memory import Memory
+from bank.estimators.motion import Motion
 from bank.estimators.physics import BestCell, Locator, NearestCell, Place, Registration
 from bank.estimators.reader import Reader
 from bank.estimators.values import BoolArray, Estimate, FloatArray, Kind, Measured, TactileFrame

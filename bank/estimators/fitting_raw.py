@@ -13,7 +13,8 @@ from bank.estimators.fitting_choices import Physics, ks_of, locator_of, ridge_fo
 from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Censored, Ridge, later_origins
-from bank.estimators.memory import Memory, Motion
+from bank.estimators.memory import Memory
+from bank.estimators.motion import Motion
 from bank.estimators.physics import Locator, register, settle_half_turn
 from bank.estimators.reader import Reader, error_on_later, fit_reader, one_sided
 from bank.estimators.values import FloatArray, FrameSeries, Measured, TactileFrame, distinct

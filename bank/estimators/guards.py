@@ -5,7 +5,7 @@ than what it computes: so all sides are compared in the same calls.
 """
 
 import math
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,7 +21,12 @@ from bank.estimators.guard import (
     SideGuard,
     relative_to,
 )
+from bank.estimators.motion import Motion
 from bank.estimators.values import BoolArray, FloatArray, everywhere
+from bank.estimators.views import Views
+
+if TYPE_CHECKING:
+    from bank._frames import Fingertips
 
 # A channel that jumps from frame to frame by more than this many times its noise, and this much, is disturbed.
 JUMP_NOISES, JUMP_V = 6.0, 0.008
@@ -30,24 +35,13 @@ JUMP_NOISES, JUMP_V = 6.0, 0.008
 _LOST_SHARE = 0.6
 
 
-class Placed(NamedTuple):
-    """Where a frame lies: the score of each side's grip, and the (m, 896) difference to the idle frame.
-
-    At the calibration's gain, as are the (m·p,) places of the frame and of its difference along the directions.
-    """
-
-    grips: list[float]
-    difference: FloatArray
-    place: FloatArray
-    from_idle: FloatArray
-
-
 class Guards:
     """All that is known of the m sides' fingertips; frames are (m, 896) in volts."""
 
-    def __init__(self, sides: tuple[SideGuard, ...], directions: FloatArray | None = None) -> None:
-        """Take the guards in the order of a frame's sides, and the (m, p, 896) directions that `place` goes along."""
+    def __init__(self, sides: tuple[SideGuard, ...], motion: Motion | None = None) -> None:
+        """Take the guards in the order of a frame's sides, and the motion whose directions `place` goes along."""
         self.sides = sides
+        self._motion = motion
         self.idle: FloatArray = np.array([guard.idle for guard in sides])
         self.gripped: FloatArray = np.array([guard.gripped for guard in sides])
         noise = np.array([guard.noise for guard in sides])
@@ -56,34 +50,34 @@ class Guards:
         self._jump_limits_v = np.maximum(JUMP_NOISES * np.sqrt(2.0) * noise, JUMP_V)
         self._frames = np.stack([self.idle, self.gripped], axis=1)
         self._known = Known(self._frames)
-        weights = np.array([guard.grip_weights for guard in sides])
-        self.directions: FloatArray = directions if directions is not None else np.zeros((len(sides), 0, N_CHANNELS))
-        self._compiled = fingertips_of(
-            *(self._known.frames, self._jump_limits_v, weights, self.directions, self._known.counts),
+        self._weights = np.array([guard.grip_weights for guard in sides])
+        self._directions = motion.directions if motion is not None else np.zeros((len(sides), 0, N_CHANNELS))
+        # The numbers of the sides at which a step in the frames tells a release.
+        self.stepping = [i for i, one in enumerate(sides) if max(one.step_limit, one.fall_limit) < math.inf]
+        # What looks at ordinary frames in a few calls.
+        self.views = Views(len(sides), self._directions.size // N_CHANNELS, self._fingertips)
+
+    def _fingertips(self, told: BoolArray, lost: BoolArray) -> "Fingertips | None":
+        """Return what is known of the fingertips while these are told to be usable, and these are lost, compiled."""
+        usable = told & ~lost
+        if any(self.too_few(usable)):
+            return None
+        known = Known(self._frames, told[:, None])
+        moves = np.zeros((2, len(self.sides), 0, N_CHANNELS))
+        if self._motion is not None and not everywhere(usable):
+            each = [self._motion.readings(i, usable[i], guard) for i, guard in enumerate(self.sides)]
+            moves = np.stack(each, axis=1)
+        jump_limits_v = np.where(usable, self._jump_limits_v, np.inf)
+        return fingertips_of(
+            *(known.frames, jump_limits_v, self._weights, self._directions, known.counts),
+            (told, lost),
+            (moves[0], moves[1]),
             fewest_at_rail=FEWEST_AT_RAIL,
             fewest_compared=FEWEST_COMPARED,
             largest_deviation=LARGEST_DEVIATION,
             lost_share=_LOST_SHARE,
             small_v=SMALL_V,
         )
-        # The numbers of the sides at which a step in the frames tells a release.
-        self.stepping = [i for i, one in enumerate(sides) if max(one.step_limit, one.fall_limit) < math.inf]
-
-    def jumping_if_ordinary(self, frame: FloatArray, usable: BoolArray, before: FloatArray) -> list[float] | None:
-        """Return `jumping_shares` of an ordinary frame in one call; None of others, and where nothing is compiled.
-
-        A frame is ordinary where all is usable, nothing at a rail, and `seen` finds no reason and nothing lost.
-        """
-        counts = self._compiled.check(frame, usable, before) if self._compiled is not None else None
-        return None if counts is None else [count / N_CHANNELS for count in counts]
-
-    def place(self, frame: FloatArray, usable: BoolArray, idle: FloatArray, gains: FloatArray) -> "Placed | None":
-        """Return where a frame lies in one call; None where not all is usable, and where nothing is compiled."""
-        if self._compiled is None:
-            return None
-        difference, places = np.empty(frame.shape), np.empty((2, self.directions.size // N_CHANNELS))
-        grips = self._compiled.placed(frame, usable, idle, gains, difference, places)
-        return None if grips is None else Placed(grips, difference, *places)
 
     def too_few(self, usable: BoolArray) -> list[str]:
         """Return for each side why it has too few usable channels, empty texts where it has enough."""

@@ -10,16 +10,17 @@ for long is told by.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 from bank.channels import N_CHANNELS
-from bank.compiled import follow, motion
+from bank.compiled import follow
 from bank.estimators.grip import Grip
 from bank.estimators.guard import LARGEST_JUMPING_SHARE, STEP_FRAMES, SideGuard, unsaturated
-from bank.estimators.guards import Guards, Placed
+from bank.estimators.guards import Guards
+from bank.estimators.motion import Motion
 from bank.estimators.values import BoolArray, FloatArray, TactileFrame, everywhere
+from bank.estimators.views import Placed
 
 # Frames that an idle baseline is averaged over at the most recent end.
 BASELINE_FRAMES = 10
@@ -51,58 +52,6 @@ class Moment:
     usable: BoolArray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Motion:
-    """The directions (m, p, 896) that each side's motion is measured along, in units of noise, and how far back.
-
-    placed says that the place relative to the idle frame is a feature too.
-    """
-
-    directions: FloatArray
-    n_lags: int
-    placed: bool = False
-
-    @classmethod
-    def fit(cls, parts: list[FloatArray], guards: tuple[SideGuard, ...], n_directions: int, n_lags: int) -> Self:
-        """Fit to (n, m, 896) gripped frames of each recording: the main directions of motion within the memory."""
-        directions = []
-        for layer, guard in enumerate(guards):
-            moved = np.vstack([(part[n_lags:, layer] - part[:-n_lags, layer]) / guard.noise for part in parts])
-            rows = np.linalg.svd(moved, full_matrices=False)[2][:n_directions] / guard.noise
-            directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
-        return cls(np.array(directions), n_lags)
-
-    def places(self, channels: FloatArray) -> FloatArray:
-        """Return the (…, m·p) places of (…, m, 896) frames along the directions."""
-        found = np.einsum("...mc,mpc->...mp", channels, self.directions)
-        return np.asarray(found.reshape(*found.shape[:-2], -1))
-
-    def step(self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
-        """Return how far all (896,) channels of a side moved, going by the usable ones and the known directions."""
-        return _along(self._shapes(layer, noise), moved, usable, noise)
-
-    def gripped_step(self, layer: int, moved: FloatArray, usable: BoolArray, guard: SideGuard) -> FloatArray:
-        """Return the same of how far (896,) channels are from idle, where the grip's own step is one more direction."""
-        shapes = np.vstack([self._shapes(layer, guard.noise), guard.gripped - guard.idle])
-        return _along(shapes, moved, usable, guard.noise)
-
-    def _shapes(self, layer: int, noise: FloatArray) -> FloatArray:
-        return np.asarray(self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2)
-
-    def features(self, places: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
-        """Return the features of the n_lags + 1 last (m·p,) places and of the newest one's from idle.
-
-        n_lags · m·p of motion, the nearest lag first, and m·p of place after them where `placed` is true.
-        """
-        return motion(tuple(places), from_idle if self.placed else None)
-
-
-def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
-    weights = np.where(usable & np.isfinite(noise), 1.0 / noise, 0.0)
-    found = np.linalg.lstsq((shapes * weights).T, moved * weights, rcond=None)[0]
-    return np.asarray(found @ shapes)
-
-
 class Memory:
     """The state of one session; every frame goes through `see` in order."""
 
@@ -110,7 +59,7 @@ class Memory:
         self, guards: tuple[SideGuard, ...], motion: Motion | None, period_s: float = np.inf, idle_frames: int = 0
     ) -> None:
         """Begin a session; its first `idle_frames` usable frames are, on somebody's word, of untouched fingertips."""
-        self._guards = Guards(guards, motion.directions if motion is not None else None)
+        self._guards = Guards(guards, motion)
         # The board's, where it is known beforehand: of one that leaves out half of its frames it cannot be learned.
         self._period_s = period_s
         self._motion = motion
@@ -140,7 +89,7 @@ class Memory:
         self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
         self._let_go = [False for _ in guards]
         self._grips = [Grip(guard.grip_threshold) for guard in guards]
-        self._lost = self._none_lost = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
+        self._lost: BoolArray = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
         # Frames that are to be taken for idle ones, and those taken.
         self._idle_wanted = idle_frames
         self._idle_taken: list[FloatArray] = []
@@ -204,15 +153,15 @@ class Memory:
 
         Of an ordinary frame one call says it all. Without a frame before there are no shares.
         """
-        shares: Sequence[float] | None = None
         if self._before is not None:
-            shares = self._guards.jumping_if_ordinary(frame.channels, frame.usable, self._before)
-        if shares is not None:
-            self._lost = self._none_lost
-            return frame.channels, frame.usable, (), shares
+            look = self._guards.views.look(frame.channels, frame.usable, self._lost, self._before)
+            if look is not None:
+                self._lost = look.lost
+                return look.channels, look.usable, (), look.jumping_shares
         usable = unsaturated(frame.channels, frame.usable)
         channels = self._filled(frame.channels, usable)
         why, lost = self._guards.seen(channels, usable)
+        self._guards.views.prepare(frame.usable, lost)
         # Channels that are lost for longer are left out; while they are being lost they count as jumping.
         judged = usable & ~(lost & self._lost)
         shares = self._guards.jumping_shares(channels, self._before, judged) if self._before is not None else ()
@@ -269,7 +218,7 @@ class Memory:
 
     def _placed(self, channels: FloatArray, usable: BoolArray) -> Placed:
         """Return where a frame lies at the calibration's gain, which does not change while it is gripped."""
-        placed = self._guards.place(channels, usable, self._baselines, self._gains)
+        placed = self._guards.views.place(channels, usable, self._baselines, self._gains)
         if placed is not None:
             return placed
         grips, difference = self._guards.grips(channels, self._baselines), self._difference(channels, usable)

@@ -196,16 +196,37 @@ def test_places_of_several_lengths_are_no_motion() -> None:
         assert not compiled._frames.motion(places[:1], np.zeros(4), np.zeros(5))
 
 
-def test_rows_of_other_lengths_are_refused() -> None:
-    if compiled.IS_COMPILED:
-        with pytest.raises(ValueError, match="is not compared with 2 of"):
-            compiled.compared(np.ones((1, 2, N_CHANNELS)), np.ones(N_CHANNELS - 1), np.array([896, 896]))
-        with pytest.raises(ValueError, match="is not compared with 3 of"):
-            compiled.compared(np.ones((1, 2, N_CHANNELS)), np.ones(N_CHANNELS), np.array([896, 896, 896]))
-        with pytest.raises(ValueError, match="3 counts for rows of 14336 bytes"):
-            compiled.medians(np.zeros((2, N_CHANNELS)), np.array([896, 896, 896]))
-        with pytest.raises(ValueError, match="no rows of 896"):
-            compiled.n_largest(np.zeros((1, N_CHANNELS - 1)))
+def test_rows_of_other_lengths_and_kinds_are_refused() -> None:
+    if not compiled.IS_COMPILED:
+        return
+    rows, counts, frames = np.ones((2, N_CHANNELS)), np.array([N_CHANNELS, N_CHANNELS]), compiled._frames
+    wrong_rows = (rows[:, 1:], rows[:1], rows.astype(np.float32), rows.astype(np.int64), rows.repeat(2, 1)[:, ::2], b"")
+    wrong_counts = (counts[:1], counts.repeat(2), counts.astype(np.int32), counts.astype(float), bytes(16), None)
+    for one in wrong_rows:
+        with pytest.raises(ValueError, match=r"medians are taken of \(n, 896\) float64 rows"):
+            frames.medians(one, counts)
+        for arguments in ((one, rows, counts, rows), (rows, one, counts, rows), (rows, rows, counts, one)):
+            if one.__class__ is np.ndarray and arguments[1] is one and one.shape == (1, N_CHANNELS):
+                continue
+            with pytest.raises(ValueError, match=r"compared with \(m, k, 896\)"):
+                frames.compared(*(array.copy() if array is rows else array for array in arguments))
+    for one in wrong_counts:
+        with pytest.raises(ValueError, match="as n int64 counts say"):
+            frames.medians(rows, one)
+        with pytest.raises(ValueError, match="int64 counts tell how many are known"):
+            frames.compared(rows, rows, one, rows.copy())
+    for one in (rows[:, 1:], rows.astype(np.float32), rows.astype(np.int64), bytes(7), 3.0):
+        with pytest.raises(ValueError, match=r"counted in \(n, 896\) float64 rows"):
+            frames.n_largest(one)
+    written = rows.copy()
+    written.setflags(write=False)
+    with pytest.raises(ValueError, match="as many are written"):
+        frames.compared(rows, rows, counts, written)
+    for call, n in ((frames.medians, 2), (frames.compared, 4), (frames.deviation, 3), (frames.follow, 3)):
+        with pytest.raises(TypeError, match=f"1 arguments instead of {n}"):
+            call(rows)
+    with pytest.raises(TypeError, match="must be real number"):
+        frames.beyond(rows, rows, rows, "far")
 
 
 def without_compiler(function: Callable[..., Any], *arguments: object) -> Any:

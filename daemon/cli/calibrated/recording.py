@@ -5,8 +5,12 @@ from dataclasses import replace
 from functools import cache
 from math import isnan
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from daemon.cli.result import add_json, tell
+
+if TYPE_CHECKING:
+    from bank.estimators.reader import Reader
 
 # A stamp that is further off belongs to another recording.
 _LARGEST_LATE_S = 600.0
@@ -110,6 +114,10 @@ def run(args: argparse.Namespace) -> int:
         f"{args.out}: estimator {args.estimator}, {' and '.join(quantities)} from {frames} frames of the "
         f"{' and '.join(calibration.sides)} side."
     ]
+    if calibration.torque is not None:
+        told["sees_loads"] = not calibration.torque.reader.misses_loads
+        if calibration.torque.reader.misses_loads:
+            sentences.append(_blind(calibration.torque.reader, args.estimator, calibration.sides))
     if late_s is None and calibration.kind == "raw":
         named = [*((name, one) for (name, _), one in zip(series, parts, strict=True)), *beside]
         timed = telling(parts, [one for _, one in beside], aligned)
@@ -137,3 +145,16 @@ def run(args: argparse.Namespace) -> int:
         sentences.append(unknown if known_mm is None else f"Its tool is of {known_mm:.3g} mm.")
     tell(told, sentences, as_json=args.json)
     return 0
+
+
+def _blind(reader: "Reader", estimator: str, sides: tuple[str, ...]) -> str:
+    """Return what it means that loads are not seen, and what may help."""
+    low_nm, high_nm = (round(limit, 3) + 0.0 for limit in (reader.low, reader.high))
+    others = ["with --estimator fused"] if estimator != "fused" else []
+    others += ["on both fingertips"] if len(sides) == 1 else []
+    cure = f"Calibrate {' or '.join(others)}, or record" if others else "Record"
+    return (
+        "It does not see the load: of the loads that it was tried on, too many lay outside of their intervals. So "
+        f"every interval spans all calibrated torques, {low_nm:g} to {high_nm:g} N·m, and no torque can be told by it. "
+        f"{cure} a grip in which the tool twists the gel more."
+    )

@@ -1,9 +1,10 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from bank.estimators import Estimate, FrameSeries
+from bank.estimators import Estimate, FrameSeries, fit
 from daemon.cli import main
 from daemon.recording.evaluation import Track, judge, reasons
 
@@ -34,6 +35,26 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     text = capsys.readouterr().out
     assert "rmse_nm" in text
     assert "diameter" not in text
+
+
+@pytest.mark.parametrize("misses_loads", [True, False])
+def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tmp_path, capsys, monkeypatch):
+    def blind(*arguments, **options):
+        found = fit(*arguments, **options)
+        reader = replace(found.torque.reader, misses_loads=misses_loads)
+        return replace(found, torque=replace(found.torque, reader=reader))
+
+    monkeypatch.setattr("bank.estimators.fit", blind)
+    calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--estimator", "regression"]
+    calibrate += ["--out", str(tmp_path / "a.cal")]
+    assert main(calibrate) == 0
+    told = capsys.readouterr().out
+    assert ("It does not see the load: " in told) == misses_loads
+    assert ("every interval spans all calibrated torques, 0.01 to 0.14 N·m, and no torque" in told) == misses_loads
+    cure = "Calibrate with --estimator fused or on both fingertips, or record a grip in which the tool twists the gel"
+    assert (cure in told) == misses_loads
+    assert main([*calibrate, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["sees_loads"] is not misses_loads
 
 
 def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, capsys):

@@ -464,7 +464,7 @@ static PyMethodDef fingertips_methods[] = {
 };
 
 static PyType_Slot fingertips_slots[] = {
-    {Py_tp_doc, "What frames are compared with; see bank/compiled.py."},
+    {Py_tp_doc, "What frames are compared with; see bank/compiled_frames.py."},
     {Py_tp_init, fingertips_init},
     {Py_tp_dealloc, fingertips_dealloc},
     {Py_tp_methods, fingertips_methods},

@@ -1,6 +1,6 @@
 /* bank/search.c for Python: holds the arrays of a compressed bank, and searches it for one frame after another.
 
-   The arrays that are handed in have been made by bank/compiled.py, which says what they are. Their sizes and whatever
+   The arrays that are handed in have been made by bank/compiled_search.py, which says what they are. Their sizes and whatever
    points into another one are checked, for they decide where is read. A search keeps the interpreter's lock, so that all
    searches of a bank can use the same memory. */
 
@@ -352,7 +352,7 @@ static PyMethodDef search_methods[] = {
 };
 
 static PyType_Slot search_slots[] = {
-    {Py_tp_doc, "A compressed bank that is searched; see bank/compiled.py."},
+    {Py_tp_doc, "A compressed bank that is searched; see bank/compiled_search.py."},
     {Py_tp_init, search_init},
     {Py_tp_dealloc, search_dealloc},
     {Py_tp_methods, search_methods},

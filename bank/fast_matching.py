@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bank.bounds import AllLagsBounds, Left, Mask, Neighbourhood, TakesLongError, ZeroLagBounds, spectra_of
 from bank.channels import N_CHANNELS
-from bank.compiled import search_of
+from bank.compiled_search import search_of
 from bank.compression import COMPRESSED_CELLS, ROUNDING, Indices, compress
 from bank.errors import MatchingError
 from bank.matching import (

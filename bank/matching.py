@@ -19,7 +19,7 @@ from scipy.special import chdtri
 
 from bank.bank_file import Bank
 from bank.channels import N_CHANNELS
-from bank.compiled import energy as compiled_energy
+from bank.compiled_search import energy as compiled_energy
 from bank.errors import MatchingError
 
 FloatArray = NDArray[np.float64]

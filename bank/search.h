@@ -52,7 +52,7 @@ typedef struct {
     uint16_t reversed[HALF]; /* where each number lies after the passes */
 } Turns;
 
-/* A compressed bank (bank/compression.py), and room to work in; bank/compiled.py says what the arrays are. */
+/* A compressed bank (bank/compression.py), and room to work in; bank/compiled_search.py says what the arrays are. */
 typedef struct {
     ptrdiff_t coarse_rank, fine_rank, n_cells;
     ptrdiff_t width;                /* the coarse rank, filled up to eights with zeros */

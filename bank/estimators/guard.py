@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 
 from bank.channels import N_CHANNELS
-from bank.compiled import compared, medians, n_largest
+from bank.compiled_frames import compared, medians, n_largest
 from bank.errors import CalibrationError
 from bank.estimators.values import BoolArray, FloatArray, everywhere
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bank.channels import N_CHANNELS
-from bank.compiled import fingertips_of
+from bank.compiled_frames import fingertips_of
 from bank.estimators.guard import (
     FEWEST_AT_RAIL,
     FEWEST_COMPARED,

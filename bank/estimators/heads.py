@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from bank.compiled import deviation
+from bank.compiled_frames import deviation
 from bank.errors import CalibrationError
 from bank.estimators.values import BoolArray, FloatArray
 

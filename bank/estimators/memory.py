@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bank.channels import N_CHANNELS
-from bank.compiled import follow
+from bank.compiled_frames import follow
 from bank.estimators.grip import Grip
 from bank.estimators.guard import LARGEST_JUMPING_SHARE, STEP_FRAMES, SideGuard, unsaturated
 from bank.estimators.guards import Guards

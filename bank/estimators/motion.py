@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from bank.channels import N_CHANNELS
-from bank.compiled import motion
+from bank.compiled_frames import motion
 from bank.estimators.guard import SideGuard
 from bank.estimators.values import BoolArray, FloatArray
 

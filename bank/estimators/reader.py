@@ -7,7 +7,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from bank.compiled import n_beyond
+from bank.compiled_frames import n_beyond
 from bank.errors import CalibrationError
 from bank.estimators.heads import Censored, Curve, Ridge, Rows, best_strength, later_splits, left_out_blocks
 from bank.estimators.intervals import LEVEL, Intervals

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bank.channels import N_CHANNELS
-from bank.compiled import all_finite
+from bank.compiled_frames import all_finite
 from bank.errors import CalibrationError
 from bank.gaussian import TWO_SIDED_95
 

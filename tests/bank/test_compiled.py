@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from scipy.linalg import cython_blas
 
 import bank
-from bank import compiled
+from bank import compiled, compiled_frames, compiled_search
 from bank.channels import N_CHANNELS
 from bank.compression import FloatArray
 from drivers.compiled import cells
@@ -56,24 +56,24 @@ def test_one_stale_part_leaves_all_to_numpy(name, monkeypatch) -> None:
 
 def test_only_blas_as_it_is_called_is_taken() -> None:
     if compiled.IS_COMPILED:
-        assert compiled._search.is_sgemm(cython_blas.__pyx_capi__["sgemm"])
+        assert compiled.search.is_sgemm(cython_blas.__pyx_capi__["sgemm"])
         for other in (cython_blas.__pyx_capi__["dgemm"], datetime.datetime_CAPI, None, 3):
-            assert not compiled._search.is_sgemm(other)
+            assert not compiled.search.is_sgemm(other)
 
 
 def test_the_energy_is_the_sum_of_squares_and_none_of_what_is_not_sound() -> None:
     random = np.random.default_rng(0)
     difference, noise = random.normal(size=2 * N_CHANNELS)[::2], random.uniform(0.1, 2, N_CHANNELS)
-    found = compiled.energy(difference, noise)
+    found = compiled_search.energy(difference, noise)
     if not compiled.IS_COMPILED:
         assert found is None
         return
     assert found == pytest.approx(((difference / noise) ** 2).sum(), rel=1e-13)
-    assert compiled.energy(np.full(N_CHANNELS, 1e200), noise) == np.inf
+    assert compiled_search.energy(np.full(N_CHANNELS, 1e200), noise) == np.inf
     for values, deviations in ((np.nan, 1.0), (np.inf, 1.0), (1.0, 0.0), (1.0, -1.0), (1.0, np.nan), (1.0, np.inf)):
         wrong, its_noise = difference.copy(), noise.copy()
         wrong[-1], its_noise[-1] = values, deviations
-        assert compiled.energy(wrong, its_noise) is None
+        assert compiled_search.energy(wrong, its_noise) is None
 
 
 # Rows as they come, all alike, in order, with ties, without some values, and of large ones.
@@ -106,8 +106,8 @@ def test_medians_are_those_of_sorted_rows_to_the_bit(kinds: list[str], seed: int
     rows = np.array([row_of(kind, np.random.default_rng((seed, i))) for i, kind in enumerate(kinds)])
     counts = (np.count_nonzero(~np.isnan(rows), axis=-1) + more).clip(0, N_CHANNELS)
     with np.errstate(invalid="ignore"):
-        expected = without_compiler(compiled.medians, rows, counts)
-    np.testing.assert_array_equal(compiled.medians(rows, counts), expected)
+        expected = without_compiler(compiled_frames.medians, rows, counts)
+    np.testing.assert_array_equal(compiled_frames.medians(rows, counts), expected)
     if more == 0 and kinds[0] == "random":
         assert expected[0] == np.median(rows[0])
 
@@ -117,11 +117,13 @@ def test_largest_values_are_counted(kinds: list[str], seed: int, n_at_rail: int)
     random = np.random.default_rng(seed)
     rows = np.array([row_of(kind, random) for kind in kinds])
     rows[0, random.permutation(N_CHANNELS)[:n_at_rail]] = 9.0
-    found = compiled.n_largest(rows)
-    assert found == without_compiler(compiled.n_largest, rows)
+    found = compiled_frames.n_largest(rows)
+    assert found == without_compiler(compiled_frames.n_largest, rows)
     assert found[0] == n_at_rail or n_at_rail == 0
-    assert compiled.n_largest(np.full((1, N_CHANNELS), -np.inf)) == [N_CHANNELS]
-    assert compiled.n_largest(rows.astype(np.float32)) == without_compiler(compiled.n_largest, rows.astype(np.float32))
+    assert compiled_frames.n_largest(np.full((1, N_CHANNELS), -np.inf)) == [N_CHANNELS]
+    assert compiled_frames.n_largest(rows.astype(np.float32)) == without_compiler(
+        compiled_frames.n_largest, rows.astype(np.float32)
+    )
 
 
 @given(
@@ -135,12 +137,12 @@ def test_a_frame_is_compared_as_by_numpy_to_the_bit(m: int, k: int, seed: int, l
         0, 0.02, (m, N_CHANNELS)
     )
     counts = np.count_nonzero(~np.isnan(known), axis=-1).ravel()
-    off, medians = compiled.compared(known, frame, counts)
-    off_too, medians_too = without_compiler(compiled.compared, known, frame, counts)
+    off, medians = compiled_frames.compared(known, frame, counts)
+    off_too, medians_too = without_compiler(compiled_frames.compared, known, frame, counts)
     np.testing.assert_array_equal(off, off_too)
     np.testing.assert_array_equal(medians, medians_too)
     if k == 2 and m == 1:
-        np.testing.assert_array_equal(compiled.compared(known[0], frame[0], counts)[0], off[0])
+        np.testing.assert_array_equal(compiled_frames.compared(known[0], frame[0], counts)[0], off[0])
 
 
 # Sizes of arrays, and what one of their values is.
@@ -158,14 +160,14 @@ def test_what_is_said_of_a_few_arrays_is_what_numpy_says(n: int, apart: int, odd
     values[random.integers(n)] = odd
     with np.errstate(all="ignore"):
         values = values.astype(kind)
-        assert compiled.all_finite(values) == np.isfinite(values).all()
+        assert compiled_frames.all_finite(values) == np.isfinite(values).all()
         expected = np.count_nonzero(np.abs(values - mean) > 1.6 * reach)
-        assert compiled.n_beyond(values, mean, reach, 1.6) == expected
-        found, expected = compiled.deviation(values, mean, weights), (values - mean) @ weights
+        assert compiled_frames.n_beyond(values, mean, reach, 1.6) == expected
+        found, expected = compiled_frames.deviation(values, mean, weights), (values - mean) @ weights
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-14 * (np.abs(values - mean) @ np.abs(weights)))
         followed = mean.copy() if apart == 1 else mean
         expected = mean + (values - mean) / 7
-        compiled.follow(followed, values, 7)
+        compiled_frames.follow(followed, values, 7)
         np.testing.assert_array_equal(followed, expected)
 
 
@@ -173,33 +175,33 @@ def test_what_is_said_of_a_few_arrays_is_what_numpy_says(n: int, apart: int, odd
 def test_motion_is_how_far_the_last_place_is_from_those_before(n, n_places, with_tail, seed, kind) -> None:
     random = np.random.default_rng(seed)
     places, tail = tuple(random.normal(size=(n_places, n)).astype(kind)), random.normal(size=n) if with_tail else None
-    found = compiled.motion(places, tail)
+    found = compiled_frames.motion(places, tail)
     moved = [places[-1] - places[-1 - lag] for lag in range(1, n_places)]
     np.testing.assert_array_equal(found, np.concatenate([np.zeros(0), *moved, *([tail] if with_tail else [])]))
-    np.testing.assert_array_equal(found, without_compiler(compiled.motion, places, tail))
+    np.testing.assert_array_equal(found, without_compiler(compiled_frames.motion, places, tail))
 
 
 def test_at_its_reach_a_value_is_not_beyond() -> None:
     for values, expected in (([2.0, -2.0], 0), ([2.0, -2.1], 1)):
-        assert compiled.n_beyond(np.array(values), np.zeros(2), np.ones(2), 2.0) == expected
+        assert compiled_frames.n_beyond(np.array(values), np.zeros(2), np.ones(2), 2.0) == expected
 
 
 def test_places_of_several_lengths_are_no_motion() -> None:
     places = np.zeros(4), np.zeros(3), np.zeros(4)
     with pytest.raises(ValueError, match="inhomogeneous"):
-        compiled.motion(places, None)
+        compiled_frames.motion(places, None)
     with pytest.raises(ValueError, match="broadcast"):
-        compiled.deviation(np.zeros(3), np.zeros(4), np.zeros(4))
+        compiled_frames.deviation(np.zeros(3), np.zeros(4), np.zeros(4))
     if compiled.IS_COMPILED:
-        assert not compiled._frames.motion((), None, np.zeros(0))
-        assert not compiled._frames.motion(places[:1], np.zeros(5), np.zeros(5))
-        assert not compiled._frames.motion(places[:1], np.zeros(4), np.zeros(5))
+        assert not compiled.frames.motion((), None, np.zeros(0))
+        assert not compiled.frames.motion(places[:1], np.zeros(5), np.zeros(5))
+        assert not compiled.frames.motion(places[:1], np.zeros(4), np.zeros(5))
 
 
 def test_rows_of_other_lengths_and_kinds_are_refused() -> None:
     if not compiled.IS_COMPILED:
         return
-    rows, counts, frames = np.ones((2, N_CHANNELS)), np.array([N_CHANNELS, N_CHANNELS]), compiled._frames
+    rows, counts, frames = np.ones((2, N_CHANNELS)), np.array([N_CHANNELS, N_CHANNELS]), compiled.frames
     wrong_rows = (rows[:, 1:], rows[:1], rows.astype(np.float32), rows.astype(np.int64), rows.repeat(2, 1)[:, ::2], b"")
     wrong_counts = (counts[:1], counts.repeat(2), counts.astype(np.int32), counts.astype(float), bytes(16), None)
     for one in wrong_rows:

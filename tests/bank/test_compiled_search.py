@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import cython_blas
 
-from bank import compiled, fast_matching
+from bank import compiled, compiled_search, fast_matching
 from bank.channels import N_CHANNELS
 from tests.bank.small_banks import (
     BANK,
@@ -96,8 +96,8 @@ def arguments_of_search() -> list:
     _, fast = PAIRS[1]
     handed = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compiled._search, "Search", lambda *arguments: handed.append(arguments))
-        compiled.search_of(
+        patch.setattr(compiled.search, "Search", lambda *arguments: handed.append(arguments))
+        compiled_search.search_of(
             *(fast._bank, fast._signals, fast._cells, fast._norms, (fast._row, fast._column)),
             tie=1e-12,
             tie_rounding=1e-14,
@@ -140,11 +140,11 @@ def arguments_of_search() -> list:
 def test_arrays_that_do_not_fit_are_refused_and_not_searched(argument, broken) -> None:
     """What a compiled search is handed decides where it reads."""
     arguments = arguments_of_search()
-    assert compiled._search.Search(*arguments).match(np.ones(N_CHANNELS), True, 1000) is not None
+    assert compiled.search.Search(*arguments).match(np.ones(N_CHANNELS), True, 1000) is not None
     arguments[argument] = broken(arguments[argument])
     with pytest.raises((ValueError, BufferError, TypeError)):
-        compiled._search.Search(*arguments)
-    refused = compiled._search.Search.__new__(compiled._search.Search)
+        compiled.search.Search(*arguments)
+    refused = compiled.search.Search.__new__(compiled.search.Search)
     with suppress(ValueError, BufferError, TypeError):
         refused.__init__(*arguments)
     with pytest.raises(ValueError, match="has no bank"):
@@ -157,7 +157,7 @@ def test_arrays_that_do_not_fit_are_refused_and_not_searched(argument, broken) -
 def test_a_search_is_made_once() -> None:
     arguments = arguments_of_search()
     with pytest.raises(TypeError, match="made once"):
-        compiled._search.Search(*arguments).__init__(*arguments)
+        compiled.search.Search(*arguments).__init__(*arguments)
 
 
 @pytest.mark.parametrize("kind", COMPILED)

@@ -371,7 +371,7 @@ LIMITS = (9, 224, 0.12, 0.6, 0.01)
 
 
 def test_fingertips_that_do_not_fit_together_are_refused(parts) -> None:
-    made = compiled._frames.Fingertips(2, 1, 3, tuple(parts.values()), *LIMITS)
+    made = compiled.frames.Fingertips(2, 1, 3, tuple(parts.values()), *LIMITS)
     with pytest.raises(TypeError, match="made once"):
         made.__init__(2, 1, 3, tuple(parts.values()), *LIMITS)
     for name, one in parts.items():
@@ -386,14 +386,14 @@ def test_fingertips_that_do_not_fit_together_are_refused(parts) -> None:
                 # A byte has no order.
                 continue
             with pytest.raises(ValueError, match="does not fit together, or is of another kind"):
-                compiled._frames.Fingertips(2, 1, 3, tuple((parts | {name: wrong}).values()), *LIMITS)
+                compiled.frames.Fingertips(2, 1, 3, tuple((parts | {name: wrong}).values()), *LIMITS)
     for arrays in ((), tuple(parts.values())[:-1], (*parts.values(), parts["lost"])):
         with pytest.raises(TypeError, match=f"{len(arrays)} arguments instead of 9"):
-            compiled._frames.Fingertips(2, 1, 3, arrays, *LIMITS)
+            compiled.frames.Fingertips(2, 1, 3, arrays, *LIMITS)
     for m, p, q in ((0, 1, 3), (-1, 1, 3), (2, -1, 3), (2**40, 1, 3), (2, 2**60, 3), (2, 1, -1), (2, 1, 2**60)):
         with pytest.raises(ValueError, match="fingertips with"):
-            compiled._frames.Fingertips(m, p, q, tuple(parts.values()), *LIMITS)
-    empty = compiled._frames.Fingertips.__new__(compiled._frames.Fingertips)
+            compiled.frames.Fingertips(m, p, q, tuple(parts.values()), *LIMITS)
+    empty = compiled.frames.Fingertips.__new__(compiled.frames.Fingertips)
     for call in (empty.check, empty.fill_in, empty.placed):
         with pytest.raises(ValueError, match="no fingertips"):
             call(*[parts["weights"]] * 4)
@@ -401,7 +401,7 @@ def test_fingertips_that_do_not_fit_together_are_refused(parts) -> None:
 
 def test_fingertips_whose_arguments_make_them_stay_as_they_were_made(parts) -> None:
     """A number that makes them while it is read for another making: what was made is kept, and its size with it."""
-    made = compiled._frames.Fingertips.__new__(compiled._frames.Fingertips)
+    made = compiled.frames.Fingertips.__new__(compiled.frames.Fingertips)
     arrays = tuple(parts.values())
 
     class Meddling:

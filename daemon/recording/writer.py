@@ -34,8 +34,12 @@ class RecordingWriter:
 
     def frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
         """Append one frame: the (1024,) values of its line in volts."""
-        values = [round(float(value), _DECIMALS) for value in line]
-        self._add(frame_topic(side), t_mid_unix_ns, {"arrival_unix_ns": arrival_unix_ns, "line": values})
+        values = np.asarray(line, dtype=np.float64)
+        # A board's lines have fewer decimals, and are as they should be: a tenth of the time.
+        rounded = values.tolist()
+        if not np.array_equal(np.round(values, _DECIMALS), values):
+            rounded = [round(value, _DECIMALS) for value in rounded]
+        self._add(frame_topic(side), t_mid_unix_ns, {"arrival_unix_ns": arrival_unix_ns, "line": rounded})
 
     def torque(self, t_unix_ns: int, torque_nm: float) -> None:
         """Append one torque of the load cell in N·m."""

@@ -2,10 +2,12 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from bank.channels import N_LINE_VALUES
 from daemon.errors import UserError
 from daemon.recording.importing import import_mat
 from daemon.recording.reader import read_recording
 from daemon.recording.series import part_of, read_series, series_of
+from daemon.recording.writer import RecordingWriter
 
 PERIOD_S = 0.5408
 
@@ -79,3 +81,12 @@ def test_what_cannot_be_imported_is_named(mat_folder, tmp_path):
         read_series(tmp_path / "a.mcap", ("left",))
     with pytest.raises(UserError, match="without slices"):
         read_series(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("decimals", [4, 6, 7, 17])
+def test_a_line_is_written_as_each_of_its_numbers_is_rounded(tmp_path, decimals):
+    line = np.round(np.random.default_rng(decimals).uniform(-1, 1, N_LINE_VALUES), decimals)
+    with RecordingWriter(tmp_path / "a.mcap", "a test") as writer:
+        writer.frame("right", 1, 2, line)
+    found = read_recording(tmp_path / "a.mcap").sides["right"].lines[0]
+    assert found.tolist() == [round(value, 6) for value in line.tolist()]

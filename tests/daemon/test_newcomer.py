@@ -30,7 +30,7 @@ REPOSITORY = Path(__file__).parents[2]
 PROGRAM = ".venv/bin/shearloop"
 SPEED = 6
 # Of the held torque, in seconds; the README's demo holds for half a minute.
-HOLD_S = 3
+HOLD_S = 2
 # As in tests/emulator_process.py: two runs of the tests at once need two addresses.
 HOST = own_address(0)
 
@@ -163,7 +163,7 @@ async def seen_on_the_page(address: str, topics: set[str]) -> dict[str, Any]:
 
 def only_twists(content: Any) -> None:
     """Let the wrist turn to a few angles in place of the demo's identification and hold."""
-    twist = {"do": "twist", "angles_rad": [0.06, 0.12, 0.03], "speed_rad_per_s": 0.4, "hold_s": 1.0}
+    twist = {"do": "twist", "angles_rad": [0.06, 0.12, 0.03], "speed_rad_per_s": 0.4, "hold_s": 0.5}
     steps = [step for step in content["steps"] if step["do"] != "identify"]
     content["steps"] = [twist if step["do"] == "hold_torque" else step for step in steps]
 

@@ -277,7 +277,12 @@ class Tracker:
         values: dict[str, tuple[float, float, float]] = {}
         for name, (task, judged) in wanted.items():
             features = read_from(calibration, name, seen.features, held)
-            read = task.reader.read(features, usable_share, judged.widening, judged.nearness)
+            whole = None
+            # The paper's place in the bank is that of any multiple of a frame.
+            if name == "torque" and judged.missing and calibration.estimator != "paper":
+                grown = features_of(calibration, self._locator, difference / (1.0 - judged.missing), moved, t_s)
+                whole = read_from(calibration, name, grown.features, held)
+            read = task.reader.read(features, usable_share, judged.widening, judged.nearness, whole)
             if name == "diameter" and self._memory is not None:
                 read = _widened(read, self._place_noise_mm / math.sqrt(self._memory.held_frames))
             why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])

@@ -15,6 +15,7 @@ from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
 from bank.estimators.guard import LARGEST_UNUSABLE_SHARE
 from bank.estimators.heads import left_out_blocks
+from bank.estimators.intervals import LEVEL
 from bank.estimators.twins import Twins
 from bank.estimators.values import BoolArray, FloatArray
 
@@ -26,6 +27,8 @@ _LEAST_DIFFERENCES = 8
 _MOST_DIRECTIONS = 4
 # Value and main drift. Further directions are so short that single frames of the calibration reach far along them.
 _REACHING = 2
+# A frame that holds less than half of what the own fingertip makes is taken for one that holds half.
+_MOST_MISSING = 0.5
 # Intervals grow by this power of the misfit. White noise alone would ask for a half; but what moves many channels
 # together moves the estimate with them. Of 1, 1.5 and 2 this parted later slices best from those with a fifth of a
 # foreign frame, at the same width for the good ones.
@@ -39,12 +42,14 @@ class Judgement:
 
     widening is by how much that grows because the difference is explained less well than is typical. nearness is how
     near it is to being refused by what it says twice: 1 at the limit, 0 without twins. What is foreign in it moves this
-    by the square of its share; up to the limit most of that may be hidden.
+    by the square of its share; up to the limit most of that may be hidden. missing is what share of the fingertip's own
+    response may have been taken away by it.
     """
 
     why: tuple[str, ...]
     widening: float = 1.0
     nearness: float = 0.0
+    missing: float = 0.0
 
 
 FAMILIAR = Judgement(())
@@ -55,7 +60,9 @@ class DifferenceGuard:
     """The mean (896,) in volts, each channel's spread (896,) in volts, and directions (r, 896) in units of spread.
 
     variances (r,) are those along the directions. typical_misfit is the median of what was left out; of an estimate
-    from more, the interval is as much wider. Calibrations that were made before there were twins have none.
+    from more, the interval is as much wider. largest_own is as much of the mean as a difference holds, but for one in
+    twenty of those left out. Calibrations that were made before there were twins have none, nor have they a largest_own
+    (0).
     """
 
     mean: FloatArray
@@ -68,6 +75,7 @@ class DifferenceGuard:
     largest_outlying: float
     largest_reach: float
     twins: Twins | None = None
+    largest_own: float = 0.0
 
     @classmethod
     def fit(cls, differences: FloatArray) -> Self:
@@ -75,11 +83,12 @@ class DifferenceGuard:
         n = len(differences)
         if n < _LEAST_DIFFERENCES:
             raise CalibrationError(f"{n} slices are too few to know what is familiar; record {_LEAST_DIFFERENCES}")
-        misfits, reaches = [], []
+        misfits, reaches, own = [], [], []
         for rest, block in left_out_blocks(n):
             part = cls._explaining(differences[rest])
             misfits += [part.misfit(one, _ALL) for one in differences[block]]
             reaches += [part.reach(one, _ALL) for one in differences[block]]
+            own += [part.own_share(one, _ALL) for one in differences[block]]
         misfit, outlying = np.array(misfits).max(axis=0)
         whole = cls._explaining(differences)
         reach = max(*reaches, *(whole.reach(one, _ALL) for one in differences))
@@ -88,6 +97,7 @@ class DifferenceGuard:
             whole.mean, whole.spread, whole.directions, whole.variances, least,
             float(np.median(misfits, axis=0)[0]), _MISFIT_MARGIN * float(misfit),
             max(_MISFIT_MARGIN * float(outlying), _LEAST_OUTLYING), _REACH_MARGIN * reach, Twins.fit(differences),
+            float(np.quantile(own, LEVEL)),
         )  # fmt: skip
 
     @classmethod
@@ -113,6 +123,23 @@ class DifferenceGuard:
         v = self.directions[:_REACHING, usable]
         scores = np.linalg.lstsq(v.T, self._scaled(difference, usable), rcond=None)[0]
         return float((scores**2 / self.variances[:_REACHING]).sum())
+
+    def own_share(self, difference: FloatArray, usable: BoolArray) -> float:
+        """Return how many times a (896,) difference holds the mean, by what the main directions do not explain of it.
+
+        A response that is smaller, as where something foreign has taken its place, moves a difference along the main
+        directions as another torque does; but a torque leaves alone what is beside them, which then is smaller too.
+        """
+        v, mean = self.directions[:, usable], (self.mean / self.spread)[usable]
+        # Partial regression (Frisch–Waugh): what it leaves of the mean, a torque does not move.
+        beside = mean - np.linalg.lstsq(v @ v.T, v @ mean, rcond=None)[0] @ v
+        return float((difference / self.spread)[usable] @ beside / (mean @ beside))
+
+    def _missing(self, difference: FloatArray, usable: BoolArray) -> float:
+        if self.largest_own <= 0:
+            return 0.0
+        left = self.own_share(difference, usable) / self.largest_own
+        return min(max(1.0 - left, 0.0), _MOST_MISSING)
 
     def filled(self, difference: FloatArray, usable: BoolArray) -> FloatArray:
         """Return a (896,) difference with unusable channels where the usable ones say, along the main directions."""
@@ -162,7 +189,7 @@ class DifferenceGuard:
                 f"outside of the calibration: the frame lies {np.sqrt(reach):.1f} standard deviations from those "
                 f"calibrated on (at most {np.sqrt(self.largest_reach):.1f})"
             )
-        return Judgement((), self._widening(misfit), nearness)
+        return Judgement((), self._widening(misfit), nearness, self._missing(difference, usable))
 
 
 def _refused(why: str) -> Judgement:

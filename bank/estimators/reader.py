@@ -27,9 +27,6 @@ STRENGTHS = tuple(10.0**power for power in range(-6, 1))
 # Future data lies further from the past than one part of a recording from the next, unless what was left out was the
 # future itself.
 _INFLATION = 1.05
-# Origins have fewer frames before them than the calibration has, of which a curve with its drift makes the most: where
-# misfit is taken account of, 97 % of later slices lie within this share of what was left out (docs/decisions/0042).
-_CURVE_INFLATION = 0.81
 _LEAST_FRAMES = 8
 # No interval is narrower than this share of the calibrated range: a load cell has noise too.
 LEAST_HALF_WIDTH = 1e-3
@@ -72,20 +69,29 @@ class Reader:
     widened: float = 1.0
 
     def read(
-        self, features: FloatArray, usable_share: float = 1.0, widening: float = 1.0, nearness: float = 0.0
+        self,
+        features: FloatArray,
+        usable_share: float = 1.0,
+        widening: float = 1.0,
+        nearness: float = 0.0,
+        whole: FloatArray | None = None,
     ) -> tuple[float, float, float]:
         """Return the value of (d,) features and how far its 95 % interval reaches below and above it.
 
         With a share of the channels unusable the rest have to carry the noise of all: the interval grows by the root.
         What may be foreign in the frame is the more, the nearer it is to being refused (`nearness`, 1 at the limit).
+        Where part of the own response may be missing, `whole` (d,) is what would be seen with it: the interval reaches
+        to what that says, with an error of its own.
         Where the lever of the calibration did not touch, the tool may have been twisted the other way as far as the
         frames say: nothing that was read then denies it.
         """
-        raw = self.head.value(features)
+        raw, grown = self._raw(features, whole)
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
         value, beyond = _shown(self.head, raw), _UNSEEN * (self.high - self.low)
-        below, above = max(half, nearness * self.hidden_below), max(half, nearness * self.hidden_above)
+        moved = _shown(self.head, grown) - value
+        below = max(half + max(-moved, 0.0), nearness * self.hidden_below)
+        above = max(half + max(moved, 0.0), nearness * self.hidden_above)
         if self.misses_loads:
             below, above = below + max(value - self.low, 0.0), above + max(self.high - value, 0.0)
         if isinstance(self.head, Censored) and raw < 0:
@@ -96,6 +102,14 @@ class Reader:
         if value >= self.high_end:
             above = max(above, self.high + beyond - value)
         return value, below, above
+
+    def _raw(self, features: FloatArray, whole: FloatArray | None) -> tuple[float, float]:
+        """Return what the head says of (d,) features, and of them with what may be missing: the same where none is."""
+        if whole is None:
+            raw = self.head.value(features)
+            return raw, raw
+        raw, grown = self.head.predict(np.array([features, whole])).tolist()
+        return raw, grown
 
     def refuse(self, value: float, features: FloatArray, name: str, unit: str) -> tuple[str, ...]:
         """Return the reasons why a value is beyond what was calibrated."""
@@ -155,8 +169,6 @@ def fit_reader(
     head = head_of(features, values, strength)
     edges = (-head.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(head, Censored) else ()
     inflation = 1.0 if left_out or isinstance(head, Curve) else _INFLATION
-    if left_out and difficulty is not None and isinstance(head, Curve):
-        inflation = _CURVE_INFLATION
     centre = features.mean(axis=0)
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)
     least = LEAST_HALF_WIDTH * float(np.ptp(values))

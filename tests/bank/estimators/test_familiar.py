@@ -140,6 +140,45 @@ def test_a_judgement_holds_what_intervals_go_by(sliced):
     assert replace(guard, twins=None).judge(frames[35], ALL).nearness == 0.0, "a calibration from before there were any"
 
 
+def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
+    frames = sliced().channels[:, 0]
+    guard = DifferenceGuard.fit(frames)
+    own = guard.own_share(frames[35], ALL)
+    assert own == pytest.approx(1.0, abs=0.1)
+    assert guard.own_share(0.8 * frames[35], ALL) == pytest.approx(0.8 * own)
+    along = guard.spread * guard.directions[0] * np.sqrt(guard.variances[0])
+    assert guard.own_share(frames[35] + 2 * along, ALL) == pytest.approx(own), "so another torque moves it"
+    some = ALL & (np.arange(896) % 4 > 0)
+    assert guard.own_share(np.where(some, 0.8 * frames[35], 9.0), some) == pytest.approx(0.8 * own, abs=0.03)
+
+
+def test_a_judgement_says_how_much_of_the_own_response_may_be_missing(sliced):
+    frames = sliced().channels[:, 0]
+    guard = DifferenceGuard.fit(frames)
+    less = 0.8 * frames[35]
+    assert guard.judge(less, ALL).missing == pytest.approx(1 - guard.own_share(less, ALL) / guard.largest_own)
+    assert guard.judge(less, ALL).missing > 0.15 > guard.judge(frames[35], ALL).missing
+    assert replace(guard, largest_own=1e-3).judge(frames[35], ALL).missing == 0.0, "more than ever is nothing missing"
+    assert replace(guard, largest_own=9.0).judge(frames[35], ALL).missing == 0.5, "no frame is made larger than twice"
+    assert replace(guard, largest_own=0.0).judge(less, ALL).missing == 0.0, "a calibration from before it was looked at"
+    # But for one in twenty of those left out none is larger; so of good ones hardly any is.
+    assert np.mean([guard.own_share(one, ALL) <= guard.largest_own for one in frames]) >= 0.9
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_may_be_missing_widens_to_the_side_where_it_would_be_read(sign):
+    rng = np.random.default_rng(5)
+    values = rng.uniform(0.0, 1.0, 100)
+    reader = reader_of(sign * values[:, None] + rng.normal(0, 1e-3, (100, 1)), values)
+    features = np.array([sign * 0.5])
+    _, *plain = reader.read(features)
+    assert reader.read(features, whole=features)[1:] == pytest.approx(plain)
+    low, high = reader.read(features, whole=features - sign * 0.2)[1:]
+    assert (low, high) == (pytest.approx(plain[0] + 0.2, abs=0.01), pytest.approx(plain[1]))
+    low, high = reader.read(features, whole=features + sign * 0.2)[1:]
+    assert (low, high) == (pytest.approx(plain[0]), pytest.approx(plain[1] + 0.2, abs=0.01))
+
+
 def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced):
     task = replace(fit("fused", [sliced()], "all").torque, ks=np.array([3.12, 3.17]))
     place = Place(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)

@@ -72,6 +72,21 @@ def test_where_it_is_seen_intervals_are_as_wide_as_without(sliced):
     assert judged(calibration, later)[2] < 1.15 * judged(without, later)[2]
 
 
+@pytest.mark.parametrize("name", ["fused", "regression"])
+def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced):
+    """It only makes the own response smaller, which is what another torque does: no misfit tells of it."""
+    calibration, later = fit(name, [sliced()], "all"), sliced(seed=3)
+    guard = calibration.torque.guard
+    blind = replace(calibration, torque=replace(calibration.torque, guard=replace(guard, largest_own=0.0)))
+    foreign = 0.2 * later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
+    spoilt = replace(later, channels=0.8 * later.channels + 0.2 * foreign)
+    valid, false_valid, _ = judged(calibration, spoilt)
+    assert valid > 0.9  # or nothing would be tested
+    assert false_valid <= 0.05
+    assert judged(blind, spoilt)[1] > 0.3  # or there was nothing to hold
+    assert judged(calibration, later)[2] < 1.2 * judged(blind, later)[2]
+
+
 def test_a_streams_intervals_know_nothing_of_mixtures(fused_calibration):
     reader = fused_calibration.torque.reader
     assert (reader.hidden_below, reader.hidden_above) == (0.0, 0.0)

@@ -148,7 +148,7 @@ def test_later_torque_slices(shared):
         covered += [figures["coverage_95"]] * figures["frames"]
     assert np.mean(errors) <= 0.012
     # Of good slices more lie inside than was promised: what cannot be seen in them has to lie inside too.
-    assert 0.9 <= np.mean(covered) <= 0.99
+    assert np.mean(covered) >= 0.95
 
 
 @pytest.mark.parametrize("name", ["fused", "regression"])
@@ -169,6 +169,24 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
         for each in (calibration, without)
     )
     assert width_nm <= 1.5 * was_nm
+
+
+@pytest.mark.parametrize("name", ["fused", "regression"])
+def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_intervals(name, shared):
+    """A cylinder responds weakly: 21 of 100 of these were false-valid with `fused`, 16 with `regression`."""
+    (series,), (cylinders,) = (
+        read_series(shared / "recordings" / each) for each in ("torque_slices", "diameter_slices")
+    )
+    missed = []
+    for n in (20, 29, 39):
+        calibration, later = fit(name, [series.between(0, n)], "earlier"), series.between(n, 49)
+        for diameter_mm in (10, 20, 30, 40):
+            foreign = cylinders.channels[cylinders.diameter_mm == diameter_mm].mean(axis=0)
+            figures = judge([follow(calibration, replace(later, channels=0.8 * later.channels + 0.2 * foreign))])
+            assert figures["valid_fraction"] == 1
+            missed.append(1 - figures["coverage_95"])
+    assert max(missed) <= 0.2, "else it breaks silently"
+    assert np.mean(missed) <= 0.1
 
 
 def test_later_slices_of_the_cylinders(shared):

@@ -104,9 +104,10 @@ class Arm:
         return bool(self._control.kickWatchdog())
 
     def clear_command(self) -> None:
-        """Clear the register that holds the last command, while no program runs.
+        """See that the register which holds the last command moves nothing any more, while no program runs.
 
-        The client has no call for it, but clears the register before it says that it cannot send: so let it refuse.
+        The client has no call for it, but clears the register before it says that it cannot send. Where it does not
+        know yet that no program runs, it leaves the sign of life there instead, which moves nothing either.
         """
         self._control.kickWatchdog()
 

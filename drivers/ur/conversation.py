@@ -87,8 +87,9 @@ class Conversation:
         self._stdin, self._stdout, self._stderr = process.stdin, stdout, process.stderr
         self._decoder = Decoder()
         self._heard_s = time.monotonic()
-        # Done when the process has no more to say, or has said what ends the conversation.
-        self._over: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        # Done when the process has no more to say, or has said what ends the conversation: then with the error, as its
+        # result, for asyncio complains of an exception where nobody listens any more.
+        self._over: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
         self._said = b""
         self._said_all = asyncio.Event()
         self._doing = "starting"
@@ -108,9 +109,8 @@ class Conversation:
                 await asyncio.wait([self._over], timeout=min(patience_s - silent_s, self._settings.hang_timeout_s))
         finally:
             self._turn_away()
-        # What was wrong with a message is raised here.
-        self._over.result()
-        raise await self._died()
+        wrong = self._over.result()
+        raise wrong if wrong is not None else await self._died()
 
     def _hear(self) -> None:
         """Take what the process has said, as it arrives: up to 125 times a second, so that no task is woken for it."""
@@ -147,12 +147,8 @@ class Conversation:
 
     def _end_with(self, error: Exception | None) -> None:
         self._turn_away()
-        if self._over.done():
-            return
-        if error is None:
-            self._over.set_result(None)
-        else:
-            self._over.set_exception(error)
+        if not self._over.done():
+            self._over.set_result(error)
 
     async def keep_alive(self) -> None:
         """Give signs of life four times in the time after which motion would be stopped; at ease nothing moves.

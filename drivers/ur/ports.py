@@ -24,7 +24,7 @@ class CureArm(Protocol):
         """Stop whatever program runs or is paused."""
 
     def clear_command(self) -> None:
-        """Clear the register that holds the last command."""
+        """See that the register which holds the last command moves nothing any more."""
 
     def upload(self) -> bool:
         """Send the control script."""

@@ -94,7 +94,7 @@ class Recovery:
             self._every_second("stop", now_ns, self._arm.stop_program)
         elif not self._cleared:
             # The registers outlive the program: a new one would carry out in its first cycle whatever was commanded
-            # last, and turn the wrist again, before its watchdog is armed. A cycle for the zero to get there.
+            # last, and turn the wrist again, before its watchdog is armed. A cycle for what replaces it.
             self._arm.clear_command()
             self._cleared = True
         else:

@@ -1,6 +1,7 @@
 """The daemon's end of the robot where there is no controller: what is said of a process that ends."""
 
 import asyncio
+import gc
 import os
 import sys
 from collections.abc import Callable
@@ -14,7 +15,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.ur.client import UrRobot
 from drivers.ur.conversation import LAST_WORDS_BYTES, Conversation, output
-from drivers.ur.messages import Reply, Stop
+from drivers.ur.messages import Failed, Reply, Stop
 from drivers.ur.wire import encode
 from tests.drivers.ur.flight import SETTINGS, Flight, flying
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
@@ -205,3 +206,16 @@ async def test_of_states_that_are_read_at_once_all_but_the_last_are_overtaken() 
         os.write(its_stdout.number, encode(flight.state))
         conversation._hear()
     assert overtaken == [True, True, False, False]
+
+
+async def test_loss_that_is_told_when_nobody_listens_any_more_is_no_complaint_of_asyncio() -> None:
+    complaints: list[dict[str, Any]] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, said: complaints.append(said))
+    with output() as (stdout, its_stdout):
+        process = Mock(spec=asyncio.subprocess.Process, stdin=Mock(), stderr=Mock())
+        conversation = Conversation(UrRobot(SETTINGS), process, stdout)
+        os.write(its_stdout.number, encode(Failed("lost", "The connection is lost.")))
+        conversation._hear()
+        del conversation
+        gc.collect()
+    assert complaints == []

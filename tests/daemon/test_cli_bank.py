@@ -11,6 +11,7 @@ import pytest
 
 from bank.bank_file import Bank
 from bank.forward import ForwardModel
+from bank.journal import RowJournal
 from bank.mesh import load_mesh
 from bank.models import conductivity
 from daemon.bank_config import load_bank_plans
@@ -83,6 +84,44 @@ def test_a_build_that_is_interrupted_says_so_and_the_same_command_goes_on(
     assert main(build) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["c.bank"]
     assert out.read_bytes() == (folder / "a.bank").read_bytes()
+
+
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_build_that_is_interrupted_when_its_bank_is_written_says_that_it_is(
+    beside, folder, tmp_path, capsys, monkeypatch
+):
+    """Before its journal is removed, and after that, as while a cluster closes; over a bank that was there before."""
+    out = tmp_path / "c.bank"
+    out.write_bytes((folder / "a.bank").read_bytes())
+    capsys.readouterr()
+    remove = RowJournal.remove
+
+    def interrupted(journal):
+        if not beside:
+            remove(journal)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(RowJournal, "remove", interrupted)
+    assert main(["bank", "build", "--config", f"{folder}/bank.yaml", "--out", str(out), "--jobs", "1"]) == 130
+    rest = f"; {out}.part is not needed any more" if beside else ""
+    assert capsys.readouterr().err == f"shearloop bank: interrupted: {out} is written, and complete{rest}\n"
+    assert Bank.open(out, verify=True).valid.any()
+    assert out.with_name("c.bank.part").exists() == beside
+
+
+def test_banks_that_are_interrupted_in_a_folder_say_what_is_there(folder, tmp_path, capsys, monkeypatch):
+    """Also where none is missing."""
+    (folder / "over.yaml").write_text(f"{BANK}over: {{amplitude: {{low: 0.5, high: 1, count: 2}}}}\n")
+    capsys.readouterr()
+
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(build_command, "_result", interrupted)
+    out = tmp_path / "banks"
+    assert main(["bank", "build", "--config", f"{folder}/over.yaml", "--out", str(out), "--jobs", "1"]) == 130
+    rest = f"what is finished of its banks and rows is in {out}, and the same command goes on from there"
+    assert capsys.readouterr().err == f"shearloop bank: interrupted: {rest}\n"
 
 
 def test_banks_over_more_parameters_lie_in_a_folder_and_a_second_build_solves_only_what_is_missing(

@@ -47,15 +47,34 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build the bank, telling how far it is on stderr."""
+    before = _version(args.out)
     try:
         return _build(args)
     except KeyboardInterrupt:
-        kept = args.out.with_name(f"{args.out.name}.part")
-        rest = f"its finished rows are in {kept}, and the same command goes on from there" if kept.exists() else ""
-        if args.out.is_dir():
-            rest = "its finished banks and rows are in it, and the same command goes on from there"
-        print(f"shearloop bank: interrupted: {args.out} was not written; {rest or 'nothing is left'}", file=sys.stderr)
+        print(f"shearloop bank: interrupted: {_left(args.out, before)}", file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """Return what differs after a file was replaced, None where there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns
+
+
+def _left(out: Path, before: tuple[int, int] | None) -> str:
+    """Return what an interrupted build leaves, by what is on the disk: its bank may be there when it is interrupted."""
+    kept = out.with_name(f"{out.name}.part")
+    if out.is_dir():
+        return f"what is finished of its banks and rows is in {out}, and the same command goes on from there"
+    if _version(out) != before:
+        rest = f"; {kept} is not needed any more" if kept.exists() else ""
+        return f"{out} is written, and complete{rest}"
+    if kept.exists():
+        return f"{out} was not written; its finished rows are in {kept}, and the same command goes on from there"
+    return f"{out} was not written; nothing is left"
 
 
 def _build(args: argparse.Namespace) -> int:

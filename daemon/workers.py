@@ -8,6 +8,7 @@ import asyncio
 import logging
 import signal
 import socket
+import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 from daemon.errors import UserError
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, LocalCluster
 
 T = TypeVar("T")
 S = TypeVar("S")
@@ -29,6 +30,8 @@ LOCAL = "local"
 CONNECT_S = 20
 # A worker takes some seconds to start.
 FIRST_WORKER_S = 30
+# Four fifths of it to end by itself, then it is killed.
+WORKERS_END_S = 0.5
 
 
 class Workers(Protocol):
@@ -79,11 +82,15 @@ class Cluster:
 
     def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
         """Yield results as they are finished; the tasks of a worker that dies go to the others."""
+        from dask import config
         from distributed import CancelledError, KilledWorker, as_completed
 
-        # The result of a task, which is made anew where the workers that had it are gone; what is scattered is lost.
-        kept = self._client.submit(_itself, shared, pure=False)
-        tasks = {self._client.submit(function, kept, item, pure=False): i for i, item in enumerate(items)}
+        # Dask warns of large tasks, such as one with a recording. Each is sent once; what is scattered instead is
+        # lost with the worker that has it, and made anew by nobody.
+        with config.set({"distributed.admin.large-graph-warning-threshold": sys.maxsize}):
+            # The result of a task, which is made anew where the workers that had it are gone.
+            kept = self._client.submit(_itself, shared, pure=False)
+            tasks = {self._client.submit(function, kept, item, pure=False): i for i, item in enumerate(items)}
         try:
             for task in as_completed(list(tasks)):
                 yield tasks[task], task.result()
@@ -124,7 +131,7 @@ def workers(cluster: str | None, jobs: int = 1) -> "Iterator[Workers]":
         yield InTurn() if jobs == 1 else Processes(jobs)
         return
     try:
-        from distributed import Client, LocalCluster
+        from distributed import Client
     except ImportError as error:
         if cluster == LOCAL:
             yield Processes(max(jobs, 1))
@@ -133,24 +140,61 @@ def workers(cluster: str | None, jobs: int = 1) -> "Iterator[Workers]":
     # It logs each connection that it lost with a traceback; what that means for us, `Cluster.map` says.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if cluster == LOCAL:
-        # Port 8787, which it would take for a page that nobody opens, may be another cluster's.
-        anywhere = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
-        with ExitStack() as closed:
-            with _uninterrupted():
-                local = LocalCluster(
-                    n_workers=max(jobs, 1),
-                    threads_per_worker=1,
-                    scheduler_kwargs=anywhere,
-                    # Tasks that an end calls off are no news either.
-                    silence_logs=logging.CRITICAL,
-                )
-                client = closed.enter_context(Client(closed.enter_context(local)))
+        with _local_client(max(jobs, 1)) as client:
             yield Cluster(client)
         return
     _reach(cluster)
     with Client(cluster, timeout=CONNECT_S) as client:
         _wait_for_a_worker(client, cluster)
         yield Cluster(client)
+
+
+@contextmanager
+def _local_client(jobs: int) -> "Iterator[Client]":
+    """Begin a cluster of this machine's own, and end it quickly: by then its results are here, or nobody wants them."""
+    from distributed import Client, LocalCluster
+
+    # Port 8787, which it would take for a page that nobody opens, may be another cluster's.
+    anywhere = {"dashboard": False, "dashboard_address": "127.0.0.1:0"}
+    closed = ExitStack()
+    try:
+        with _uninterrupted():
+            local = closed.enter_context(
+                LocalCluster(
+                    n_workers=jobs,
+                    threads_per_worker=1,
+                    scheduler_kwargs=anywhere,
+                    # Tasks that an end calls off are no news either.
+                    silence_logs=logging.CRITICAL,
+                )
+            )
+            closed.callback(local.sync, _end_workers, local)
+            client = closed.enter_context(Client(local))
+        yield client
+    finally:
+        # Dask's closing does not survive an interrupt: at the end of the process it is waited for, for 10 s.
+        with _interrupted_later():
+            closed.close()
+
+
+async def _end_workers(local: "LocalCluster") -> None:
+    """End the workers at once: one in the middle of a task would be given 4 s to finish it."""
+    nannies = list(local.workers.values())
+    # One that is not gone in time even so has been killed, and is left to the system.
+    await asyncio.gather(*(nanny.close(timeout=WORKERS_END_S) for nanny in nannies), return_exceptions=True)
+
+
+@contextmanager
+def _interrupted_later() -> Iterator[None]:
+    """Hear of Ctrl-C only after what is done here, in whichever thread the system tells of it."""
+    heard: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if heard:
+        signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager

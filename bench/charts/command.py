@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
         import matplotlib as _  # noqa: F401 - so that its absence is told before anything is measured
     except ModuleNotFoundError as error:
         raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
-    from bench.charts.picture import check_takes_pictures
+    from bench.charts.picture import check_takes_pictures, empty_ones_removed
 
     check_takes_pictures(args.out)
     charts: dict[str, Callable[[argparse.Namespace], list[Path]]] = {
@@ -68,7 +68,10 @@ def run(args: argparse.Namespace) -> int:
         "stability": _stability,
         "scene": _scene,
     }
-    for path in charts[args.name](args):
+    # One that is interrupted, or fails, may have made folders by then and nothing in them.
+    with empty_ones_removed(args.out / "banks"):
+        paths = charts[args.name](args)
+    for path in paths:
         print(path)
     return 0
 

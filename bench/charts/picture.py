@@ -1,8 +1,8 @@
 """What all charts have in common: figures without a window, marks that can be told apart in grey, one way to save."""
 
 import json
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
@@ -132,13 +132,21 @@ def check_takes_pictures(directory: Path) -> None:
 
     One that has to be made for that is removed again: a recording that cannot be read leaves nothing behind.
     """
+    with empty_ones_removed(directory):
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            with TemporaryFile(dir=directory):
+                pass
+        except OSError as error:
+            raise _unwritable(directory, error) from error
+
+
+@contextmanager
+def empty_ones_removed(directory: Path) -> Iterator[None]:
+    """Remove a directory, and those above it, where they were made in here and hold nothing at the end."""
     absent = [one for one in (directory, *directory.parents) if not one.exists()]
     try:
-        directory.mkdir(parents=True, exist_ok=True)
-        with TemporaryFile(dir=directory):
-            pass
-    except OSError as error:
-        raise _unwritable(directory, error) from error
+        yield
     finally:
         for one in absent:
             # What somebody else has put into it meanwhile is theirs.

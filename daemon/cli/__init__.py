@@ -95,6 +95,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_OK
     except KeyboardInterrupt:
+        print(f"shearloop {known.command}: interrupted before it was done", file=sys.stderr)
         return EXIT_INTERRUPTED
 
 

@@ -3,6 +3,7 @@
 import argparse
 import sys
 
+from daemon.cli import EXIT_INTERRUPTED, EXIT_OK
 from daemon.cli.connection import add_connection, client_keys
 from daemon.wire.addresses import PUBLISH_ADDRESS
 
@@ -42,9 +43,13 @@ def run(args: argparse.Namespace) -> int:
             flush=True,
         )
 
-    heard = messages(args.connect, args.topics, args.timeout, client_keys(args), tell_quiet)
-    for number, (topic, content) in enumerate(heard, start=1):
-        print(write(topic, content), flush=True)
-        if number == args.count:
-            break
-    return 0
+    try:
+        heard = messages(args.connect, args.topics, args.timeout, client_keys(args), tell_quiet)
+        for number, (topic, content) in enumerate(heard, start=1):
+            print(write(topic, content), flush=True)
+            if number == args.count:
+                break
+    except KeyboardInterrupt:
+        # That is how listening ends, and nothing to tell.
+        return EXIT_INTERRUPTED
+    return EXIT_OK

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -132,6 +133,20 @@ def test_a_mistake_is_one_sentence_and_leaves_no_folder(
     said = capsys.readouterr().err
     assert complaint in said
     assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_chart_that_is_interrupted_leaves_no_empty_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(_: object, __: object, scratch: Path) -> NoReturn:
+        scratch.mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bench.charts.sources.splits", interrupted)
+    monkeypatch.setattr("bench.charts.sources.mesh_of", lambda _: None)
+    assert main(["chart", name, "--out", str(tmp_path / "some" / "out")]) == 130
     assert list(tmp_path.iterdir()) == []
 
 

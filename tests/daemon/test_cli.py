@@ -5,7 +5,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -157,6 +157,20 @@ def test_a_mistake_on_the_command_line_is_one_sentence(
     arguments: list[str], part: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert part in mistake(capsys, *arguments)
+
+
+def test_what_is_interrupted_says_so_except_listening_which_ends_so(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(*_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("daemon.cli.evaluate.run", interrupted)
+    assert main(["evaluate", "a.cal", "b.mcap"]) == 130
+    assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
+    monkeypatch.setattr("daemon.wire.subscriber.messages", interrupted)
+    assert main(["listen"]) == 130
+    assert capsys.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(

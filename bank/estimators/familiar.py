@@ -16,6 +16,7 @@ from bank.errors import CalibrationError
 from bank.estimators.guard import LARGEST_UNUSABLE_SHARE
 from bank.estimators.heads import left_out_blocks
 from bank.estimators.intervals import LEVEL
+from bank.estimators.soundness import LEAST_NOISE, check_slices
 from bank.estimators.twins import Twins
 from bank.estimators.values import BoolArray, FloatArray
 
@@ -83,6 +84,7 @@ class DifferenceGuard:
         n = len(differences)
         if n < _LEAST_DIFFERENCES:
             raise CalibrationError(f"{n} slices are too few to know what is familiar; record {_LEAST_DIFFERENCES}")
+        check_slices(differences)
         misfits, reaches, own = [], [], []
         for rest, block in left_out_blocks(n):
             part = cls._explaining(differences[rest])
@@ -104,11 +106,13 @@ class DifferenceGuard:
     def _explaining(cls, differences: FloatArray) -> Self:
         mean, rank = differences.mean(axis=0), min(_MOST_DIRECTIONS, len(differences) // 4)
         variance = differences.var(axis=0)
-        if not variance.any():
-            raise CalibrationError("the slices have no noise at all: this is no recording of a real board")
         # Half is everybody's: of few frames a channel's own variance says little.
         spread = np.sqrt(0.5 * variance + 0.5 * np.median(variance))
         _, s, vt = np.linalg.svd((differences - mean) / spread, full_matrices=False)
+        if np.sqrt((s[rank:] ** 2).sum()) <= LEAST_NOISE * s[0]:
+            raise CalibrationError(
+                "the slices have no noise: they are multiples or sums of a few; record slices as they come"
+            )
         variances = s[:rank] ** 2 / (len(differences) - 1)
         return cls(mean, spread, vt[:rank], variances, 0.0, 1.0, np.inf, np.inf, np.inf)
 

@@ -49,6 +49,8 @@ def fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physi
                 f"{known.sum()} slices with a torque are too few to calibrate on; record {_LEAST_TORQUE_SLICES} or more"
             )
         differences = np.abs(frames[known])
+        # Before anything else is fitted to them: it looks whether they are slices of a board.
+        guard = DifferenceGuard.fit(differences[:, 0])
         features = np.array(
             [
                 features_of(blank, registered, one, None, t).features
@@ -67,7 +69,7 @@ def fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physi
             difficulty=later.difficulty if later is not None else None,
             mixed=later.passing if later is not None else None,
         )
-        tasks[name] = Task(reader, DifferenceGuard.fit(differences[:, 0]), ks_of(blank.estimator, features))
+        tasks[name] = Task(reader, guard, ks_of(blank.estimator, features))
     if not tasks:
         raise CalibrationError("the slices come with neither torque nor diameter")
     return replace(blank, torque=tasks.get("torque"), diameter=tasks.get("diameter"))

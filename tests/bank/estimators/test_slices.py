@@ -101,6 +101,47 @@ def test_what_cannot_be_calibrated_says_why(sliced, name, change, message):
         fit(name, [FrameSeries(**content)], "x")
 
 
+def alike(frames):
+    return np.repeat(frames[:1], len(frames), axis=0)
+
+
+def multiples(frames):
+    return np.linspace(1.0, 2.0, len(frames))[:, None, None] * frames[:1]
+
+
+def loose(frames):
+    """Return frames of which the first forty come through a ribbon cable that carries three quarters of the wires."""
+    frames = frames.copy()
+    frames[:40, :, 600:] = 0.0
+    return frames
+
+
+def loose_at_half(frames):
+    return np.where(np.arange(896) < 448, 0.0, frames)
+
+
+@pytest.mark.parametrize("name", ["fused", "regression"])
+@pytest.mark.parametrize(
+    ("spoilt", "message"),
+    [
+        (alike, "50 of the 50 slices are all alike; record slices as they come"),
+        (multiples, "the slices have no noise: they are multiples or sums of a few"),
+        (loose_at_half, "in 50 of the 50 slices 50 % of the channels never change: .* look at the ribbon cable"),
+        (loose, "in 40 of the 50 slices 33 % of the channels never change: .* look at the ribbon cable"),
+    ],
+)
+def test_slices_that_no_sound_board_sends_are_refused(sliced, name, spoilt, message):
+    whole = sliced()
+    with pytest.raises(CalibrationError, match=message):
+        fit(name, [replace(whole, channels=spoilt(whole.channels))], "spoilt")
+
+
+def test_up_to_a_quarter_of_the_channels_may_be_dead_as_in_a_live_frame(sliced):
+    whole = sliced()
+    quarter = replace(whole, channels=np.where(np.arange(896) < 224, 0.0, whole.channels))
+    assert fit("fused", [quarter], "a quarter is dead").torque is not None
+
+
 def test_raw_frames_and_slices_do_not_mix(sliced, recorded):
     with pytest.raises(CalibrationError, match="do not go into one calibration"):
         fit("fused", [sliced(), recorded], "x")

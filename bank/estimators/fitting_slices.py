@@ -13,14 +13,15 @@ from bank.estimators.heads import Curve, later_origins
 from bank.estimators.mixtures import Mixtures
 from bank.estimators.physics import Locator
 from bank.estimators.reader import Head, fit_reader
+from bank.estimators.soundness import parts_of
 from bank.estimators.values import FloatArray, FrameSeries
 
 # The curve of frames over torque and over diameter: degree, directions of drift, and whether there is a trend. Of the
 # torque's the mean error over six origins (19 to 44 of 49 slices, judged on all that follow) was least for these
 # (docs/decisions/0042).
 _TORQUE_CURVE, _DIAMETER_CURVE = (3, 3, True), (1, 1, False)
-# With a block left out, as many are left as it takes to know what is familiar.
-_LEAST_TORQUE_SLICES = 10
+# With a block left out, as many are left as it takes to know what is familiar, or to determine the torque's curve.
+_LEAST_TORQUE_SLICES, _LEAST_FOR_CURVE = 10, 14
 
 
 def fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:
@@ -44,9 +45,11 @@ def fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physi
         known = np.isfinite(values) & (np.isfinite(diameter) if name == "diameter" else ~np.isfinite(diameter))
         if not known.any():
             continue
-        if name == "torque" and known.sum() < _LEAST_TORQUE_SLICES:
+        least = _LEAST_FOR_CURVE if blank.estimator == "fused" else _LEAST_TORQUE_SLICES
+        if name == "torque" and known.sum() < least:
             raise CalibrationError(
-                f"{known.sum()} slices with a torque are too few to calibrate on; record {_LEAST_TORQUE_SLICES} or more"
+                f"{known.sum()} slices with a torque are too few for the estimator {blank.estimator}; record {least} "
+                "or more"
             )
         differences = np.abs(frames[known])
         # Before anything else is fitted to them: it looks whether they are slices of a board.
@@ -60,6 +63,8 @@ def fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physi
         columns = columns_for(blank.estimator, name, features)
         later = _mixtures(blank, registered, differences[:, 0], times[known]) if name == "torque" else None
         curve = _TORQUE_CURVE if name == "torque" else _DIAMETER_CURVE
+        if blank.estimator == "fused":
+            _check_distinct(name, values[known], curve[0])
         reader = fit_reader(
             columns,
             values[known],
@@ -83,6 +88,19 @@ def _mixtures(blank: Calibration, locator: Locator | None, differences: FloatArr
         return columns_for(blank.estimator, "torque", seen.features)
 
     return Mixtures(differences, features)
+
+
+def _check_distinct(name: str, values: FloatArray, degree: int) -> None:
+    """Raise CalibrationError where a part of (n,) values has too few different ones for a curve, unless all are one."""
+    if np.ptp(values) == 0:
+        return
+    for rows in parts_of(len(values)):
+        distinct = len(np.unique(values[rows]))
+        if distinct <= degree:
+            raise CalibrationError(
+                f"{len(rows)} of the {len(values)} slices have too few different {name}s for the estimator fused, "
+                f"{distinct}; record more of them, in turn"
+            )
 
 
 def _curve(shape: tuple[int, int, bool]) -> Callable[[FloatArray, FloatArray, float], Head]:

@@ -18,7 +18,7 @@ def check_slices(differences: FloatArray) -> None:
     n = len(differences)
     with np.errstate(over="ignore"):
         rounding_v = LEAST_NOISE * np.sqrt((differences**2).mean())
-    for rows in _parts(n):
+    for rows in parts_of(n):
         still = np.ptp(differences[rows], axis=0) <= rounding_v
         if still.all():
             raise CalibrationError(f"{len(rows)} of the {n} slices are all alike; record slices as they come")
@@ -29,7 +29,7 @@ def check_slices(differences: FloatArray) -> None:
             )
 
 
-def _parts(n: int) -> Iterator[Rows]:
+def parts_of(n: int) -> Iterator[Rows]:
     """Yield the rows of all slices, then of each part of them that something is fitted to by itself."""
     yield np.arange(n)
     for rest, _ in left_out_blocks(n):

@@ -101,6 +101,27 @@ def test_what_cannot_be_calibrated_says_why(sliced, name, change, message):
         fit(name, [FrameSeries(**content)], "x")
 
 
+@pytest.mark.parametrize(("name", "least"), [("fused", 14), ("regression", 10)])
+def test_as_many_slices_as_an_estimator_asks_for_are_enough(sliced, name, least):
+    whole = sliced()
+    for n in (5, least - 1):
+        with pytest.raises(CalibrationError, match=f"^{n} slices with a torque .* {name}; record {least} or more$"):
+            fit(name, [whole.between(0, n)], "too few")
+    assert fit(name, [whole.between(0, least)], "enough").torque is not None
+
+
+@pytest.mark.parametrize(
+    ("torque", "message"),
+    [
+        (np.tile([0.01, 0.05, 0.1], 17)[:50], "50 of the 50 slices have too few different torques .*, 3; record more"),
+        (np.repeat([0.01, 0.03, 0.05, 0.07, 0.1], 10), "30 of the 50 slices have too few different torques .*, 3;"),
+    ],
+)
+def test_too_few_different_torques_are_not_called_too_few_slices(sliced, torque, message):
+    with pytest.raises(CalibrationError, match=message):
+        fit("fused", [replace(sliced(), torque_nm=torque)], "x")
+
+
 def alike(frames):
     return np.repeat(frames[:1], len(frames), axis=0)
 

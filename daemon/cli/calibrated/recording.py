@@ -55,6 +55,7 @@ def run(args: argparse.Namespace) -> int:
     from daemon.cli.recorded import parsed_part, parsed_sides
     from daemon.cli.writing_over import check_writes_over
     from daemon.errors import UserError
+    from daemon.recording.copies import check_no_copies, check_paths_differ
     from daemon.recording.reader import read_recording
     from daemon.recording.schema import LARGEST_DIAMETER_MM
     from daemon.recording.series import part_of, read_series, series_of
@@ -68,8 +69,10 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
     sides = parsed_sides(args.sides)
     check_writes_over(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
-    series = [(path.name, one) for path in args.recordings for one in read_series(path, sides, tool_mm)]
+    check_paths_differ(args.recordings)
+    series = [(path, one) for path in args.recordings for one in read_series(path, sides, tool_mm)]
     parts = [part_of(one, start, stop) for _, one in series]
+    check_no_copies([(str(path), part) for (path, _), part in zip(series, parts, strict=True)])
     if late_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]
     # A fingertip that hardly moves with the load has its times from the other one, wherever both were recorded.
@@ -119,7 +122,7 @@ def run(args: argparse.Namespace) -> int:
         if calibration.torque.reader.misses_loads:
             sentences.append(_blind(calibration.torque.reader, args.estimator, calibration.sides))
     if late_s is None and calibration.kind == "raw":
-        named = [*((name, one) for (name, _), one in zip(series, parts, strict=True)), *beside]
+        named = [*((path.name, one) for (path, _), one in zip(series, parts, strict=True)), *beside]
         timed = telling(parts, [one for _, one in beside], aligned)
         told["load_late_s"] = [found and round(found.late_s, 3) for found in map(aligned, timed)]
         known = ", ".join(f"{each:.2f}" for each in told["load_late_s"] if each is not None)

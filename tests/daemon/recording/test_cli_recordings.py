@@ -106,6 +106,32 @@ def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, capsys)
     assert message in capsys.readouterr().err
 
 
+def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, tmp_path, capsys):
+    def refused(*paths):
+        assert main(["calibrate", *map(str, paths), "--out", str(tmp_path / "x.cal")]) == 2
+        assert not (tmp_path / "x.cal").exists()
+        return capsys.readouterr().err
+
+    link, copy = tmp_path / "link", tmp_path / "copy"
+    link.symlink_to(slices_folder)
+    assert f"{slices_folder} is given twice; name it once" in refused(slices_folder, slices_folder)
+    assert f"{link} is given twice, once as {slices_folder}; name it once" in refused(slices_folder, link)
+    torque, cylinders = slices_folder / "torque_slices", slices_folder / "diameter_slices"
+    copy.mkdir()
+    (copy / "Data_Slice_3.mat").write_bytes((torque / "Data_Slice_7.mat").read_bytes())
+    told = refused(torque, copy)
+    assert f"{copy}: Data_Slice_3.mat holds exactly what {torque}: Data_Slice_7.mat does; leave copies out" in told
+    for number in (5, 6):
+        (cylinders / f"20mm_Data_{number}.mat").write_bytes((cylinders / "20mm_Data_2.mat").read_bytes())
+    told = refused(cylinders)
+    assert "slice 5 of 20 mm holds exactly what" in told
+    assert "slice 2 of 20 mm does, and 1 more are such copies; leave copies out" in told
+    first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
+    assert main(["import", "mat", str(mat_folder()), "--out", str(first)]) == 0
+    second.write_bytes(first.read_bytes())
+    assert f"{second} holds exactly what {first} does; leave copies out" in refused(first, second)
+
+
 def test_the_load_cell_is_still_calibrated_by_its_name(capsys):
     with pytest.raises(SystemExit):
         main(["calibrate", "load", "--help"])

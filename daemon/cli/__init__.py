@@ -8,8 +8,11 @@ their command is asked for, and import what is heavy only when they run, so that
 import argparse
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple, NoReturn, Protocol
 
 # Many small solves and products: a BLAS that spreads each over all cores is slower. Before numpy is loaded.
@@ -54,6 +57,8 @@ EXIT_OK, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
 EXIT_UNFINISHED = 3
 # As a shell has it for what SIGINT ended.
 EXIT_INTERRUPTED = 130
+# After which compiled code has mostly gone on; where it has not, the same is done once more.
+AGAIN_S = 0.05
 
 
 class Parser(argparse.ArgumentParser):
@@ -86,7 +91,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     spelled_out = getattr(module, "spelled_out", list)
     args = parser.parse_args(spelled_out(arguments[1:]))
     try:
-        return module.run(args)
+        with _interrupts_heard():
+            return module.run(args)
     except _user_errors() as error:
         print(f"shearloop {known.command}: {error}", file=sys.stderr)
         return EXIT_USAGE
@@ -97,6 +103,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f"shearloop {known.command}: interrupted before it was done", file=sys.stderr)
         return EXIT_INTERRUPTED
+
+
+@contextmanager
+def _interrupts_heard() -> Iterator[None]:
+    """Send Ctrl-C again that came in what compiled code calls: that cannot pass it on, and it would be lost."""
+    again: list[threading.Timer] = []
+    before = sys.unraisablehook
+
+    def ignored(told: "sys.UnraisableHookArgs") -> None:
+        if not issubclass(told.exc_type, KeyboardInterrupt):
+            before(told)
+            return
+        again.append(threading.Timer(AGAIN_S, os.kill, (os.getpid(), signal.SIGINT)))
+        again[-1].start()
+
+    sys.unraisablehook = ignored
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+        for timer in again:
+            timer.cancel()
+            timer.join()
 
 
 def _user_errors() -> tuple[type[Exception], ...]:

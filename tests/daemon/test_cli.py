@@ -1,8 +1,11 @@
 """Every mistake ends in one sentence that names the file, the key and the cure, and exit status 2."""
 
+import ctypes
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
@@ -171,6 +174,26 @@ def test_what_is_interrupted_says_so_except_listening_which_ends_so(
     monkeypatch.setattr("daemon.wire.subscriber.messages", interrupted)
     assert main(["listen"]) == 130
     assert capsys.readouterr() == ("", "")
+
+
+def test_an_interrupt_in_what_compiled_code_calls_is_not_lost(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """So numba calls us for each function that it loads: the command went on after a traceback."""
+
+    def loads(_: object) -> int:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        threading.Event().wait(10)
+        return 0
+
+    monkeypatch.setattr("daemon.cli.evaluate.run", loads)
+    # A test process may have been told to ignore it.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert main(["evaluate", "a.cal", "b.mcap"]) == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
+from pydantic_core import PydanticSerializationError
 
 from bank.bank_file import Bank
 from bank.channels import CHANNEL_TABLE_HASH
 from daemon.config import DaemonConfig
 from daemon.config_file import ConfigModel
+from daemon.errors import UserError
 from daemon.experiment.steps import ExperimentFile
 from daemon.recording.schema import CONFIGURATION, DIAMETER_NOTE, FORMAT_VERSION
 
@@ -64,18 +66,33 @@ def basic_identity(source: str) -> dict[str, str]:
 
 
 def identity_of(config: DaemonConfig) -> Identity:
-    """Return the identity of a daemon's recordings; raises BankError for a bank that cannot be opened."""
+    """Return the identity of a daemon's recordings.
+
+    Raises BankError for a bank that cannot be opened, and UserError for a path that is no text in UTF-8.
+    """
     metadata = basic_identity(f"a daemon on {platform.node()}")
     metadata["python"] = f"{platform.python_version()}, numpy {np.__version__}, {platform.machine()}"
     for name, fingertip in config.fingertips.items():
         if fingertip.bank is not None:
             metadata[f"bank_{name}"] = Bank.open(fingertip.bank).identity
-    attached = [Attached(CONFIGURATION, "application/json", config.model_dump_json(indent=1).encode())]
+    attached = [Attached(CONFIGURATION, "application/json", _as_json(config))]
     for path in dict.fromkeys(_files(config)):
         for one in Attached.if_there(path):
             attached.append(one)
             metadata[f"sha256 {path}"] = hashlib.sha256(one.data).hexdigest()
     return Identity(metadata, tuple(attached))
+
+
+def _as_json(config: DaemonConfig) -> bytes:
+    """Return the configuration as JSON, which is UTF-8; raises UserError where it names a path that is not."""
+    try:
+        return config.model_dump_json(indent=1).encode()
+    except PydanticSerializationError as error:
+        folder = config.recording.folder if config.recording is not None else Path()
+        raise UserError(
+            "a recording keeps the configuration with the paths in it, and one of them is no text in UTF-8 (it records "
+            f"into {str(folder)!r}); choose another name"
+        ) from error
 
 
 def notes_of(experiment: ExperimentFile) -> dict[str, str]:

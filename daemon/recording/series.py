@@ -48,6 +48,12 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
     """Return a recording's frames, those of two sides paired by time; times are in seconds since its first frame."""
     wanted = sides or tuple(side for side in SIDES if side in recording.sides) or tuple(recording.sides)
     missing = [side for side in wanted if side not in recording.sides]
+    if wanted and not set(wanted) <= {*SIDES, *recording.sides}:
+        # No file that could be imported has any of these.
+        raise UserError(
+            f"{recording.path} has frames of {' and '.join(recording.sides) or 'no side'}, not of "
+            f"{' and '.join(missing)}; name a side that it has"
+        )
     if missing or not wanted:
         raise UserError(
             f"{recording.path} has frames of {' and '.join(recording.sides) or 'no side'}, not of "

@@ -1,11 +1,16 @@
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mcap.writer import Writer
 
 from bank.channels import line_of_channels
+from daemon.config import RecordingConfig, load_daemon_config
 from daemon.errors import UserError
 from daemon.recording import identity
 from daemon.recording.reader import read_recording
+from daemon.recording.series import read_series
 from daemon.recording.writer import RecordingWriter
 
 
@@ -72,3 +77,17 @@ def test_foreign_and_stale_files_are_refused(tmp_path, monkeypatch):
         read_recording(tmp_path / "new.mcap")
     with pytest.raises(UserError, match="choose another --out"):
         RecordingWriter(tmp_path / "no" / "where.mcap", "x")
+
+
+def test_a_side_that_no_file_has_is_not_to_be_imported(tmp_path):
+    written(tmp_path / "a.mcap")
+    with pytest.raises(UserError, match="has frames of right, not of left; import those files as well"):
+        read_series(tmp_path / "a.mcap", ("left",))
+    with pytest.raises(UserError, match="has frames of right, not of up; name a side that it has"):
+        read_series(tmp_path / "a.mcap", ("up",))
+
+
+def test_a_folder_whose_name_is_no_text_is_refused_in_a_sentence(config):
+    recorded = RecordingConfig(folder=Path(os.fsdecode(b"caf\xe9")))
+    with pytest.raises(UserError, match=r"no text in UTF-8 \(it records into 'caf\\udce9'\); choose another name"):
+        identity.identity_of(load_daemon_config(config()).model_copy(update={"recording": recorded}))

@@ -25,6 +25,7 @@ from daemon.eit.fingertip import FingertipTask
 from daemon.eit.opening import AnyEstimator, open_both, open_estimator
 from daemon.eit.tool_diameter import FingertipDiameters
 from daemon.eit.tracking import TrackedEstimator
+from daemon.ending_signals import ending_signals
 from daemon.health import HealthReporter, TaskFacts
 from daemon.links import log_link
 from daemon.load_cell_task import LOAD_CELL
@@ -352,10 +353,11 @@ async def run_daemon(
     facts: Mapping[str, Callable[[], TaskFacts]] = MappingProxyType({}),
     on_ready: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Run a daemon until SIGINT, SIGTERM or the command `stop`; return whether nothing was left undone.
+    """Run a daemon until SIGINT, SIGTERM, SIGHUP or the command `stop`; return whether nothing was left undone.
 
-    SIGTERM is how a service manager ends a service: what that leaves undone was to be left. `listeners` hear every
-    message; `facts` are what health tells of them, by name; `on_ready` is called once all that lasts has been made.
+    SIGTERM is how a service manager ends a service, SIGHUP tells that its terminal was closed: what they leave undone
+    was to be left. `listeners` hear every message; `facts` are what health tells of them, by name; `on_ready` is called
+    once all that lasts has been made.
     """
     loop, terminated = asyncio.get_running_loop(), False
 
@@ -370,11 +372,12 @@ async def run_daemon(
             daemon.publisher.listen(listener)
         for name, told in facts.items():
             daemon.health.add(name, told)
-        loop.add_signal_handler(signal.SIGINT, daemon.stop)
-        loop.add_signal_handler(signal.SIGTERM, terminate)
+        ending = ending_signals()
+        for number in ending:
+            loop.add_signal_handler(number, daemon.stop if number == signal.SIGINT else terminate)
         try:
             await daemon.run(on_ready)
         finally:
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in ending:
                 loop.remove_signal_handler(number)
     return daemon.finished or terminated

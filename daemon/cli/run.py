@@ -45,13 +45,16 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run until SIGINT, SIGTERM or `shearloop command stop`, or until the experiment has ended (`stop_when_done`)."""
+    """Run until a signal, `shearloop command stop`, or the end of the experiment (`stop_when_done`)."""
     from daemon.collector import kept_from_lasting_objects
+    from daemon.ending_signals import ending_signals
     from daemon.logs import logging_to_stderr
     from daemon.outlet import Outlet
 
     # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    for number in ending_signals():
+        if number != signal.SIGINT:
+            signal.signal(number, lambda *_: sys.exit(0))
     with (
         kept_from_lasting_objects() as collect_what_comes,
         logging_to_stderr(json_lines=args.json_log) as log,

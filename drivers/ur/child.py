@@ -115,8 +115,8 @@ class Pipe:
 def main() -> NoReturn:
     """Run until told to go, until the daemon is gone, or until the controller is."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    # Ctrl-C at the terminal reaches the daemon too, as does a service manager's end; it then says when to stop.
-    for number in (signal.SIGINT, signal.SIGTERM):
+    # Ctrl-C at the terminal and its end reach the daemon too, as does a service manager's; it then says when to stop.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     # What the client prints must not get between the messages.
     stdout = os.dup(1)

@@ -1,4 +1,5 @@
 import asyncio
+import signal
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager
@@ -16,6 +17,10 @@ from bank.calibration import Calibration
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60
+
+
+# Whose tests run under `nohup` has children to which the end of a terminal means nothing.
+HEARS_OF_TERMINAL = pytest.mark.skipif(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN, reason="SIGHUP is ignored")
 
 
 @pytest.fixture(scope="session")

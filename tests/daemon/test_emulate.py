@@ -14,6 +14,7 @@ from bank.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from daemon.cli import EXIT_USAGE, main
 from drivers.eit_format import ADC_STEP_V
 from drivers.eit_kit import EitKit, Frame
+from tests.daemon.conftest import HEARS_OF_TERMINAL
 
 # Guards against a test that hangs; none of them waits for so long.
 DEADLINE_S = 60
@@ -83,13 +84,16 @@ async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_orde
     assert spread_s > 0.9 * 831 * PERIOD_S / 100
 
 
-async def test_a_recording_is_played_again_and_again_under_the_name_given(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGHUP, marks=HEARS_OF_TERMINAL)])
+async def test_a_recording_is_played_again_and_again_under_the_name_given(
+    number: signal.Signals, tmp_path: Path
+) -> None:
     path, lines = recording(tmp_path, 3)
     link = tmp_path / "eit"
     async with emulator("--recording", str(path), "--speed", "500", "--link", str(link)) as (process, port):
         assert port == str(link)
         frames = await take(EitKit(zero_slots=ZERO_SLOTS, path=port), 7)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         assert await process.wait() == 0
     np.testing.assert_array_equal([frame.raw for frame in frames], [lines[n % 3] for n in range(7)])
     assert not link.is_symlink(), "a stopped emulator leaves no port behind"

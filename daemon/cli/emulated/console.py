@@ -3,16 +3,17 @@
 import asyncio
 import contextlib
 import os
-import signal
 import sys
 from collections.abc import Callable, Coroutine
+
+from daemon.ending_signals import ending_signals
 
 STDIN = 0
 READ_BYTES = 4096
 
 
 def play(device: Coroutine[None, None, None], on_command: Callable[[str], None]) -> None:
-    """Run `device` until it ends, SIGINT or SIGTERM comes, or standard input is closed.
+    """Run `device` until it ends, SIGINT, SIGTERM or SIGHUP comes, or standard input is closed.
 
     Each line of standard input, where that is a pipe or a terminal, goes to `on_command`; a ValueError of its is told
     on stderr and changes nothing.
@@ -39,7 +40,7 @@ async def _play(device: Coroutine[None, None, None], on_command: Callable[[str],
             except ValueError as error:
                 print(error, file=sys.stderr, flush=True)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ending_signals():
         loop.add_signal_handler(number, task.cancel)
     # A file or /dev/null cannot be waited for, and gives no commands.
     with contextlib.suppress(PermissionError):

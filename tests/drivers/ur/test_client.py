@@ -299,7 +299,7 @@ async def test_connection_that_is_refused_is_explained(
         assert said in (await robot.send(Enable())).refused
 
 
-@pytest.mark.parametrize("told", [None, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("told", [None, signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 async def test_leaving_stops_the_arm_and_ends_the_program(
     told: signal.Signals | None, controller: ControllerProcess
 ) -> None:

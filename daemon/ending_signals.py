@@ -1,0 +1,9 @@
+"""Which signals end a process in order."""
+
+import signal
+
+
+def ending_signals() -> tuple[signal.Signals, ...]:
+    """Return SIGINT, SIGTERM, and SIGHUP of a terminal that is closed, unless that was to be ignored (`nohup`)."""
+    hangs_up = signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+    return (signal.SIGINT, signal.SIGTERM, *((signal.SIGHUP,) if hangs_up else ()))

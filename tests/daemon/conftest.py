@@ -19,10 +19,6 @@ from bank.calibration import Calibration
 DEADLINE_S = 60
 
 
-# Whose tests run under `nohup` has children to which the end of a terminal means nothing.
-HEARS_OF_TERMINAL = pytest.mark.skipif(signal.getsignal(signal.SIGHUP) is signal.SIG_IGN, reason="SIGHUP is ignored")
-
-
 @pytest.fixture(scope="session")
 def tiny_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bank of 8 × 8 random signals: scored in a millisecond."""
@@ -154,3 +150,11 @@ def subscriber() -> Iterator[Callable[[str, str], "zmq.Socket[bytes]"]]:
         yield connect
         for socket in sockets:
             socket.close()
+
+
+@pytest.fixture
+def hears_of_terminal() -> Iterator[None]:
+    """Processes that are started hear of a terminal that is closed, even where the tests do not (`nohup`)."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)

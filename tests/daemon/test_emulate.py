@@ -14,7 +14,6 @@ from bank.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from daemon.cli import EXIT_USAGE, main
 from drivers.eit_format import ADC_STEP_V
 from drivers.eit_kit import EitKit, Frame
-from tests.daemon.conftest import HEARS_OF_TERMINAL
 
 # Guards against a test that hangs; none of them waits for so long.
 DEADLINE_S = 60
@@ -84,7 +83,8 @@ async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_orde
     assert spread_s > 0.9 * 831 * PERIOD_S / 100
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGHUP, marks=HEARS_OF_TERMINAL)])
+@pytest.mark.usefixtures("hears_of_terminal")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
 async def test_a_recording_is_played_again_and_again_under_the_name_given(
     number: signal.Signals, tmp_path: Path
 ) -> None:

@@ -16,7 +16,7 @@ from daemon.config import load_daemon_config
 from daemon.configured_experiment import ConfiguredExperiment
 from daemon.errors import UserError
 from daemon.experiment.machine import Phase
-from tests.daemon.conftest import HEARS_OF_TERMINAL, Log, deadline, shearloop
+from tests.daemon.conftest import Log, deadline, shearloop
 from tests.emulator_process import own_address
 
 Write = Callable[..., Path]
@@ -33,9 +33,10 @@ def waiting_config(config: Write, tmp_path: Path) -> Path:
     return config(robot="ur.yaml", experiment="experiment.yaml", stop_when_done=True)
 
 
+@pytest.mark.usefixtures("hears_of_terminal")
 @pytest.mark.parametrize(
     ("number", "status"),
-    [(signal.SIGINT, 3), (signal.SIGTERM, 0), pytest.param(signal.SIGHUP, 0, marks=HEARS_OF_TERMINAL)],
+    [(signal.SIGINT, 3), (signal.SIGTERM, 0), (signal.SIGHUP, 0)],
 )
 async def test_an_experiment_that_is_not_done_is_seen_in_the_exit_status(
     number: signal.Signals, status: int, waiting_config: Path

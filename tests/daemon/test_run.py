@@ -22,7 +22,7 @@ from daemon.config import load_daemon_config
 from daemon.messages import decode
 from daemon.wire.request import request
 from drivers.eit_format import ADC_STEP_V
-from tests.daemon.conftest import DEADLINE_S, HEARS_OF_TERMINAL, shearloop
+from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
 Connect = Callable[[str, str], "zmq.Socket[bytes]"]
@@ -76,9 +76,8 @@ async def stop_and_time(daemon: asyncio.subprocess.Process, number: signal.Signa
     assert time.monotonic() - begun < 5
 
 
-@pytest.mark.parametrize(
-    "number", [signal.SIGINT, signal.SIGTERM, pytest.param(signal.SIGHUP, marks=HEARS_OF_TERMINAL)]
-)
+@pytest.mark.usefixtures("hears_of_terminal")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 async def test_the_daemon_and_its_emulators_stop_cleanly_on_a_signal(
     number: signal.Signals, config: Write, tmp_path: Path, subscriber: Connect
 ) -> None:

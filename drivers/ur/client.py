@@ -11,7 +11,7 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -208,7 +208,7 @@ class UrRobot:
         finally:
             self._disconnected()
             # Cancelled: let it stop the arm. Lost: there is nothing to wait for.
-            await asyncio.shield(conversation.end())
+            await _in_any_case(conversation.end())
             self.pid = None
         if loss is not None:
             raise loss
@@ -267,6 +267,16 @@ class UrRobot:
     def _tell(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
         self.link = LinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
         self._on_link(self.link)
+
+
+async def _in_any_case(ending: Coroutine[None, None, None]) -> None:
+    """Await it to its end, also where we are cancelled only meanwhile: nobody else would wait for it."""
+    task = asyncio.ensure_future(ending)
+    try:
+        await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await task
+        raise
 
 
 def unheard(_state: RobotState) -> None:

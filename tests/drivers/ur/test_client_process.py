@@ -219,3 +219,26 @@ async def test_loss_that_is_told_when_nobody_listens_any_more_is_no_complaint_of
         del conversation
         gc.collect()
     assert complaints == []
+
+
+async def test_process_that_ends_by_itself_as_the_daemon_stops_is_waited_for(
+    play: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play("exit 1")
+    begun, may_end = asyncio.Event(), asyncio.Event()
+    real, ended = Conversation.end, []
+
+    async def end(conversation: Conversation) -> None:
+        begun.set()
+        await may_end.wait()
+        await real(conversation)
+        ended.append(conversation)
+
+    monkeypatch.setattr(Conversation, "end", end)
+    run = asyncio.create_task(UrRobot(settings_for("127.0.0.254")).run())
+    await begun.wait()
+    run.cancel()
+    asyncio.get_running_loop().call_soon(may_end.set)
+    with pytest.raises(asyncio.CancelledError):
+        await run
+    assert len(ended) == 1

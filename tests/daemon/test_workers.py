@@ -8,12 +8,13 @@ import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from multiprocessing import get_context, resource_tracker
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
+from unittest.mock import AsyncMock
 
 import numpy as np
 import pytest
@@ -126,8 +127,8 @@ def test_results_that_nobody_goes_on_with_are_let_go_after_the_end_of_the_cluste
     with workers(scheduler) as cluster:
         found = cluster.map(square, {"factor": 0.37}, range(3))
         next(found)
-    # As Python does when it throws the iterator away.
-    found.close()  # type: ignore[attr-defined]
+    # Python throws the iterator away here; what fails in it then is a warning, and so an error.
+    del found
 
 
 def interrupts_blocked(tell: Any) -> None:
@@ -184,13 +185,12 @@ def waits(told: str, _: int) -> None:
 
 
 @pytest.mark.usefixtures("scheduler")
-def test_a_local_cluster_ends_at_once_when_it_is_interrupted_and_again_while_it_ends(
+def test_a_local_cluster_ends_when_it_is_interrupted_and_again_while_it_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A worker in the middle of a task had 4 s; closing that was interrupted was waited for at exit, for 10 s."""
+    """Closing that was interrupted was waited for at exit, for 10 s, and left a worker in the middle of a task."""
     os.mkfifo(tmp_path / "told")
     running: list[int] = []
-    interrupted_s: list[float] = []
     end_workers = daemon.workers._end_workers
 
     async def again(local: Any) -> None:
@@ -200,7 +200,6 @@ def test_a_local_cluster_ends_at_once_when_it_is_interrupted_and_again_while_it_
 
     def interrupt() -> None:
         running.append(int((tmp_path / "told").read_text()))
-        interrupted_s.append(time.monotonic())
         os.kill(os.getpid(), signal.SIGINT)
 
     ended: list[Any] = []
@@ -219,13 +218,18 @@ def test_a_local_cluster_ends_at_once_when_it_is_interrupted_and_again_while_it_
             interrupted()
     finally:
         signal.signal(signal.SIGINT, before)
-    took_s = time.monotonic() - interrupted_s[0]
     thread.join()
     assert ended[0].status.name == "closed"
     with pytest.raises(ProcessLookupError):
         os.kill(running[0], 0)
-    # 0.4 s where nothing else runs.
-    assert took_s < 3
+
+
+async def test_workers_are_given_little_time_to_end_each_though_another_fails() -> None:
+    """One in the middle of a task had 4 s."""
+    nannies = [SimpleNamespace(close=AsyncMock(side_effect=TimeoutError)) for _ in range(2)]
+    await daemon.workers._end_workers(cast(Any, SimpleNamespace(workers=dict(enumerate(nannies)))))
+    for nanny in nannies:
+        nanny.close.assert_awaited_once_with(timeout=daemon.workers.WORKERS_END_S)
 
 
 def size(_: None, item: Any) -> int:

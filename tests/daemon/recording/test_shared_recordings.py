@@ -136,9 +136,10 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
 def test_later_torque_slices(shared):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
     (series,) = read_series(shared / "recordings/torque_slices")
-    errors, covered = [], []
+    errors, covered, widths_nm = [], [], []
     for n in (19, 24, 29, 34, 39, 44):
-        figures = judge([follow(fit("fused", [series.between(0, n)], "earlier"), series.between(n, 49))])
+        followed = follow(fit("fused", [series.between(0, n)], "earlier"), series.between(n, 49))
+        figures = judge([followed])
         r, rmse_nm, coverage = LATER_SLICES.get(n, (0.96, 0.018, 0.0))
         assert figures["r"] >= r
         assert figures["rmse_nm"] <= rmse_nm
@@ -146,9 +147,12 @@ def test_later_torque_slices(shared):
         assert figures["valid_fraction"] == 1
         errors.append(figures["rmse_nm"])
         covered += [figures["coverage_95"]] * figures["frames"]
+        widths_nm += [one.torque_high_nm - one.torque_low_nm for one in followed.estimates]
     assert np.mean(errors) <= 0.012
     # Of good slices more lie inside than was promised: what cannot be seen in them has to lie inside too.
     assert np.mean(covered) >= 0.95
+    # Which they would in any that are wide enough: the slices span 0.131 N·m.
+    assert np.median(widths_nm) <= 0.09
 
 
 @pytest.mark.parametrize("name", ["fused", "regression"])

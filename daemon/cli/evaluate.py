@@ -36,18 +36,21 @@ def run(args: argparse.Namespace) -> int:
     from bank.estimators.alignment import doubt
     from daemon.cli.recorded import check_kind, parsed_part
     from daemon.errors import UserError
+    from daemon.recording.copies import check_no_copies, check_paths_differ
     from daemon.recording.evaluation import followed, judge, reasons
     from daemon.recording.series import part_of, read_series
     from daemon.workers import in_order, workers
 
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
+    check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
     start, stop = parsed_part(args.part)
     named = [(path, one) for path in args.recordings for one in read_series(path)]
     check_kind(args.calibration, calibration, [one for _, one in named])
     parts = [part_of(one, start, stop) for _, one in named]
+    check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
     shared = (calibration, None if bank is None else str(args.bank.resolve()))
     with workers(args.cluster) as pool:
         tracks = in_order(pool.map(followed, shared, parts))

@@ -1,4 +1,7 @@
-"""Refuses what was given twice: a copy is no second measurement, and makes every interval too narrow."""
+"""Refuses what was given twice: a copy is no second measurement.
+
+What is fitted to it has too narrow intervals, and what is judged on it has the figures of more frames than there are.
+"""
 
 import hashlib
 from collections.abc import Iterator, Sequence

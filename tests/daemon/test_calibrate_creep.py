@@ -76,3 +76,14 @@ def test_a_recording_without_held_twists_is_refused(
     monkeypatch.setattr("daemon.recording.evaluation.follow", lambda *_: found)
     assert main(["calibrate", "creep", "held.mcap", "--calibration", "right.cal"]) == 2
     assert "10 readings are too few to learn it from; hold a twist for a minute" in capsys.readouterr().err
+
+
+def test_twists_that_are_given_twice_are_refused(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("bank.estimators.Calibration.load", lambda _: Loaded())
+    monkeypatch.setattr("daemon.recording.series.read_series", lambda *_: [track().series])
+    told_of = {"held.mcap": "is given twice; name it once", "copy.mcap": "holds exactly what held.mcap does"}
+    for copy, told in told_of.items():
+        assert main(["calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal"]) == 2
+        assert f"{copy} {told}" in capsys.readouterr().err

@@ -282,12 +282,13 @@ def test_banks_over_more_parameters_have_the_same_bytes_from_a_cluster(varied: t
 def test_recordings_are_evaluated_to_the_same_figures_on_a_cluster_that_a_worker_is_killed_of(
     scheduler: str, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], killed: list[int]
 ) -> None:
-    slices, calibration = str(shared / "recordings" / "torque_slices"), str(tmp_path / "slices.cal")
+    slices, cylinders = (str(shared / "recordings" / name) for name in ("torque_slices", "diameter_slices"))
+    calibration = str(tmp_path / "slices.cal")
     assert main(["calibrate", slices, "--estimator", "regression", "--part", "0:0.6", "--out", calibration]) == 0
     figures = []
     for options in ([], ["--cluster", scheduler]):
         capsys.readouterr()
-        assert main(["evaluate", calibration, slices, slices, "--part", "0.6:1", "--json", *options]) == 0
+        assert main(["evaluate", calibration, slices, cylinders, "--part", "0.6:1", "--json", *options]) == 0
         found = json.loads(capsys.readouterr().out)
         figures.append({name: value for name, value in found.items() if not name.startswith("latency")})
     assert killed

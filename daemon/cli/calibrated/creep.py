@@ -25,14 +25,18 @@ def run(args: argparse.Namespace) -> int:
     from bank.estimators import Calibration
     from daemon.cli.recorded import check_kind
     from daemon.control.creep import fit_creep
+    from daemon.recording.copies import check_no_copies, check_paths_differ
     from daemon.recording.evaluation import follow
     from daemon.recording.grips import grips_of
     from daemon.recording.series import read_series
 
+    check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
-    series = [one for path in args.recordings for one in read_series(path, calibration.sides)]
+    named = [(str(path), one) for path in args.recordings for one in read_series(path, calibration.sides)]
+    series = [one for _, one in named]
     check_kind(args.calibration, calibration, series)
+    check_no_copies(named)
     grips = [grip for one in series for grip in grips_of(follow(calibration, one, bank))]
     found = fit_creep(grips)
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)

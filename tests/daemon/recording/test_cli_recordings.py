@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from shutil import copytree
 
 import numpy as np
 import pytest
@@ -130,6 +131,22 @@ def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, t
     assert main(["import", "mat", str(mat_folder()), "--out", str(first)]) == 0
     second.write_bytes(first.read_bytes())
     assert f"{second} holds exactly what {first} does; leave copies out" in refused(first, second)
+
+
+def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folder, tmp_path, capsys):
+    slices, copy, calibration = slices_folder / "torque_slices", tmp_path / "copy", tmp_path / "a.cal"
+    assert main(["calibrate", str(slices), "--estimator", "regression", "--out", str(calibration)]) == 0
+    copytree(slices, copy)
+    capsys.readouterr()
+    assert main(["evaluate", str(calibration), str(slices), str(slices)]) == 2
+    assert capsys.readouterr() == (
+        "",
+        f"shearloop evaluate: {slices} is given twice; name it once: a copy tells nothing new\n",
+    )
+    assert main(["evaluate", str(calibration), str(slices), str(copy), "--part", "0.6:1"]) == 2
+    out, told = capsys.readouterr()
+    assert out == ""
+    assert f"{copy}: Data_Slice_30.mat holds exactly what {slices}: Data_Slice_30.mat does, and 19 more are" in told
 
 
 def test_the_load_cell_is_still_calibrated_by_its_name(capsys):

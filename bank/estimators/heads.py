@@ -163,10 +163,13 @@ class Curve:
         n, n_trend = len(values), N_TREND * trend
         centre, scale = float(values.mean()), float(values.std())
         distinct = len(np.unique(values))
-        if distinct <= degree or n < degree + n_trend + n_drift + 3 or scale == 0:
+        least_values, least_frames = degree + 1, degree + n_trend + n_drift + 3
+        if distinct < least_values or n < least_frames or scale == 0:
+            # Of what was recorded these may be the rest, as without the largest fifth of the values.
             raise CalibrationError(
                 f"{n} frames at {distinct} distinct values do not determine a curve of degree {degree} and its noise; "
-                f"record at least {degree + n_trend + n_drift + 3}"
+                f"record more, at more different values: where some are left out and told by the rest, {least_values} "
+                f"values and {least_frames} frames have to be left"
             )
         z = (values - centre) / scale
         spread = _spread_about_parabola(frames, z)

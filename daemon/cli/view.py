@@ -29,7 +29,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve the page until SIGINT or SIGTERM."""
+    """Serve the page until SIGINT, SIGTERM or SIGHUP."""
     import asyncio
     import json
     from importlib.util import find_spec

@@ -1,13 +1,13 @@
 """Runs the page's server beside its subscription until a signal ends both."""
 
 import asyncio
-import signal
 from collections.abc import Callable
 
 import zmq.asyncio
 from aiohttp import web
 
 from bank.fingertip import Fingertip
+from daemon.ending_signals import ending_signals
 from daemon.errors import UserError
 from daemon.view.bridge import Bridge, Place
 from daemon.view.conductivity import outline
@@ -20,12 +20,12 @@ SHUTDOWN_S = 1.0
 
 
 async def serve(place: Place, port: int, token: str, fingertip: Fingertip, ready: Callable[[int], None]) -> None:
-    """Serve the page on loopback, call `ready` with its port, and return after SIGINT or SIGTERM.
+    """Serve the page on loopback, call `ready` with its port, and return after SIGINT, SIGTERM or SIGHUP.
 
     Raises UserError for a port that is taken and for a malformed address.
     """
     loop = asyncio.get_running_loop()
-    ended = asyncio.Event()
+    ending, ended = ending_signals(), asyncio.Event()
     with zmq.asyncio.Context() as context:
         bridge = Bridge(context, place, Latest(fingertip.height_cm))
         runner = web.AppRunner(
@@ -41,7 +41,7 @@ async def serve(place: Place, port: int, token: str, fingertip: Fingertip, ready
                 raise UserError(
                     f"the page cannot be served on {HOST}:{port} ({error.strerror}); give another --port"
                 ) from error
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in ending:
                 loop.add_signal_handler(number, ended.set)
             ready(runner.addresses[0][1])
             waiting = asyncio.create_task(ended.wait())
@@ -52,7 +52,7 @@ async def serve(place: Place, port: int, token: str, fingertip: Fingertip, ready
             if reading.done():
                 reading.result()
         finally:
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in ending:
                 loop.remove_signal_handler(number)
             reading.cancel()
             await asyncio.gather(reading, return_exceptions=True)

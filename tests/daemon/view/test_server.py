@@ -3,6 +3,7 @@
 import asyncio
 import hashlib
 import json
+import signal
 import socket
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
@@ -275,7 +276,11 @@ async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tm
             await serve(Place(publish, commands), 0, TOKEN, tip, ready)
 
 
-async def test_the_command_prints_its_address_with_the_token_once_and_ends_on_a_signal(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("hears_of_terminal")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+async def test_the_command_prints_its_address_with_the_token_once_and_ends_on_a_signal(
+    number: signal.Signals, tmp_path: Path
+) -> None:
     token = tmp_path / "token"
     addresses = ("--connect", f"ipc://{tmp_path}/p", "--commands", f"ipc://{tmp_path}/c")
     async with shearloop("view", "--port", "0", "--json", "--token-file", str(token), *addresses) as view:
@@ -284,8 +289,9 @@ async def test_the_command_prints_its_address_with_the_token_once_and_ends_on_a_
         assert told["url_with_token"] == f"{told['url']}#token={token.read_text().strip()}"
         async with aiohttp.ClientSession() as http, http.ws_connect(f"{told['url']}stream") as stream:
             assert (await stream.receive_json())["first"]
-            view.terminate()
-            while (await stream.receive()).type is not aiohttp.WSMsgType.CLOSE:
+            view.send_signal(number)
+            while (message := await stream.receive()).type is aiohttp.WSMsgType.TEXT:
                 continue
+            assert message.type is aiohttp.WSMsgType.CLOSE
         assert await view.wait() == 0
         assert token.read_text().strip() not in (await view.stdout.read()).decode()

@@ -24,11 +24,13 @@ setup(
     ext_modules=[
         compiled(
             "bank._search",
-            ["bank/_search.c", "bank/candidates.c", "bank/lags.c", "bank/search.c"],
-            ["bank/eight.h", "bank/search.h"],
+            ["bank/_search.c", "bank/arrays.c", "bank/candidates.c", "bank/lags.c", "bank/search.c"],
+            ["bank/arrays.h", "bank/eight.h", "bank/search.h"],
         ),
         compiled(
-            "bank._frames", ["bank/_frames.c", "bank/look.c", "bank/medians.c"], ["bank/look.h", "bank/medians.h"]
+            "bank._frames",
+            ["bank/_frames.c", "bank/_fingertips.c", "bank/arrays.c", "bank/look.c", "bank/medians.c"],
+            ["bank/_fingertips.h", "bank/arrays.h", "bank/look.h", "bank/medians.h"],
         ),
         compiled("drivers._cells", ["drivers/_cells.c"], []),
     ]

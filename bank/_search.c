@@ -1,13 +1,10 @@
 /* bank/search.c for Python: holds the arrays of a compressed bank, and searches it for one frame after another.
 
-   The arrays that are handed in have been made by bank/compiled_search.py, which says what they are. Their sizes and whatever
-   points into another one are checked, for they decide where is read. A search keeps the interpreter's lock, so that all
+   The arrays that are handed in have been made by bank/compiled_search.py, which says what they are. Their kinds and sizes and
+   whatever points into another one are checked, for they decide where is read. A search keeps the interpreter's lock, so that all
    searches of a bank can use the same memory. */
 
-#define Py_LIMITED_API 0x030B0000
-#define PY_SSIZE_T_CLEAN
-#include <Python.h>
-
+#include "arrays.h"
 #include "search.h"
 
 #include <math.h>
@@ -60,14 +57,15 @@ static PyObject *matched(PyObject *self, PyObject *args, Find *find)
 {
     const Bank *bank = bank_of(self);
     Hunt hunt;
-    Py_buffer difference;
+    PyObject *difference;
     int with_runner_up;
     long most_scores;
     Found best = {-1, 0}, other = {-1, 0};
-    if (!bank || !PyArg_ParseTuple(args, "y*pl", &difference, &with_runner_up, &most_scores))
+    Taken taken = {.n = 0};
+    if (!bank || !PyArg_ParseTuple(args, "Opl", &difference, &with_runner_up, &most_scores))
         return NULL;
-    int sound = difference.len == CHANNELS * sizeof(double) && take_frame(&hunt, bank, difference.buf);
-    PyBuffer_Release(&difference);
+    int sound = take(&taken, difference, 'd', CHANNELS) && take_frame(&hunt, bank, taken.values[0]);
+    Py_XDECREF(done_or_none(&taken, NULL));
     if (!sound || find(&hunt, most_scores, &best, with_runner_up ? &other : NULL) != FOUND)
         Py_RETURN_NONE;
     return as_tuple(&best, &other);
@@ -81,7 +79,8 @@ static PyObject *match(PyObject *self, PyObject *args)
 PyDoc_STRVAR(match_doc,
 "match(difference, runner_up, most_scores) -> (cell, score, cell, score) | None\n\n"
 "Search at lag 0 for a (896,) float64 difference: the best cell and the best one outside its peak, -1 where there is\n"
-"none. None: the difference has no magnitude, a tie hangs on rounding, or more scores would have to be computed.");
+"none. None: it is no such difference or has no magnitude, a tie hangs on rounding, or more scores would have to be\n"
+"computed.");
 
 static PyObject *match_at_all_lags(PyObject *self, PyObject *args)
 {
@@ -94,48 +93,47 @@ PyDoc_STRVAR(match_at_all_lags_doc,
 "runner-up.");
 
 /* Σ (difference / noise)², or −1 where a value is not finite or a noise not above zero. */
+static double sum_of_squares(const double *values, const double *deviations, Py_ssize_t n)
+{
+    double sum = 0.0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        if (!(isfinite(values[i]) && isfinite(deviations[i]) && deviations[i] > 0))
+            return -1.0;
+        double ratio = values[i] / deviations[i];
+        sum += ratio * ratio;
+    }
+    return sum;
+}
+
 static PyObject *energy(PyObject *module, PyObject *args)
 {
     (void)module;
-    Py_buffer difference, noise;
-    if (!PyArg_ParseTuple(args, "y*y*", &difference, &noise))
-        return NULL;
-    double sum = -1.0;
-    if (difference.len == noise.len) {
-        const double *value = difference.buf, *deviation = noise.buf;
-        Py_ssize_t n = difference.len / (Py_ssize_t)sizeof(double);
-        sum = 0.0;
-        for (Py_ssize_t i = 0; i < n; i++) {
-            if (!(isfinite(value[i]) && isfinite(deviation[i]) && deviation[i] > 0)) {
-                sum = -1.0;
-                break;
-            }
-            double ratio = value[i] / deviation[i];
-            sum += ratio * ratio;
-        }
-    }
-    PyBuffer_Release(&difference);
-    PyBuffer_Release(&noise);
-    return PyFloat_FromDouble(sum);
+    PyObject *found = NULL;
+    Taken taken;
+    if (take_all(&taken, args, "dd", SIZES{ANY, AS_FIRST}))
+        found = PyFloat_FromDouble(sum_of_squares(taken.values[0], taken.values[1], taken.n_values[0]));
+    return done(&taken, found, "an energy is of as many float64 differences as noises");
 }
 
 PyDoc_STRVAR(energy_doc,
 "energy(difference, noise) -> float\n\n"
 "Return the sum of the squares of difference / noise, both float64; -1 where one of them is not sound.");
 
-/* The buffer of an array of `n` items of `size` bytes, which is held as long as the search lives; NULL with an error. */
-static const void *hold(Search *s, PyObject *array, Py_ssize_t n, size_t size)
+/* The values of an array of a kind, `n` of them or, below 0, any number, held as long as the search lives; NULL with an error. */
+static const void *hold(Search *s, PyObject *array, char kind, Py_ssize_t n)
 {
     if (s->n_held == MOST_BUFFERS) {
         PyErr_SetString(PyExc_ValueError, "more arrays than a search holds");
         return NULL;
     }
     Py_buffer *held = &s->held[s->n_held];
-    if (PyObject_GetBuffer(array, held, PyBUF_C_CONTIGUOUS) < 0)
+    if (!take_array(held, array, kind)) {
+        PyErr_Format(PyExc_ValueError, "an array of a bank is in pieces, or not of the kind %c", kind);
         return NULL;
+    }
     s->n_held++;
-    if (held->itemsize != (Py_ssize_t)size || (n >= 0 && held->len != n * (Py_ssize_t)size)) {
-        PyErr_Format(PyExc_ValueError, "an array of %zd bytes where %zd items of %zu bytes belong", held->len, n, size);
+    if (n >= 0 && held->len != n * held->itemsize) {
+        PyErr_Format(PyExc_ValueError, "an array of %zd bytes where %zd items of %zd bytes belong", held->len, n, held->itemsize);
         return NULL;
     }
     return held->buf;
@@ -180,11 +178,11 @@ static int hold_level(Search *s, PyObject *arrays, Level *level)
 {
     PyObject *blocks, *parts, *starts;
     if (!PyArg_ParseTuple(arrays, "OOO", &blocks, &parts, &starts)
-        || !(level->parts = hold(s, parts, -1, sizeof(int32_t))))
+        || !(level->parts = hold(s, parts, 'i', -1)))
         return -1;
     level->n = n_of_last(s) / LANES;
-    if (!(level->blocks = hold(s, blocks, level->n * LANES * (s->bank.width + 2), sizeof(float)))
-        || !(level->starts = hold(s, starts, -1, sizeof(int32_t))))
+    if (!(level->blocks = hold(s, blocks, 'f', level->n * LANES * (s->bank.width + 2)))
+        || !(level->starts = hold(s, starts, 'i', -1)))
         return -1;
     level->n_before = n_of_last(s) - 1;
     if (level->n < 1 || level->n_before < 1 || s->held[s->n_held - 3].len != level->n * LANES * 4
@@ -223,10 +221,10 @@ static int hold_levels(Search *s, PyObject *levels)
 static int hold_bank(Search *s, PyObject *const *arrays, PyObject *levels)
 {
     Bank *bank = &s->bank;
-    if (!(bank->basis = hold(s, arrays[0], -1, sizeof(float))))
+    if (!(bank->basis = hold(s, arrays[0], 'f', -1)))
         return -1;
     bank->fine_rank = n_of_last(s) / CHANNELS;
-    if (!(bank->norms = hold(s, arrays[4], -1, sizeof(double))))
+    if (!(bank->norms = hold(s, arrays[4], 'd', -1)))
         return -1;
     bank->n_cells = n_of_last(s) / 2;
     if (!bank->n_cells || bank->n_cells > INT32_MAX) {
@@ -239,13 +237,13 @@ static int hold_bank(Search *s, PyObject *const *arrays, PyObject *levels)
         return -1;
     }
     bank->width = (bank->coarse_rank + LANES - 1) / LANES * LANES;
-    if (!(bank->fine = hold(s, arrays[1], bank->n_cells * (bank->fine_rank + 2), sizeof(float)))
-        || !(bank->places = hold(s, arrays[3], bank->n_cells, sizeof(int64_t)))
-        || !(bank->k_of = hold(s, arrays[5], bank->n_cells, sizeof(int32_t)))
-        || !(bank->sigma_of = hold(s, arrays[6], bank->n_cells, sizeof(int32_t)))
-        || !(bank->overlaps = hold(s, arrays[7], 2 * CHANNELS, sizeof(double)))
-        || !(bank->spectra = hold(s, arrays[8], bank->width * 2 * (HALF + 1), sizeof(float)))
-        || !(bank->signals = hold(s, arrays[2], -1, sizeof(float))))
+    if (!(bank->fine = hold(s, arrays[1], 'f', bank->n_cells * (bank->fine_rank + 2)))
+        || !(bank->places = hold(s, arrays[3], 'q', bank->n_cells))
+        || !(bank->k_of = hold(s, arrays[5], 'i', bank->n_cells))
+        || !(bank->sigma_of = hold(s, arrays[6], 'i', bank->n_cells))
+        || !(bank->overlaps = hold(s, arrays[7], 'd', 2 * CHANNELS))
+        || !(bank->spectra = hold(s, arrays[8], 'f', bank->width * 2 * (HALF + 1)))
+        || !(bank->signals = hold(s, arrays[2], 'f', -1)))
         return -1;
     Py_ssize_t n_signals = n_of_last(s) / CHANNELS;
     for (Py_ssize_t i = 0; i < bank->n_cells; i++) {
@@ -255,7 +253,7 @@ static int hold_bank(Search *s, PyObject *const *arrays, PyObject *levels)
         }
     }
     if (hold_levels(s, levels) < 0
-        || !(bank->roots = hold(s, arrays[9], bank->levels[0].n * LANES * (bank->width + 2), sizeof(float))))
+        || !(bank->roots = hold(s, arrays[9], 'f', bank->levels[0].n * LANES * (bank->width + 2))))
         return -1;
     return 0;
 }

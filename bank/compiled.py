@@ -31,8 +31,11 @@ def is_stale(module: ModuleType, *names: str) -> bool:
 
 
 # In the order of setup.py.
-_SEARCH = ("_search.c", "candidates.c", "lags.c", "search.c", "eight.h", "search.h")
-_FRAMES = ("_frames.c", "look.c", "medians.c", "look.h", "medians.h")
+_SEARCH = ("_search.c", "arrays.c", "candidates.c", "lags.c", "search.c", "arrays.h", "eight.h", "search.h")
+_FRAMES = (
+    *("_frames.c", "_fingertips.c", "arrays.c", "look.c", "medians.c"),
+    *("_fingertips.h", "arrays.h", "look.h", "medians.h"),
+)
 # BLAS as scipy hands it to compiled code.
 SGEMM = getattr(cython_blas, "__pyx_capi__", {}).get("sgemm")
 _FRESH = search is not None and not is_stale(search, *_SEARCH) and not is_stale(frames, *_FRAMES)

@@ -51,11 +51,12 @@ def search_of(
 def energy(difference: FloatArray, noise: FloatArray) -> float | None:
     """Return Σ (difference/noise)² of two (896,) arrays, or None.
 
-    None: nothing is compiled, or a value is not finite, or a noise is not above zero.
+    None: nothing is compiled, or a value is not finite, or a noise is not above zero. Raises ValueError for arrays of
+    different lengths.
     """
     if not compiled.IS_COMPILED:
         return None
-    found = compiled.search.energy(np.ascontiguousarray(difference), np.ascontiguousarray(noise))
+    found = compiled.search.energy(*(np.ascontiguousarray(one, dtype=np.float64) for one in (difference, noise)))
     return None if found < 0 else found
 
 

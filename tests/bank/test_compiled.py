@@ -74,6 +74,19 @@ def test_the_energy_is_the_sum_of_squares_and_none_of_what_is_not_sound() -> Non
         wrong, its_noise = difference.copy(), noise.copy()
         wrong[-1], its_noise[-1] = values, deviations
         assert compiled_search.energy(wrong, its_noise) is None
+    assert compiled_search.energy(difference.astype(np.float32), noise.astype(">f8")) == pytest.approx(found, rel=1e-6)
+    wrong_kinds = (
+        noise[1:],
+        noise.repeat(2)[::2],
+        noise.astype(np.float32),
+        noise.view(np.int64),
+        noise.tobytes(),
+        3.0,
+    )
+    for wrong in wrong_kinds:
+        for pair in ((noise, wrong), (wrong, noise), (noise.repeat(2).astype(np.float32), wrong)):
+            with pytest.raises(ValueError, match="as many float64 differences as noises"):
+                compiled.search.energy(*pair)
 
 
 # Rows as they come, all alike, in order, with ties, without some values, and of large ones.

@@ -111,14 +111,19 @@ def arguments_of_search() -> list:
     ("argument", "broken"),
     [
         (0, lambda rows: rows[:, :-1].copy()),
+        (0, lambda rows: rows.view(np.int32)),
         (1, lambda rows: rows[:-1]),
         (2, lambda rows: rows.astype(np.float64)),
         (3, lambda places: places + 10_000),
+        (3, lambda places: places.view(np.float64)),
         (4, lambda norms: norms[:-1]),
+        (4, lambda norms: norms.view(np.float32)),
+        (5, lambda rows: rows.view(np.float32)),
         (6, lambda columns: columns[::2]),
         (7, lambda overlaps: overlaps[1:]),
         (8, lambda spectra: spectra[..., :-1, :, :]),
         (9, lambda roots: roots[1:]),
+        (9, lambda roots: roots.astype(roots.dtype.newbyteorder())),
         (10, lambda levels: levels[:-1]),
         (10, lambda levels: levels[:0]),
         (10, lambda levels: levels * 4),
@@ -151,6 +156,19 @@ def test_arrays_that_do_not_fit_are_refused_and_not_searched(argument, broken) -
         refused.match(np.ones(N_CHANNELS), True, 1000)
     with pytest.raises(ValueError, match="has no bank"):
         refused.match_at_all_lags(np.ones(N_CHANNELS), True, 1000)
+
+
+@is_compiled
+def test_differences_of_other_lengths_and_kinds_are_not_searched() -> None:
+    """Nor read as what they are not: of some the bytes are as many."""
+    search, frame = compiled.search.Search(*arguments_of_search()), np.ones(N_CHANNELS)
+    for find in (search.match, search.match_at_all_lags):
+        assert find(frame, True, 100_000) is not None
+        for wrong in (
+            *(frame[1:], frame.repeat(2), frame.repeat(2)[::2], frame.repeat(2).astype(np.float32)),
+            *(frame.astype(np.int64), frame.astype(frame.dtype.newbyteorder()), frame.tobytes(), None),
+        ):
+            assert find(wrong, True, 100_000) is None
 
 
 @is_compiled

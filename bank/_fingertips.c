@@ -18,6 +18,7 @@ typedef struct {
     int is_whole;   /* all of it is there */
     Limits limits;
     double small_v;
+    PyObject *made_of; /* the arguments */
 } Fingertips;
 
 static Fingertips *fingertips_of(PyObject *self)
@@ -197,15 +198,28 @@ static int fingertips_init(PyObject *self, PyObject *args, PyObject *named)
         f->n_sides = told.n_sides;
         f->limits = told.limits;
         f->small_v = told.small_v;
+        f->made_of = Py_NewRef(args);
         made = copy(f, n_directions, n_moves, &taken) ? Py_NewRef(Py_None) : PyErr_NoMemory();
     }
     Py_XDECREF(done(&taken, made, "what is known of the fingertips does not fit together, or is of another kind"));
     return made ? 0 : -1;
 }
 
+static PyObject *reduce(PyObject *self, PyObject *nothing)
+{
+    const Fingertips *f = fingertips_of(self);
+    (void)nothing;
+    return f ? PyTuple_Pack(2, (PyObject *)Py_TYPE(self), f->made_of) : NULL;
+}
+
+PyDoc_STRVAR(reduce_doc,
+"__reduce__() -> tuple\n\n"
+"Return what makes the same fingertips again, for copies and for other processes.");
+
 static void fingertips_dealloc(PyObject *self)
 {
     PyTypeObject *type = Py_TYPE(self);
+    Py_XDECREF(((Fingertips *)self)->made_of);
     PyMem_Free(((Fingertips *)self)->tips);
     PyMem_Free(((Fingertips *)self)->values);
     freefunc release = (freefunc)PyType_GetSlot(type, Py_tp_free);
@@ -214,6 +228,7 @@ static void fingertips_dealloc(PyObject *self)
 }
 
 static PyMethodDef fingertips_methods[] = {
+    {"__reduce__", reduce, METH_NOARGS, reduce_doc},
     {"check", check, METH_VARARGS, check_doc},
     {"fill_in", fill_in, METH_VARARGS, fill_in_doc},
     {"placed", placed, METH_VARARGS, placed_doc},

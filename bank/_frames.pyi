@@ -1,4 +1,4 @@
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +38,7 @@ class Fingertips:
         places: NDArray[np.float64],
         /,
     ) -> list[float] | None: ...
+    def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]: ...
 
 def all_finite(values: NDArray[np.float64], /) -> bool | None: ...
 def beyond(

@@ -118,14 +118,19 @@ class Bench:
         while self._socket.poll(0):
             self._socket.recv_multipart()
         end_s = time.monotonic() + within_s
-        while time.monotonic() < end_s:
+        loop: dict[str, Any] = {}
+        while time.monotonic() < end_s and self.daemon.poll() is None:
             if self._socket.poll(100):
                 name, payload = self._socket.recv_multipart()
-                if name.decode() == topic:
-                    content = decode(payload)
-                    if is_so(content):
-                        return content
-        raise RuntimeError(f"{topic} never said so within {within_s:g} s")
+                content = decode(payload)
+                if name == b"loop.state":
+                    loop = content
+                if name.decode() == topic and is_so(content):
+                    return content
+        if self.daemon.poll() is not None:
+            raise RuntimeError(f"the daemon has ended with status {self.daemon.poll()}; its last words are above")
+        said = ": ".join(filter(None, (loop.get("phase"), loop.get("doing"), loop.get("reasons"))))
+        raise RuntimeError(f"{topic} never said so within {within_s:g} s; the loop is {said or 'silent'}")
 
     def until_phase(self, phase: str) -> dict[str, Any]:
         """Return the first state of the loop in a phase."""

@@ -8,7 +8,7 @@ import ctypes
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import dashboard_client
@@ -16,6 +16,7 @@ import rtde_control
 
 from drivers.errors import DriverError
 from drivers.ur.messages import MoveLinear, Reading, WristSpeed
+from drivers.ur.ready import Ready
 from drivers.ur.receiver import Receiver
 from drivers.ur.sample_age import SampleAge
 from drivers.ur.settings import UrSettings
@@ -23,8 +24,8 @@ from drivers.ur.settings import UrSettings
 # A thread of the client asks its socket for data, sleeps for 0.1 ms, and asks again: 5 % of a core. Woken up to so much
 # later it takes two samples at a time. What is sent over and over (a wrist speed, a sign of life) does not wait for it.
 # What is done once (beginning or stopping a straight move, ending the turning of a wrist at rest, zeroing the wrench,
-# setting the watchdog) waits until it has seen that done, and what comes next until it has seen the robot ready again:
-# each so much longer at most, and a robot that hears nothing meanwhile has patience for six of them.
+# setting the watchdog) waits until it has seen that done, and what comes next until it has seen the robot ready again
+# (see `drivers.ur.ready`): each so much longer at most, and a robot that hears nothing meanwhile has patience for six.
 _LONGEST_POLL_SLACK_NS, _SLACKS_IN_PATIENCE = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
 
@@ -52,6 +53,7 @@ class Arm:
         # Whether a straight move may be under way: one was begun, and the wrist has not been turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
+        self._ready = Ready(self._receiver, 1.0 / settings.watchdog_hz)
 
     def read(self) -> Reading:
         """Return the controller's latest sample and its age."""
@@ -78,54 +80,65 @@ class Arm:
         """Turn wrist 3, the other joints held; of an arm that is on no straight move."""
         self._may_move_linearly = False
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
-        return bool(self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0))
+        return self._ready.wait() and bool(self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0))
 
     def end_speed(self, deceleration_rad_per_s2: float) -> bool:
         """End the script's speed thread; blocks until the arm rests, so only for an arm that does."""
-        return bool(self._control.speedStop(deceleration_rad_per_s2))
+        return self._once(self._control.speedStop, deceleration_rad_per_s2)
 
     def move(self, command: MoveLinear) -> bool:
         """Begin a linear move; `Reading.moving_linearly` tells its end."""
         self._may_move_linearly = True
-        return bool(
-            self._control.moveL(
-                [*command.pose], command.speed_m_per_s, command.acceleration_m_per_s2, asynchronous=True
-            )
-        )
+        speed, acceleration = command.speed_m_per_s, command.acceleration_m_per_s2
+        return self._once(self._control.moveL, [*command.pose], speed, acceleration, asynchronous=True)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
         """Begin to end a linear move."""
         # The client does not say whether the stop was taken; whether the program takes what comes after it, it does.
-        self._control.stopJ(deceleration_rad_per_s2, asynchronous=True)
+        self._once(self._control.stopJ, deceleration_rad_per_s2, asynchronous=True)
         return self.kick()
 
     def kick(self) -> bool:
         """Tell the robot's watchdog that we live."""
-        return bool(self._control.kickWatchdog())
+        return self._ready.wait() and bool(self._control.kickWatchdog())
 
-    def clear_command(self) -> None:
+    def clear_command(self) -> bool:
         """See that the register which holds the last command moves nothing any more, while no program runs.
 
-        The client has no call for it, but clears the register before it says that it cannot send. Where it does not
-        know yet that no program runs, it leaves the sign of life there instead, which moves nothing either.
+        The client has no call for it, but clears the register before it says that it cannot send. False: it does not
+        know yet that no program runs, and would wait for that to be ready.
         """
+        if self._control.isProgramRunning():
+            return False
         self._control.kickWatchdog()
+        return True
 
     def zero_wrench(self) -> bool:
         """Take the present wrench as zero."""
-        return bool(self._control.zeroFtSensor())
+        return self._once(self._control.zeroFtSensor)
 
     def upload(self) -> bool:
         """Send the control script; the program then starts by itself."""
-        return bool(self._control.reuploadScript())
+        uploaded = bool(self._control.reuploadScript())
+        self._ready.called()
+        return uploaded
 
     def arm_watchdog(self) -> bool:
         """Have the robot end its program when it hears nothing; to be done after every upload."""
-        return bool(self._control.setWatchdog(self._settings.watchdog_hz))
+        return self._once(self._control.setWatchdog, self._settings.watchdog_hz)
 
     def end_program(self) -> None:
-        """End the control script."""
-        self._control.stopScript()
+        """End the control script, unless it is not ready for that: the robot's watchdog ends it then."""
+        if self._ready.wait():
+            self._control.stopScript()
+
+    def _once(self, call: Callable[..., object], *arguments: object, **options: object) -> bool:
+        """Have a command carried out that the script says to be done with."""
+        if not self._ready.wait():
+            return False
+        done = bool(call(*arguments, **options))
+        self._ready.called()
+        return done
 
     def unlock(self) -> None:
         """Unlock a protective stop; `DashboardRefusedError` in its first 5 s."""

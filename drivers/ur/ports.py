@@ -23,8 +23,8 @@ class CureArm(Protocol):
     def stop_program(self) -> None:
         """Stop whatever program runs or is paused."""
 
-    def clear_command(self) -> None:
-        """See that the register which holds the last command moves nothing any more."""
+    def clear_command(self) -> bool:
+        """See that the register which holds the last command moves nothing any more; False: to be asked again."""
 
     def upload(self) -> bool:
         """Send the control script."""

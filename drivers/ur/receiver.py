@@ -5,12 +5,14 @@ of what the robot's process costs at rest. Here samples wait in the kernel until
 UR's RTDE guide, protocol 2: setting up outputs, start, and the data package.
 """
 
+import select
 import socket
 import struct
 
 from drivers.errors import ProtocolError
 from drivers.ur.messages import Sample
 from drivers.ur.probe import HEADER, RTDE_PORT, agree_on_protocol, explained, request
+from drivers.values import value
 
 _OUTPUTS, _START, _DATA = ord("O"), ord("S"), ord("U")
 # The outputs, with their types, in the order of a sample's fields.
@@ -24,13 +26,21 @@ _TYPES = {
     "safety_mode": "INT32",
     "runtime_state": "UINT32",
     "speed_scaling": "DOUBLE",
+    "output_int_register_0": "INT32",
 }
 # The same after the header and the number of the recipe.
-_VALUES = struct.Struct(">d24d2iId")
+_VALUES = struct.Struct(">d24d2iIdi")
 _PACKAGE_BYTES = HEADER.size + 1 + _VALUES.size
 _RATE = struct.Struct(">d")
 # A second's worth of samples.
 _READ_BYTES = 1 << 15
+
+
+@value(frozen=True, slots=True)
+class Received(Sample):
+    """A sample, and what ur-rtde's control script says there of itself: 1 for ready, 2 for done with a command."""
+
+    script_state: int
 
 
 class SampleParser:
@@ -40,7 +50,7 @@ class SampleParser:
         """Start with nothing received."""
         self._begun = b""
 
-    def feed(self, data: bytes) -> Sample | None:
+    def feed(self, data: bytes) -> Received | None:
         """Return the newest sample that is complete by now, and was not before; None where there is none.
 
         Raises:
@@ -87,7 +97,7 @@ class Receiver:
         self.connected = False
         self._connection.close()
 
-    def _first_sample(self, rate_hz: float) -> Sample:
+    def _first_sample(self, rate_hz: float) -> Received:
         agree_on_protocol(self._connection)
         answer = request(self._connection, _OUTPUTS, _RATE.pack(rate_hz) + ",".join(_TYPES).encode())
         types = answer[1:].decode(errors="replace")
@@ -101,13 +111,17 @@ class Receiver:
                 return sample
         raise OSError("it closed the connection on which it was to send its state")
 
-    def latest(self) -> Sample:
+    def latest(self) -> Received:
         """Return the newest sample that has arrived, which is the last one again where none has; never waits."""
         if self.connected:
             self._sample = self._received() or self._sample
         return self._sample
 
-    def _received(self) -> Sample | None:
+    def wait(self, seconds: float) -> bool:
+        """Return whether something has come that `latest` has not taken, waiting for it for so long at most."""
+        return self.connected and bool(select.select([self._connection], [], [], max(0.0, seconds))[0])
+
+    def _received(self) -> Received | None:
         """Return the newest sample of all that has arrived since the last call."""
         newest, more = None, True
         while more:
@@ -125,6 +139,6 @@ class Receiver:
         return newest
 
 
-def _sample(data: bytes, start: int) -> Sample:
+def _sample(data: bytes, start: int) -> Received:
     values = _VALUES.unpack_from(data, start)
-    return Sample(values[0], values[1:7], values[7:13], values[13:19], values[19:25], *values[25:])
+    return Received(values[0], values[1:7], values[7:13], values[13:19], values[19:25], *values[25:])

@@ -95,8 +95,7 @@ class Recovery:
         elif not self._cleared:
             # The registers outlive the program: a new one would carry out in its first cycle whatever was commanded
             # last, and turn the wrist again, before its watchdog is armed. A cycle for what replaces it.
-            self._arm.clear_command()
-            self._cleared = True
+            self._cleared = self._arm.clear_command()
         else:
             # Not every upload takes: the controller may still be in the middle of something.
             self._every_second("upload", now_ns, self._arm.upload)

@@ -102,9 +102,10 @@ class FakeArm:
         self.hear("kick")
         return True
 
-    def clear_command(self) -> None:
+    def clear_command(self) -> bool:
         self.calls.append("clear_command")
         self.stale_command = False
+        return True
 
     def zero_wrench(self) -> bool:
         self.hear("zero_wrench")

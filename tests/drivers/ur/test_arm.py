@@ -4,12 +4,13 @@ import ctypes
 import dataclasses
 import importlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from drivers.ur.messages import MoveLinear, Sample, WristSpeed
+from drivers.ur.messages import MoveLinear, WristSpeed
+from drivers.ur.receiver import Received
 from tests.drivers.ur.flight import SETTINGS
 
 SIX = (0.0,) * 6
@@ -22,6 +23,10 @@ class Client:
 
     def __init__(self, *_: object) -> None:
         self.connected = True
+
+    def latest(self) -> Received:
+        """Be a controller whose program has ended while a command was done, and not ready again."""
+        return Received(1.0, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 2)
 
 
 @pytest.fixture
@@ -47,7 +52,7 @@ def test_sample_that_has_waited_in_the_socket_is_read_as_old(arm: ModuleType, mo
     monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
     six = (0.0,) * 6
     for number, waited_ns in enumerate([0, 0, 200_000_000]):
-        sample = Sample(50.0 + 0.008 * number, six, six, six, six, 7, 1, 2, 1.0)
+        sample = Received(50.0 + 0.008 * number, six, six, six, six, 7, 1, 2, 1.0, 1)
         monkeypatch.setattr(reader, "_receiver", SimpleNamespace(latest=lambda it=sample: it, connected=True))
         now_ns = 10**12 + 8_000_000 * number + waited_ns
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)
@@ -100,8 +105,14 @@ def test_a_straight_move_is_asked_after_from_its_beginning_until_the_wrist_is_tu
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Controlled)
-    sample = Sample(1.0, SIX, SIX, SIX, SIX, 7, 1, 2, 1.0)
-    monkeypatch.setattr(arm, "Receiver", lambda *_: SimpleNamespace(connected=True, latest=lambda: sample))
+    times_s = iter(range(1, 100))
+    monkeypatch.setattr(
+        arm,
+        "Receiver",
+        lambda *_: SimpleNamespace(
+            connected=True, latest=lambda: Received(float(next(times_s)), SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
+        ),
+    )
     one = arm.Arm(SETTINGS)
     assert not one.read().moving_linearly
     one.move(MoveLinear(SIX, 0.1, 0.1))
@@ -109,3 +120,54 @@ def test_a_straight_move_is_asked_after_from_its_beginning_until_the_wrist_is_tu
     one.wrist(WristSpeed(0.1, 1.0))
     assert not one.read().moving_linearly
     assert one._control.asked == 3
+
+
+class Hanging(Client):
+    """Waits for ever, in each call but the first, for a program that has ended to be ready; `calls` names them."""
+
+    def __init__(self, *_: object) -> None:
+        super().__init__()
+        self.calls: list[str] = []
+        self.knows_of_the_end = False
+
+    def __getattr__(self, name: str) -> Callable[..., bool]:
+        def call(*_: object, **__: object) -> bool:
+            assert not self.calls, f"{name} does not come back"
+            self.calls.append(name)
+            return True
+
+        return call
+
+    def isProgramRunning(self) -> bool:  # noqa: N802
+        return not self.knows_of_the_end
+
+
+def test_nothing_is_asked_of_the_client_for_which_it_would_wait_in_vain(
+    arm: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot's watchdog has ended the program after a command was done, before it was ready for another."""
+    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
+    one = arm.Arm(SETTINGS)
+    assert one.zero_wrench()
+    assert not one.kick()
+    assert not one.wrist(WristSpeed(0.1, 1.0))
+    assert not one.move(MoveLinear(SIX, 0.1, 0.1))
+    assert not one.stop_move(1.0)
+    assert not one.end_speed(1.0)
+    assert not one.zero_wrench()
+    assert not one.arm_watchdog()
+    one.end_program()
+    assert one._control.calls == ["zeroFtSensor"]
+
+
+def test_register_is_cleared_once_the_client_knows_that_no_program_runs(
+    arm: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before, it would wait for that program to be ready."""
+    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
+    one = arm.Arm(SETTINGS)
+    assert not one.clear_command()
+    assert one._control.calls == []
+    one._control.knows_of_the_end = True
+    assert one.clear_command()
+    assert one._control.calls == ["kickWatchdog"]

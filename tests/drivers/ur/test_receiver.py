@@ -13,11 +13,10 @@ from hypothesis import strategies as st
 
 from drivers.errors import ProtocolError
 from drivers.ur import receiver as receiver_module
-from drivers.ur.messages import Sample
 from drivers.ur.probe import ProbeError
-from drivers.ur.receiver import Receiver, SampleParser
+from drivers.ur.receiver import Received, Receiver, SampleParser
 
-TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE"
+TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32"
 
 
 def package(kind: bytes, payload: bytes) -> bytes:
@@ -27,7 +26,7 @@ def package(kind: bytes, payload: bytes) -> bytes:
 def data(number: int) -> bytes:
     """Return the package of the sample that has this number for a timestamp."""
     values = [number + 0.01 * index for index in range(24)]
-    return package(b"U", b"\x01" + struct.pack(">d24diiId", number, *values, 7, -1, 2, 0.5))
+    return package(b"U", b"\x01" + struct.pack(">d24diiIdi", number, *values, 7, -1, 2, 0.5, 1))
 
 
 def text(length: int) -> bytes:
@@ -36,7 +35,7 @@ def text(length: int) -> bytes:
 
 def test_sample_has_the_values_in_their_order() -> None:
     sample = SampleParser().feed(data(3))
-    assert sample == Sample(
+    assert sample == Received(
         timestamp_s=3.0,
         q_rad=(3.0, 3.01, 3.02, 3.03, 3.04, 3.05),
         qd_rad_per_s=(3.06, 3.07, 3.08, 3.09, 3.1, 3.11),
@@ -46,6 +45,7 @@ def test_sample_has_the_values_in_their_order() -> None:
         safety_mode=-1,
         runtime_state=2,
         speed_scaling=0.5,
+        script_state=1,
     )
 
 
@@ -132,9 +132,12 @@ def test_outputs_are_asked_for_at_the_rate_and_the_newest_is_kept(play: Callable
     controller.send(data(2) + data(3) + data(4)[:100])
     assert arrived(receiver, 3.0)
     assert receiver.latest().timestamp_s == 3.0
+    assert not receiver.wait(0.0)
     controller.send(data(4)[100:])
+    assert receiver.wait(5.0)
     assert arrived(receiver, 4.0)
     receiver.close()
+    assert not receiver.wait(5.0)
 
 
 @pytest.mark.parametrize("last", [b"", package(b"U", bytes(8))])

@@ -1,0 +1,79 @@
+"""When the control script is ready for what is sent next, from samples of the test's own and in a time of its own."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from drivers.ur import ready as ready_module
+from drivers.ur.ready import Ready
+from drivers.ur.receiver import Received
+
+SIX = (0.0,) * 6
+READY, DONE = 1, 2
+PLAYING, STOPPED, PAUSED = 2, 1, 4
+
+
+class Samples:
+    """Samples every 8 ms, which say how the script is and whether its program plays; the last one says so for ever."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, *said: tuple[int, int]) -> None:
+        self._said = list(said)
+        self.connected = True
+        self.taken, self.now_s = 0, 5.0
+        monkeypatch.setattr(ready_module, "time", SimpleNamespace(monotonic=lambda: self.now_s))
+
+    def latest(self) -> Received:
+        script_state, runtime_state = self._said[min(self.taken, len(self._said) - 1)]
+        return Received(50.0 + 0.008 * self.taken, SIX, SIX, SIX, SIX, 7, 1, runtime_state, 1.0, script_state)
+
+    def wait(self, seconds: float) -> bool:
+        self.now_s += min(max(seconds, 0.0), 0.008)
+        self.taken += seconds >= 0.008
+        return seconds >= 0.008
+
+
+def test_where_no_command_was_done_nothing_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = Samples(monkeypatch, (DONE, STOPPED))
+    assert Ready(samples, 0.1).wait()
+    assert samples.taken == 0
+
+
+def test_only_a_sample_of_after_the_command_says_that_the_script_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = Samples(monkeypatch, (READY, PLAYING), (DONE, PLAYING), (DONE, PLAYING), (READY, PLAYING))
+    ready = Ready(samples, 0.1)
+    ready.called()
+    assert ready.wait()
+    assert samples.taken == 3
+    assert ready.wait()
+    assert samples.taken == 3
+
+
+@pytest.mark.parametrize("runtime_state", [STOPPED, PAUSED])
+def test_program_that_has_ended_or_pauses_is_not_waited_for(
+    monkeypatch: pytest.MonkeyPatch, runtime_state: int
+) -> None:
+    """The watchdog ends it in the middle of a command where the computer was away for long: ready it never becomes."""
+    samples = Samples(monkeypatch, (DONE, PLAYING), (DONE, PLAYING), (DONE, runtime_state))
+    ready = Ready(samples, 0.1)
+    ready.called()
+    assert not ready.wait()
+    assert samples.taken == 2
+    assert not ready.wait()
+
+
+def test_script_that_stays_done_is_waited_for_no_longer_than_the_watchdog_is_patient(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    samples = Samples(monkeypatch, (DONE, PLAYING))
+    ready = Ready(samples, 0.1)
+    ready.called()
+    assert not ready.wait()
+    assert samples.now_s == pytest.approx(5.1, abs=0.01)
+
+
+def test_connection_that_has_ended_says_nothing_of_the_script(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = Samples(monkeypatch, (READY, PLAYING))
+    ready = Ready(samples, 0.1)
+    ready.called()
+    samples.taken, samples.connected = 1, False
+    assert not ready.wait()

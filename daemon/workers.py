@@ -9,13 +9,15 @@ import logging
 import signal
 import socket
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import active_children, get_context, resource_tracker
+from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
+from daemon.ending_signals import ending_signals
 from daemon.errors import UserError
 
 if TYPE_CHECKING:
@@ -61,17 +63,32 @@ class Processes:
 
     def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
         """Yield results as they are finished."""
-        with ProcessPoolExecutor(min(self._count, max(len(items), 1)), get_context("spawn")) as pool:
+        others = active_children()
+        tasks: dict[Future[R], int] = {}
+        with ExitStack() as closed:
+            with _uninterrupted():
+                pool = ProcessPoolExecutor(min(self._count, max(len(items), 1)), get_context("spawn"))
+                closed.callback(_end_pool, pool, tasks, others)
+                tasks |= {pool.submit(function, shared, item): number for number, item in enumerate(items)}
             try:
-                tasks = {pool.submit(function, shared, item): number for number, item in enumerate(items)}
-                for task in as_completed(tasks):
+                for task in as_completed(list(tasks)):
                     yield tasks.pop(task), task.result()
             except BrokenProcessPool as error:
                 raise UserError(
                     "a process was killed, perhaps for want of memory; run again with fewer --jobs"
                 ) from error
-            finally:
-                pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _end_pool(pool: ProcessPoolExecutor, unfinished: Collection[object], others: Collection[BaseProcess]) -> None:
+    """End a pool, and its processes at once where nobody wants what they have not finished: they may have long to go.
+
+    `others` are our children that are none of its processes.
+    """
+    with _interrupted_later():
+        for process in active_children() if unfinished else ():
+            if process not in others:
+                process.terminate()
+        pool.shutdown(wait=True, cancel_futures=True)
 
 
 class Cluster:
@@ -186,30 +203,34 @@ async def _end_workers(local: "LocalCluster") -> None:
 
 @contextmanager
 def _interrupted_later() -> Iterator[None]:
-    """Hear of Ctrl-C only after what is done here, in whichever thread the system tells of it."""
+    """Hear of Ctrl-C, or whatever ends us, only after what is done here, in whichever thread the system tells of it."""
     heard: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _: heard.append(number))
+    before = {number: signal.signal(number, lambda told, _: heard.append(told)) for number in ending_signals()}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-    if heard:
-        signal.raise_signal(signal.SIGINT)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        # Also where it failed: processes that are begun here may have been ended with us.
+        if heard:
+            signal.raise_signal(heard[0])
 
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Keep Ctrl-C from the threads and processes that are begun here, and from this one until it is done.
+    """Keep what a terminal tells all of its processes from those that are begun here, and from us until it is done.
 
-    A terminal interrupts all of its processes: each worker would print where it was.
+    At Ctrl-C each worker would print where it was, and at the terminal's end the tracker would die before its time.
     """
-    # Its process is spawned with the first other one, in a thread that lets interrupts in again then.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    with _interrupted_later():
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
+        try:
+            # Its process is spawned with the first other one, in a thread that lets Ctrl-C in again then.
+            resource_tracker.ensure_running()
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _reach(address: str) -> None:

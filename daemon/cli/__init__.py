@@ -8,12 +8,11 @@ their command is asked for, and import what is heavy only when they run, so that
 import argparse
 import importlib
 import os
-import signal
 import sys
-import threading
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import NamedTuple, NoReturn, Protocol
+
+from daemon.cli.interruption import ended, interrupts_heard
 
 # Many small solves and products: a BLAS that spreads each over all cores is slower. Before numpy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -55,10 +54,6 @@ COMMANDS = {
 EXIT_OK, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
 # Of `run`: the experiment with which it was to end (`stop_when_done`) is not done.
 EXIT_UNFINISHED = 3
-# As a shell has it for what SIGINT ended.
-EXIT_INTERRUPTED = 130
-# After which compiled code has mostly gone on; where it has not, the same is done once more.
-AGAIN_S = 0.05
 
 
 class Parser(argparse.ArgumentParser):
@@ -91,7 +86,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     spelled_out = getattr(module, "spelled_out", list)
     args = parser.parse_args(spelled_out(arguments[1:]))
     try:
-        with _interrupts_heard():
+        with interrupts_heard():
             return module.run(args)
     except _user_errors() as error:
         print(f"shearloop {known.command}: {error}", file=sys.stderr)
@@ -100,32 +95,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output (`| head`) has gone; that is no error.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_OK
-    except KeyboardInterrupt:
-        print(f"shearloop {known.command}: interrupted before it was done", file=sys.stderr)
-        return EXIT_INTERRUPTED
-
-
-@contextmanager
-def _interrupts_heard() -> Iterator[None]:
-    """Send Ctrl-C again that came in what compiled code calls: that cannot pass it on, and it would be lost."""
-    again: list[threading.Timer] = []
-    before = sys.unraisablehook
-
-    def ignored(told: "sys.UnraisableHookArgs") -> None:
-        if not issubclass(told.exc_type, KeyboardInterrupt):
-            before(told)
-            return
-        again.append(threading.Timer(AGAIN_S, os.kill, (os.getpid(), signal.SIGINT)))
-        again[-1].start()
-
-    sys.unraisablehook = ignored
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before
-        for timer in again:
-            timer.cancel()
-            timer.join()
+    except KeyboardInterrupt as interrupt:
+        return ended(f"shearloop {known.command}: interrupted before it was done", interrupt)
 
 
 def _user_errors() -> tuple[type[Exception], ...]:

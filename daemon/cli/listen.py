@@ -3,8 +3,9 @@
 import argparse
 import sys
 
-from daemon.cli import EXIT_INTERRUPTED, EXIT_OK
+from daemon.cli import EXIT_OK
 from daemon.cli.connection import add_connection, client_keys
+from daemon.cli.interruption import status_of
 from daemon.wire.addresses import PUBLISH_ADDRESS
 
 
@@ -49,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
             print(write(topic, content), flush=True)
             if number == args.count:
                 break
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         # That is how listening ends, and nothing to tell.
-        return EXIT_INTERRUPTED
+        return status_of(interrupt)
     return EXIT_OK

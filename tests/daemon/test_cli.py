@@ -6,9 +6,10 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -162,37 +163,63 @@ def test_a_mistake_on_the_command_line_is_one_sentence(
     assert part in mistake(capsys, *arguments)
 
 
-def test_what_is_interrupted_says_so_except_listening_which_ends_so(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.fixture
+def default_signals() -> Iterator[None]:
+    """Signals do what they do in a new process: one that runs tests may have been told to ignore them (`nohup`)."""
+    defaults = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {number: signal.signal(number, handler) for number, handler in defaults.items()}
+    yield
+    after = {number: signal.signal(number, handler) for number, handler in before.items()}
+    assert after == defaults, "what a command does with signals is undone at its end"
+
+
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_what_a_signal_interrupts_says_so_except_listening_which_ends_so(
+    number: signal.Signals, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(*_: object) -> NoReturn:
+        signal.raise_signal(number)
+        raise AssertionError
+
+    monkeypatch.setattr("daemon.cli.evaluate.run", interrupted)
+    assert main(["evaluate", "a.cal", "b.mcap"]) == status
+    assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
+    monkeypatch.setattr("daemon.wire.subscriber.messages", interrupted)
+    assert main(["listen"]) == status
+    assert capsys.readouterr() == ("", "")
+
+
+def test_at_the_end_of_the_terminal_a_sentence_that_goes_nowhere_is_no_traceback(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(_: object) -> NoReturn:
+        monkeypatch.setattr(sys.stderr, "write", Mock(side_effect=OSError(5, "Input/output error")))
         raise KeyboardInterrupt
 
     monkeypatch.setattr("daemon.cli.evaluate.run", interrupted)
     assert main(["evaluate", "a.cal", "b.mcap"]) == 130
-    assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
-    monkeypatch.setattr("daemon.wire.subscriber.messages", interrupted)
-    assert main(["listen"]) == 130
     assert capsys.readouterr() == ("", "")
 
 
-def test_an_interrupt_in_what_compiled_code_calls_is_not_lost(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.usefixtures("default_signals")
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_what_compiled_code_calls_is_not_lost(
+    number: signal.Signals, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """So numba calls us for each function that it loads: the command went on after a traceback."""
 
     def loads(_: object) -> int:
-        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
         threading.Event().wait(10)
         return 0
 
     monkeypatch.setattr("daemon.cli.evaluate.run", loads)
-    # A test process may have been told to ignore it.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        assert main(["evaluate", "a.cal", "b.mcap"]) == 130
-    finally:
-        signal.signal(signal.SIGINT, before)
+    assert main(["evaluate", "a.cal", "b.mcap"]) == status
     assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
 
 

@@ -8,12 +8,12 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, nullcontext
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import active_children, get_context, resource_tracker
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 from unittest.mock import AsyncMock
 
 import numpy as np
@@ -21,6 +21,7 @@ import pytest
 
 import daemon.workers
 from daemon.cli import main
+from daemon.cli.interruption import interrupts_heard
 from daemon.errors import UserError
 from daemon.workers import Cluster, InTurn, Processes, workers
 from tests.daemon.test_bank_config import BANK, FINGERTIP
@@ -28,6 +29,8 @@ from tests.daemon.test_bank_config import BANK, FINGERTIP
 # Every worker imports this module for its tasks: what takes long to import is imported by the test that needs it.
 ROOT = Path(__file__).parents[2]
 STARTED_S = 90
+# From a signal and what it interrupts to the process in which a task was.
+Interrupted: TypeAlias = Callable[[signal.Signals, Callable[[], object]], int]
 
 
 @pytest.fixture(scope="module")
@@ -184,44 +187,92 @@ def waits(told: str, _: int) -> None:
     threading.Event().wait(600)
 
 
-@pytest.mark.usefixtures("scheduler")
-def test_a_local_cluster_ends_when_it_is_interrupted_and_again_while_it_ends(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Closing that was interrupted was waited for at exit, for 10 s, and left a worker in the middle of a task."""
+def terminal_signals_blocked(_: None, __: int) -> set[int]:
+    """Return which of a terminal's signals this process does not hear of."""
+    return {signal.SIGINT, signal.SIGHUP} & set(signal.pthread_sigmask(signal.SIG_BLOCK, []))
+
+
+def test_processes_beside_this_one_hear_nothing_of_the_terminal() -> None:
+    """At Ctrl-C each of them failed in its task, and began another."""
+    assert list(Processes(1).map(terminal_signals_blocked, None, [0])) == [(0, {signal.SIGINT, signal.SIGHUP})]
+    assert terminal_signals_blocked(None, 0) == set()
+
+
+@pytest.fixture
+def interrupted_once_it_works(tmp_path: Path) -> Iterator[Interrupted]:
+    """Interrupts this process as soon as a task `waits`, and returns the process that the task was in."""
     os.mkfifo(tmp_path / "told")
     running: list[int] = []
-    end_workers = daemon.workers._end_workers
 
-    async def again(local: Any) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        await end_workers(local)
-        ended.append(local)
-
-    def interrupt() -> None:
+    def interrupt(number: signal.Signals) -> None:
         running.append(int((tmp_path / "told").read_text()))
-        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), number)
 
-    ended: list[Any] = []
-    monkeypatch.setattr("daemon.workers._end_workers", again)
-    thread = threading.Thread(target=interrupt)
-
-    def interrupted() -> None:
-        with workers("local", 1) as cluster:
-            thread.start()
-            next(cluster.map(waits, str(tmp_path / "told"), [0]))
+    def during(number: signal.Signals, work: Callable[[], object]) -> int:
+        thread = threading.Thread(target=interrupt, args=(number,))
+        thread.start()
+        with pytest.raises(KeyboardInterrupt), interrupts_heard():
+            work()
+        thread.join()
+        return running[0]
 
     # A test process may have been told to ignore it.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        with pytest.raises(KeyboardInterrupt):
-            interrupted()
-    finally:
-        signal.signal(signal.SIGINT, before)
-    thread.join()
+    yield during
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_processes_end_when_this_one_is_interrupted(
+    number: signal.Signals, interrupted_once_it_works: Interrupted, tmp_path: Path
+) -> None:
+    """They were waited for until their tasks were done; of SIGTERM they did not hear, and stayed."""
+    process = interrupted_once_it_works(
+        number, lambda: list(Processes(1).map(waits, str(tmp_path / "told"), [0, 1, 2]))
+    )
+    assert active_children() == []
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, 0)
+
+
+@pytest.mark.usefixtures("scheduler")
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_local_cluster_ends_when_it_is_interrupted_and_again_while_it_ends(
+    number: signal.Signals, interrupted_once_it_works: Interrupted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Closing that was interrupted was waited for at exit, for 10 s, and left a worker in the middle of a task."""
+    end_workers = daemon.workers._end_workers
+    ended: list[Any] = []
+
+    async def again(local: Any) -> None:
+        os.kill(os.getpid(), number)
+        await end_workers(local)
+        ended.append(local)
+
+    def work() -> None:
+        with workers("local", 1) as cluster:
+            next(cluster.map(waits, str(tmp_path / "told"), [0]))
+
+    monkeypatch.setattr("daemon.workers._end_workers", again)
+    worker = interrupted_once_it_works(number, work)
     assert ended[0].status.name == "closed"
     with pytest.raises(ProcessLookupError):
-        os.kill(running[0], 0)
+        os.kill(worker, 0)
+
+
+def test_what_fails_because_everything_is_ended_is_told_as_that() -> None:
+    """As workers that were to begin, where a whole group of processes is sent SIGTERM: it was a traceback."""
+
+    def fails(number: signal.Signals | None) -> None:
+        with interrupts_heard(), daemon.workers._interrupted_later():
+            if number is not None:
+                signal.raise_signal(number)
+            raise RuntimeError
+
+    with pytest.raises(KeyboardInterrupt):
+        fails(signal.SIGTERM)
+    with pytest.raises(RuntimeError):
+        fails(None)
 
 
 async def test_workers_are_given_little_time_to_end_each_though_another_fails() -> None:

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Self
 
-from daemon.cli import EXIT_INTERRUPTED
 from daemon.cli.cluster import add_cluster
+from daemon.cli.interruption import ended
 from daemon.errors import UserError
 
 if TYPE_CHECKING:
@@ -50,9 +50,8 @@ def run(args: argparse.Namespace) -> int:
     before = _version(args.out)
     try:
         return _build(args)
-    except KeyboardInterrupt:
-        print(f"shearloop bank: interrupted: {_left(args.out, before)}", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    except KeyboardInterrupt as interrupt:
+        return ended(f"shearloop bank: interrupted: {_left(args.out, before)}", interrupt)
 
 
 def _version(path: Path) -> tuple[int, int] | None:

@@ -1,0 +1,64 @@
+"""A real Dask cluster of two workers, for tests of where heavy tasks run."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from multiprocessing import resource_tracker
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[3]
+STARTED_S = 90
+
+
+@pytest.fixture(scope="module", autouse=True)
+def lasting() -> None:
+    """Have what stays for good: spawned processes have a tracker of resources, Dask a thread for large messages."""
+    from distributed.utils import _offload_executor
+
+    resource_tracker.ensure_running()
+    _offload_executor.submit(int).result()
+
+
+@pytest.fixture(scope="module")
+def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Start a scheduler and two workers, all processes of their own, and return the address."""
+    from distributed import Client
+
+    folder = tmp_path_factory.mktemp("dask")
+    found, log = folder / "scheduler.json", folder / "log"
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "OPENBLAS_NUM_THREADS": "1",
+        # A worker is forked, also the one that takes a killed one's place, instead of importing everything anew.
+        "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver",
+        "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+    }
+    common = ["--scheduler-file", str(found), "--no-dashboard"]
+    two = ["--nworkers", "2", "--nthreads", "1", "--local-directory", str(folder)]
+    commands = [
+        ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0", *common],
+        ["distributed.cli.dask_worker", *two, *common],
+    ]
+    processes: list[subprocess.Popen[bytes]] = []
+    with ExitStack() as stack:
+        output = stack.enter_context(log.open("wb"))
+        try:
+            processes += [
+                subprocess.Popen(
+                    [sys.executable, "-m", *command], cwd=ROOT, env=environment, stdout=output, stderr=output
+                )
+                for command in commands
+            ]
+            with Client(scheduler_file=str(found), timeout=STARTED_S) as client:
+                client.wait_for_workers(2, timeout=STARTED_S)
+                address = str(client.scheduler.address)
+            yield address
+        finally:
+            # The workers first: without their scheduler they would wait for it.
+            for process in reversed(processes):
+                process.terminate()
+                process.wait(STARTED_S)

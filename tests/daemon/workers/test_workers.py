@@ -1,0 +1,149 @@
+"""The same tasks in turn, in processes, and on a real Dask cluster of two workers, one of which may be killed."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.cli import main
+from daemon.errors import UserError
+from daemon.workers import InTurn, Processes, workers
+from tests.daemon.test_bank_config import BANK, FINGERTIP
+from tests.daemon.workers.conftest import ROOT, STARTED_S
+
+# Every worker imports this module for its tasks: what takes long to import is imported by the test that needs it.
+
+
+def square(shared: dict[str, float], item: int) -> float:
+    """Return what every kind of worker has to return alike."""
+    return float(np.sin(shared["factor"] * item) ** 2)
+
+
+def fails(_: None, item: int) -> int:
+    """Fail for one item."""
+    if item == 2:
+        raise UserError("item 2 is wrong")
+    return item
+
+
+def dies_once(folder: str, item: int) -> int:
+    """Leave a line for every run; item 4 kills its worker the first time."""
+    with (Path(folder) / "runs").open("a") as file:
+        file.write(f"{item}\n")
+    first = Path(folder) / "killed"
+    if item == 4 and not first.exists():
+        first.write_text(str(os.getpid()))
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item * item
+
+
+def test_the_numbers_are_the_same_wherever_they_are_computed(scheduler: str) -> None:
+    items, shared = list(range(12)), {"factor": 0.37}
+    alone = dict(InTurn().map(square, shared, items))
+    assert dict(Processes(2).map(square, shared, items)) == alone
+    with workers(scheduler) as cluster:
+        assert dict(cluster.map(square, shared, items)) == alone
+
+
+def test_what_a_task_raises_is_raised_here(scheduler: str) -> None:
+    with workers(scheduler) as cluster, pytest.raises(UserError, match="item 2 is wrong"):
+        list(cluster.map(fails, None, range(4)))
+
+
+def test_a_worker_killed_in_the_middle_costs_only_its_tasks(scheduler: str, tmp_path: Path) -> None:
+    with workers(scheduler) as cluster:
+        results = dict(cluster.map(dies_once, str(tmp_path), range(12)))
+    assert results == {item: item * item for item in range(12)}
+    assert (tmp_path / "killed").exists()
+    runs = [int(line) for line in (tmp_path / "runs").read_text().split()]
+    # Twice ran the task that it died of, and what it had done but not yet handed over; all else once.
+    assert runs.count(4) == 2
+    assert len(runs) < 2 * 12 - 3
+
+
+def test_results_that_nobody_goes_on_with_are_let_go_after_the_end_of_the_cluster(scheduler: str) -> None:
+    """So ends what is interrupted where a result is used; a traceback told of it after the sentence."""
+    with workers(scheduler) as cluster:
+        found = cluster.map(square, {"factor": 0.37}, range(3))
+        next(found)
+    # Python throws the iterator away here; what fails in it then is a warning, and so an error.
+    del found
+
+
+def size(_: None, item: Any) -> int:
+    """Return the number of values."""
+    return int(item.size)
+
+
+def test_a_large_recording_is_sent_to_a_cluster_without_a_warning(scheduler: str) -> None:
+    """Dask warned of what is over 10 MB, in six lines; warnings are errors here."""
+    with workers(scheduler) as cluster:
+        assert list(cluster.map(size, None, [np.zeros(1_500_000)])) == [(0, 1_500_000)]
+
+
+def test_no_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "tip.yaml").write_text(FINGERTIP)
+    (tmp_path / "bank.yaml").write_text(BANK)
+    command = ["bank", "build", "--config", str(tmp_path / "bank.yaml"), "--out", str(tmp_path / "a.bank")]
+    assert main([*command, "--cluster", "tcp://127.0.0.1:9"]) == 2
+    assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
+
+
+def test_what_listens_and_is_no_scheduler_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("daemon.workers.CONNECT_S", 0.5)
+    with socket.create_server(("127.0.0.1", 0)) as deaf:
+        address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
+        with pytest.raises(UserError, match=f"no Dask scheduler answers at {address} within 0.5 s"), workers(address):
+            pass
+
+
+@pytest.fixture
+def lonely(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
+    """Start a scheduler without workers, and return its process and its address."""
+    from distributed import Client
+
+    found = tmp_path / "scheduler.json"
+    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(found)]
+    with (tmp_path / "log").open("wb") as output:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "distributed.cli.dask_scheduler", *options], cwd=ROOT, stdout=output, stderr=output
+        )
+    try:
+        with Client(scheduler_file=str(found), timeout=STARTED_S) as client:
+            address = str(client.scheduler.address)
+        yield process, address
+    finally:
+        process.kill()
+        process.wait(STARTED_S)
+
+
+def test_a_scheduler_without_workers_and_one_that_ends_are_one_sentence_each(
+    lonely: tuple[subprocess.Popen[bytes], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import distributed
+
+    process, address = lonely
+    monkeypatch.setattr("daemon.workers.FIRST_WORKER_S", 0.5)
+    with pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"), workers(address):
+        pass
+    monkeypatch.setattr("daemon.workers._wait_for_a_worker", lambda *_: None)
+    # As soon as the tasks are waited for.
+    begun = distributed.as_completed
+    monkeypatch.setattr(distributed, "as_completed", lambda tasks: (process.kill(), begun(tasks))[1])
+    with workers(address) as cluster, pytest.raises(UserError, match="the connection to the Dask scheduler was lost"):
+        list(cluster.map(square, {"factor": 1.0}, range(3)))
+
+
+def test_without_the_extra_an_address_is_refused_and_a_local_cluster_is_processes(monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with workers("local", 2) as pool:
+        assert isinstance(pool, Processes)
+    with pytest.raises(UserError, match=r"pip install 'shearloop\[cluster\]'"), workers("tcp://127.0.0.1:9"):
+        pass

@@ -1,0 +1,124 @@
+"""Banks, evaluations and charts from a real Dask cluster, a worker of which is killed, are the same as without."""
+
+import json
+import os
+import signal
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from daemon.cli import main
+from daemon.workers import Cluster, InTurn, workers
+from tests.daemon.test_bank_config import BANK, FINGERTIP
+from tests.daemon.workers.conftest import STARTED_S
+
+
+@pytest.fixture(scope="module")
+def banks(scheduler: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Return a bank built here, and the same one built on the cluster; before any test is watched (tqdm's thread)."""
+    folder = tmp_path_factory.mktemp("banks")
+    (folder / "tip.yaml").write_text(FINGERTIP)
+    (folder / "bank.yaml").write_text(BANK)
+    built = []
+    for name, options in (("here", ["--jobs", "1"]), ("there", ["--cluster", scheduler])):
+        built.append(folder / f"{name}.bank")
+        command = ["bank", "build", "--config", str(folder / "bank.yaml"), "--out", str(built[-1]), *options]
+        assert main(command) == 0
+    return built[0], built[1]
+
+
+def test_a_bank_has_the_same_bytes_from_a_cluster(banks: tuple[Path, Path]) -> None:
+    assert banks[0].read_bytes() == banks[1].read_bytes()
+
+
+@pytest.fixture(scope="module")
+def varied(banks: tuple[Path, Path], scheduler: str) -> tuple[Path, Path]:
+    """Return folders of banks over tilt and amplitude, built here and on the cluster."""
+    folder = banks[0].parent
+    over = "over: {tilt_deg: {low: -5, high: 5, count: 2}, amplitude: {low: 0.5, high: 1, count: 2}}"
+    (folder / "over.yaml").write_text(f"{BANK}{over}\n")
+    for name, options in (("over-here", ["--jobs", "1"]), ("over-there", ["--cluster", scheduler])):
+        command = ["bank", "build", "--config", str(folder / "over.yaml"), "--out", str(folder / name), *options]
+        assert main(command) == 0
+    return folder / "over-here", folder / "over-there"
+
+
+def test_banks_over_more_parameters_have_the_same_bytes_from_a_cluster(varied: tuple[Path, Path]) -> None:
+    here, there = ({path.name: path.read_bytes() for path in folder.iterdir()} for folder in varied)
+    assert len(set(here.values())) == 4
+    assert here == there
+
+
+@pytest.fixture
+def killed(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+    """Kill a worker as soon as the first result of anything is here, and give the numbers of those killed.
+
+    Its nanny starts another one, which is waited for at the end.
+    """
+    from distributed import Client
+
+    found: list[int] = []
+    whole = Cluster.map
+
+    def interrupted(self: Cluster, function: Any, shared: Any, items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+        for number, result in whole(self, function, shared, items):
+            if not found:
+                found.append(next(iter(self._client.run(os.getpid).values())))
+                os.kill(found[0], signal.SIGKILL)
+            yield number, result
+
+    monkeypatch.setattr(Cluster, "map", interrupted)
+    yield found
+    with Client(scheduler, timeout=STARTED_S) as client:
+        client.wait_for_workers(2, timeout=STARTED_S)
+
+
+def test_recordings_are_evaluated_to_the_same_figures_on_a_cluster_that_a_worker_is_killed_of(
+    scheduler: str, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], killed: list[int]
+) -> None:
+    slices, cylinders = (str(shared / "recordings" / name) for name in ("torque_slices", "diameter_slices"))
+    calibration = str(tmp_path / "slices.cal")
+    assert main(["calibrate", slices, "--estimator", "regression", "--part", "0:0.6", "--out", calibration]) == 0
+    figures = []
+    for options in ([], ["--cluster", scheduler]):
+        capsys.readouterr()
+        assert main(["evaluate", calibration, slices, cylinders, "--part", "0.6:1", "--json", *options]) == 0
+        found = json.loads(capsys.readouterr().out)
+        figures.append({name: value for name, value in found.items() if not name.startswith("latency")})
+    assert killed
+    assert figures[0] == figures[1]
+
+
+def test_a_bank_that_a_worker_is_killed_under_has_the_same_bytes(
+    banks: tuple[Path, Path], scheduler: str, killed: list[int]
+) -> None:
+    again = banks[0].with_name("killed.bank")
+    config = str(banks[0].with_name("bank.yaml"))
+    assert main(["bank", "build", "--config", config, "--out", str(again), "--cluster", scheduler]) == 0
+    assert killed
+    assert again.read_bytes() == banks[0].read_bytes()
+
+
+def test_a_chart_has_the_same_numbers_from_a_cluster_that_a_worker_is_killed_of(
+    scheduler: str, killed: list[int], tmp_path: Path
+) -> None:
+    from bank.estimators import Name, Physics
+    from bench.charts.faults import FAULTS
+    from bench.charts.sources import Split, bank_of, own_fingertip, synthetic_slices
+    from bench.charts.stability import sweeps
+    from daemon.reproduce.banks import Grid
+
+    bank = bank_of(None, own_fingertip(0.4).mesh(), tmp_path, Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8)))
+    slices = synthetic_slices(tmp_path)
+    # Few frames are judged at each level of each fault.
+    split = Split("slices", slices.between(0, 29), slices.between(29, 34), slices)
+    # The quickest one, twice: a task each.
+    names: tuple[Name, ...] = ("regression", "regression")
+    with workers(scheduler) as cluster:
+        there = sweeps(split, names, Physics(bank, None), bank, cluster)
+    assert killed
+    assert there == sweeps(split, names, Physics(bank, None), bank, InTurn())
+    assert len(there) == 2 * len(FAULTS)

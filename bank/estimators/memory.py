@@ -90,6 +90,9 @@ class Memory:
         self._let_go = [False for _ in guards]
         self._grips = [Grip(guard.grip_threshold) for guard in guards]
         self._lost: BoolArray = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
+        # Channels that the session began without: their idle voltages are not known.
+        self._unknown: BoolArray = self._lost
+        self._some_unknown = False
         # Frames that are to be taken for idle ones, and those taken.
         self._idle_wanted = idle_frames
         self._idle_taken: list[FloatArray] = []
@@ -138,13 +141,16 @@ class Memory:
             return Moment(channels, np.zeros_like(channels), tuple(filter(None, why)), usable)
         if disturbed:
             return self._bridge(channels, disturbed, usable)
+        if self._before is None and not self._begun and not self._idle_taken:
+            self._unknown = ~usable
+            self._some_unknown = not everywhere(usable)
         if self.taking_idle:
             return self._taken_for_idle(channels, usable)
         if self._before is None:
             self._before = channels
             return Moment(channels, np.zeros_like(channels), ("there is no frame before to compare with",), usable)
         self._refused, self._before, self._left_out = None, channels, 0
-        self._learn_baseline(channels)
+        self._learn_baseline(channels, frame)
         self._notice_release(channels)
         return self._judged(channels, usable)
 
@@ -155,7 +161,7 @@ class Memory:
         """
         if self._before is not None:
             look = self._guards.views.look(frame.channels, frame.usable, self._lost, self._before)
-            if look is not None:
+            if look is not None and not (self._some_unknown and np.count_nonzero(look.usable & self._unknown)):
                 self._lost = look.lost
                 return look.channels, look.usable, (), look.jumping_shares
         usable = unsaturated(frame.channels, frame.usable)
@@ -163,11 +169,11 @@ class Memory:
         why, lost = self._guards.seen(channels, usable)
         self._guards.views.prepare(frame.usable, lost)
         # Channels that are lost for longer are left out; while they are being lost they count as jumping.
-        judged = usable & ~(lost & self._lost)
+        judged = usable & ~((lost & self._lost) | self._unknown)
         shares = self._guards.jumping_shares(channels, self._before, judged) if self._before is not None else ()
         self._lost = lost
-        if np.count_nonzero(lost):
-            usable = usable & ~lost
+        if self._some_unknown or np.count_nonzero(lost):
+            usable = usable & ~(lost | self._unknown)
             why = why if any(why) else self._guards.too_few(usable)
             channels = self._filled(frame.channels, usable)
         return channels, usable, why, shares
@@ -329,8 +335,11 @@ class Memory:
                 assumed[layer] += self._motion.step(layer, moved, usable[layer], guard.noise)
         return np.where(usable, channels, assumed)
 
-    def _learn_baseline(self, channels: FloatArray) -> None:
-        """Follow the idle frame while nothing is gripped; a session that begins gripped has the calibration's."""
+    def _learn_baseline(self, channels: FloatArray, frame: TactileFrame) -> None:
+        """Follow the idle frame while nothing is gripped; a session that begins gripped has the calibration's.
+
+        Channels that were unknown and have come back in an idle frame are taken up into (m, 896) channels with it.
+        """
         first, self._begun = not self._begun, True
         if self._recent:
             return
@@ -342,9 +351,21 @@ class Memory:
             limit = 0.5 * guard.grip_threshold if learned else max(_OUTRIGHT, guard.grip_threshold)
             following = bool(idle) and guard.grip(channels[layer], self._baselines[layer]) < limit
             if begun or following:
+                if self._some_unknown:
+                    self._take_up(layer, channels, frame)
                 idle.append(channels[layer])
                 self._baselines[layer] = np.mean(idle, axis=0)
                 self._take_gains()
+
+    def _take_up(self, layer: int, channels: FloatArray, frame: TactileFrame) -> None:
+        alive = unsaturated(frame.channels, frame.usable) & ~self._lost
+        back = self._unknown[layer] & alive[layer]
+        if np.count_nonzero(back):
+            # Idle frames before this one had none of them.
+            self._idle[layer].clear()
+            channels[layer, back] = frame.channels[layer, back]
+            self._unknown[layer] &= ~back
+            self._some_unknown = bool(np.count_nonzero(self._unknown))
 
     def _take_gains(self) -> None:
         if self.own_baseline:

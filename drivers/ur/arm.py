@@ -15,7 +15,9 @@ import dashboard_client
 import rtde_control
 
 from drivers.errors import DriverError
+from drivers.ur.connections import connections_to
 from drivers.ur.messages import MoveLinear, Reading, WristSpeed
+from drivers.ur.probe import RTDE_PORT
 from drivers.ur.ready import Ready
 from drivers.ur.receiver import Receiver
 from drivers.ur.sample_age import SampleAge
@@ -46,10 +48,11 @@ class Arm:
         """
         self._settings = settings
         self._receiver = Receiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
-        kind = rtde_control.RTDEControlInterface
+        kind, ours = rtde_control.RTDEControlInterface, connections_to(RTDE_PORT)
         patience_ns = 1e9 / settings.watchdog_hz
         with _woken_late(min(_LONGEST_POLL_SLACK_NS, int(patience_ns / _SLACKS_IN_PATIENCE))):
             self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
+        self._its_connections = connections_to(RTDE_PORT) - ours
         # Whether a straight move may be under way: one was begun, and the wrist has not been turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
@@ -71,7 +74,9 @@ class Arm:
             sample.speed_scaling,
             now_ns,
             self._age.age_ns(sample.timestamp_s, now_ns),
-            self._receiver.connected and self._control.isConnected(),
+            self._receiver.connected
+            and self._control.isConnected()
+            and all(one.lasts for one in self._its_connections),
             # Two calls that wrap an object: not in each cycle in which the answer is known.
             self._may_move_linearly and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )

@@ -3,6 +3,7 @@
 import ctypes
 import dataclasses
 import importlib
+import socket
 import sys
 from collections.abc import Callable, Iterator
 from types import ModuleType, SimpleNamespace
@@ -171,3 +172,34 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(
     one._control.knows_of_the_end = True
     assert one.clear_command()
     assert one._control.calls == ["kickWatchdog"]
+
+
+def test_connection_that_the_client_has_made_anew_is_a_lost_one(
+    arm: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says nothing of it; on the descriptor of the one before there is another."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = server.getsockname()
+        monkeypatch.setattr(arm, "RTDE_PORT", address[1])
+        with socket.create_connection(address):
+
+            class Reconnecting(Controlled):
+                """Has a connection to the controller, and has another after `reconnect`."""
+
+                def __init__(self, *_: object) -> None:
+                    super().__init__()
+                    self.socket = socket.create_connection(address)
+
+                def reconnect(self) -> None:
+                    descriptor = self.socket.fileno()
+                    self.socket.close()
+                    self.socket = socket.create_connection(address)
+                    assert self.socket.fileno() == descriptor
+
+            monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Reconnecting)
+            one = arm.Arm(SETTINGS)
+            assert one.read().connected
+            one._control.reconnect()
+            assert not one.read().connected
+            one._control.socket.close()
+            assert not one.read().connected

@@ -107,13 +107,18 @@ def _user_errors() -> tuple[type[Exception], ...]:
     return (BankError, DriverError, UserError)
 
 
+_BEGINNING = """Where to begin with devices of your own:
+`shearloop ports` says how to name them, `shearloop check CONFIG` whether the configuration
+is in order, `shearloop doctor CONFIG` what is wrong with cables and devices."""
+
+
 def _overview() -> argparse.ArgumentParser:
     width = max(map(len, COMMANDS))
     listing = "\n".join(f"  {name:<{width}}  {command.summary}" for name, command in COMMANDS.items())
     parser = Parser(
         prog="shearloop",
         description="Closed-loop twisting with soft shear-sensing skins.",
-        epilog=f"commands:\n{listing}\n\n`shearloop COMMAND --help` explains one.",
+        epilog=f"commands:\n{listing}\n\n`shearloop COMMAND --help` explains one. {_BEGINNING}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")

@@ -11,8 +11,9 @@ if TYPE_CHECKING:
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `check`."""
-    parser.add_argument("config", type=Path, help="a YAML file such as config/demo.yaml")
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="a YAML file such as config/demo.yaml")
     parser.add_argument("--json", action="store_true", help="print what it says as JSON")
+    parser.epilog = "Opens no device: `shearloop doctor CONFIG` does, and listens to them."
 
 
 def run(args: argparse.Namespace) -> int:

@@ -50,7 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--experiment", type=Path, metavar="FILE", help="for start (default: the one that the configuration names)"
     )
-    add_connection(parser, COMMAND_ADDRESS)
+    add_connection(parser, COMMAND_ADDRESS, "where the daemon takes commands")
     parser.add_argument(
         "--timeout",
         type=float,

@@ -5,6 +5,7 @@ import argparse
 SHELLS = ("bash", "zsh", "tcsh")
 EPILOG = """bash: shearloop completion bash | sudo tee /etc/bash_completion.d/shearloop
 zsh:  shearloop completion zsh > ~/.zsh/completions/_shearloop   (a folder of your fpath)
+tcsh: shearloop completion tcsh | sudo tee /etc/profile.d/shearloop.csh
 """
 
 

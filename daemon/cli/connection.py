@@ -17,9 +17,9 @@ def own_key_folder() -> Path:
     return (Path(home) if home else Path.home() / ".config") / "shearloop"
 
 
-def add_connection(parser: argparse.ArgumentParser, default: str) -> None:
-    """Add the options of a command that speaks to a daemon."""
-    parser.add_argument("--connect", default=default, metavar="ADDRESS", help="default: %(default)s")
+def add_connection(parser: argparse.ArgumentParser, default: str, what: str) -> None:
+    """Add the options of a command that speaks to a daemon; `what` says for what it is connected to."""
+    parser.add_argument("--connect", default=default, metavar="ADDRESS", help=f"{what} (default: %(default)s)")
     parser.add_argument(
         "--key", type=Path, metavar="FILE", help="your .key_secret, for a daemon on the network (default: in ~/.config)"
     )

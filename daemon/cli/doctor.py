@@ -8,7 +8,13 @@ MARKS = {"good": "ok   ", "note": "note ", "trouble": "WRONG"}
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `doctor`."""
-    parser.add_argument("config", type=Path, nargs="?", help="the configuration, for files and devices")
+    parser.add_argument(
+        "config",
+        type=Path,
+        nargs="?",
+        metavar="CONFIG",
+        help="whose files and devices are looked at (default: none, this computer alone)",
+    )
     parser.add_argument(
         "--seconds",
         type=float,
@@ -20,6 +26,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--geometry", type=Path, metavar="FILE", help="the fingertip's geometry, to hold its bank against"
     )
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
+    parser.epilog = (
+        "Exit status: 0 nothing is wrong, 1 something is. docs/troubleshooting.md has what to do, by what is said."
+    )
 
 
 def run(args: argparse.Namespace) -> int:

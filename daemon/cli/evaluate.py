@@ -21,12 +21,17 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--part",
         metavar="FROM:TO",
         default="0:1",
-        help="share of each recording to judge on (default: all)",
+        help="share of each recording to judge on, e.g. 0.6:1 of one that was calibrated on with 0:0.6 (default: all)",
     )
     add_cluster(parser)
     parser.add_argument("--json", action="store_true", help="print the figures as JSON, and nothing else, on stdout")
     parser.add_argument("--plot", action="store_true", help="draw truth against estimate over time into --out")
     parser.add_argument("--out", type=Path, metavar="FILE", help="figure to draw (default with --plot: CAL.png)")
+    parser.epilog = (
+        "Prints, of valid estimates whose truth is known: correlation (r), root mean square error and bias in N·m, and "
+        "the share of truths within the 95 % intervals (coverage_95); of all frames: how many are valid, why others "
+        "are not, and how many milliseconds an estimate takes."
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -17,6 +17,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_place(parser)
     parser.add_argument("--program", type=Path, metavar="PATH", help="what the service runs; by default this program")
     parser.add_argument("--real-time", action="store_true", help="with the real-time options of docs/service.md")
+    parser.epilog = (
+        "Puts unit, user, udev rules, folders and an example configuration in place, with sudo (docs/service.md)."
+    )
 
 
 def add_place(parser: argparse.ArgumentParser) -> None:

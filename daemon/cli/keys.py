@@ -15,7 +15,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
     def action(name: str, summary: str, folder: Path) -> argparse.ArgumentParser:
         added = actions.add_parser(name, help=summary, description=summary)
-        added.add_argument("--dir", type=Path, default=folder, metavar="DIR", help="default: %(default)s")
+        added.add_argument(
+            "--dir", type=Path, default=folder, metavar="DIR", help="folder of the keys (default: %(default)s)"
+        )
         add_json(added)
         return added
 

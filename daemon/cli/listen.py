@@ -8,13 +8,23 @@ from daemon.cli.connection import add_connection, client_keys
 from daemon.cli.interruption import status_of
 from daemon.wire.addresses import PUBLISH_ADDRESS
 
+EPILOG = """
+examples:
+  shearloop listen eit.estimate load.torque
+  shearloop listen health --count 1 --json
+
+docs/messages.md says which topics there are and what is in them. Ends with Ctrl-C.
+"""
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `listen`."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.epilog = EPILOG
     parser.add_argument(
         "topics", nargs="*", default=[], metavar="TOPIC", help="topics, or their beginnings (eit); all by default"
     )
-    add_connection(parser, PUBLISH_ADDRESS)
+    add_connection(parser, PUBLISH_ADDRESS, "where the daemon publishes")
     parser.add_argument("--json", action="store_true", help="one JSON object a line, arrays included")
     parser.add_argument("--count", type=int, metavar="N", help="stop after N messages")
     parser.add_argument("--timeout", type=float, metavar="S", help="give up when nothing comes for S seconds")

@@ -6,6 +6,7 @@ import argparse
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `ports`."""
     parser.add_argument("--json", action="store_true", help="print them as JSON")
+    parser.epilog = "Says of each what to write as `device` in the configuration, so that it is found in any socket."
 
 
 def run(args: argparse.Namespace) -> int:

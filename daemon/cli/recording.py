@@ -26,13 +26,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         description="Copy what is sound of a recording that was not closed, or is damaged, into one with an index.",
     )
     repair.add_argument("recording", type=Path, metavar="REC", help="e.g. NAME.mcap.partial; it stays as it is")
-    repair.add_argument("--out", type=Path, metavar="FILE", help="default: NAME.mcap, or NAME.repaired.mcap")
+    repair.add_argument(
+        "--out", type=Path, metavar="FILE", help="recording to write (default: NAME.mcap, or NAME.repaired.mcap)"
+    )
     add_json(repair)
     export = parts.add_parser(
         "export", help="as CSV, Parquet or for MATLAB", description="Write a recording's topics as tables."
     )
-    export.add_argument("recording", type=Path, metavar="REC")
-    export.add_argument("--format", choices=FORMS, default="csv", help="default: %(default)s")
+    export.add_argument("recording", type=Path, metavar="REC", help="a recording (.mcap or .mcap.partial)")
+    export.add_argument("--format", choices=FORMS, default="csv", help="of the tables (default: %(default)s)")
     export.add_argument(
         "--out", type=Path, metavar="PATH", help="a folder for a file per topic; for mat a file (default: beside REC)"
     )

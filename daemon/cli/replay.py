@@ -22,9 +22,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("recording", type=Path, metavar="REC", help="made by `shearloop run --record` or imported")
     # Of a folder with two recordings, `recordings/first/*.mcap` names both.
     parser.add_argument("more", nargs="*", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--speed", default="1", metavar="N", help="times as fast as it happened, or max; default 1")
-    parser.add_argument("--publish", default=PUBLISH_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
-    parser.add_argument("--config", type=Path, help="instead of the configuration in the recording")
+    parser.add_argument(
+        "--speed", default="1", metavar="N", help="times as fast as it happened, or max (default: %(default)s)"
+    )
+    parser.add_argument("--publish", default=PUBLISH_ADDRESS, metavar="ADDRESS", help="where to (default: %(default)s)")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="instead of the configuration in the recording")
     parser.add_argument("--wait", action="store_true", help="begin when somebody subscribes")
     printed = parser.add_mutually_exclusive_group()
     printed.add_argument("--show", action="store_true", help="print the estimates as they come")

@@ -25,7 +25,7 @@ EMULATOR_STOP_S = 0.5
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `run`."""
-    parser.add_argument("config", type=Path, help="a YAML file such as config/demo.yaml")
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="a YAML file such as config/demo.yaml")
     parser.add_argument(
         "--show", action="store_true", help="print the estimates as they come, and what happened at the end"
     )
@@ -42,6 +42,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--recording", type=Path, metavar="FILE", help="let the configuration's EIT emulators play this .mat recording"
     )
     parser.add_argument("--record", type=Path, metavar="DIR", help="record everything into files in this folder")
+    parser.epilog = (
+        "Ends at Ctrl-C, SIGTERM, the end of its terminal, `shearloop command stop`, or with the experiment where the "
+        "configuration says stop_when_done. Exit status: 0 it ended as it was told to, 2 it could not run (and why), "
+        "3 it was to end with its experiment, which was stopped before."
+    )
 
 
 def run(args: argparse.Namespace) -> int:

@@ -23,13 +23,21 @@ Synthetic: the paper's measured figure was put into a synthetic recording; this 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add `characterise` and `calibrate`."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    characterise = actions.add_parser("characterise", help="print the paper's table beside the models'")
+    characterise = actions.add_parser(
+        "characterise",
+        help="print the paper's table beside the models'",
+        description="Print the paper's table beside the models'.",
+    )
     characterise.add_argument("--out", type=Path, metavar="DIR", help="draw figures 5, 6 and 7 here, PNG and SVG")
     add_json(characterise)
-    calibrate = actions.add_parser("calibrate", help="fit a calibration to a recorded table")
-    calibrate.add_argument("table", type=Path, help="CSV with r1_ohm, r2_ohm, shear_n, normal_n")
+    calibrate = actions.add_parser(
+        "calibrate", help="fit a calibration to a recorded table", description="Fit a calibration to a recorded table."
+    )
+    calibrate.add_argument("table", type=Path, metavar="TABLE", help="CSV with r1_ohm, r2_ohm, shear_n, normal_n")
     calibrate.add_argument("--out", type=Path, required=True, metavar="YAML", help="where the calibration goes")
-    calibrate.add_argument("--friction", type=float, help="coefficient of friction, where the table cannot tell it")
+    calibrate.add_argument(
+        "--friction", type=float, metavar="MU", help="coefficient of friction, where the table cannot tell it"
+    )
     add_json(calibrate)
 
 

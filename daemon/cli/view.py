@@ -15,17 +15,31 @@ PORT = 7760
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `view`."""
-    add_connection(parser, PUBLISH_ADDRESS)
-    parser.add_argument("--commands", default=COMMAND_ADDRESS, metavar="ADDRESS", help="default: %(default)s")
+    add_connection(parser, PUBLISH_ADDRESS, "where the daemon publishes")
     parser.add_argument(
-        "--port", type=int, default=PORT, help="on 127.0.0.1; 0 for any that is free (default: %(default)s)"
+        "--commands",
+        default=COMMAND_ADDRESS,
+        metavar="ADDRESS",
+        help="where the daemon takes commands (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--port",
+        type=int,
+        default=PORT,
+        help="the page's, on 127.0.0.1; 0 for any that is free (default: %(default)s)",
     )
     parser.add_argument(
         "--fingertip", type=Path, metavar="FILE", help="the fingertip's measures; by default the paper's fingertip"
     )
-    parser.add_argument("--token-file", type=Path, metavar="FILE", help="default: ~/.local/state/shearloop/view-token")
+    parser.add_argument(
+        "--token-file",
+        type=Path,
+        metavar="FILE",
+        help="what opens the buttons that move something (default: ~/.local/state/shearloop/view-token)",
+    )
     parser.add_argument("--new-token", action="store_true", help="make the token anew; the one before opens nothing")
     parser.add_argument("--json", action="store_true", help="print the page's address as JSON")
+    parser.epilog = "Prints the address to open in a browser of this computer, and serves it until Ctrl-C."
 
 
 def run(args: argparse.Namespace) -> int:

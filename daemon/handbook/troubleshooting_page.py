@@ -232,7 +232,7 @@ def troubleshooting_page(root: Path) -> str:
 def cure_of(sentence: Sentence, section: Section) -> str:
     """Return what to do: the sentence's own cure, the one for its words, or the section's."""
     if sentence.cure:
-        return sentence.cure[0].upper() + sentence.cure[1:] + "."
+        return sentence.cure[0].upper() + sentence.cure[1:] + ("" if sentence.cure.endswith("?") else ".")
     for words, cure in CURES:
         if words in sentence.said:
             return cure

@@ -1,5 +1,6 @@
 """Every mistake ends in one sentence that names the file, the key and the cure, and exit status 2."""
 
+import argparse
 import ctypes
 import shutil
 import signal
@@ -18,8 +19,11 @@ import zmq.asyncio
 
 from bank.bank_file import Bank
 from bank.calibration import Calibration
+from bank.models import MODELS
 from daemon.app import Daemon
 from daemon.cli import COMMANDS, main
+from daemon.cli.bank.build import MODELS as MODELS_IN_HELP
+from daemon.cli.completion import whole_parser
 from daemon.cli.readable import as_json, as_line
 from daemon.config import TAKEN_NAMES, load_daemon_config
 from daemon.eit.both import BOTH
@@ -248,7 +252,26 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
     with pytest.raises(SystemExit) as ended:
         main([name, "--help"])
     assert ended.value.code == 0
-    assert f"usage: shearloop {name}" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert f"usage: shearloop {name}" in told
+    assert "%%" not in told
+
+
+def test_every_argument_says_what_it_is_and_not_its_default_alone() -> None:
+    def arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for below in action.choices.values():
+                    yield from arguments(below)
+            else:
+                unsaid = action.help is None or action.help.startswith(("default", "(default"))
+                yield f"{parser.prog} {action.dest}" if unsaid else ""
+
+    assert list(filter(None, arguments(whole_parser()))) == []
+
+
+def test_help_names_all_basis_models() -> None:
+    assert MODELS_IN_HELP.replace(" or ", ", ").split(", ") == list(MODELS)
 
 
 def test_an_unknown_command_is_refused_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:

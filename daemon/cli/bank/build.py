@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from bank.mesh import Mesh
     from daemon.bank_config import BankPlan, GridConfig
 
+# In words, for `--help` loads nothing that computes.
+MODELS = "step, linear, cut_linear, gaussian_derivative or modulated_gaussian"
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
@@ -29,14 +32,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, required=True, metavar="PATH", help="the bank file to write; with `over`, the folder"
     )
     add_overrides(parser)
-    parser.add_argument("--jobs", type=int, metavar="N", help="threads that solve (default: one per core)")
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        metavar="N",
+        help="threads that solve, or workers of a cluster of this machine (default: one per core)",
+    )
     add_cluster(parser)
     parser.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def add_overrides(parser: argparse.ArgumentParser) -> None:
     """Add the options that take the place of what the configuration says."""
-    parser.add_argument("--model", metavar="M", help="basis model, in place of the configured one")
+    parser.add_argument("--model", metavar="M", help=f"basis model ({MODELS}), in place of the configured one")
     parser.add_argument(
         "--k",
         metavar="LO:HI:N",

@@ -3,13 +3,15 @@
 import argparse
 from pathlib import Path
 
+from daemon.cli.bank.build import MODELS
+
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument(
         "--mesh", type=Path, required=True, metavar="FILE", help="a mesh (.npz, EIDORS .mat) or a fingertip (.yaml)"
     )
-    parser.add_argument("--model", required=True, metavar="M", help="basis model")
+    parser.add_argument("--model", required=True, metavar="M", help=f"basis model: {MODELS}")
     parser.add_argument("--k", type=float, required=True, metavar="K", help="the model's first parameter")
     parser.add_argument("--sigma", type=float, required=True, metavar="S", help="the model's second parameter")
     parser.add_argument("--out", type=Path, required=True, metavar="V.npy", help="file for the 896 float64 voltages")

@@ -9,10 +9,18 @@ from daemon.cli.result import add_json, tell
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument(
-        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) of twists that are held, best ten"
+        "recordings",
+        nargs="+",
+        type=Path,
+        metavar="REC",
+        help="recordings (.mcap) of twists that are held; best of ten twists",
     )
     parser.add_argument(
-        "--calibration", type=Path, required=True, metavar="CAL", help="of the estimator that is to drive the loop"
+        "--calibration",
+        type=Path,
+        required=True,
+        metavar="CAL",
+        help="calibration of the estimator that is to drive the loop",
     )
     parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank the calibration was made with, if any")
     add_json(parser)

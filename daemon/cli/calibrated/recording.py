@@ -22,10 +22,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) or folders of slices, oldest first"
     )
-    parser.add_argument("--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="default: %(default)s")
+    parser.add_argument(
+        "--estimator", choices=ESTIMATORS, default=ESTIMATORS[0], help="what to calibrate (default: %(default)s)"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="CAL", help="calibration to write")
-    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank, for the estimators paper and bank")
-    parser.add_argument("--mesh", type=Path, metavar="FILE", help="the mesh, for the estimator reconstruction")
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="a bank, which the estimators paper and bank need")
+    parser.add_argument("--mesh", type=Path, metavar="FILE", help="a mesh, which the estimator reconstruction needs")
     parser.add_argument("--sides", metavar="SIDE[,SIDE]", help="sides to use, e.g. right (default: all that are there)")
     parser.add_argument(
         "--part", metavar="FROM:TO", default="0:1", help="share of each recording to use, e.g. 0:0.5 (default: all)"
@@ -40,9 +42,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--tool-mm",
         type=float,
         metavar="MM",
-        help="diameter of the tool in recordings that do not name it; on another one its torque is refused",
+        help="diameter of the tool in recordings that do not name it; on another tool no torque is told",
     )
     add_json(parser)
+    parser.epilog = (
+        "A recording has to hold some seconds idle, the grip, several twists (best ten) with the load cell read "
+        "beside, and some seconds idle after letting go. docs/estimators.md says what the estimators are and need."
+    )
 
 
 def run(args: argparse.Namespace) -> int:

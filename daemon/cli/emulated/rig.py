@@ -43,12 +43,20 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
     parser.add_argument("--bank", type=Path, required=True, metavar="FILE", help="the frames are made of its signals")
-    parser.add_argument("--run-dir", type=Path, required=True, metavar="DIR", help="eit-right, eit-left and load-cell")
+    parser.add_argument(
+        "--run-dir",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for the ports eit-right, eit-left and load-cell",
+    )
     parser.add_argument(
         "--skin", action="store_true", help="a shear skin on one finger too: skin-source and skin-daq in --run-dir"
     )
     parser.add_argument("--host", default="127.0.0.1", help="address of robot and gripper (default: %(default)s)")
-    parser.add_argument("--gripper", choices=("socket", "modbus"), default="socket", help="(default: %(default)s)")
+    parser.add_argument(
+        "--gripper", choices=("socket", "modbus"), default="socket", help="how it is spoken to (default: %(default)s)"
+    )
     parser.add_argument("--joint", choices=JOINTS, default="lever", help="what the tool is in (default: %(default)s)")
     parser.add_argument("--diameter-mm", type=float, default=20.0, metavar="MM", help="of the tool (default: 20)")
     parser.add_argument(

@@ -8,9 +8,10 @@ import numpy as np
 
 from bank.bank_file import Bank
 from bank.estimators.calibrated import NEEDS_BANK, Calibration, Name, locator_for
+from bank.estimators.fitting_reader import STRENGTHS
 from bank.estimators.heads import Ridge
 from bank.estimators.physics import Locator
-from bank.estimators.reader import STRENGTHS, Head
+from bank.estimators.reader import Head
 from bank.estimators.values import FloatArray
 
 if TYPE_CHECKING:

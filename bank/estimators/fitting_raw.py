@@ -10,13 +10,14 @@ from bank.estimators.alignment import torque_within
 from bank.estimators.calibrated import NEEDS_BANK, Calibration, Task, columns_for, features_of
 from bank.estimators.cylinders import LEAST_LEFT, Gripped, fit_cylinders
 from bank.estimators.fitting_choices import Physics, ks_of, locator_of, ridge_for, strengths_for
+from bank.estimators.fitting_reader import error_on_later, fit_reader, one_sided
 from bank.estimators.gripped import gripped_part
 from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Censored, Ridge, later_origins
 from bank.estimators.memory import Memory
 from bank.estimators.motion import Motion
 from bank.estimators.physics import Locator, register, settle_half_turn
-from bank.estimators.reader import Reader, error_on_later, fit_reader, one_sided
+from bank.estimators.reader import Reader
 from bank.estimators.values import FloatArray, FrameSeries, Measured, TactileFrame, distinct
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.

@@ -9,10 +9,11 @@ from bank.errors import CalibrationError
 from bank.estimators.calibrated import Calibration, Task, columns_for, features_of
 from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.fitting_choices import Physics, ks_of, locator_of, ridge_for, strengths_for
+from bank.estimators.fitting_reader import fit_reader
 from bank.estimators.heads import Curve, later_origins
 from bank.estimators.mixtures import Mixtures
 from bank.estimators.physics import Locator
-from bank.estimators.reader import Head, fit_reader
+from bank.estimators.reader import Head
 from bank.estimators.soundness import parts_of
 from bank.estimators.values import FloatArray, FrameSeries
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from bank.estimators.fitting_reader import STRENGTHS
 from bank.estimators.heads import Ridge, Rows, best_strength, later_splits, ranked_channels
-from bank.estimators.reader import STRENGTHS
 from bank.estimators.values import FloatArray
 
 

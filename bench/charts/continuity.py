@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from bank.bank_file import Bank
 from bank.estimators import Calibration, TactileFrame, Tracker
+from bank.estimators.fitting_reader import fit_reader
 from bank.estimators.heads import Ridge
 from bank.estimators.physics import NOT_TURNED, BestCell, Locator, NearestCell
-from bank.estimators.reader import fit_reader
 from bench.charts.sources import Split
 
 Floats = NDArray[np.float64]

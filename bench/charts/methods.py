@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from bank.bank_file import Bank
 from bank.errors import BankError
 from bank.estimators import Calibration, FrameSeries, Name, Physics, fit
+from bank.estimators.fitting_reader import fit_reader
 from bank.estimators.heads import Ridge, ranked_channels
 from bank.estimators.physics import NOT_TURNED, NearestCell
-from bank.estimators.reader import Reader, fit_reader
+from bank.estimators.reader import Reader
 from bank.fast_matching import FastMatcher, FastZeroLagMatcher
 from bank.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
 from bench.charts.sources import Split

@@ -7,9 +7,10 @@ import pytest
 
 from bank.estimators import FrameSeries, TactileFrame, Tracker, fit
 from bank.estimators.familiar import DifferenceGuard
+from bank.estimators.fitting_reader import fit_reader
 from bank.estimators.heads import Ridge
 from bank.estimators.physics import Place
-from bank.estimators.reader import Reader, fit_reader
+from bank.estimators.reader import Reader
 from bank.estimators.twins import Twins
 
 ALL = np.ones(896, dtype=np.bool_)

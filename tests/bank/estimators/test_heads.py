@@ -3,6 +3,7 @@ import pytest
 from scipy.stats import truncnorm
 
 from bank.errors import CalibrationError
+from bank.estimators.fitting_reader import fit_reader
 from bank.estimators.heads import (
     Censored,
     Curve,
@@ -13,7 +14,6 @@ from bank.estimators.heads import (
     later_splits,
     left_out_blocks,
 )
-from bank.estimators.reader import fit_reader
 
 
 def test_a_ridge_without_strength_is_least_squares():

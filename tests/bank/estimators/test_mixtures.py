@@ -8,9 +8,9 @@ import pytest
 
 from bank.estimators import Calibration, FrameSeries, TactileFrame, Tracker, fit
 from bank.estimators.familiar import DifferenceGuard
+from bank.estimators.fitting_reader import fit_reader
 from bank.estimators.heads import Ridge
 from bank.estimators.mixtures import Mixtures, Passing
-from bank.estimators.reader import fit_reader
 
 
 def shrinking(seed: int) -> FrameSeries:

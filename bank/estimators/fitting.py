@@ -27,6 +27,7 @@ def fit(
     physics: Physics | None = None,
     *,
     trust_times: bool = False,
+    all_torques: bool = False,
     timed_by: Sequence[FrameSeries] = (),
     aligned: Aligned | None = None,
 ) -> Calibration:
@@ -34,7 +35,8 @@ def fit(
 
     Slices with torque give a torque, those with diameters a diameter. `timed_by` may be what was recorded beside by
     other fingertips, by which the torques' times are checked where these hardly move with the load; `aligned` may be
-    `alignment` with what it has found for whoever asks it too. Raises CalibrationError for recordings that do not
+    `alignment` with what it has found for whoever asks it too. `all_torques` vouches that no torque will come beyond
+    those of the slices: their intervals reach no further then. Raises CalibrationError for recordings that do not
     determine the calibration, for torques that are clearly stamped at other times than the frames unless `trust_times`
     is set, and for physics that the estimator needs and did not get.
     """
@@ -69,7 +71,7 @@ def fit(
     )
     chosen = [one.of_sides(sides) for one in recordings]
     if blank.kind != "raw":
-        return fit_slices(blank, chosen, physics)
+        return fit_slices(blank, chosen, physics, all_torques=all_torques)
     if trust_times:
         return fit_raw(blank, chosen, physics, 0.0)
     aligned = aligned or cache(alignment)

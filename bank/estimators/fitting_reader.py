@@ -7,7 +7,7 @@ import numpy as np
 
 from bank.errors import CalibrationError
 from bank.estimators.heads import Censored, Curve, Rows, best_strength, later_splits, left_out_blocks
-from bank.estimators.intervals import LEVEL, Intervals
+from bank.estimators.intervals import LEVEL, Intervals, for_few
 from bank.estimators.mixtures import Passing
 from bank.estimators.reader import LEAST_HALF_WIDTH, Head, Reader, shown
 from bank.estimators.values import BoolArray, FloatArray
@@ -27,6 +27,9 @@ _LEAST_FRAMES = 8
 # Values left out at either end of the range, to see whether what lies beyond it is read as beyond it, or at its end:
 # if more than half of the way beyond is missing.
 _AT_END, _MAY_BE_MISSING = 0.2, 0.5
+# As far beyond the range, in spans of it, as frames still pass for familiar ones: slices of 0.14 N·m do where those
+# below 0.08 were calibrated on (`extrapolation-torque-slices` of docs/charts.md).
+_UNSEEN = 1.0
 # Loads above this share of the largest count as loads, and this share of them must lie within their intervals.
 _LOADED_SHARE, _LEAST_COVERED = 0.1, 0.75
 
@@ -42,14 +45,16 @@ def fit_reader(
     difficulty: Difficulty | None = None,
     mixed: Mixed | None = None,
     within: tuple[FloatArray, FloatArray] | None = None,
+    all_values: bool = False,
 ) -> Reader:
     """Fit a head to (n, d) features and (n,) values in time order, and intervals to the residuals of what was left out.
 
     `left_out` are pairs of rows fitted to and rows that stand for what is to come; by default blocks of time in turn.
     With `difficulty` residuals are taken in units of it, and whoever reads widens by it (normalised conformal
     prediction, Papadopoulos et al. 2002); then it is also looked at whether values beyond the range would be read as
-    such. With `mixed` intervals reach as far as what passes with something foreign in it goes astray.
-    Where a value may be any from the first to the second (n,) of `within`, intervals reach as far as the further one.
+    such, unless these are `all_values` that will ever come. With `mixed` intervals reach as far as what passes with
+    something foreign in it goes astray. Where a value may be any from the first to the second (n,) of `within`,
+    intervals reach as far as the further one.
     Raises CalibrationError where the data does not determine them.
     """
     if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
@@ -75,7 +80,10 @@ def fit_reader(
         hardness = np.concatenate([difficulty(past, future) for past, future in blocks])
     head = head_of(features, values, strength)
     edges = (-head.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(head, Censored) else ()
-    inflation = 1.0 if left_out or isinstance(head, Curve) else _INFLATION
+    rows = np.concatenate([future for _, future in blocks])
+    inflation = 1.0 if isinstance(head, Curve) else _INFLATION
+    if left_out:
+        inflation = for_few(len(np.unique(rows)))
     centre = features.mean(axis=0)
     reach = np.abs(features - centre).max(axis=0) if limit_reach else np.zeros(0)
     least = LEAST_HALF_WIDTH * float(np.ptp(values))
@@ -84,13 +92,15 @@ def fit_reader(
     half = np.array([intervals.half_width(one) for one in predicted])
     misses_loads = difficulty is None and _misses_loads(truth, np.abs(residuals) <= half)
     if within is not None:
-        rows = np.concatenate([future for _, future in blocks])
+        if not left_out:
+            # Times that could not be checked are those of few loads, in a block or two each.
+            inflation = for_few(len(blocks))
         astray = np.max([np.abs(truth + residuals - end[rows]) for end in within], axis=0)
         known_nm = intervals.half_widths[-1]
         intervals = Intervals.fit(predicted, astray / hardness, edges, inflation, least)
         widened = float(intervals.half_widths[-1] / known_nm)
     low_end, high_end = -np.inf, np.inf
-    if difficulty is not None:
+    if difficulty is not None and not all_values:
         low_end, high_end = (
             _end(head, features, values, lambda rows: head_of(features[rows], values[rows], strength), sign)
             for sign in (1, -1)
@@ -101,7 +111,7 @@ def fit_reader(
         hidden = _hidden(features, values, heads, inflation)
     return Reader(
         head, intervals, float(values.min()), float(values.max()),
-        low_end, high_end, misses_loads, centre, reach, *hidden, widened,
+        low_end, high_end, misses_loads, centre, reach, *hidden, widened, _UNSEEN,
     )  # fmt: skip
 
 
@@ -132,8 +142,9 @@ def _hidden(
 def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[Rows], Head], sign: int) -> float:
     """Return the value at or below which (for the sign −1: above which) a reading may be of anything further out.
 
-    The outermost values are left out and read by what is left. If they are read at its end instead of beyond it, then
-    so will be what lies beyond the whole range. Otherwise it is the end of the range itself.
+    The outermost values are left out and read by what is left. If they are read at its end instead of beyond it, or
+    even within it, then so will be what lies beyond the whole range, and the more, the further it lies: here the middle
+    of all that passes unseen. Otherwise it is the end of the range itself.
     """
     outward = sign * values
     order = np.argsort(outward, kind="stable")
@@ -148,8 +159,10 @@ def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[
 
     seen, true = read(refit(kept), out), float(np.median(outward[out]))
     if seen - true > _MAY_BE_MISSING * (inside - true) > 0:
-        # As far inside the end as these were read, or as the outermost are read now, so will be those beyond.
-        found = max(found, found + seen - inside, read(head, order[: n_out // 2]))
+        short = (seen - inside) / (inside - true)
+        middle = _UNSEEN / 2 * float(np.ptp(values))
+        # At least as far inside as the outermost are read now.
+        found = max(found, found + short * middle, read(head, order[: n_out // 2]))
     return sign * found
 
 

@@ -25,10 +25,13 @@ _TORQUE_CURVE, _DIAMETER_CURVE = (3, 3, True), (1, 1, False)
 _LEAST_TORQUE_SLICES, _LEAST_FOR_CURVE = 10, 14
 
 
-def fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physics) -> Calibration:
+def fit_slices(
+    blank: Calibration, recordings: list[FrameSeries], physics: Physics, *, all_torques: bool = False
+) -> Calibration:
     """Return a blank calibration with what slices in time order tell of torque and diameter.
 
-    Raises CalibrationError for slices of several fingertips, and for too few.
+    With `all_torques` none beyond them will come. Raises CalibrationError for slices of several fingertips, and for
+    too few.
     """
     if len(blank.sides) > 1:
         raise CalibrationError(
@@ -74,6 +77,7 @@ def fit_slices(blank: Calibration, recordings: list[FrameSeries], physics: Physi
             left_out=later_origins(int(known.sum())) if name == "torque" else (),
             difficulty=later.difficulty if later is not None else None,
             mixed=later.passing if later is not None else None,
+            all_values=all_torques,
         )
         tasks[name] = Task(reader, guard, ks_of(blank.estimator, features))
     if not tasks:

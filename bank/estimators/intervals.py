@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+from scipy.special import stdtrit
 
 from bank.errors import CalibrationError
 from bank.estimators.values import FloatArray
@@ -57,6 +58,11 @@ class Intervals:
     def half_width(self, predicted: float) -> float:
         """Return half of the 95 % interval's width at this prediction."""
         return float(self.half_widths[self.edges.searchsorted(predicted)])
+
+
+def for_few(n: int) -> float:
+    """Return by how much wider a 95 % interval is because its width was told by n values alone (Student 1908)."""
+    return float(stdtrit(n - 1, (1 + LEVEL) / 2)) / TWO_SIDED_95
 
 
 def _quantile(absolute: FloatArray) -> float:

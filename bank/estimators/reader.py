@@ -20,8 +20,6 @@ LEAST_HALF_WIDTH = 1e-3
 _LARGEST_BEYOND = 0.35
 # Features this many times larger than any at calibration are of something else.
 _LARGEST_REACH = 1.6
-# As far beyond the range, in spans of it, as frames still pass for familiar ones (`stability-rims` of docs/charts.md).
-UNSEEN = 0.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +31,8 @@ class Reader:
     interval reaches over all values that it was calibrated on. hidden_below and hidden_above are how far below and
     above what is read the truth may lie for what is foreign in a frame unseen, at a nearness of 1 (0 where that was
     not looked at, as in older calibrations). widened is by how many times the intervals of loads are wider because
-    nobody knows when they were measured.
+    nobody knows when they were measured. unseen is how far beyond the range, in spans of it, values may lie that are
+    read at its ends (half of one in older calibrations).
     """
 
     head: Head
@@ -48,6 +47,7 @@ class Reader:
     hidden_below: float = 0.0
     hidden_above: float = 0.0
     widened: float = 1.0
+    unseen: float = 0.5
 
     def read(
         self,
@@ -69,7 +69,7 @@ class Reader:
         raw, grown = self._raw(features, whole)
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
-        value, beyond = shown(self.head, raw), UNSEEN * (self.high - self.low)
+        value, beyond = shown(self.head, raw), self.unseen * (self.high - self.low)
         moved = shown(self.head, grown) - value
         below = max(half + max(-moved, 0.0), nearness * self.hidden_below)
         above = max(half + max(moved, 0.0), nearness * self.hidden_above)

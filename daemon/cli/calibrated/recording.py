@@ -1,6 +1,7 @@
 """`shearloop calibrate REC… --estimator NAME --out CAL`: fit an estimator to recordings."""
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from math import isnan
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING
 from daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
+    from bank.estimators import Calibration, FrameSeries
+    from bank.estimators.alignment import Aligned
     from bank.estimators.reader import Reader
 
 # A stamp that is further off belongs to another recording.
@@ -39,6 +42,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="seconds that the load cell's stamps are late, which are taken off; 0 takes them for right unchecked",
     )
     parser.add_argument(
+        "--all-torques",
+        action="store_true",
+        help="no torque will come beyond those of the slices: their intervals then do not reach beyond them",
+    )
+    parser.add_argument(
         "--tool-mm",
         type=float,
         metavar="MM",
@@ -55,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     """Fit, write, and say what was fitted."""
     from bank.bank_file import Bank
     from bank.estimators import Physics, fit
-    from bank.estimators.alignment import alignment, doubt, telling, unchecked_s
+    from bank.estimators.alignment import alignment, telling
     from bank.estimators.archive import ARCHIVE_MAGIC
     from bank.mesh import load_mesh
     from daemon.cli.recorded import parsed_part, parsed_sides
@@ -79,6 +87,8 @@ def run(args: argparse.Namespace) -> int:
     series = [(path, one) for path in args.recordings for one in read_series(path, sides, tool_mm)]
     parts = [part_of(one, start, stop) for _, one in series]
     check_no_copies([(str(path), part) for (path, _), part in zip(series, parts, strict=True)])
+    if args.all_torques and any(one.kind == "raw" for one in parts):
+        raise UserError("--all-torques is for slices: what is read of recordings has no such ends; leave it out")
     if late_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]
     # A fingertip that hardly moves with the load has its times from the other one, wherever both were recorded.
@@ -105,6 +115,7 @@ def run(args: argparse.Namespace) -> int:
         source,
         physics,
         trust_times=late_s is not None,
+        all_torques=args.all_torques,
         timed_by=[one for _, one in beside],
         aligned=aligned,
     )
@@ -127,23 +138,15 @@ def run(args: argparse.Namespace) -> int:
         told["sees_loads"] = not calibration.torque.reader.misses_loads
         if calibration.torque.reader.misses_loads:
             sentences.append(_blind(calibration.torque.reader, args.estimator, calibration.sides))
+        if calibration.kind != "raw" and not args.all_torques:
+            told["reads_beyond"] = beyond = not _reads_within(calibration.torque.reader)
+            sentences += [] if beyond else [_ends(calibration.torque.reader)]
     if late_s is None and calibration.kind == "raw":
         named = [*((path.name, one) for (path, _), one in zip(series, parts, strict=True)), *beside]
         timed = telling(parts, [one for _, one in beside], aligned)
-        told["load_late_s"] = [found and round(found.late_s, 3) for found in map(aligned, timed)]
-        known = ", ".join(f"{each:.2f}" for each in told["load_late_s"] if each is not None)
-        sentences += [f"The load is stamped {known} s after the frames move."] if known else []
-        doubts = [f"{name}: {why}" for name, one in named if one in timed and (why := doubt(one, aligned))]
-        told["load_doubts"] = doubts
-        sentences += [f"Doubtful is {why}." for why in doubts]
-        told["load_unchecked_s"] = unsure_s = round(unchecked_s(timed, aligned), 3)
-        if calibration.torque is not None and unsure_s:
-            told["widened"] = widened = round(calibration.torque.reader.widened, 2)
-            sentences.append(
-                f"When the load is stamped could not be checked, for it changes too seldom: it may be {unsure_s:.2g} s "
-                f"off unseen, so the intervals of loads are {widened:.2g} times as wide. Record more changes of load, "
-                "as ten twists, or vouch for the load cell's clock with --load-late 0."
-            )
+        of_times, said = _of_times(calibration, named, timed, aligned)
+        told |= of_times
+        sentences += said
     if calibration.kind == "raw":
         known_mm = None if isnan(calibration.tool_mm) else calibration.tool_mm
         told["tool_mm"] = known_mm
@@ -156,6 +159,32 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _of_times(
+    calibration: "Calibration",
+    named: Sequence[tuple[str, "FrameSeries"]],
+    timed: Sequence["FrameSeries"],
+    aligned: "Aligned",
+) -> tuple[dict[str, object], list[str]]:
+    """Return what is known of when the loads of recordings were measured, which `timed` tell: as JSON, and in words."""
+    from bank.estimators.alignment import doubt, unchecked_s
+
+    late_s = [found and round(found.late_s, 3) for found in map(aligned, timed)]
+    known = ", ".join(f"{each:.2f}" for each in late_s if each is not None)
+    sentences = [f"The load is stamped {known} s after the frames move."] if known else []
+    doubts = [f"{name}: {why}" for name, one in named if one in timed and (why := doubt(one, aligned))]
+    sentences += [f"Doubtful is {why}." for why in doubts]
+    unsure_s = round(unchecked_s(timed, aligned), 3)
+    told: dict[str, object] = {"load_late_s": late_s, "load_doubts": doubts, "load_unchecked_s": unsure_s}
+    if calibration.torque is not None and unsure_s:
+        told["widened"] = widened = round(calibration.torque.reader.widened, 2)
+        sentences.append(
+            f"When the load is stamped could not be checked, for it changes too seldom: it may be {unsure_s:.2g} s "
+            f"off unseen, so the intervals of loads are {widened:.2g} times as wide. Record more changes of load, "
+            "as ten twists, or vouch for the load cell's clock with --load-late 0."
+        )
+    return told, sentences
+
+
 def _blind(reader: "Reader", estimator: str, sides: tuple[str, ...]) -> str:
     """Return what it means that loads are not seen, and what may help."""
     low_nm, high_nm = (round(limit, 3) + 0.0 for limit in (reader.low, reader.high))
@@ -166,4 +195,22 @@ def _blind(reader: "Reader", estimator: str, sides: tuple[str, ...]) -> str:
         "It does not see the load: of the loads that it was tried on, too many lay outside of their intervals. So "
         f"every interval spans all calibrated torques, {low_nm:g} to {high_nm:g} N·m, and no torque can be told by it. "
         f"{cure} a grip in which the tool twists the gel more."
+    )
+
+
+def _reads_within(reader: "Reader") -> bool:
+    """Return whether torques beyond those calibrated on may be read as some of them."""
+    return reader.low_end > reader.low or reader.high_end < reader.high
+
+
+def _ends(reader: "Reader") -> str:
+    """Return what it means that torques beyond the range are read within it, and what helps."""
+    low_nm, high_nm, below_nm, above_nm = (
+        round(limit, 3) + 0.0 for limit in (reader.low, reader.high, reader.low_end, reader.high_end)
+    )
+    return (
+        f"Torques beyond the calibrated {low_nm:g} to {high_nm:g} N·m may be read within them, as the outermost were "
+        f"when they were left out: intervals of what is read below {below_nm:g} or above {above_nm:g} N·m reach as far "
+        "beyond as the range is wide, and no further. Calibrate on all torques that will come, and say so with "
+        "--all-torques."
     )

@@ -21,6 +21,7 @@ from bank.estimators.alignment import (
     unchecked_s,
 )
 from bank.estimators.gripped import gripped_part
+from bank.estimators.intervals import for_few
 
 
 @pytest.mark.parametrize("late_s", [-2.0, -0.5, 0.0, 0.3, 1.0, 4.0])
@@ -171,7 +172,7 @@ def test_intervals_hold_what_times_that_could_not_be_checked_do_to_the_torque(re
     unchecked = fit("fused", [recorded], "unchecked").torque.reader
     vouched = fit("fused", [recorded], "vouched for", trust_times=True).torque.reader
     assert checked.widened == vouched.widened == 1.0
-    assert unchecked.widened > 1.1
+    assert unchecked.widened > 1.1 * for_few(5), "blocks of few loads tell little, and other times' loads are wider"
     assert unchecked.intervals.half_widths[-1] == pytest.approx(unchecked.widened * checked.intervals.half_widths[-1])
     np.testing.assert_array_equal(vouched.intervals.half_widths, checked.intervals.half_widths)
     np.testing.assert_array_equal(unchecked.head.weights, checked.head.weights)

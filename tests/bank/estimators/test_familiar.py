@@ -78,6 +78,28 @@ def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it(
     assert max(below, above) < 0.3
 
 
+def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_anywhere_above_that():
+    """Left out, a tenth of the range beyond is read a tenth inside: so half a range beyond, half of it inside."""
+    values = np.random.default_rng(5).uniform(0.0, 1.0, 200)
+
+    def folded(value):
+        return np.minimum(value, 1.6 - value)[:, None]
+
+    features = folded(values) + np.random.default_rng(6).normal(0, 1e-3, (200, 1))
+    reader = reader_of(features, values)
+    assert reader.low_end == values.min(), "below nothing is folded"
+    assert reader.high_end == pytest.approx(0.5, abs=0.05)
+    _, below, above = reader.read(np.array([0.3]))
+    assert max(below, above) < 0.5
+    value, _, above = reader.read(np.array([0.6]))
+    assert value + above == pytest.approx(values.max() + np.ptp(values)), "as far beyond as the range is wide"
+    vouched = fit_reader(
+        features, values, Ridge.fit, strengths=(1e-9,), difficulty=lambda _, later: np.ones(len(later)), all_values=True
+    )
+    assert vouched.read(np.array([0.6]))[2] < 0.5
+    assert vouched.read(np.array([0.6]))[0] == value
+
+
 def test_where_values_beyond_are_read_as_such_intervals_reach_no_further_than_the_range():
     rng = np.random.default_rng(2)
     values = rng.uniform(0.0, 1.0, 200)

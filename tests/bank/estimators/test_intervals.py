@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bank.errors import CalibrationError
-from bank.estimators.intervals import Intervals
+from bank.estimators.intervals import Intervals, for_few
 
 
 def test_each_stratum_covers_its_own_future():
@@ -25,6 +25,23 @@ def test_strata_with_few_residuals_join():
     intervals = Intervals.fit(predicted, rng.normal(size=102), (0.0, 0.4), 1.1)
     assert len(intervals.edges) == 0
     assert intervals.half_width(-5) == intervals.half_width(5)
+
+
+@pytest.mark.parametrize(("n", "students_t"), [(5, 2.776), (20, 2.093), (1001, 1.962)])
+def test_of_few_values_an_interval_is_as_wide_as_students(n, students_t):
+    assert for_few(n) == pytest.approx(students_t / 1.96, abs=3e-4)
+
+
+def test_an_interval_told_by_six_residuals_holds_what_it_promises():
+    rng = np.random.default_rng(6)
+    held = {factor: [] for factor in (1.0, for_few(6))}
+    for _ in range(2000):
+        residuals, future = rng.normal(size=6), rng.normal(size=20)
+        for factor, inside in held.items():
+            inside.append(np.abs(future) <= Intervals.fit(np.zeros(6), residuals, (), factor).half_width(0.0))
+    short, whole = (np.mean(inside) for inside in held.values())
+    assert 0.94 < whole < 0.98
+    assert short < 0.92, "else there is nothing to mend"
 
 
 def test_too_few_residuals_are_refused():

@@ -83,7 +83,7 @@ def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name
     valid, false_valid, _ = judged(calibration, spoilt)
     assert valid > 0.9  # or nothing would be tested
     assert false_valid <= 0.05
-    assert judged(blind, spoilt)[1] > 0.3  # or there was nothing to hold
+    assert judged(blind, spoilt)[1] > 0.2  # or there was nothing to hold
     assert judged(calibration, later)[2] < 1.2 * judged(blind, later)[2]
 
 
@@ -132,13 +132,13 @@ def test_a_calibration_from_before_is_read_as_it_was(sliced, tmp_path):
     calibration = fit("fused", [sliced()], "all")
     old = replace(calibration, torque=replace(calibration.torque, reader=_without(calibration.torque.reader)))
     old.save(tmp_path / "old.cal")
-    _remove_from_header(tmp_path / "old.cal", "hidden_below", "hidden_above")
+    _remove_from_header(tmp_path / "old.cal", "hidden_below", "hidden_above", "unseen")
     later = sliced(seed=3)
     assert judged(Calibration.load(tmp_path / "old.cal"), later) == judged(old, later)
 
 
 def _without(reader):
-    return replace(reader, hidden_below=0.0, hidden_above=0.0)
+    return replace(reader, hidden_below=0.0, hidden_above=0.0, unseen=0.5)
 
 
 def _remove_from_header(path, *names):

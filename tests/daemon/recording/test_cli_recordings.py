@@ -58,6 +58,21 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tm
     assert json.loads(capsys.readouterr().out)["sees_loads"] is not misses_loads
 
 
+def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, capsys, monkeypatch):
+    fitted = []
+    monkeypatch.setattr("bank.estimators.fit", lambda *a, **options: fitted.append(fit(*a, **options)) or fitted[-1])
+    calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--out", str(tmp_path / "a.cal")]
+    assert main(calibrate) == 0
+    reader = fitted[-1].torque.reader
+    ends = f"read below {reader.low_end:.3g} or above {reader.high_end:.3g} N·m reach as far beyond as the range is"
+    assert ends in capsys.readouterr().out
+    assert main([*calibrate, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["reads_beyond"] is False
+    assert main([*calibrate, "--all-torques"]) == 0
+    assert "beyond" not in capsys.readouterr().out
+    assert np.isinf(fitted[-1].torque.reader.high_end)
+
+
 def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, capsys):
     recording, calibration = tmp_path / "a.mcap", tmp_path / "a.cal"
     assert main(["import", "mat", str(mat_folder()), "--out", str(recording)]) == 0
@@ -65,6 +80,8 @@ def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_
     assert main(["calibrate", str(slices_folder / "torque_slices"), "--out", str(calibration)]) == 0
     assert main(["evaluate", str(calibration), str(recording)]) == 2
     assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
+    assert main(["calibrate", str(recording), "--all-torques", "--out", str(calibration)]) == 2
+    assert "--all-torques is for slices" in capsys.readouterr().err
     assert main(["calibrate", "creep", str(recording), "--calibration", str(calibration)]) == 2
     assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
 

@@ -136,7 +136,7 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
 def test_later_torque_slices(shared):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
     (series,) = read_series(shared / "recordings/torque_slices")
-    errors, covered, widths_nm = [], [], []
+    errors, covered, widths_nm, vouched_nm = [], [], [], []
     for n in (19, 24, 29, 34, 39, 44):
         followed = follow(fit("fused", [series.between(0, n)], "earlier"), series.between(n, 49))
         figures = judge([followed])
@@ -148,11 +148,36 @@ def test_later_torque_slices(shared):
         errors.append(figures["rmse_nm"])
         covered += [figures["coverage_95"]] * figures["frames"]
         widths_nm += [one.torque_high_nm - one.torque_low_nm for one in followed.estimates]
+        vouched = follow(fit("fused", [series.between(0, n)], "earlier", all_torques=True), series.between(n, 49))
+        vouched_nm += [one.torque_high_nm - one.torque_low_nm for one in vouched.estimates]
     assert np.mean(errors) <= 0.012
     # Of good slices more lie inside than was promised: what cannot be seen in them has to lie inside too.
     assert np.mean(covered) >= 0.95
     # Which they would in any that are wide enough: the slices span 0.131 N·m.
-    assert np.median(widths_nm) <= 0.09
+    assert np.median(widths_nm) <= 0.12
+    # Intervals of torques near the ends reach beyond them, unless somebody vouches for the range.
+    assert np.median(vouched_nm) <= 0.09
+
+
+@pytest.mark.parametrize("name", ["fused", "regression"])
+@pytest.mark.parametrize(("low_nm", "high_nm"), [(0.0, 0.08), (0.05, 1.0), (0.07, 1.0)])
+def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_nm, high_nm, shared):
+    """They are read within the range, and up to nine tenths of them were false-valid; far beyond it some still are."""
+    (series,) = read_series(shared / "recordings/torque_slices")
+    inside = (low_nm <= series.torque_nm) & (series.torque_nm < high_nm)
+    calibration = fit(name, [_some(series, inside)], "a part of the torques")
+    figures = judge([follow(calibration, _some(series, ~inside))])
+    assert figures["valid_fraction"] > 0.9, "or nothing would be tested"
+    assert figures["coverage_95"] >= 0.9
+    vouched = fit(name, [_some(series, inside)], "no other will come", all_torques=True)
+    assert judge([follow(vouched, _some(series, ~inside))])["coverage_95"] < 0.8, "or there was nothing to hold"
+
+
+def _some(series: FrameSeries, chosen) -> FrameSeries:
+    return replace(
+        series, t_s=series.t_s[chosen], channels=series.channels[chosen], torque_t_s=series.torque_t_s[chosen],
+        torque_nm=series.torque_nm[chosen], diameter_mm=series.diameter_mm[chosen],
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ["fused", "regression"])
@@ -241,7 +266,7 @@ def test_a_load_half_a_second_off_in_a_short_recording_lies_within_the_intervals
         for one, truth in zip(estimates, truth_nm, strict=True)
         if np.isfinite(truth)
     ]
-    assert np.mean(missed) <= 0.2
+    assert np.mean(missed) <= 0.15
 
 
 def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_one(twists):

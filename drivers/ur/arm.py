@@ -13,6 +13,7 @@ from contextlib import contextmanager
 
 import dashboard_client
 import rtde_control
+import script_client
 
 from drivers.errors import DriverError
 from drivers.ur.connections import connections_to
@@ -21,6 +22,7 @@ from drivers.ur.probe import RTDE_PORT
 from drivers.ur.ready import Ready
 from drivers.ur.receiver import Receiver
 from drivers.ur.sample_age import SampleAge
+from drivers.ur.script import in_a_file, watched
 from drivers.ur.settings import UrSettings
 
 # A thread of the client asks its socket for data, sleeps for 0.1 ms, and asks again: 5 % of a core. Woken up to so much
@@ -39,14 +41,23 @@ class DashboardRefusedError(DriverError):
 class Arm:
     """One connection to a controller for reading, one for control; the dashboard when needed."""
 
-    def __init__(self, settings: UrSettings) -> None:
+    def __init__(self, settings: UrSettings, version: str) -> None:
         """Connect without starting a program, so that a robot in a protective stop can be connected to as well.
+
+        `version` is the controller's, as 5.17.3.0.
 
         Raises:
             RuntimeError: whatever ur-rtde says.
             ProbeError: the controller does not send its state.
         """
         self._settings = settings
+        major, minor = map(int, version.split(".")[:2])
+        # Not connected: it is asked for the text alone.
+        self._script = watched(script_client.ScriptClient("", major, minor).getScript(), settings.watchdog_hz)
+        if not self._script:
+            sys.stderr.write(
+                "The control script of this ur-rtde has another form: a command alone arms its watchdog.\n"
+            )
         self._receiver = Receiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
         kind, ours = rtde_control.RTDEControlInterface, connections_to(RTDE_PORT)
         patience_ns = 1e9 / settings.watchdog_hz
@@ -123,13 +134,19 @@ class Arm:
         return self._once(self._control.zeroFtSensor)
 
     def upload(self) -> bool:
-        """Send the control script; the program then starts by itself."""
-        uploaded = bool(self._control.reuploadScript())
+        """Send the control script; the program then starts by itself, and ends when it hears nothing."""
+        if self._script:
+            with in_a_file(self._script) as path:
+                # Sends it, too.
+                self._control.setCustomScriptFile(path)
+            uploaded = True
+        else:
+            uploaded = bool(self._control.reuploadScript())
         self._ready.called()
         return uploaded
 
     def arm_watchdog(self) -> bool:
-        """Have the robot end its program when it hears nothing; to be done after every upload."""
+        """Have the robot end its program when it hears nothing; after every upload, which it shows to have taken."""
         return self._once(self._control.setWatchdog, self._settings.watchdog_hz)
 
     def end_program(self) -> None:

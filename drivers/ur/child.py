@@ -150,12 +150,12 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "Arm":
         _fail(pipe, "not-installed", sentences.NOT_INSTALLED)
     pipe.send(Phase("greeting the controller"))
     try:
-        probe(settings.host, settings.connect_timeout_s / 3)
+        version = probe(settings.host, settings.connect_timeout_s / 3)
     except ProbeError as error:
         _fail(pipe, error.kind, str(error))
     pipe.send(Phase("connecting"))
     try:
-        return Arm(settings)
+        return Arm(settings, version)
     except ProbeError as error:
         _fail(pipe, error.kind, str(error))
     except RuntimeError as error:

@@ -97,6 +97,9 @@ class Recovery:
             # last, and turn the wrist again, before its watchdog is armed. A cycle for what replaces it.
             self._cleared = self._arm.clear_command()
         else:
+            if self._uploaded:
+                # A sign of life, too: the program arms its watchdog by itself, whenever it begins.
+                self._arm.clear_command()
             # Not every upload takes: the controller may still be in the middle of something.
             self._every_second("upload", now_ns, self._arm.upload)
             self._uploaded = True

@@ -120,8 +120,11 @@ class Robot:
 
     # ---- program --------------------------------------------------------------------------------------------------
 
-    def upload(self) -> None:
-        """Run a control script: what arrives on the script port, once it is complete."""
+    def upload(self, watchdog_hz: float = 0.0) -> None:
+        """Run a control script: what arrives on the script port, once it is complete.
+
+        `watchdog_hz` is what the script itself arms its watchdog with, before it reads a register; 0 where it does not.
+        """
         if self.safety_mode != SAFETY_NORMAL or self.robot_mode != MODE_RUNNING:
             self._note("script-refused", f"robot mode {self.robot_mode}, safety mode {self.safety_mode}")
             return
@@ -131,6 +134,10 @@ class Robot:
         self._watchdog_s = math.inf
         self.runtime_state = PLAYING
         self._note("program-started")
+        if watchdog_hz:
+            # What a client has written before counts: nobody says that the time begins anew.
+            self._watchdog_s = 1.0 / watchdog_hz
+            self._note("script-armed-watchdog", f"{watchdog_hz:g} Hz")
 
     def end_program(self, cause: str) -> None:
         """End the program; the arm slows down by itself."""

@@ -7,6 +7,7 @@ the script moves the arm ends the program, as it does in URScript.
 """
 
 import math
+import re
 from typing import Protocol
 
 import numpy as np
@@ -24,6 +25,16 @@ TCP_OFFSET, FORWARD_KINEMATICS, IS_STEADY, FLANGE_POSE = 40, 43, 47, 58
 END = 255
 
 ASYNC_RUNNING = 1 << 15
+
+
+# With a number for the frequency: the script's text has the call for its command as well, with a variable.
+_ARMED = re.compile(rb'rtde_set_watchdog\("input_int_register_0", ([0-9.]+), "stop"\)')
+
+
+def armed_hz(text: bytes | bytearray) -> float:
+    """Return what a script arms its watchdog with before its loop, or 0."""
+    found = _ARMED.search(text)
+    return float(found[1]) if found is not None else 0.0
 
 
 class Arm(Protocol):

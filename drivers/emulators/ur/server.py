@@ -9,6 +9,7 @@ from contextlib import AsyncExitStack, suppress
 from drivers.emulators.ur import dashboard
 from drivers.emulators.ur.robot import Event, Robot
 from drivers.emulators.ur.rtde import NotRtdeError, RtdeSession
+from drivers.emulators.ur.script import armed_hz
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # A control script closes its outermost block in the first column.
@@ -127,7 +128,7 @@ class Controller:
             while data := await reader.read(65536):
                 text += data
                 if text.endswith(SCRIPT_END):
-                    self.robot.upload()
+                    self.robot.upload(armed_hz(text))
                     text.clear()
                 elif len(text) > LARGEST_SCRIPT:
                     log.warning("a script without an end was dropped after %d bytes", len(text))

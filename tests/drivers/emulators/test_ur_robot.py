@@ -18,6 +18,7 @@ from drivers.emulators.ur.script import (
     SPEED_STOP,
     STOP_J,
     ZERO_FT,
+    armed_hz,
 )
 
 DT_S = 0.002
@@ -107,6 +108,20 @@ def test_watchdog_does_not_outlive_the_program_it_was_armed_in() -> None:
     robot.upload()
     wait(robot, 1.0)
     assert robot.program_running
+
+
+def test_script_may_arm_its_watchdog_by_itself() -> None:
+    text = b'  rtde_set_watchdog("input_int_register_0", watchdog_min_frequency, "stop")\n'
+    assert armed_hz(text) == 0.0
+    own_hz = armed_hz(text + b'rtde_set_watchdog("input_int_register_0", 12.5, "stop")\n')
+    assert own_hz == 12.5
+    robot = started()
+    robot.write("input_int_register_0", 0)
+    robot.upload(own_hz)
+    wait(robot, 0.06)
+    assert robot.program_running
+    wait(robot, 0.06)
+    assert not robot.program_running
 
 
 def test_watchdog_ends_the_program_under_a_blocking_move() -> None:

@@ -261,3 +261,16 @@ def test_unlocking_a_controller_whose_states_stay_old_is_answered_in_time() -> N
     flight.arm.calls.clear()
     flight.fly(100)
     assert flight.arm.calls == [], "nothing is unlocked so long after the operator's word"
+
+
+def test_program_that_is_slow_to_begin_is_given_signs_of_life_until_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It arms its watchdog by itself as it begins, whenever that is."""
+    flight = Flight()
+    upload = flight.arm.upload
+    monkeypatch.setattr(flight.arm, "upload", lambda: flight.arm.calls.append("upload"))
+    flight.fly(50)
+    assert flight.arm.calls == ["clear_command", "upload", *["clear_command"] * 48]
+    monkeypatch.setattr(flight.arm, "upload", upload)
+    flight.arm.be(runtime_state=2)
+    flight.fly(1)
+    assert flight.arm.calls[-1] == "arm_watchdog"

@@ -1,0 +1,64 @@
+"""The control script as it is sent: ur-rtde's own, with its watchdog armed before it reads a register."""
+
+import asyncio
+import sys
+from pathlib import Path
+
+import pytest
+
+from drivers.ur.script import in_a_file, watched
+from tests.drivers.ur.robots import ROOT
+from tests.emulator_process import EmulatorProcess as ControllerProcess
+
+# Uploads the script, and is gone before the watchdog is armed by a command.
+DIES_TOO_SOON = """
+import os, sys, time
+from drivers.ur.arm import Arm
+from tests.drivers.ur.robots import settings_for
+arm = Arm(settings_for(sys.argv[1]), "5.17.3.0")
+while not arm.clear_command():
+    time.sleep(0.001)
+arm.upload()
+os._exit(0)
+"""
+
+
+def test_of_ur_rtdes_own_script_one_line_is_new_and_comes_before_it_reads_a_register() -> None:
+    script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
+    text = script_client.ScriptClient("", 5, 17).getScript()
+    program = watched(text, 10.0)
+    lines, its = program.splitlines(), ["def rtde_control():", *text.splitlines(), "end"]
+    (at,) = [number for number, line in enumerate(lines) if "rtde_set_watchdog(" in line and ", 10," in line]
+    assert lines[at].strip() == 'rtde_set_watchdog("input_int_register_0", 10, "stop")'
+    assert lines[:at] + lines[at + 1 :] == its
+    (loop,) = [number for number, line in enumerate(lines) if line.strip() == "while keep_running:"]
+    assert at < loop
+    # What comes before it in the program itself, beside functions, reads nothing.
+    assert not any("read_input" in line for line in lines[at:loop])
+    assert program.endswith("\nend\n")
+
+
+def test_script_of_another_form_is_not_touched() -> None:
+    assert not watched("def other():\n  sync()\nend\n", 10.0)
+    assert not watched("        keep_running = True\n" * 2, 10.0)
+
+
+def test_program_is_in_a_file_for_as_long_as_it_is_needed() -> None:
+    with in_a_file("a program\n") as path:
+        assert [Path(path).read_text() for _ in range(2)] == ["a program\n"] * 2
+
+
+@pytest.mark.real_time
+async def test_program_of_a_process_that_dies_before_it_has_armed_the_watchdog_ends_by_it(
+    controller: ControllerProcess,
+) -> None:
+    """Nothing moves, for the register is cleared before; and nothing stays that would do what is written there."""
+    pytest.importorskip("rtde_control", reason="ur-rtde has wheels for CPython up to 3.12 on x86-64 only")
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-c", DIES_TOO_SOON, controller.host, cwd=ROOT, stdout=asyncio.subprocess.DEVNULL
+    )
+    assert await process.wait() == 0
+    started = await controller.event("program-started", 0)
+    ended = await controller.event("program-ended", started["t_mono_ns"])
+    assert "watchdog" in ended["detail"]
+    assert not controller.happened("motion-started", 0)

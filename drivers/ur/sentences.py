@@ -22,6 +22,10 @@ NOT_OURS = (
 NOT_STOPPING = (
     "The arm did not come to rest in time after it was told to stop: keep clear of it, look at the teach pendant."
 )
+PAUSED = (
+    "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach pendant, "
+    "or unlock, which stops it and starts the control program."
+)
 ASTRAY = "The arm moved although nothing was asked of it: look whether somebody or something else moves it."
 
 _SAFETY = {
@@ -107,6 +111,8 @@ def unfit(reading: Reading, host: str, state_timeout_s: float) -> str:
         return _SAFETY.get(reading.safety_mode, f"The robot's safety system is in mode {reading.safety_mode}.")
     if reading.robot_mode != ROBOT_MODE_RUNNING:
         return f"The arm is not powered and released (robot mode {reading.robot_mode}): unlock to power it."
+    if reading.program_paused:
+        return PAUSED
     if not reading.program_running:
         return (
             "The control program on the robot does not run: it was stopped at the pendant, or by the watchdog when "

@@ -197,3 +197,19 @@ def test_program_whose_states_are_old_is_not_taken_for_somebody_elses() -> None:
     flight.fly(500)
     flight.arm.be(age_ns=0, runtime_state=4)
     assert len(asked_s(flight, 0.5)) == 1
+
+
+def test_program_that_both_a_process_and_its_daemon_left_paused_is_told_to_who_may_resume_it() -> None:
+    """Once the protective stop is unlocked at the pendant, its button to play would turn the wrist."""
+    flight = Flight()
+    flight.arm.be(safety_mode=3, runtime_state=4)
+    flight.fly(5)
+    assert "Protective stop" in flight.state.blocked
+    flight.arm.be(safety_mode=1)
+    flight.fly(5)
+    assert "is paused" in flight.state.blocked
+    assert "unlock, which stops it" in flight.state.blocked
+    assert "stop_program" not in flight.arm.calls
+    assert flight.ask(Unlock()).accepted
+    assert "stop_program" in flight.arm.calls
+    assert not flight.state.blocked

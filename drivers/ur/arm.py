@@ -64,6 +64,7 @@ class Arm:
         with _woken_late(min(_LONGEST_POLL_SLACK_NS, int(patience_ns / _SLACKS_IN_PATIENCE))):
             self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
         self._its_connections = connections_to(RTDE_PORT) - ours
+        self._takes_scripts = True
         # Whether a straight move may be under way: one was begun, and the wrist has not been turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
@@ -85,12 +86,15 @@ class Arm:
             sample.speed_scaling,
             now_ns,
             self._age.age_ns(sample.timestamp_s, now_ns),
-            self._receiver.connected
-            and self._control.isConnected()
-            and all(one.lasts for one in self._its_connections),
+            self._connected,
             # Two calls that wrap an object: not in each cycle in which the answer is known.
             self._may_move_linearly and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
+
+    @property
+    def _connected(self) -> bool:
+        theirs = self._takes_scripts and self._control.isConnected()
+        return self._receiver.connected and theirs and all(one.lasts for one in self._its_connections)
 
     def wrist(self, command: WristSpeed) -> bool:
         """Turn wrist 3, the other joints held; of an arm that is on no straight move."""
@@ -135,15 +139,19 @@ class Arm:
 
     def upload(self) -> bool:
         """Send the control script; the program then starts by itself, and ends when it hears nothing."""
-        if self._script:
-            with in_a_file(self._script) as path:
-                # Sends it, too.
-                self._control.setCustomScriptFile(path)
-            uploaded = True
-        else:
-            uploaded = bool(self._control.reuploadScript())
+        try:
+            if self._script:
+                with in_a_file(self._script) as path:
+                    # Sends it, too.
+                    self._control.setCustomScriptFile(path)
+            else:
+                self._control.reuploadScript()
+        except RuntimeError as error:
+            # The controller has closed the connection for scripts, or restarts: ur-rtde does not open it again.
+            sys.stderr.write(f"The control script could not be sent: {error}.\n")
+            self._takes_scripts = False
         self._ready.called()
-        return uploaded
+        return self._takes_scripts
 
     def arm_watchdog(self) -> bool:
         """Have the robot end its program when it hears nothing; after every upload, which it shows to have taken."""

@@ -231,3 +231,20 @@ def test_script_that_is_sent_arms_its_watchdog_by_itself(arm: ModuleType, monkey
     other = arm.Arm(SETTINGS, VERSION)
     assert other.upload()
     assert other._control.sent == "its own"
+
+
+def test_connection_on_which_no_script_can_be_sent_is_a_lost_one(
+    arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Only another process opens it again; the one that met it died of it, and told its traceback."""
+
+    class Closed(Controlled):
+        def setCustomScriptFile(self, _path: str) -> None:  # noqa: N802 - ur-rtde's name
+            raise RuntimeError("write: Broken pipe")
+
+    monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Closed)
+    one = arm.Arm(SETTINGS, VERSION)
+    assert one.read().connected
+    assert not one.upload()
+    assert not one.read().connected
+    assert "could not be sent: write: Broken pipe" in capsys.readouterr().err

@@ -14,6 +14,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from multiprocessing import active_children, get_context, resource_tracker
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
@@ -85,10 +86,23 @@ def _end_pool(pool: ProcessPoolExecutor, unfinished: Collection[object], others:
     `others` are our children that are none of its processes.
     """
     with _interrupted_later():
-        for process in active_children() if unfinished else ():
-            if process not in others:
-                process.terminate()
+        if unfinished:
+            _let_go_of_the_queue(pool)
+            for process in active_children():
+                if process not in others:
+                    process.terminate()
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _let_go_of_the_queue(pool: ProcessPoolExecutor) -> None:
+    """Let the thread that hands out tasks see that nobody takes them: Pythons before 3.11.5 wait for it for ever.
+
+    A task larger than a pipe holds (64 kB) is written while it is read, and an end to read from is ours. The cure is
+    that of later Pythons (CPython issue 94777), which may be closing it themselves.
+    """
+    if sys.version_info < (3, 11, 5):
+        reader: Connection = vars(vars(pool)["_call_queue"])["_reader"]
+        reader.close()
 
 
 class Cluster:
@@ -211,9 +225,10 @@ def _interrupted_later() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        # Also where it failed: processes that are begun here may have been ended with us.
-        if heard:
-            signal.raise_signal(heard[0])
+        # Also where it failed: processes that are begun here may have been ended with us. The first one raises, unless
+        # it is ignored (SIGINT, in a script's background) and the next one is not.
+        for told in heard:
+            signal.raise_signal(told)
 
 
 @contextmanager

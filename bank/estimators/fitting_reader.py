@@ -109,9 +109,11 @@ def fit_reader(
     if mixed is not None:
         heads = ((head_of(features[past], values[past], strength), mixed(past, future)) for past, future in blocks)
         hidden = _hidden(features, values, heads, inflation)
+    low, high, beyond = float(values.min()), float(values.max()), _UNSEEN * float(np.ptp(values))
     return Reader(
-        head, intervals, float(values.min()), float(values.max()),
-        low_end, high_end, misses_loads, centre, reach, *hidden, widened, _UNSEEN,
+        head, intervals, low, high, low_end, high_end, misses_loads, centre, reach, *hidden, widened,
+        # However far from the range it is, a load may always be none.
+        min(low - beyond, 0.0), max(high + beyond, 0.0),
     )  # fmt: skip
 
 

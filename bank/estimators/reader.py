@@ -31,8 +31,8 @@ class Reader:
     interval reaches over all values that it was calibrated on. hidden_below and hidden_above are how far below and
     above what is read the truth may lie for what is foreign in a frame unseen, at a nearness of 1 (0 where that was
     not looked at, as in older calibrations). widened is by how many times the intervals of loads are wider because
-    nobody knows when they were measured. unseen is how far beyond the range, in spans of it, values may lie that are
-    read at its ends (half of one in older calibrations).
+    nobody knows when they were measured. lowest and highest are the furthest values that may be read at the ends
+    (NaN in older calibrations: half a range beyond it).
     """
 
     head: Head
@@ -47,7 +47,8 @@ class Reader:
     hidden_below: float = 0.0
     hidden_above: float = 0.0
     widened: float = 1.0
-    unseen: float = 0.5
+    lowest: float = math.nan
+    highest: float = math.nan
 
     def read(
         self,
@@ -69,7 +70,7 @@ class Reader:
         raw, grown = self._raw(features, whole)
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
-        value, beyond = shown(self.head, raw), self.unseen * (self.high - self.low)
+        value = shown(self.head, raw)
         moved = shown(self.head, grown) - value
         below = max(half + max(-moved, 0.0), nearness * self.hidden_below)
         above = max(half + max(moved, 0.0), nearness * self.hidden_above)
@@ -79,10 +80,13 @@ class Reader:
             other_way = widening * TWO_SIDED_95 * self.head.sigma - raw
             below, above = (max(below, other_way), above) if self.head.sign > 0 else (below, max(above, other_way))
         if value <= self.low_end:
-            below = max(below, value - (self.low - beyond))
+            below = max(below, value - self._or_half_beyond(self.lowest, self.low, -1))
         if value >= self.high_end:
-            above = max(above, self.high + beyond - value)
+            above = max(above, self._or_half_beyond(self.highest, self.high, 1) - value)
         return value, below, above
+
+    def _or_half_beyond(self, furthest: float, end: float, sign: int) -> float:
+        return end + sign * 0.5 * (self.high - self.low) if math.isnan(furthest) else furthest
 
     def _raw(self, features: FloatArray, whole: FloatArray | None) -> tuple[float, float]:
         """Return what the head says of (d,) features, and of them with what may be missing: the same where none is."""

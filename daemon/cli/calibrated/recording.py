@@ -205,12 +205,11 @@ def _reads_within(reader: "Reader") -> bool:
 
 def _ends(reader: "Reader") -> str:
     """Return what it means that torques beyond the range are read within it, and what helps."""
-    low_nm, high_nm, below_nm, above_nm = (
-        round(limit, 3) + 0.0 for limit in (reader.low, reader.high, reader.low_end, reader.high_end)
-    )
+    limits = (reader.low, reader.high, reader.low_end, reader.high_end, reader.lowest, reader.highest)
+    low_nm, high_nm, below_nm, above_nm, lowest_nm, highest_nm = (round(limit, 3) + 0.0 for limit in limits)
     return (
         f"Torques beyond the calibrated {low_nm:g} to {high_nm:g} N·m may be read within them, as the outermost were "
-        f"when they were left out: intervals of what is read below {below_nm:g} or above {above_nm:g} N·m reach as far "
-        "beyond as the range is wide, and no further. Calibrate on all torques that will come, and say so with "
-        "--all-torques."
+        f"when they were left out: intervals of what is read below {below_nm:g} N·m reach to {lowest_nm:g}, of what is "
+        f"read above {above_nm:g} to {highest_nm:g} N·m, and no further. Calibrate on all torques that will come, and "
+        "say so with --all-torques."
     )

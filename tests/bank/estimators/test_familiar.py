@@ -100,6 +100,15 @@ def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_
     assert vouched.read(np.array([0.6]))[0] == value
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_is_read_at_the_end_towards_zero_may_be_no_load_at_all(sign):
+    rng = np.random.default_rng(1)
+    values = rng.uniform(0.0, 1.0, 200)
+    reader = reader_of(saturating(values) + rng.normal(0, 1e-3, (200, 2)), sign * (values + 3.0))
+    value, *reach = reader.read(saturating(np.array([-3.0]))[0])
+    assert value - sign * reach[0 if sign > 0 else 1] == pytest.approx(0.0)
+
+
 def test_where_values_beyond_are_read_as_such_intervals_reach_no_further_than_the_range():
     rng = np.random.default_rng(2)
     values = rng.uniform(0.0, 1.0, 200)

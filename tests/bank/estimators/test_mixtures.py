@@ -132,13 +132,13 @@ def test_a_calibration_from_before_is_read_as_it_was(sliced, tmp_path):
     calibration = fit("fused", [sliced()], "all")
     old = replace(calibration, torque=replace(calibration.torque, reader=_without(calibration.torque.reader)))
     old.save(tmp_path / "old.cal")
-    _remove_from_header(tmp_path / "old.cal", "hidden_below", "hidden_above", "unseen")
+    _remove_from_header(tmp_path / "old.cal", "hidden_below", "hidden_above", "lowest", "highest")
     later = sliced(seed=3)
     assert judged(Calibration.load(tmp_path / "old.cal"), later) == judged(old, later)
 
 
 def _without(reader):
-    return replace(reader, hidden_below=0.0, hidden_above=0.0, unseen=0.5)
+    return replace(reader, hidden_below=0.0, hidden_above=0.0, lowest=np.nan, highest=np.nan)
 
 
 def _remove_from_header(path, *names):

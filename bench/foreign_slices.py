@@ -105,10 +105,18 @@ def gripped_frames(stream: FrameSeries) -> dict[str, Floats]:
 
 
 def counted(
-    name: Name, slices: FrameSeries, n: int, fingertips: Mapping[str, Floats], cylinders: FrameSeries, bank: Bank
+    name: Name,
+    slices: FrameSeries,
+    n: int,
+    fingertips: Mapping[str, Floats],
+    cylinders: FrameSeries,
+    bank: Bank,
+    *,
+    all_torques: bool = False,
 ) -> list[Counted]:
     """Return what an estimator that is calibrated on the first n slices says of the others, as they are and mixed."""
-    tracker = Tracker(fit(name, [slices.between(0, n)], "earlier slices", Physics(bank)), bank)
+    calibration = fit(name, [slices.between(0, n)], "earlier slices", Physics(bank), all_torques=all_torques)
+    tracker = Tracker(calibration, bank)
     future = slices.between(n, len(slices.t_s))
     later, truth_nm = future.channels[:, 0], future.torque_at_frames()
     mixed = [(GOOD, "", 0.0, later)]
@@ -196,6 +204,9 @@ def main() -> None:
     parser.add_argument("recordings", type=Path, help="folder with torque_slices, diameter_slices and streams")
     parser.add_argument("--bank", type=Path, help="a bank, for the estimator bank (default: a small one, built)")
     parser.add_argument("--before", type=Path, metavar="JSON", help="numbers of an earlier run, to compare with")
+    parser.add_argument(
+        "--all-torques", action="store_true", help="calibrate as `shearloop calibrate --all-torques` does"
+    )
     parser.add_argument("--out", type=Path, default=Path("build/foreign"))
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
@@ -213,7 +224,15 @@ def main() -> None:
         one
         for name in NAMES
         for origin in ORIGINS
-        for one in counted(name, slices, round(origin * len(slices.t_s)), fingertips, cylinders, bank)
+        for one in counted(
+            name,
+            slices,
+            round(origin * len(slices.t_s)),
+            fingertips,
+            cylinders,
+            bank,
+            all_torques=args.all_torques,
+        )
     ]
     (args.out / "foreign_slices.json").write_text(json.dumps([asdict(one) for one in found], indent=1) + "\n")
     print("\n".join(tables(found, before)))

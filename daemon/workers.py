@@ -6,6 +6,7 @@ with it when it died is given to another one; only where tasks kill one worker a
 
 import asyncio
 import logging
+import os
 import signal
 import socket
 import sys
@@ -152,26 +153,28 @@ def in_order(found: Iterable[tuple[int, R]]) -> list[R]:
 
 
 @contextmanager
-def workers(cluster: str | None, jobs: int = 1) -> "Iterator[Workers]":
+def workers(cluster: str | None, jobs: int | None = None) -> "Iterator[Workers]":
     """Return where tasks run: on the cluster at an address, on a local one, or in `jobs` processes without.
 
+    Where `jobs` is not said, a local cluster has a worker for each processor; without a cluster tasks run in turn.
     A local cluster needs the extra `cluster`; without it, processes do the same. Raises UserError for an address at
     which no scheduler answers, and for one that is given without the extra.
     """
     if cluster is None:
-        yield InTurn() if jobs == 1 else Processes(jobs)
+        yield InTurn() if jobs in (None, 1) else Processes(jobs)
         return
+    n_local = len(os.sched_getaffinity(0)) if jobs is None else jobs
     try:
         from distributed import Client
     except ImportError as error:
         if cluster == LOCAL:
-            yield Processes(max(jobs, 1))
+            yield Processes(n_local)
             return
         raise UserError(f"--cluster needs {error.name}: `pip install 'shearloop[cluster]'`") from error
     # It logs each connection that it lost with a traceback; what that means for us, `Cluster.map` says.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if cluster == LOCAL:
-        with _local_client(max(jobs, 1)) as client:
+        with _local_client(n_local) as client:
             yield Cluster(client)
         return
     _reach(cluster)

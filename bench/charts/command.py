@@ -34,7 +34,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--split", type=float, default=0.6, metavar="SHARE", help="earlier part, which is fitted to (default: 0.6)"
     )
     add_cluster(parser)
-    parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes to share the work (default: 1)")
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="processes or local workers (default: 1; --cluster alone: one per core)"
+    )
     parser.add_argument(
         "--rounds", type=int, default=5, metavar="N", help="how often everything is timed, by turns (default: 5)"
     )
@@ -48,9 +50,9 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--split must be a share from 0.1 to 0.9, not {args.split:g}")
     if args.rounds < 1:
         raise UserError(f"--rounds must be 1 or more, not {args.rounds}")
-    if args.jobs < 1:
+    if args.jobs is not None and args.jobs < 1:
         raise UserError(f"--jobs must be 1 or more, not {args.jobs}")
-    if args.name == "speed-accuracy" and (args.cluster is not None or args.jobs > 1):
+    if args.name == "speed-accuracy" and (args.cluster is not None or args.jobs not in (None, 1)):
         raise UserError("speed-accuracy measures times, one thread on this machine: leave out --cluster and --jobs")
     if args.name == "scene" and (args.bank is not None or args.mesh is not None):
         raise UserError(

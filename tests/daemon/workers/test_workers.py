@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import pytest
 
 from daemon.cli import main
 from daemon.errors import UserError
-from daemon.workers import InTurn, Processes, workers
+from daemon.workers import LOCAL, InTurn, Processes, workers
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 from tests.daemon.workers.conftest import ROOT, STARTED_S
 
@@ -50,6 +51,23 @@ def test_the_numbers_are_the_same_wherever_they_are_computed(scheduler: str) -> 
     assert dict(Processes(2).map(square, shared, items)) == alone
     with workers(scheduler) as cluster:
         assert dict(cluster.map(square, shared, items)) == alone
+
+
+def test_a_cluster_of_this_machines_own_has_a_worker_for_each_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    @contextmanager
+    def local(jobs: int) -> Iterator[None]:
+        asked.append(jobs)
+        yield None
+
+    monkeypatch.setattr("daemon.workers._local_client", local)
+    for jobs in (None, 1, 5):
+        with workers(LOCAL, jobs):
+            pass
+    assert asked == [len(os.sched_getaffinity(0)), 1, 5]
+    with workers(None) as alone:
+        assert isinstance(alone, InTurn)
 
 
 def test_what_a_task_raises_is_raised_here(scheduler: str) -> None:

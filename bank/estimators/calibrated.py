@@ -14,6 +14,7 @@ from bank.errors import CalibrationError
 from bank.estimators.archive import read_archive, write_archive
 from bank.estimators.cylinders import is_line
 from bank.estimators.familiar import FAMILIAR, DifferenceGuard
+from bank.estimators.filling import Filling, died
 from bank.estimators.guard import SideGuard
 from bank.estimators.heads import Ridge
 from bank.estimators.memory import Memory
@@ -63,9 +64,10 @@ class Task:
 class Calibration:
     """All that an estimator knows of its fingertips; `source` says in words what it was fitted to.
 
-    guards and motion are there for raw frames; scale (m, 896) divides differences channel by channel; image (p, 896)
-    turns them into pixels. bank_identity is empty for an estimator without a bank. tool_mm is the diameter of the one
-    tool that all was recorded with, NaN where it is not known or not one.
+    guards and motion are there for raw frames; scale (m, 896) divides differences channel by channel, those that were
+    dead by infinity; image (p, 896) turns them into pixels. bank_identity is empty for an estimator without a bank.
+    tool_mm is the diameter of the one tool that all was recorded with, NaN where it is not known or not one. filling is
+    there for raw frames that are read without memory; calibrations that were made before there was any have none.
     """
 
     estimator: Name
@@ -81,6 +83,7 @@ class Calibration:
     image: FloatArray | None
     torque: Task | None
     diameter: Task | None
+    filling: Filling | None = None
 
     def save(self, path: str | Path) -> None:
         """Write the calibration's file, the same bytes for the same calibration; CalibrationError where it fails."""
@@ -149,6 +152,9 @@ def features_of(
     features = (difference / calibration.scale).ravel()
     return Seen(np.append(features, t_s) if calibration.estimator == "fused" else features)
 
+
+# In which what stands for unusable channels may be off, where nothing stands for any.
+_NO_WAYS: FloatArray = np.zeros((0, 1, N_CHANNELS))
 
 # The features that each quantity is read from, where that is not all of them: the paper's sigma and its square, and k.
 PAPER_COLUMNS = {"torque": slice(1, 3), "diameter": slice(0, 1)}
@@ -262,12 +268,13 @@ class Tracker:
         if not wanted:
             return Estimate(valid=False, why=tuple(refused))
         guard = next((task.guard for task, _ in wanted.values() if task.guard is not None), None)
-        usable_share = np.count_nonzero(usable) / usable.size
-        if guard is not None and usable_share < 1.0:
-            # A curve does without dead channels; all else has to be told what they would have said.
-            curve = calibration.estimator == "fused"
-            said = np.full(N_CHANNELS, np.nan) if curve else guard.filled(difference[0], usable[0])
-            difference = np.where(usable, difference, said)
+        usable_share, ways = np.count_nonzero(usable) / usable.size, _NO_WAYS
+        if usable_share < 1.0 and calibration.motion is None:
+            older = calibration.kind == "raw" and calibration.filling is None
+            missing = died(calibration.guards, usable) if older else ()
+            if missing:
+                return Estimate(valid=False, why=missing)
+            difference, ways = self._without(usable, difference, guard)
         seen = features_of(calibration, self._locator, difference, moved, t_s)
         held = self._memory.held if self._memory is not None else difference
         if seen.place is not None and seen.place.ambiguous:
@@ -283,9 +290,18 @@ class Tracker:
                 grown = features_of(calibration, self._locator, difference / (1.0 - judged.missing), moved, t_s)
                 whole = read_from(calibration, name, grown.features, held)
             read = task.reader.read(features, usable_share, judged.widening, judged.nearness, whole)
+            unread: tuple[str, ...] = ()
+            if len(ways):
+                off = [features_of(calibration, self._locator, difference + way, moved, t_s).features for way in ways]
+                values_off = [task.reader.read(read_from(calibration, name, one, held))[0] for one in off]
+                unsure = TWO_SIDED_95 * math.hypot(*(one - read[0] for one in values_off))
+                if 2 * unsure > read[1] + read[2]:
+                    # They told of it, and what the others say of them is a guess.
+                    unread = died(calibration.guards, usable)
+                read = _widened(read, unsure)
             if name == "diameter" and self._memory is not None:
                 read = _widened(read, self._place_noise_mm / math.sqrt(self._memory.held_frames))
-            why = task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])
+            why = unread or task.refuse_place(seen.place) or task.reader.refuse(read[0], features, name, tasks[name][1])
             refused += [reason for reason in why if reason not in refused]
             if not why:
                 values[name] = read
@@ -293,6 +309,23 @@ class Tracker:
             # What a frame beyond the calibrated torques says of the tool was not calibrated either.
             values.clear()
         return _with_place(_estimate(values, tuple(refused)), seen.place)
+
+    def _without(
+        self, usable: BoolArray, difference: FloatArray, guard: DifferenceGuard | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return a (m, 896) difference in which channels that are not usable have what the others say of them.
+
+        And the (k, m, 896) ways in which that may be off, each by a standard deviation.
+        """
+        if self.calibration.filling is not None:
+            return self.calibration.filling.filled(difference, usable)
+        if guard is None:
+            # All of them were dead at calibration too.
+            return difference, _NO_WAYS
+        # A curve does without dead channels; all else has to be told what they would have said.
+        curve = self.calibration.estimator == "fused"
+        said = np.full(N_CHANNELS, np.nan) if curve else guard.filled(difference[0], usable[0])
+        return np.where(usable, difference, said), _NO_WAYS
 
 
 def columns_for(estimator: Name, quantity: str, features: FloatArray) -> FloatArray:

@@ -9,6 +9,7 @@ from bank.errors import CalibrationError
 from bank.estimators.alignment import torque_within
 from bank.estimators.calibrated import NEEDS_BANK, Calibration, Task, columns_for, features_of
 from bank.estimators.cylinders import LEAST_LEFT, Gripped, fit_cylinders
+from bank.estimators.filling import Filling
 from bank.estimators.fitting_choices import Physics, ks_of, locator_of, ridge_for, strengths_for
 from bank.estimators.fitting_reader import error_on_later, fit_reader, one_sided
 from bank.estimators.gripped import gripped_part
@@ -47,7 +48,7 @@ def fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics,
         SideGuard.fit(side, *(_frames_of(one, part, layer) for one, part in zip(recordings, parts, strict=True)))
         for layer, side in enumerate(blank.sides)
     )
-    calibration = replace(blank, guards=guards, scale=_finite(np.array([guard.noise for guard in guards])))
+    calibration = replace(blank, guards=guards, scale=np.array([guard.noise for guard in guards]))
     if blank.estimator == "fused":
         gripped = [one.channels[part[1]] for one, part in zip(recordings, parts, strict=True)]
         motion = replace(Motion.fit(gripped, guards, _N_DIRECTIONS, _N_LAGS), placed=True)
@@ -62,6 +63,9 @@ def fit_raw(blank: Calibration, recordings: list[FrameSeries], physics: Physics,
     rows = [row for i, one in enumerate(recordings) for row in _replayed(calibration, locator, i, one, every)]
     if not rows:
         raise CalibrationError("no frame of the recordings is gripped and undisturbed for long enough to calibrate on")
+    if calibration.motion is None:
+        places = np.array([row.place for row in rows])
+        calibration = replace(calibration, filling=Filling.fit(places, guards))
     features = np.array([row.features for row in rows])
     torque_nm = np.array([row.torque_nm for row in rows])
     calibration, reader, unexplained = _torque_reader(
@@ -205,8 +209,3 @@ def _thinning(calibration: Calibration, recordings: list[FrameSeries]) -> int:
     if calibration.estimator != "paper":
         return 1
     return max(1, sum(len(one.t_s) for one in recordings) // _LARGEST_MATCHED)
-
-
-def _finite(noise: FloatArray) -> FloatArray:
-    """Return the noise with that of dead channels so large that they say nothing."""
-    return np.where(np.isfinite(noise), noise, 1e9)

@@ -41,6 +41,7 @@ SECTIONS = (
             "bank/estimators/guard.py",
             "bank/estimators/guards.py",
             "bank/estimators/familiar.py",
+            "bank/estimators/filling.py",
             "daemon/skin/estimator.py",
             "daemon/skin/zero.py",
             "drivers/shear_skin/judge.py",

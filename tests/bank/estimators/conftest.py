@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from bank.bank_file import Bank, BankDefinition, write_bank
 from bank.channels import N_CHANNELS
 from bank.estimators import Calibration, FrameSeries, fit
 
@@ -105,3 +106,17 @@ def recorded() -> FrameSeries:
 def fused_calibration(recorded: FrameSeries) -> Calibration:
     """An estimator calibrated on the shared recording."""
     return fit("fused", [recorded], "a played rig")
+
+
+@pytest.fixture(scope="session")
+def bank(tmp_path_factory) -> Bank:
+    """Signals that move smoothly along the channels with k and widen with sigma."""
+    k, sigma = np.linspace(1, 3, 21), np.linspace(0.5, 2, 16)
+    channel = np.linspace(0, 4, 896)
+    signals = np.exp(-0.5 * ((channel - k[:, None, None]) / (0.3 * sigma[None, :, None])) ** 2)
+    path = tmp_path_factory.mktemp("bank") / "smooth.bank"
+    shape = (21, 16)
+    homogeneous = np.random.default_rng(0).normal(size=896)
+    definition = BankDefinition("ab" * 32, "gaussian_derivative", k, sigma)
+    write_bank(path, definition, homogeneous, np.ones(shape), np.ones(shape, bool), signals.astype(np.float32))
+    return Bank.open(path)

@@ -3,26 +3,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bank.bank_file import Bank, BankDefinition, write_bank
 from bank.channels import CHANNELS
 from bank.errors import CalibrationError
 from bank.estimators import FrameSeries, Physics, TactileFrame, Tracker, fit
 from bank.estimators.physics import NOT_TURNED, NearestCell, Registration, image_matrix, register, settle_half_turn
 from bank.forward import ForwardModel
-
-
-@pytest.fixture(scope="module")
-def bank(tmp_path_factory) -> Bank:
-    """Signals that move smoothly along the channels with k and widen with sigma."""
-    k, sigma = np.linspace(1, 3, 21), np.linspace(0.5, 2, 16)
-    channel = np.linspace(0, 4, 896)
-    signals = np.exp(-0.5 * ((channel - k[:, None, None]) / (0.3 * sigma[None, :, None])) ** 2)
-    path = tmp_path_factory.mktemp("bank") / "smooth.bank"
-    shape = (21, 16)
-    homogeneous = np.random.default_rng(0).normal(size=896)
-    definition = BankDefinition("ab" * 32, "gaussian_derivative", k, sigma)
-    write_bank(path, definition, homogeneous, np.ones(shape), np.ones(shape, bool), signals.astype(np.float32))
-    return Bank.open(path)
 
 
 @pytest.mark.parametrize("reflected", [False, True])

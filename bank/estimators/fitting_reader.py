@@ -150,21 +150,24 @@ def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[
     """
     outward = sign * values
     order = np.argsort(outward, kind="stable")
-    n_out = round(_AT_END * len(values))
+    # Equal ones stay together: if some of them were fitted to, they would tell where the others are.
+    n_out = int((outward <= outward[order[round(_AT_END * len(values)) - 1]]).sum())
     out, kept = order[:n_out], np.sort(order[n_out:])
-    found, inside = float(outward.min()), float(outward[kept].min())
-    if len(kept) < _LEAST_FRAMES or np.ptp(values[kept]) == 0:
-        return sign * found
 
     def read(by: Head, rows: Rows) -> float:
         return float(np.median([sign * shown(by, one) for one in by.predict(features[rows])]))
 
+    found, read_now = float(outward.min()), read(head, order[: max(n_out // 2, 1)])
+    if len(kept) < _LEAST_FRAMES or np.ptp(values[kept]) == 0:
+        # Nobody can tell: of what is read as the outermost are now, none is known to be one of them.
+        return sign * max(found, read_now)
+    inside = float(outward[kept].min())
     seen, true = read(refit(kept), out), float(np.median(outward[out]))
     if seen - true > _MAY_BE_MISSING * (inside - true) > 0:
         short = (seen - inside) / (inside - true)
         middle = _UNSEEN / 2 * float(np.ptp(values))
         # At least as far inside as the outermost are read now.
-        found = max(found, found + short * middle, read(head, order[: n_out // 2]))
+        found = max(found, found + short * middle, read_now)
     return sign * found
 
 

@@ -109,6 +109,19 @@ def test_what_is_read_at_the_end_towards_zero_may_be_no_load_at_all(sign):
     assert value - sign * reach[0 if sign > 0 else 1] == pytest.approx(0.0)
 
 
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_equal_values_do_not_tell_where_the_outermost_of_them_are(steps):
+    """As torques that were commanded, not measured: more than a fifth are the largest, and some of these were kept.
+
+    Of one step nothing is left to tell the others by, and as far as the largest are read now nothing is known.
+    """
+    values = np.round(np.random.default_rng(5).uniform(0.0, 1.0, 200) ** 0.5 * steps) / steps
+    features = np.minimum(values, 1.4 - values)[:, None] + np.random.default_rng(6).normal(0, 0.1, (200, 1))
+    reader = reader_of(features, values)
+    assert (values == 1.0).mean() > 0.2
+    assert reader.high_end < 0.95
+
+
 def test_where_values_beyond_are_read_as_such_intervals_reach_no_further_than_the_range():
     rng = np.random.default_rng(2)
     values = rng.uniform(0.0, 1.0, 200)

@@ -125,7 +125,7 @@ def test_too_few_different_torques_are_not_called_too_few_slices(sliced, torque,
 def test_where_few_torques_are_left_without_the_outermost_it_is_they_that_are_asked_for(sliced):
     few = sliced().between(0, 14)
     few = replace(few, torque_t_s=few.t_s, torque_nm=np.resize([0.01, 0.05, 0.1, 0.14], 14))
-    message = "11 frames at 3 distinct values .* at more different values: .*, 4 values and 11 frames have to be left$"
+    message = "10 frames at 3 distinct values .* at more different values: .*, 4 values and 11 frames have to be left$"
     with pytest.raises(CalibrationError, match=message):
         fit("fused", [few], "four torques")
 

@@ -275,6 +275,8 @@ class Tracker:
             if missing:
                 return Estimate(valid=False, why=missing)
             difference, ways = self._without(usable, difference, guard)
+            if self._difference is not None:
+                self._difference = difference
         seen = features_of(calibration, self._locator, difference, moved, t_s)
         held = self._memory.held if self._memory is not None else difference
         if seen.place is not None and seen.place.ambiguous:

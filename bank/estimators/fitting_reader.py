@@ -27,6 +27,9 @@ _LEAST_FRAMES = 8
 # Values left out at either end of the range, to see whether what lies beyond it is read as beyond it, or at its end:
 # if more than half of the way beyond is missing.
 _AT_END, _MAY_BE_MISSING = 0.2, 0.5
+# What is left out is taken for no less far beyond the rest than so many spans of the range: where torques that are
+# nearly equal are parted, their noise would be read as a way.
+_LEAST_TRIED = 0.05
 # As far beyond the range, in spans of it, as frames still pass for familiar ones: slices of 0.14 N·m do where those
 # below 0.08 were calibrated on (`extrapolation-torque-slices` of docs/charts.md).
 _UNSEEN = 1.0
@@ -164,8 +167,10 @@ def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[
     inside = float(outward[kept].min())
     seen, true = read(refit(kept), out), float(np.median(outward[out]))
     if seen - true > _MAY_BE_MISSING * (inside - true) > 0:
-        short = (seen - inside) / (inside - true)
-        middle = _UNSEEN / 2 * float(np.ptp(values))
+        span = float(np.ptp(values))
+        # By what lies hardly beyond the rest nothing tells how it goes on.
+        short = (seen - inside) / max(inside - true, _LEAST_TRIED * span)
+        middle = _UNSEEN / 2 * span
         # At least as far inside as the outermost are read now.
         found = max(found, found + short * middle, read_now)
     return sign * found

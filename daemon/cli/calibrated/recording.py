@@ -44,7 +44,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--all-torques",
         action="store_true",
-        help="no torque will come beyond those of the slices: their intervals then do not reach beyond them",
+        help="no torque will come beyond those of the slices: intervals are then not stretched to hold such ones",
     )
     parser.add_argument(
         "--tool-mm",
@@ -207,9 +207,16 @@ def _ends(reader: "Reader") -> str:
     """Return what it means that torques beyond the range are read within it, and what helps."""
     limits = (reader.low, reader.high, reader.low_end, reader.high_end, reader.lowest, reader.highest)
     low_nm, high_nm, below_nm, above_nm, lowest_nm, highest_nm = (round(limit, 3) + 0.0 for limit in limits)
+    where = (
+        f"intervals of what is read below {below_nm:g} N·m reach to {lowest_nm:g} at least, of what is read above "
+        f"{above_nm:g} to {highest_nm:g} N·m"
+    )
+    if below_nm >= high_nm and above_nm <= low_nm:
+        where = (
+            f"all intervals reach from {lowest_nm:g} to {highest_nm:g} N·m at least, and no torque can be told by it"
+        )
     return (
         f"Torques beyond the calibrated {low_nm:g} to {high_nm:g} N·m may be read within them, as the outermost were "
-        f"when they were left out: intervals of what is read below {below_nm:g} N·m reach to {lowest_nm:g}, of what is "
-        f"read above {above_nm:g} to {highest_nm:g} N·m, and no further. Calibrate on all torques that will come, and "
-        "say so with --all-torques."
+        f"when they were left out: {where}. Calibrate on all torques that will come, and say so with "
+        "--all-torques."
     )

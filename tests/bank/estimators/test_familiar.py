@@ -122,6 +122,16 @@ def test_equal_values_do_not_tell_where_the_outermost_of_them_are(steps):
     assert reader.high_end < 0.95
 
 
+def test_values_that_are_nearly_equal_say_nothing_of_how_it_goes_on_beyond_them():
+    """Where the cut parts a level, what is left out lies a hair's breadth beyond, and is read with an error."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        values = np.resize([0.0, 0.3, 0.7, 1.0], 200) + 1e-6 * rng.normal(size=200)
+        reader = reader_of(values[:, None] + rng.normal(0, 0.03, (200, 1)), values)
+        assert reader.low_end < 0.2
+        assert reader.high_end > 0.8
+
+
 def test_where_values_beyond_are_read_as_such_intervals_reach_no_further_than_the_range():
     rng = np.random.default_rng(2)
     values = rng.uniform(0.0, 1.0, 200)

@@ -62,6 +62,19 @@ def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank
     assert wrong < 0.12
 
 
+def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank, twisting) -> None:
+    """A heatmap of them showed where they were when they died."""
+    series, tracker, seen = twisting(seed=3, cycles=3), Tracker(calibration, bank), []
+    for t_s, channels in zip(series.t_s, series.channels, strict=True):
+        usable = np.ones(channels.shape, dtype=np.bool_)
+        usable[0, ELECTRODE] = len(seen) < DEATH
+        tracker.estimate(TactileFrame.of(float(t_s), np.where(usable, channels, 0.0), usable))
+        seen.append(tracker.difference)
+    after = np.array([one[0, ELECTRODE] for one in seen[DEATH:] if one is not None])
+    assert len(after) > 50
+    assert np.ptp(after, axis=0).min() > 0
+
+
 @pytest.mark.parametrize("start", [0, DEATH])
 def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monkeypatch, start) -> None:
     """What the others say of them is a guess then: nine of ten torques lay outside of their intervals."""

@@ -65,7 +65,7 @@ def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, 
     assert main(calibrate) == 0
     reader = fitted[-1].torque.reader
     low_end, lowest = (round(limit, 3) for limit in (reader.low_end, reader.lowest))
-    ends = f"of what is read below {low_end:g} N·m reach to {lowest:g}, of what is read above "
+    ends = f"of what is read below {low_end:g} N·m reach to {lowest:g} at least, of what is read above "
     assert ends in capsys.readouterr().out
     assert main([*calibrate, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["reads_beyond"] is False

@@ -28,9 +28,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--plot", action="store_true", help="draw truth against estimate over time into --out")
     parser.add_argument("--out", type=Path, metavar="FILE", help="figure to draw (default with --plot: CAL.png)")
     parser.epilog = (
-        "Prints, of valid estimates whose truth is known: correlation (r), root mean square error and bias in N·m, and "
-        "the share of truths within the 95 % intervals (coverage_95); of all frames: how many are valid, why others "
-        "are not, and how many milliseconds an estimate takes."
+        "Prints, of valid estimates whose truth is known: correlation (r), root mean square error and bias in N·m, "
+        "the share of truths within the 95 % intervals (coverage_95), and how wide the median interval is from end to "
+        "end (interval_nm, of diameters diameter_interval_mm), without which a coverage of 1 says little; of all "
+        "frames: how many are valid, why others are not, and how many milliseconds an estimate takes."
     )
 
 

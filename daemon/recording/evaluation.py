@@ -44,10 +44,12 @@ def followed(shared: tuple[Calibration, str | None], series: FrameSeries) -> Tra
 
 
 def judge(tracks: Sequence[Track]) -> dict[str, float | int | None]:
-    """Return the figures of `shearloop evaluate`: r, rmse_nm, bias_nm, coverage_95, valid_fraction, latency, frames.
+    """Return the figures of `shearloop evaluate`, by the names that it prints.
 
-    Torque is judged on valid frames with a known truth; a figure is None where there are too few of them. Where
-    diameters are known, diameter_rmse_mm is given, and coverage_95 is theirs if there is no torque to judge.
+    Torque is judged on valid frames with a known truth; a figure is None where there are too few of them. interval_nm
+    is the median width of their intervals, from end to end: wide enough ones hold every truth and tell nothing. Where
+    diameters are known, diameter_rmse_mm, diameter_coverage_95 and diameter_interval_mm are given, and coverage_95 is
+    theirs if there is no torque to judge.
     """
     torque = _compared(tracks, "torque")
     diameter = _compared(tracks, "diameter")
@@ -58,6 +60,7 @@ def judge(tracks: Sequence[Track]) -> dict[str, float | int | None]:
         "rmse_nm": torque.rmse,
         "bias_nm": torque.bias,
         "coverage_95": torque.coverage if torque.n else diameter.coverage,
+        "interval_nm": torque.width,
         "valid_fraction": float(np.mean(valid)) if valid else None,
         "latency_ms_p50": float(np.quantile(latency, 0.5)) if len(latency) else None,
         "latency_ms_p99": float(np.quantile(latency, 0.99)) if len(latency) else None,
@@ -66,6 +69,7 @@ def judge(tracks: Sequence[Track]) -> dict[str, float | int | None]:
     if any(np.isfinite(track.series.diameter_mm).any() for track in tracks):
         figures["diameter_rmse_mm"] = diameter.rmse
         figures["diameter_coverage_95"] = diameter.coverage
+        figures["diameter_interval_mm"] = diameter.width
     return figures
 
 
@@ -89,6 +93,7 @@ class _Compared:
     rmse: float | None
     bias: float | None
     coverage: float | None
+    width: float | None
 
 
 def _compared(tracks: Sequence[Track], quantity: str) -> _Compared:
@@ -100,10 +105,10 @@ def _compared(tracks: Sequence[Track], quantity: str) -> _Compared:
             value = getattr(estimate, f"{quantity}_{unit}")
             if value is not None and np.isfinite(truth):
                 low, high = getattr(estimate, f"{quantity}_low_{unit}"), getattr(estimate, f"{quantity}_high_{unit}")
-                rows.append((value, float(truth), low <= truth <= high))
+                rows.append((value, float(truth), low <= truth <= high, high - low))
     if len(rows) < 2:
-        return _Compared(len(rows), None, None, None, None)
-    value, truth, inside = np.array(rows, dtype=np.float64).T
+        return _Compared(len(rows), None, None, None, None, None)
+    value, truth, inside, width = np.array(rows, dtype=np.float64).T
     error = value - truth
     changing = value.std() > 0 and truth.std() > 0
     return _Compared(
@@ -112,4 +117,5 @@ def _compared(tracks: Sequence[Track], quantity: str) -> _Compared:
         float(np.sqrt((error**2).mean())),
         float(error.mean()),
         float(inside.mean()),
+        float(np.median(width)),
     )

@@ -1,4 +1,5 @@
 import json
+import re
 from dataclasses import replace
 from shutil import copytree
 
@@ -9,7 +10,8 @@ from bank.estimators import Estimate, FrameSeries, fit
 from daemon.cli import main
 from daemon.recording.evaluation import Track, judge, reasons
 
-KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "valid_fraction", "latency_ms_p50", "latency_ms_p99", "frames"}
+KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
+KEYS |= {"latency_ms_p50", "latency_ms_p99"}
 
 
 @pytest.mark.usefixtures("fonts")
@@ -23,7 +25,9 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert (told["path"], told["estimator"], told["quantities"]) == (str(second), "fused", ["torque", "diameter"])
     assert main(["evaluate", str(first), str(slices_folder), "--part", "0.6:1", "--json", "--plot"]) == 0
     figures = json.loads(capsys.readouterr().out)
-    assert set(figures) == KEYS | {"diameter_rmse_mm", "diameter_coverage_95"}
+    assert set(figures) == KEYS | {"diameter_rmse_mm", "diameter_coverage_95", "diameter_interval_mm"}
+    assert 0 < figures["interval_nm"] < 0.1
+    assert 0 < figures["diameter_interval_mm"] < 40
     assert figures["r"] > 0.97
     assert figures["rmse_nm"] < 0.01
     assert figures["diameter_rmse_mm"] < 3
@@ -35,6 +39,7 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert main(["evaluate", str(first), str(slices_folder / "torque_slices")]) == 0
     text = capsys.readouterr().out
     assert "rmse_nm" in text
+    assert re.search(r"^interval_nm +0\.\d+$", text, re.MULTILINE)
     assert "diameter" not in text
 
 
@@ -190,3 +195,21 @@ def test_figures_are_what_their_names_say():
     assert figures["valid_fraction"] == 0.75
     assert (figures["latency_ms_p50"], figures["frames"]) == (2.5, 4)
     assert "diameter_rmse_mm" not in figures
+
+
+def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
+    t, halves = np.arange(4.0), (0.01, 0.02, 0.1)
+    torques = [
+        Estimate(True, (), torque_nm=0.1, torque_low_nm=0.1 - half, torque_high_nm=0.1 + half) for half in halves
+    ]
+    cylinders = [Estimate(True, (), diameter_mm=20.0, diameter_low_mm=15.0, diameter_high_mm=25.0 + n) for n in t]
+    refused = [Estimate(False, ("no grip",))]
+    told = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, np.full(4, 0.1), np.full(4, np.nan))
+    of_cylinders = replace(told, torque_t_s=t[:0], torque_nm=t[:0], diameter_mm=np.full(4, 20.0))
+    tracks = [Track(told, (*torques, *refused), np.ones(4)), Track(of_cylinders, tuple(cylinders), np.ones(4))]
+    figures = judge(tracks)
+    assert figures["coverage_95"] == 1.0
+    assert figures["interval_nm"] == pytest.approx(0.04)
+    assert figures["diameter_interval_mm"] == pytest.approx(11.5)
+    nothing = judge([Track(replace(told, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))])
+    assert nothing["interval_nm"] is nothing["diameter_interval_mm"] is None

@@ -223,11 +223,15 @@ def _fly(pipe: Pipe, configured: Configure, arm: "Arm") -> NoReturn:
 
 
 def _end_program(settings: UrSettings, pilot: Pilot, arm: "Arm") -> None:
-    """Leave no program behind: none that this very cycle has started, and none that waits to be resumed."""
+    """Leave no program of ours behind: none that a late upload has started, and none that waits to be resumed.
+
+    What is somebody else's plays on: only the operator stops it, with `unlock`.
+    """
     _alarm(settings.hang_timeout_s)
     reading = arm.read()
     if reading.program_running:
-        arm.end_program()
+        if pilot.may_be_ours(time.monotonic_ns()):
+            arm.end_program()
     elif pilot.left_paused(reading):
         _alarm(FAREWELL_S + settings.hang_timeout_s)
         arm.stop_program()

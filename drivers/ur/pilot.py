@@ -27,7 +27,7 @@ from drivers.ur.motion import tool_axis_torque
 from drivers.ur.mover import Mover
 from drivers.ur.paused import PausedProgram, Unkicked
 from drivers.ur.ports import PilotArm
-from drivers.ur.recovery import Outcome, Recovery
+from drivers.ur.recovery import ENDS_ITSELF_S, Outcome, Recovery
 from drivers.ur.settings import UrSettings
 
 
@@ -46,6 +46,8 @@ class Pilot:
         self._leaving = False
         # Whether a program that is there was started here, or left behind by a process before; not while one is begun.
         self._ours = takes_over
+        # When one was being started here last: an upload may take after the recovery that sent it was given up.
+        self._starting_ns: int | None = None
         self._paused, self._unkicked = PausedProgram(arm), Unkicked()
         # Whether it is stopped in the next cycle, of which the daemon learns beforehand that it may take long.
         self._stops_paused = False
@@ -76,6 +78,11 @@ class Pilot:
     def ours(self) -> bool:
         """Whether a program on the robot is one that was started here, or that a process before has left behind."""
         return self._ours or (self._recovery is not None and self._recovery.starts)
+
+    def may_be_ours(self, now_ns: int) -> bool:
+        """Return whether a program that plays is ours, or may be: one was being started here just now."""
+        just_now = self._starting_ns is not None and now_ns - self._starting_ns <= ENDS_ITSELF_S * 1e9
+        return self.ours or just_now
 
     def puzzled(self) -> bool:
         """Return, once, whether the robot did not take something: the next reading may say why.
@@ -117,6 +124,8 @@ class Pilot:
         """Let one cycle pass: judge the reading, send what is due; return the reply to an `Unlock` that is decided."""
         self._mover.watch(reading, now_ns)
         announced, self._stops_paused = self._stops_paused, False
+        if self._recovery is not None and self._recovery.starts:
+            self._starting_ns = now_ns
         left = self._recovery is not None or self._mover.barred
         plays = bool(left) and reading.program_running and self._is_new(reading)
         if reading.runtime_state == RUNTIME_STOPPED or self._unkicked.outlives(now_ns, plays=plays):

@@ -4,10 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from drivers.ur import child
-from drivers.ur.messages import Disconnect, Enable, Reply, Unlock, WristSpeed
+from drivers.ur.messages import Disconnect, Enable, Message, Reading, Reply, Unlock, WristSpeed
 from tests.drivers.ur.process import CyclingArm, Daemon, fly
 
 ROOT = Path(__file__).parents[3]
@@ -40,18 +38,57 @@ def test_nothing_that_comes_after_a_disconnection_is_carried_out(daemon: Daemon)
     assert [reply.accepted for reply in replies] == [True, False, False, False]
 
 
-def test_program_that_this_very_cycle_started_is_ended(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever started it: what counts is what runs when the process leaves, not when its last cycle began."""
+class Uploading(CyclingArm):
+    """Its upload takes only when it is read so many times more; when it is sent, the daemon says something."""
+
+    def __init__(self, daemon: Daemon, *said: Message, reads: int) -> None:
+        super().__init__()
+        self._daemon, self._said, self._reads = daemon, said, reads
+        self._left: int | None = None
+
+    def upload(self) -> bool:
+        if self._left is None:
+            self.calls.append("upload")
+            self._daemon.say(*self._said)
+            self._left = self._reads
+        return True
+
+    def read(self) -> Reading:
+        if self._left is not None:
+            self._left -= 1
+            if self._left == 0:
+                self.be(runtime_state=2)
+        return super().read()
+
+
+def test_program_that_a_late_upload_has_started_is_ended(daemon: Daemon) -> None:
+    """What counts is what runs when the process leaves, not when its last cycle began."""
+    # The next cycle's reading still shows none; that by which the process leaves shows it.
+    arm = Uploading(daemon, Disconnect(), reads=2)
+    fly(daemon, arm)
+    assert arm.calls == ["clear_command", "upload", "end_program"]
+    assert not arm.reading.program_running
+
+
+def test_program_that_plays_and_was_started_here_is_ended(daemon: Daemon) -> None:
+    class Ready(CyclingArm):
+        def arm_watchdog(self) -> bool:
+            daemon.say(Disconnect())
+            return super().arm_watchdog()
+
+    arm = Ready()
+    fly(daemon, arm)
+    assert [call for call in arm.calls if call != "kick"] == ["clear_command", "upload", "arm_watchdog", "end_program"]
+
+
+def test_program_of_somebody_else_plays_on_when_the_process_leaves(daemon: Daemon) -> None:
+    """As of another daemon on the same robot."""
     arm = CyclingArm()
-
-    def starts_a_program(*_: object) -> None:
-        arm.upload()
-
-    monkeypatch.setattr("drivers.ur.pilot.Pilot.tick", starts_a_program)
+    arm.be(runtime_state=2)
     daemon.say(Disconnect())
     fly(daemon, arm)
-    assert arm.calls == ["upload", "end_program"]
-    assert not arm.reading.program_running
+    assert arm.calls == []
+    assert arm.reading.program_running
 
 
 def test_program_that_is_paused_is_stopped_before_the_process_leaves(daemon: Daemon) -> None:

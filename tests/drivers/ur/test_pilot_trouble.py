@@ -118,6 +118,20 @@ def test_program_that_was_not_started_here_is_sent_nothing() -> None:
     assert flight.arm.calls[:4] == ["close_popups", "stop_program", "clear_command", "upload"]
 
 
+def test_program_that_plays_just_after_a_given_up_start_may_be_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its upload was sent, and takes only after the operator's stop; ours ends by its watchdog before long."""
+    flight = Flight()
+    monkeypatch.setattr(flight.arm, "upload", lambda: True)
+    flight.fly(5)
+    flight.pilot._recovery.give_up("Nobody waits for it.")  # type: ignore[union-attr]
+    flight.fly(5)
+    assert not flight.state.recovering
+    assert not flight.state.ours
+    assert flight.pilot.may_be_ours(flight.now_ns)
+    flight.fly(250)
+    assert not flight.pilot.may_be_ours(flight.now_ns)
+
+
 def test_hard_limit_stops_and_holds_until_enabled_anew() -> None:
     flight = turning()
     flight.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, 6.5))

@@ -43,6 +43,7 @@ class Event(Enum):
     HELD_TOO_LONG = "held too long"
     RECORDING_FAILED = "recording failed"
     COMMAND_REFUSED = "command refused"
+    COMMAND_UNANSWERED = "command unanswered"
     STEP_OVERDUE = "step overdue"
 
 
@@ -169,6 +170,11 @@ TABLE: Mapping[Event, Rule] = {
         Response.NOTE,
         "a command was refused: {detail}.",
         "Nothing was done; mend the command and send it again.",
+    ),
+    Event.COMMAND_UNANSWERED: Rule(
+        Response.NOTE,
+        "the robot's process was gone when the loop commanded it: {detail}.",
+        "It is started anew by itself; once the robot is connected again, `shearloop command unlock`.",
     ),
     Event.STEP_OVERDUE: Rule(
         _KEEP,

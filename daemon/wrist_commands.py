@@ -80,7 +80,9 @@ class WristCommands:
         self._unanswered -= 1
         try:
             if not reply.accepted:
-                self._brain.note_refusal(reply.refused)
+                # Without a process there is nobody who could have refused it.
+                gone = self._robot.state is None
+                (self._brain.note_unanswered if gone else self._brain.note_refusal)(reply.refused)
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
             self._brain.sent(self.sent_rad_per_s)
         except Exception as error:  # noqa: BLE001 - not the robot's process, which has answered, but the next tick's

@@ -178,6 +178,10 @@ class Brain:
         """Tell of a command that a device refused."""
         self._notes.append(Trouble(Event.COMMAND_REFUSED, sentence))
 
+    def note_unanswered(self, sentence: str) -> None:
+        """Tell of a command of the loop's own that the robot's process, which has ended, did not answer."""
+        self._notes.append(Trouble(Event.COMMAND_UNANSWERED, sentence))
+
     def action_ended(self, failure: str = "") -> None:
         """Tell that the action that was begun has ended, well or with a reason."""
         self._action = ActionState.FAILED if failure else ActionState.DONE

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from daemon.experiment.machine import Phase
 from daemon.wrist_commands import RENEWED_AFTER, WristCommands
 from drivers.ur.messages import Reply, RobotState, WristSpeed
 from tests.daemon.cell import driven
@@ -39,6 +40,27 @@ async def test_a_wrist_speed_that_is_clipped_is_told_in_each_cycle() -> None:
         cell.robot.commands.clear()
         await cell.cycles(50)
         assert cell.robot.commands == [TURN] * 50
+
+
+async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none() -> None:
+    """Nobody has sent one that could be mended; what helps is told instead."""
+    async with driven() as cell:
+        await cell.start(TWIST)
+        # What is clipped is told in each cycle, so that one is unanswered whenever the process dies.
+        cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
+        await cell.cycles(20)
+        cell.brain.senses.lost["robot"] = "The robot's process died of SIGKILL."
+        cell.robot.die(50)
+        cell.loop.decide_now()
+        assert cell.phase is Phase.STOPPED
+        assert "a command was refused" not in cell.why
+        assert "ended before it answered" in cell.why
+        assert cell.why.endswith("once the robot is connected again, `shearloop command unlock`.")
+        # Neither was the stop that comes next, of which there is nobody to hear.
+        cell.loop.decide_now()
+        told = " ".join(cell.brain.standing.verdict.reasons)
+        assert "not connected" in told
+        assert "a command was refused" not in told
 
 
 class Process:

@@ -8,7 +8,14 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import AfterValidator, Field, model_validator
 
 from daemon.config_file import ConfigModel, load_yaml_model
-from daemon.wire.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, open_to_the_network, stays_on_this_machine
+from daemon.wire.addresses import (
+    COMMAND_ADDRESS,
+    LARGEST_PORT,
+    PUBLISH_ADDRESS,
+    has_a_port,
+    open_to_the_network,
+    stays_on_this_machine,
+)
 
 # What else a daemon has a task of, publishes as, drives by or records under. A fingertip of such a name would be taken
 # for it: its torque for the load cell's that supervises it, its zero for the other's.
@@ -23,6 +30,8 @@ TAKEN_NAMES = frozenset(
 def _known_transport(address: str) -> str:
     if not address.startswith(("ipc://", "tcp://")):
         raise ValueError("must be ipc or a tcp address, for this machine alone a loopback one: tcp://127.0.0.1:7761")
+    if not has_a_port(address):
+        raise ValueError(f"must end in a port, a whole number up to {LARGEST_PORT}, as in tcp://127.0.0.1:7761")
     return address
 
 

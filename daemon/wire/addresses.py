@@ -6,6 +6,7 @@ from urllib.parse import urlsplit
 
 PUBLISH_ADDRESS = "tcp://127.0.0.1:7761"
 COMMAND_ADDRESS = "tcp://127.0.0.1:7762"
+LARGEST_PORT = 65535
 
 
 def stays_on_this_machine(address: str) -> bool:
@@ -20,6 +21,17 @@ def stays_on_this_machine(address: str) -> bool:
         return ipaddress.ip_address(parts.hostname).is_loopback
     except ValueError:
         return False
+
+
+def has_a_port(address: str) -> bool:
+    """Return whether a tcp address ends in a port, or in `*` for one that is free; every other address needs none.
+
+    libzmq reads a port up to what is no digit, and takes 65536 off what is too large: 70000 would be 4464.
+    """
+    port = address.rpartition(":")[2]
+    if not address.startswith("tcp://") or port == "*":
+        return True
+    return port.isascii() and port.isdecimal() and len(port) <= len(str(LARGEST_PORT)) and int(port) <= LARGEST_PORT
 
 
 def needs_keys(address: str) -> bool:

@@ -15,7 +15,7 @@ from daemon.clock import Clock
 from daemon.errors import UserError
 from daemon.messages import Message, encode, wire_map
 from daemon.topics import TOPICS
-from daemon.wire.addresses import open_to_the_network, stays_on_this_machine
+from daemon.wire.addresses import LARGEST_PORT, has_a_port, open_to_the_network, stays_on_this_machine
 from daemon.wire.keys import KeyPair
 
 # Messages kept for a subscriber that reads too slowly; older ones are dropped for it, never delayed for others.
@@ -159,6 +159,11 @@ def bind(socket: "zmq.Socket[Any]", address: str, key: str, keys: KeyPair | None
             if keys is None:
                 raise UserError(open_to_the_network(address, key))
             keys.serve(socket)
+        if not has_a_port(address):
+            raise UserError(
+                f"`{key}: {address}` ends in no port, which is a whole number up to {LARGEST_PORT}; "
+                "use e.g. tcp://127.0.0.1:7761"
+            )
         _leave_what_is_there(address, key)
         socket.bind(address)
     except UserError:

@@ -15,8 +15,9 @@ from daemon.cli import main
 from daemon.config import load_daemon_config
 from daemon.errors import UserError
 from daemon.messages import decode, encode
-from daemon.wire.addresses import needs_keys, open_stop_address, stays_on_this_machine
+from daemon.wire.addresses import has_a_port, needs_keys, open_stop_address, stays_on_this_machine
 from daemon.wire.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
+from daemon.wire.publisher import bind
 
 Write = Callable[..., Path]
 NETWORK = "tcp://0.0.0.0:*"
@@ -50,6 +51,16 @@ def test_what_can_be_reached_from_the_network() -> None:
         assert not stays_on_this_machine(address), address
     assert not needs_keys("tcp://localhost:1")
     assert needs_keys("tcp://pc:1")
+
+
+def test_which_addresses_end_in_a_port_that_there_is() -> None:
+    for address in ("tcp://127.0.0.1:1", "tcp://[::1]:65535", "tcp://0.0.0.0:*", "ipc:///run/x", "ipc://@x:70000"):
+        assert has_a_port(address), address
+    for port in ("65536", "70000", "0000070000", "7761a", "-1", "", "²", "1" * 5000):
+        assert not has_a_port(f"tcp://127.0.0.1:{port}"), port
+    assert not has_a_port("tcp://127.0.0.1")
+    with zmq.Context() as context, pytest.raises(UserError, match="ends in no port, which is a whole number"):
+        bind(context.socket(zmq.PUB), "tcp://127.0.0.1:70000", "publish")
 
 
 @pytest.mark.parametrize("command", ["run", "check"])

@@ -170,16 +170,17 @@ def _of_times(
 
     late_s = [found and round(found.late_s, 3) for found in map(aligned, timed)]
     known = ", ".join(f"{each:.2f}" for each in late_s if each is not None)
-    sentences = [f"The load is stamped {known} s after the frames move."] if known else []
+    unsure_s = round(unchecked_s(timed, aligned), 3)
+    stamped = "probably stamped" if unsure_s else "stamped"
+    sentences = [f"The load is {stamped} {known} s after the frames move."] if known else []
     doubts = [f"{name}: {why}" for name, one in named if one in timed and (why := doubt(one, aligned))]
     sentences += [f"Doubtful is {why}." for why in doubts]
-    unsure_s = round(unchecked_s(timed, aligned), 3)
     told: dict[str, object] = {"load_late_s": late_s, "load_doubts": doubts, "load_unchecked_s": unsure_s}
     if calibration.torque is not None and unsure_s:
         told["widened"] = widened = round(calibration.torque.reader.widened, 2)
         sentences.append(
             f"When the load is stamped could not be checked, for it changes too seldom: it may be {unsure_s:.2g} s "
-            f"off unseen, so the intervals of loads are {widened:.2g} times as wide. Record more changes of load, "
+            f"off unseen, so the intervals are wider, those of loads {widened:.2g} times. Record more changes of load, "
             "as ten twists, or vouch for the load cell's clock with --load-late 0."
         )
     return told, sentences

@@ -2,12 +2,15 @@ import json
 import re
 from dataclasses import replace
 from shutil import copytree
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from bank.estimators import Estimate, FrameSeries, fit
+from bank.estimators.alignment import Alignment
 from daemon.cli import main
+from daemon.cli.calibrated.recording import _of_times
 from daemon.recording.evaluation import Track, judge, reasons
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
@@ -213,3 +216,15 @@ def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
     assert figures["diameter_interval_mm"] == pytest.approx(11.5)
     nothing = judge([Track(replace(told, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))])
     assert nothing["interval_nm"] is nothing["diameter_interval_mm"] is None
+
+
+@pytest.mark.parametrize(("error_s", "unsure"), [(0.03, False), (0.2, True)])
+def test_a_time_that_could_not_be_checked_is_told_as_probable(error_s, unsure):
+    t = np.arange(4.0)
+    series = FrameSeries("raw", ("right",), t, np.zeros((4, 1, 896)), t, np.zeros(4), np.full(4, np.nan))
+    found = Alignment(late_s=0.16, error_s=error_s, explained=0.5)
+    calibration = SimpleNamespace(torque=SimpleNamespace(reader=SimpleNamespace(widened=1.9)))
+    told, (late, *sentences) = _of_times(calibration, [], [series], lambda _: found)
+    assert late == f"The load is {'probably ' if unsure else ''}stamped 0.16 s after the frames move."
+    assert ("widened" in told) == unsure == bool(sentences)
+    assert all("so the intervals are wider, those of loads 1.9 times. Record more" in one for one in sentences)

@@ -283,7 +283,7 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
     assert main(calibrate) == 0
     told = capsys.readouterr().out
     assert "When the load is stamped could not be checked, for it changes too seldom: it may be 0.75 s off" in told
-    assert re.search(r"intervals of loads are \d\.\d times as wide\. Record more changes of load", told)
+    assert re.search(r"intervals are wider, those of loads \d\.\d times\. Record more changes of load", told)
     assert main([*calibrate, "--load-late", "0"]) == 0
     assert "could not be checked" not in capsys.readouterr().out
     looked, of_side = [], alignments._of_side

@@ -41,6 +41,7 @@ _SEEDS = (7, 8, 9)
 _TURNED_ELECTRODES = (5, 11)
 # Frames of the twists are alike where they follow one another.
 _EVERY_FRAME = 24
+_NUMBERS = "foreign_slices.json"
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,6 +199,11 @@ def _widths(found: Sequence[Counted], before: Sequence[Counted] | None, name: Na
     return f"{unit.format(widths[0])} ({unit.format(widths[1:].min())} to {unit.format(widths[1:].max())})"
 
 
+def counts_in(path: Path) -> list[Counted]:
+    """Return the numbers of an earlier run; raises OSError, ValueError, TypeError or KeyError where there are none."""
+    return [Counted(**{**row, "widths_nm": tuple(row["widths_nm"])}) for row in json.loads(path.read_text())]
+
+
 def main() -> None:
     """Measure, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -207,14 +213,17 @@ def main() -> None:
     parser.add_argument(
         "--all-torques", action="store_true", help="calibrate as `shearloop calibrate --all-torques` does"
     )
-    parser.add_argument("--out", type=Path, default=Path("build/foreign"))
+    parser.add_argument("--out", type=Path, metavar="FOLDER", default=Path("build/foreign"), help=f"for {_NUMBERS}")
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
+    if args.out.suffix == ".json" or (args.out.exists() and not args.out.is_dir()):
+        parser.error(f"--out {args.out} must be a folder; {_NUMBERS} is written into it")
     before = None
     if args.before is not None:
-        before = [
-            Counted(**{**row, "widths_nm": tuple(row["widths_nm"])}) for row in json.loads(args.before.read_text())
-        ]
+        try:
+            before = counts_in(args.before)
+        except (OSError, ValueError, TypeError, KeyError):
+            parser.error(f"--before {args.before} holds no numbers of an earlier run; give its {_NUMBERS}")
+    args.out.mkdir(parents=True, exist_ok=True)
     recording = args.out / "twists.mcap"
     import_mat([args.recordings / "streams" / "2024-12-03_16-09"], recording)
     fingertips = gripped_frames(series_of(read_recording(recording)))
@@ -234,7 +243,7 @@ def main() -> None:
             all_torques=args.all_torques,
         )
     ]
-    (args.out / "foreign_slices.json").write_text(json.dumps([asdict(one) for one in found], indent=1) + "\n")
+    (args.out / _NUMBERS).write_text(json.dumps([asdict(one) for one in found], indent=1) + "\n")
     print("\n".join(tables(found, before)))
 
 

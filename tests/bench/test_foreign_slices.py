@@ -20,6 +20,7 @@ from bench.foreign_slices import (
     counted,
     foreign_frames,
     gripped_frames,
+    main,
     tables,
 )
 from daemon.recording.evaluation import follow, judge
@@ -125,3 +126,19 @@ def test_beside_an_earlier_run_the_tables_say_what_has_changed() -> None:
     assert "| 0 → 0 | 20 → 10 |" in row
     assert any("× 1.50 (× 1.50 to × 1.50)" in line for line in lines)
     assert lines[-1] == f"| `fused` | {CYLINDERS} | 20% | 0 → 0 | 1 → 0 | 1 of 2 → 0 of 2 |"
+
+
+def test_what_is_no_folder_or_holds_no_numbers_is_refused_in_a_sentence(tmp_path, capsys, monkeypatch) -> None:
+    def refused(*arguments: str) -> str:
+        monkeypatch.setattr("sys.argv", ["foreign_slices", str(tmp_path / "nowhere"), *arguments])
+        with pytest.raises(SystemExit, match="2"):
+            main()
+        return capsys.readouterr().err
+
+    out, other = tmp_path / "a.json", tmp_path / "other.json"
+    assert f"--out {out} must be a folder; foreign_slices.json is written into it" in refused("--out", str(out))
+    assert not out.exists()
+    for text in ("no JSON", "3", '[{"widths_nm": []}]', "[{}]", "[3]"):
+        other.write_text(text)
+        assert f"--before {other} holds no numbers of an earlier run" in refused("--before", str(other))
+    assert f"--before {tmp_path} holds no numbers of an earlier run" in refused("--before", str(tmp_path))

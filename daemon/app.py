@@ -208,6 +208,9 @@ class Daemon:
             await self._stop.wait()
             sd_notify.notify("STOPPING=1")
             if self._rig is not None:
+                self._rig.end()
+                if self._experiment is not None:
+                    await self._experiment.told()
                 await self._rig.loop.released()
             for task in running:
                 task.cancel()

@@ -1,6 +1,7 @@
 """The experiment that a configuration names: begun once, as soon as it can be, unless somebody calls it off."""
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from daemon.experiment.machine import Experiment, Phase
 
 # How often a start that was refused is tried again.
 START_RETRY_S = 0.5
+# A daemon that ends waits no longer than this to be told of the experiment's end; where the loop is dead it is not.
+TOLD_WITHIN_S = 0.2
 
 
 class ConfiguredExperiment:
@@ -29,6 +32,9 @@ class ConfiguredExperiment:
         self.left_to_operator = False
         self._awaited = self._called_off = False
         self._begun_now = asyncio.Event()
+        # Set unless an experiment is seen to its end, of which it has not been told yet.
+        self._told = asyncio.Event()
+        self._told.set()
         self._mark = BegunMark()
 
     async def run(self) -> None:
@@ -58,11 +64,21 @@ class ConfiguredExperiment:
     async def begun_and_ended(self) -> None:
         """Wait until it is begun, by hand where it does not begin by itself, and return when it has ended."""
         await self._begun_now.wait()
-        experiment = await self._ended()
-        self.done = experiment.phase is Phase.DONE
-        structlog.get_logger().info(
-            "the experiment has ended", experiment=str(self.path), phase=experiment.phase.value, why=experiment.why
-        )
+        self._told.clear()
+        try:
+            experiment = await self._ended()
+            self.done = experiment.phase is Phase.DONE
+            structlog.get_logger().info(
+                "the experiment has ended", experiment=str(self.path), phase=experiment.phase.value, why=experiment.why
+            )
+        finally:
+            self._told.set()
+
+    async def told(self) -> None:
+        """Wait until the end of the experiment is told, where it has begun and has ended just now."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(TOLD_WITHIN_S):
+                await self._told.wait()
 
     def has_begun(self, path: Path) -> None:
         """Take note that an experiment has begun: this one does no more by itself, whichever it was."""

@@ -212,6 +212,14 @@ class Rig:
         self.brain.stop("the operator said stop")
         return experiment.file.name
 
+    def end(self) -> None:
+        """Stop the experiment that runs, for the daemon ends, and tell of it as of every other end."""
+        experiment = self.brain.experiment
+        if experiment is not None and experiment.running:
+            self.brain.stop("the daemon was told to end: the wrist is stopped, a tool that is gripped stays gripped")
+            # No other state of the robot may be decided upon before the loop is cancelled.
+            self.loop.decide_now()
+
     def _robot_link(self, event: UrLinkEvent) -> None:
         up = event.status == "up"
         log_event("robot", up, event.sentence, repeated=event.losses > 1)

@@ -17,11 +17,12 @@ from bank.bank_file import Bank
 from bank.calibration import Calibration
 from daemon.app import Daemon
 from daemon.config import load_daemon_config
+from daemon.run_summary import RunSummary
 from daemon.view.bridge import Bridge, Place
 from daemon.view.latest import Latest
 from daemon.view.server import make_app
 from daemon.wire.request import request
-from tests.daemon.conftest import DEADLINE_S, shearloop
+from tests.daemon.conftest import DEADLINE_S, Log, shearloop
 from tests.emulator_process import own_address
 
 pytestmark = pytest.mark.real_time
@@ -264,6 +265,24 @@ async def test_a_daemon_that_ends_with_its_experiment_knows_whether_it_is_done(
             cause(fault)
         await daemon.stopped()
         assert daemon.finished is finished
+
+
+async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_end(
+    rig_config: Path, tiny_bank: Path, log: Log
+) -> None:
+    told: list[str] = []
+    path = ending_with(rig_config, {"do": "release"}, {"do": "turn_to", "angle_rad": 3.0, "speed_rad_per_s": 0.2})
+    async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):
+        daemon.publisher.listen(RunSummary(told.extend))
+        await watcher.until("robot.state", lambda state: abs(state["wrist_speed_rad_per_s"]) > 0.1)
+        daemon.stop()
+        await daemon.stopped()
+    why = "the daemon was told to end: the wrist is stopped, a tool that is gripped stays gripped"
+    assert not daemon.finished
+    assert (watcher.seen["loop.state"][-1]["phase"], watcher.seen["loop.state"][-1]["doing"]) == ("stopped", why)
+    assert any("STOPPED before its end" in line for line in told)
+    assert f"  {why}" in told
+    assert "the experiment has ended" in log.said
 
 
 async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig_config: Path, tiny_bank: Path) -> None:

@@ -127,7 +127,7 @@ FAULTS = st.lists(
 )  # fmt: skip
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(
     st.sampled_from(["fused", "fused", "regression"]),
     st.integers(1, 2),

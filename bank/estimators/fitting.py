@@ -36,8 +36,9 @@ def fit(
     Slices with torque give a torque, those with diameters a diameter. `timed_by` may be what was recorded beside by
     other fingertips, by which the torques' times are checked where these hardly move with the load; `aligned` may be
     `alignment` with what it has found for whoever asks it too. `all_torques` vouches that no torque will come beyond
-    those of the slices: their intervals reach no further then. Raises CalibrationError for recordings that do not
-    determine the calibration, for torques that are clearly stamped at other times than the frames unless `trust_times`
+    those of the slices: intervals are then not stretched to hold such ones.
+
+    Raises CalibrationError for recordings that do not determine the calibration, for torques that are clearly stamped at other times than the frames unless `trust_times`
     is set, and for physics that the estimator needs and did not get.
     """
     physics = physics or Physics()

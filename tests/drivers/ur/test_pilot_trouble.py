@@ -123,7 +123,9 @@ def test_program_that_plays_just_after_a_given_up_start_may_be_ours(monkeypatch:
     flight = Flight()
     monkeypatch.setattr(flight.arm, "upload", lambda: True)
     flight.fly(5)
-    flight.pilot._recovery.give_up("Nobody waits for it.")  # type: ignore[union-attr]
+    recovery = flight.pilot._recovery
+    assert recovery is not None
+    recovery.give_up("Nobody waits for it.")
     flight.fly(5)
     assert not flight.state.recovering
     assert not flight.state.ours

@@ -38,8 +38,8 @@ def fit(
     `alignment` with what it has found for whoever asks it too. `all_torques` vouches that no torque will come beyond
     those of the slices: intervals are then not stretched to hold such ones.
 
-    Raises CalibrationError for recordings that do not determine the calibration, for torques that are clearly stamped at other times than the frames unless `trust_times`
-    is set, and for physics that the estimator needs and did not get.
+    Raises CalibrationError for recordings that do not determine the calibration, for torques clearly stamped at
+    other times than the frames unless `trust_times` is set, and for physics that the estimator needs and did not get.
     """
     physics = physics or Physics()
     if not recordings:

@@ -7,7 +7,7 @@ import zmq
 
 from daemon.errors import UserError
 from daemon.messages import decode
-from daemon.wire.addresses import needs_keys
+from daemon.wire.addresses import LARGEST_PORT, has_a_port, needs_keys
 from daemon.wire.keys import ClientKeys
 
 # The slowest topic of a daemon that runs, health, comes once a second.
@@ -75,6 +75,11 @@ def keys_hint(keys: ClientKeys | None) -> str:
 
 def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
     """Connect a socket; a malformed address becomes a sentence, and so does one of the network without keys."""
+    if not has_a_port(address):
+        raise UserError(
+            f"{address} ends in no port, which is a whole number up to {LARGEST_PORT}; give one such as "
+            "tcp://127.0.0.1:7761"
+        )
     if keys is not None:
         keys.use(socket)
     elif needs_keys(address):

@@ -160,6 +160,11 @@ def test_a_calibration_of_another_bank_is_refused_by_name(
         (["command", "status", "--timeout", "nan"], "--timeout nan"),
         (["command", "status", "--timeout", "-1"], "--timeout -1"),
         (["listen", "--connect", "here", "--timeout", "1"], "'here' is not an address"),
+        (
+            ["listen", "--connect", "tcp://127.0.0.1:70000", "--timeout", "0.05"],
+            "tcp://127.0.0.1:70000 ends in no port",
+        ),
+        (["command", "stop", "--connect", "tcp://127.0.0.1:7762a", "--timeout", "0.05"], "a whole number up to 65535"),
         (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "nothing was heard"),
         (["command", "tare", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no daemon answered"),
     ],

@@ -271,9 +271,10 @@ async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tm
         port = taken.getsockname()[1]
         with pytest.raises(UserError, match=f"cannot be served on 127.0.0.1:{port}"):
             await serve(Place(PUBLISH_ADDRESS, f"ipc://{tmp_path}/c"), port, TOKEN, tip, ready)
-    for publish, commands in (("nonsense", PUBLISH_ADDRESS), (PUBLISH_ADDRESS, "nonsense")):
-        with pytest.raises(UserError, match="'nonsense' is not an address"):
-            await serve(Place(publish, commands), 0, TOKEN, tip, ready)
+    for wrong, said in (("nonsense", "'nonsense' is not an address"), ("tcp://127.0.0.1:70000", "ends in no port")):
+        for publish, commands in ((wrong, PUBLISH_ADDRESS), (PUBLISH_ADDRESS, wrong)):
+            with pytest.raises(UserError, match=said):
+                await serve(Place(publish, commands), 0, TOKEN, tip, ready)
 
 
 @pytest.mark.usefixtures("hears_of_terminal")

@@ -82,8 +82,8 @@ def run(args: argparse.Namespace) -> int:
     width = max(map(len, figures))
     for name, value in figures.items():
         print(f"{name:<{width}}  {_shown(value)}")
-    for why, count in reasons(tracks).most_common():
-        print(f"{count:>6} frames not valid: {why}")
+    for reason in reasons(tracks):
+        print(f"{reason.frames:>6} frames not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
     return 0
 
 

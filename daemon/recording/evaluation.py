@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +13,8 @@ from bank.bank_file import Bank
 from bank.estimators import Calibration, Estimate, FrameSeries, TactileFrame, Tracker
 
 FloatArray = NDArray[np.float64]
+
+_NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -73,17 +75,22 @@ def judge(tracks: Sequence[Track]) -> dict[str, float | int | None]:
     return figures
 
 
-def reasons(tracks: Sequence[Track]) -> Counter[str]:
-    """Return why frames were not valid, each reason without its numbers and what follows from it, with how often."""
-    return Counter(_kind(why) for track in tracks for estimate in track.estimates for why in estimate.why)
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """Why `frames` were not valid: the sentence that was said most often, or, where they `differ`, first of them."""
+
+    frames: int
+    sentence: str
+    differ: bool
 
 
-def _kind(why: str) -> str:
-    """Return a reason up to its first colon, or, where that only names a fingertip, to what follows from it."""
-    head, _, rest = why.partition(":")
-    if head.endswith("fingertip") and rest:
-        head = f"{head}:{rest.partition(';')[0]}"
-    return re.sub(r"\d+(?:\.\d+)?", "#", head)
+def reasons(tracks: Sequence[Track]) -> list[Reason]:
+    """Return why frames were not valid, what differs in its numbers alone together; the most frequent come first."""
+    kinds: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    for why in (why for track in tracks for estimate in track.estimates for why in estimate.why):
+        kinds[_NUMBER.sub("#", why)][why] += 1
+    found = [Reason(said.total(), said.most_common(1)[0][0], len(said) > 1) for said in kinds.values()]
+    return sorted(found, key=lambda reason: -reason.frames)
 
 
 @dataclass(frozen=True, slots=True)

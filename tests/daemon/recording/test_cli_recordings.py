@@ -11,7 +11,7 @@ from bank.estimators import Estimate, FrameSeries, fit
 from bank.estimators.alignment import Alignment
 from daemon.cli import main
 from daemon.cli.calibrated.recording import _of_times
-from daemon.recording.evaluation import Track, judge, reasons
+from daemon.recording.evaluation import Reason, Track, judge, reasons
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
 KEYS |= {"latency_ms_p50", "latency_ms_p99"}
@@ -95,21 +95,38 @@ def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_
     assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
 
 
-def test_reasons_say_what_is_the_matter_and_not_with_whom_alone():
+def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alone():
+    """The numbers stood as #, and what follows from them was left out."""
     said = [
-        "right fingertip: 7 % of the channels jumped since the frame before; it was touched",
-        "right fingertip: 17 % of the channels jumped since the frame before; it was touched",
-        "right fingertip: 31.5 % of the channels are dead or saturated; look at the ribbon cable",
         "outside of the calibration: the misfit is 2.1 (at most 1.5)",
+        "right fingertip: 7 % of the channels jumped since the frame before; it was touched",
+        *("right fingertip: 17.5 % of the channels jumped since the frame before; it was touched",) * 2,
+        "right fingertip: 31.5 % of the channels are dead or saturated; look at the ribbon cable",
+        *("the torque would be -0.2 N·m", "the torque would be 0.2 N·m"),
+        "outside of the calibration: the frame lies 3.0 standard deviations from those calibrated on",
     ]
-    nothing = np.full(4, np.nan)
-    series = FrameSeries("raw", ("right",), np.arange(4.0), np.zeros((4, 1, 896)), nothing[:0], nothing[:0], nothing)
-    track = Track(series, tuple(Estimate(valid=False, why=(why,)) for why in said), np.zeros(4))
-    assert reasons([track]) == {
-        "right fingertip: # % of the channels jumped since the frame before": 2,
-        "right fingertip: # % of the channels are dead or saturated": 1,
-        "outside of the calibration": 1,
-    }
+    nothing = np.full(8, np.nan)
+    series = FrameSeries("raw", ("right",), np.arange(8.0), np.zeros((8, 1, 896)), nothing[:0], nothing[:0], nothing)
+    track = Track(series, tuple(Estimate(valid=False, why=(why,)) for why in said), np.zeros(8))
+    assert reasons([track]) == [
+        Reason(3, said[2], differ=True),
+        Reason(2, said[5], differ=True),
+        *(Reason(1, said[row], differ=False) for row in (0, 4, 7)),
+    ]
+
+
+def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, tmp_path, capsys):
+    calibration, slices = tmp_path / "a.cal", str(slices_folder / "torque_slices")
+    assert main(["calibrate", slices, "--out", str(calibration)]) == 0
+    told = [
+        Reason(12, "gripped too lately: 12 more frames are needed", differ=True),
+        Reason(1, "no grip", differ=False),
+    ]
+    monkeypatch.setattr("daemon.recording.evaluation.reasons", lambda _: told)
+    assert main(["evaluate", str(calibration), slices]) == 0
+    said = capsys.readouterr().out
+    assert "12 frames not valid, e.g.: gripped too lately: 12 more frames are needed" in said
+    assert "1 frames not valid: no grip" in said
 
 
 @pytest.mark.parametrize(

@@ -87,8 +87,7 @@ def run(args: argparse.Namespace) -> int:
     series = [(path, one) for path in args.recordings for one in read_series(path, sides, tool_mm)]
     parts = [part_of(one, start, stop) for _, one in series]
     check_no_copies([(str(path), part) for (path, _), part in zip(series, parts, strict=True)])
-    if args.all_torques and any(one.kind == "raw" for one in parts):
-        raise UserError("--all-torques is for slices: what is read of recordings has no such ends; leave it out")
+    _check_options(args, parts)
     if late_s:
         parts = [replace(one, torque_t_s=one.torque_t_s - late_s) for one in parts]
     # A fingertip that hardly moves with the load has its times from the other one, wherever both were recorded.
@@ -119,6 +118,8 @@ def run(args: argparse.Namespace) -> int:
         timed_by=[one for _, one in beside],
         aligned=aligned,
     )
+    if args.all_torques and calibration.torque is None:
+        raise UserError("--all-torques vouches for torques, and these slices tell diameters alone; leave it out")
     calibration.save(args.out)
     quantities = [name for name in ("torque", "diameter") if getattr(calibration, name) is not None]
     frames = sum(len(one.t_s) for one in parts)
@@ -157,6 +158,23 @@ def run(args: argparse.Namespace) -> int:
         sentences.append(unknown if known_mm is None else f"Its tool is of {known_mm:.3g} mm.")
     tell(told, sentences, as_json=args.json)
     return 0
+
+
+def _check_options(args: argparse.Namespace, parts: "Sequence[FrameSeries]") -> None:
+    """Raise UserError for an option that does nothing for what is calibrated on."""
+    from daemon.errors import UserError
+
+    if args.all_torques and any(one.kind == "raw" for one in parts):
+        raise UserError("--all-torques is for slices: what is read of recordings has no such ends; leave it out")
+    if all(one.kind == "raw" for one in parts):
+        return
+    for option, given, why in (
+        ("--load-late", args.load_late, "each slice holds its torque itself"),
+        ("--tool-mm", args.tool_mm, "a calibration of slices knows of no tool"),
+        ("--sides", args.sides, "slices do not tell whose they are"),
+    ):
+        if given is not None:
+            raise UserError(f"{option} is for recordings: {why}; leave it out")
 
 
 def _of_times(

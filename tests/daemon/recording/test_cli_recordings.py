@@ -140,14 +140,23 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
             ["calibrate", "{slices}", "--tool-mm", "0", "--out", "x"],
             "--tool-mm must be above 0 and below 140 mm, not 0",
         ),
+        (["calibrate", "{slices}", "--load-late", "0", "--out", "x"], "--load-late is for recordings: each slice"),
+        (["calibrate", "{slices}", "--tool-mm", "20", "--out", "x"], "--tool-mm is for recordings: a calibration of"),
+        (["calibrate", "{slices}", "--sides", "left", "--out", "x"], "--sides is for recordings: slices do not tell"),
+        (
+            ["calibrate", "{slices}/diameter_slices", "--all-torques", "--out", "x"],
+            "--all-torques vouches for torques, and these slices tell diameters alone; leave it out",
+        ),
         (["calibrate", "nowhere.mcap", "--out", "x"], "nowhere.mcap: the recording cannot be read"),
         (["evaluate", "nowhere.cal", "{slices}"], "nowhere.cal: the calibration cannot be read"),
         (["evaluate", "nowhere.cal", "{slices}", "--out", "x.mcap"], "x.mcap is not the name of a figure"),
     ],
 )
-def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, capsys):
+def test_mistakes_end_in_one_sentence(arguments, message, slices_folder, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     assert main([one.format(slices=slices_folder) for one in arguments]) == 2
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, tmp_path, capsys):

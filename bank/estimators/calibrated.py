@@ -27,6 +27,12 @@ from bank.gaussian import TWO_SIDED_95
 Name = Literal["paper", "bank", "regression", "reconstruction", "fused"]
 NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
 NEEDS_BANK: tuple[Name, ...] = ("paper", "bank")
+# What may be taken on somebody's word, as a sentence goes on that says so.
+Vouched = Literal["all torques", "load times"]
+_ON_WORD: dict[Vouched, str] = {
+    "all torques": "that no torque will come beyond those of its slices (--all-torques)",
+    "load times": "for when its loads were measured (--load-late)",
+}
 # Two cells of the paper's bank.
 _LEAST_MARGIN_K_CM = 0.05
 
@@ -68,6 +74,7 @@ class Calibration:
     dead by infinity; image (p, 896) turns them into pixels. bank_identity is empty for an estimator without a bank.
     tool_mm is the diameter of the one tool that all was recorded with, NaN where it is not known or not one. filling is
     there for raw frames that are read without memory; calibrations that were made before there was any have none.
+    vouched is what was taken on somebody's word, None where the calibration is older than that is told.
     """
 
     estimator: Name
@@ -84,6 +91,12 @@ class Calibration:
     torque: Task | None
     diameter: Task | None
     filling: Filling | None = None
+    vouched: tuple[Vouched, ...] | None = None
+
+    @property
+    def word(self) -> str:
+        """What was taken on somebody's word, as "on somebody's word …" goes on; empty for nothing."""
+        return " and ".join(_ON_WORD[one] for one in self.vouched or ())
 
     def save(self, path: str | Path) -> None:
         """Write the calibration's file, the same bytes for the same calibration; CalibrationError where it fails."""

@@ -5,6 +5,7 @@ calibration will be judged on.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -69,12 +70,14 @@ def fit(
         image=image_matrix(physics.mesh) if name == "reconstruction" and physics.mesh is not None else None,
         torque=None,
         diameter=None,
+        vouched=(),
     )
     chosen = [one.of_sides(sides) for one in recordings]
     if blank.kind != "raw":
-        return fit_slices(blank, chosen, physics, all_torques=all_torques)
+        fitted = fit_slices(blank, chosen, physics, all_torques=all_torques)
+        return replace(fitted, vouched=("all torques",)) if all_torques and fitted.torque is not None else fitted
     if trust_times:
-        return fit_raw(blank, chosen, physics, 0.0)
+        return replace(fit_raw(blank, chosen, physics, 0.0), vouched=("load times",))
     aligned = aligned or cache(alignment)
     timed = telling(recordings, timed_by, aligned)
     check_alignment(timed, aligned)

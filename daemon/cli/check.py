@@ -56,8 +56,10 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _torque(estimator: "AnyEstimator", *, calibrated: bool) -> str:
+    from daemon.eit.opening import on_word
+
     if estimator.measures_torque:
-        return "with torque"
+        return f"with torque{on_word(estimator)}"
     why = "its calibration is of diameters alone" if calibrated else "no calibration is configured"
     return f"without torque: {why}"
 

@@ -61,6 +61,8 @@ def run(args: argparse.Namespace) -> int:
     with workers(args.cluster) as pool:
         tracks = in_order(pool.map(followed, shared, parts))
     figures = judge(tracks)
+    if calibration.word:
+        print(f"{args.calibration} was made on somebody's word {calibration.word}.", file=sys.stderr)
     for (path, _), part in zip(named, parts, strict=True):
         if why := doubt(part):
             print(f"Doubtful is {path.name}: {why}.", file=sys.stderr)

@@ -9,7 +9,7 @@ from bank.errors import BankError
 from daemon.config import Both, CurveConfig, DaemonConfig, Fingertip
 from daemon.config_file import load_yaml_model
 from daemon.doctor.finding import Finding, from_file, from_sentence, good, note, trouble
-from daemon.eit.opening import open_both, open_estimator
+from daemon.eit.opening import on_word, open_both, open_estimator
 from daemon.eit.tracking import TrackedEstimator
 from daemon.errors import UserError
 from daemon.experiment.steps import ExperimentFile
@@ -76,7 +76,8 @@ def calibration_finding(name: str, fingertip: Fingertip) -> Finding:
     except (UserError, BankError) as error:
         return from_sentence(subject, str(error), "there is no torque")
     if isinstance(estimator, TrackedEstimator):
-        return good(subject, f"{fingertip.calibration} is of the estimator {estimator.name} and this fingertip")
+        found = f"{fingertip.calibration} is of the estimator {estimator.name} and this fingertip"
+        return good(subject, found + on_word(estimator))
     return good(subject, f"{fingertip.calibration} belongs to this bank")
 
 
@@ -86,7 +87,8 @@ def both_finding(both: Both, fingertips: dict[str, Fingertip]) -> Finding:
         estimator = open_both(both, fingertips)
     except (UserError, BankError) as error:
         return from_sentence("calibration of both", str(error), "there is no estimate of both together")
-    return good("calibration of both", f"{both.calibration} is of {' and '.join(estimator.sides)}, {estimator.name}")
+    found = f"{both.calibration} is of {' and '.join(estimator.sides)}, {estimator.name}"
+    return good("calibration of both", found + on_word(estimator))
 
 
 def keys_finding(curve: CurveConfig | None, network: dict[str, str]) -> Finding:

@@ -77,6 +77,12 @@ def open_both(config: Both, fingertips: dict[str, Fingertip]) -> TrackedEstimato
     return _tracked(fitted, fingertips[fitted.sides[0]])
 
 
+def on_word(estimator: AnyEstimator) -> str:
+    """Return what is added where a calibration is shown that somebody vouched for; empty for others."""
+    word = estimator.word if isinstance(estimator, TrackedEstimator) else ""
+    return f", on somebody's word {word}" if word else ""
+
+
 def _tracked(fitted: FittedCalibration, config: Fingertip) -> TrackedEstimator:
     bank = Bank.open(config.bank) if config.bank is not None else None
     scoring = Scoring(_matcher(bank, config.matching), bank.model) if bank is not None else None

@@ -48,6 +48,7 @@ class TrackedEstimator:
         self.name = calibration.estimator
         # One of diameters alone does not.
         self.measures_torque = calibration.torque is not None
+        self.word = calibration.word
         self.model = scoring.model if scoring is not None else ""
         self._tracker = Tracker(calibration, bank, period_s=period_s)
         self._scoring = scoring

@@ -130,6 +130,7 @@ def run(args: argparse.Namespace) -> int:
         "frames": frames,
         "sides": list(calibration.sides),
         "source": source,
+        "vouched": list(calibration.vouched or ()),
     }
     sentences = [
         f"{args.out}: estimator {args.estimator}, {' and '.join(quantities)} from {frames} frames of the "

@@ -3,11 +3,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bank.errors import BankError, CalibrationError
-from bank.estimators import Calibration, TactileFrame, Tracker
+from bank.estimators import Calibration, TactileFrame, Tracker, fit
 from bank.estimators.archive import write_archive
 from bank.estimators.calibrated import Task
 from bank.estimators.cylinders import Gripped, fit_cylinders
@@ -95,3 +96,23 @@ def test_what_cannot_be_kept_is_an_error(tmp_path):
         write_archive(tmp_path / "x.cal", {}, {"a": 1})
     with pytest.raises(CalibrationError, match="choose another --out"):
         write_archive(tmp_path / "none" / "x.cal", {}, np.zeros(1))
+
+
+def test_what_was_taken_on_somebodys_word_is_kept_and_older_files_do_not_tell(
+    fused_calibration, recorded, sliced, tmp_path
+):
+    assert fused_calibration.vouched == ()
+    assert fused_calibration.word == ""
+    timed = fit("fused", [recorded], "a played rig", trust_times=True)
+    assert timed.word == "for when its loads were measured (--load-late)"
+    path, older = tmp_path / "new.cal", tmp_path / "older.cal"
+    fit("regression", [sliced()], "slices", all_torques=True).save(path)
+    assert Calibration.load(path).word == "that no torque will come beyond those of its slices (--all-torques)"
+    with zipfile.ZipFile(path) as new, zipfile.ZipFile(older, "w") as written:
+        header = yaml.safe_load(new.read("calibration.yaml"))
+        del header["content"]["vouched"]
+        written.writestr("calibration.yaml", yaml.safe_dump(header))
+        for name in header["sha256"]:
+            written.writestr(name, new.read(name))
+    assert Calibration.load(older).vouched is None
+    assert Calibration.load(older).word == ""

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from bank.bank_file import Bank
 from bank.estimators import Calibration, FrameSeries, fit
 from bank.fast_matching import FastZeroLagMatcher
+from daemon.cli.check import _torque
 from daemon.config import Both, Fingertip
+from daemon.doctor.files import both_finding, calibration_finding
 from daemon.eit.opening import open_both, open_estimator
 from daemon.eit.tracking import Scoring, TrackedEstimator
 from daemon.errors import UserError
@@ -152,6 +154,21 @@ def test_the_calibration_says_which_estimator_it_is(files: dict[str, Path]) -> N
     both = open_both(Both(calibration=files["both"]), {"right": fingertip(), "left": fingertip()})
     assert both.sides == ("right", "left")
     assert both.grids is None
+
+
+def test_doctor_and_check_show_what_was_taken_on_somebodys_word(
+    calibration: Calibration, files: dict[str, Path], tmp_path: Path
+) -> None:
+    path, tips = tmp_path / "both.cal", {"right": fingertip(), "left": fingertip()}
+    alone = fingertip(calibration=files["right"])
+    replace(calibration, vouched=("load times",)).save(path)
+    vouched = both_finding(Both(calibration=path), tips)
+    assert vouched.state == "good"
+    assert vouched.found.endswith(", on somebody's word for when its loads were measured (--load-late)")
+    assert "with torque, on somebody's word for" in _torque(open_both(Both(calibration=path), tips), calibrated=True)
+    for finding in (both_finding(Both(calibration=files["both"]), tips), calibration_finding("right", alone)):
+        assert finding.state == "good"
+        assert "word" not in finding.found
 
 
 @pytest.mark.parametrize(

@@ -77,9 +77,15 @@ def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, 
     assert ends in capsys.readouterr().out
     assert main([*calibrate, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["reads_beyond"] is False
+    assert main(["evaluate", str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")]) == 0
+    assert "somebody's word" not in capsys.readouterr().err
     assert main([*calibrate, "--all-torques"]) == 0
     assert "beyond" not in capsys.readouterr().out
     assert np.isinf(fitted[-1].torque.reader.high_end)
+    assert main(["evaluate", str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")]) == 0
+    assert "a.cal was made on somebody's word that no torque will come beyond those of" in capsys.readouterr().err
+    assert main([*calibrate, "--all-torques", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["vouched"] == ["all torques"]
 
 
 def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, capsys):

@@ -15,7 +15,10 @@ except ImportError:
 
 
 def is_stale(module: ModuleType) -> bool:
-    """Return whether a module is compiled from another source than lies beside it, for that has changed since."""
+    """Return whether a module is compiled from another source than lies beside it, for that has changed since.
+
+    As `bank.compiled` asks of its own: neither package imports the other.
+    """
     source = Path(__file__).with_name("_cells.c")
     return source.exists() and crc32(source.read_bytes()) != getattr(module, "SOURCES", None)
 

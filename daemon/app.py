@@ -6,7 +6,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
+from types import FrameType, MappingProxyType
 from typing import Any
 
 import structlog
@@ -350,6 +350,10 @@ def _board(
     )
 
 
+def _told_already(_number: int, _frame: FrameType | None) -> None:
+    """Do nothing: the daemon has ended already."""
+
+
 async def run_daemon(
     config: DaemonConfig,
     listeners: tuple[Listener, ...] = (),
@@ -360,7 +364,7 @@ async def run_daemon(
 
     SIGTERM is how a service manager ends a service, SIGHUP tells that its terminal was closed: what they leave undone
     was to be left. `listeners` hear every message; `facts` are what health tells of them, by name; `on_ready` is called
-    once all that lasts has been made.
+    once all that lasts has been made. Afterwards SIGTERM and SIGHUP do nothing any more.
     """
     loop, terminated = asyncio.get_running_loop(), False
 
@@ -383,4 +387,7 @@ async def run_daemon(
         finally:
             for number in ending:
                 loop.remove_signal_handler(number)
+                if number != signal.SIGINT:
+                    # Said once more it would kill us, before emulators are ended and what is shown is written.
+                    signal.signal(number, _told_already)
     return daemon.finished or terminated

@@ -28,8 +28,12 @@ class Ended(KeyboardInterrupt):
 def interrupts_heard() -> Iterator[None]:
     """Raise signals that end a command, in its main thread; a command may have handlers of its own for them.
 
-    One that comes in what compiled code calls is sent again: that cannot pass it on, and it would be lost.
+    One that comes in what compiled code calls is sent again: that cannot pass it on, and it would be lost. In another
+    thread nothing is heard.
     """
+    if not ending_signals():
+        yield
+        return
     again: list[threading.Timer] = []
     before = sys.unraisablehook
 

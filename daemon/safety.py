@@ -38,6 +38,8 @@ class Event(Enum):
     STATE_STALE = "state stale"
     DEVICE_AWAITED = "device awaited"
     DEVICE_LOST = "device lost"
+    ROBOT_LOST = "robot lost"
+    ROBOT_BLOCKED = "robot blocked"
     TASK_DIED = "task died"
     LOOP_LATE = "loop late"
     HELD_TOO_LONG = "held too long"
@@ -143,6 +145,16 @@ TABLE: Mapping[Event, Rule] = {
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",
         "Plug it in again; it is found by itself, then start the experiment again.",
+    ),
+    Event.ROBOT_LOST: Rule(
+        _KEEP,
+        "the robot, or the daemon's process that drives it, is gone: {detail}.",
+        "It is connected again by itself; then `shearloop command unlock`, and start the experiment again.",
+    ),
+    Event.ROBOT_BLOCKED: Rule(
+        _KEEP,
+        "the robot does not move: {detail}.",
+        "Clear what it names and `shearloop command unlock`, then start the experiment again.",
     ),
     Event.TASK_DIED: Rule(
         _KEEP,

@@ -55,7 +55,8 @@ def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: in
     found += _arm_and_hand(senses, watched, t_ns)
     for name, why in senses.lost.items():
         if name in watched.required and name not in _awaited(senses, watched):
-            found.append(Trouble(Event.DEVICE_LOST, f"{name}: {why}"))
+            lost = (Event.ROBOT_LOST, why) if name == "robot" else (Event.DEVICE_LOST, f"{name}: {why}")
+            found.append(Trouble(*lost))
     for name, why in senses.died.items():
         found.append(Trouble(Event.TASK_DIED, f"{name}: {why}"))
     if senses.late_s > LATEST_LOOP_S:
@@ -196,7 +197,7 @@ def _arm(arm: Arm, t_ns: int) -> list[Trouble]:
     if arm.protective_stop:
         return [Trouble(Event.PROTECTIVE_STOP, arm.blocked or "the controller reports it")]
     if arm.blocked:
-        return [Trouble(Event.DEVICE_LOST, f"the robot does not move: {arm.blocked}")]
+        return [Trouble(Event.ROBOT_BLOCKED, arm.blocked)]
     return []
 
 

@@ -69,7 +69,7 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged() -> Non
     [
         ({"protective_stop": True}, Event.PROTECTIVE_STOP),
         ({"emergency_stop": True}, Event.EMERGENCY_STOP),
-        ({"blocked": "the robot's process was started again"}, Event.DEVICE_LOST),
+        ({"blocked": "the robot's process was started again"}, Event.ROBOT_BLOCKED),
     ],
 )
 def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense: dict[str, Any], event: Event) -> None:

@@ -8,7 +8,7 @@ from daemon.experiment.steps import Limits
 from daemon.loop.senses import Arm, Hand, Senses, Source, Torque
 from daemon.loop.watch import ARM_STALE_S, LONGEST_TICK_S, Watched, WatchSettings, compared_for_s, troubles
 from daemon.loop_task import PUBLISH_EVERY, wrench_source
-from daemon.safety import TABLE, Event
+from daemon.safety import TABLE, Event, Response
 from drivers.ur.pace import Pace
 from drivers.ur.sample_age import SampleAge
 from tests.drivers.ur.flight import SETTINGS
@@ -136,13 +136,27 @@ def test_devices_that_were_never_there_are_awaited_in_one_sentence() -> None:
 def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there() -> None:
     arm, hand = Arm(0.0, NOW_NS), Hand(NOW_NS, 30.0, holding=False, moving=False)
     assert devices(LOST, arm=arm, hand=hand) == [
-        (Event.DEVICE_LOST, f"robot: {LOST['robot']}"),
+        (Event.ROBOT_LOST, LOST["robot"]),
         (Event.DEVICE_LOST, f"gripper: {LOST['gripper']}"),
     ]
     assert devices({"gripper": LOST["gripper"]}, arm=arm) == [
         (Event.DEVICE_AWAITED, "gripper, There is no gripper socket")
     ]
     assert [event for event, _ in devices(LOST, hand=hand)] == [Event.DEVICE_AWAITED, Event.DEVICE_LOST]
+
+
+def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again() -> None:
+    """Its process, killed, was "gone" and to be plugged in; what comes back is blocked until it is unlocked."""
+    died = "The robot's process died of SIGKILL while controlling. The process is started again with motion disabled."
+    blocked = Arm(0.0, NOW_NS, blocked="Motion has not been enabled since the robot's process was started.")
+    for senses in (Senses(arm=Arm(0.0, NOW_NS), lost={"robot": died}), Senses(arm=blocked)):
+        (trouble,) = troubles(
+            senses, replace(watched(EIT, ()), torque_needed=False, required=("robot",)), WatchSettings(), NOW_NS
+        )
+        assert trouble.rule.response is Response.STOP_AND_KEEP_GRIP
+        assert trouble.sentence.startswith("the robot")
+        assert "`shearloop command unlock`" in trouble.rule.cure
+        assert "lug" not in trouble.sentence
 
 
 def test_a_sensor_that_was_never_there_is_not_gone() -> None:

@@ -163,8 +163,8 @@ TABLE: Mapping[Event, Rule] = {
     ),
     Event.LOOP_LATE: Rule(
         _HOLD,
-        "the daemon is too slow for its devices: {detail}.",
-        "End other programs on this computer, or see the service's real-time options.",
+        "the daemon did not keep up with its devices: {detail}.",
+        "Let nothing pause it or suspend the computer, end other programs, or see the service's real-time options.",
         hold_at_most_s=5.0,
         told_afterwards=True,
     ),
@@ -202,10 +202,14 @@ HELD_AT_MOST_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """One event with what is particular to this occurrence."""
+    """One event with what is particular to this occurrence.
+
+    It `follows` where it is so only because the loop was late, which is told: then it goes without saying.
+    """
 
     event: Event
     detail: str
+    follows: bool = False
 
     @property
     def rule(self) -> Rule:
@@ -228,8 +232,8 @@ class Verdict:
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """One sentence a trouble."""
-        return tuple(trouble.sentence for trouble in self.troubles)
+        """One sentence a trouble, but for what follows from another one."""
+        return tuple(trouble.sentence for trouble in self.troubles if not trouble.follows)
 
 
 class SafetyGate:

@@ -13,10 +13,10 @@ from daemon.experiment.steps import ExperimentFile
 from daemon.loop.senses import Torque
 from daemon.loop_actions import along_tool
 from daemon.loop_task import PUBLISH_EVERY, WRENCH
-from daemon.safety import Event
+from daemon.safety import Event, Trouble
 from drivers.ur.messages import Enable, MoveLinear, Stop, WristSpeed
 from tests.daemon.cell import SPEED_M_PER_S, driven, no_tick
-from tests.drivers.ur.flight import SETTINGS
+from tests.drivers.ur.flight import CYCLE_NS, SETTINGS
 
 
 @pytest.mark.parametrize(
@@ -144,6 +144,18 @@ async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read:
             if cell.phase is not Phase.RUNNING:
                 break
         assert "loop was woken" in cell.why
+
+
+async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_it() -> None:
+    """Of as many as eight sentences the cause was the last: torques and states are old to one who was away."""
+    async with driven() as cell:
+        await cell.start(TWIST)
+        await cell.cycles(50)
+        for _ in range(6_000_000_000 // CYCLE_NS):
+            cell.robot.cycle(read=False)
+        await cell.cycles(1)
+        assert cell.phase is Phase.STOPPED
+        assert cell.why == Trouble(Event.LOOP_LATE, "the daemon itself was not running for 6.0 s").sentence
 
 
 async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -> None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 
 import structlog
 
+from drivers.cancelled import is_cancelled
+
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
 # A task that ran this long before it died had recovered: its next pause is short again.
@@ -57,6 +59,9 @@ class Supervisor:
             try:
                 await run()
             except Exception as error:  # whatever kills one task must not kill the others
+                if is_cancelled():
+                    log.exception("the task died as it was ended")
+                    raise asyncio.CancelledError from error
                 deaths = 1 if loop.time() - started_s > RECOVERED_AFTER_S else deaths + 1
                 pause_s = restart_pause_s(deaths)
                 record.restarts += 1

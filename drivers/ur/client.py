@@ -15,6 +15,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
+from drivers.cancelled import is_cancelled
 from drivers.errors import DriverError
 from drivers.ur import sentences
 from drivers.ur.conversation import HEARTBEAT, Conversation, Descriptor, LossKind, LostError, output
@@ -211,6 +212,8 @@ class UrRobot:
             await _in_any_case(conversation.end())
             self.pid = None
         if loss is not None:
+            if is_cancelled():
+                raise asyncio.CancelledError
             raise loss
 
     def connected(self, stdin: asyncio.StreamWriter) -> None:

@@ -46,3 +46,23 @@ async def test_a_cancelled_task_stays_cancelled() -> None:
         await task
     assert not watched.records["waits"].alive
     assert watched.records["waits"].restarts == 0
+
+
+async def test_a_task_that_dies_of_being_cancelled_is_not_started_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a task group does in which something fails meanwhile: nobody would cancel it once more."""
+    monkeypatch.setattr(supervisor, "restart_pause_s", lambda _: pytest.fail("it is started again"))
+    watched, started = Supervisor(), asyncio.Event()
+
+    async def dies_of_it() -> None:
+        started.set()
+        try:
+            await asyncio.Event().wait()
+        except asyncio.CancelledError:
+            raise RuntimeError("the last words") from None
+
+    task = asyncio.create_task(watched.keep_running("stubborn", dies_of_it))
+    await started.wait()
+    task.cancel()
+    with capture_logs() as logs, pytest.raises(asyncio.CancelledError):
+        await task
+    assert [entry["event"] for entry in logs] == ["the task died as it was ended"]

@@ -14,7 +14,7 @@ import pytest
 
 from drivers.errors import DriverError
 from drivers.ur.client import UrRobot
-from drivers.ur.conversation import LAST_WORDS_BYTES, Conversation, output
+from drivers.ur.conversation import LAST_WORDS_BYTES, Conversation, LostError, output
 from drivers.ur.messages import Failed, Reply, Stop
 from drivers.ur.wire import encode
 from tests.drivers.ur.flight import SETTINGS, Flight, flying
@@ -242,3 +242,31 @@ async def test_process_that_ends_by_itself_as_the_daemon_stops_is_waited_for(
     with pytest.raises(asyncio.CancelledError):
         await run
     assert len(ended) == 1
+
+
+async def test_a_process_that_is_lost_while_the_daemon_ends_is_not_started_again(
+    play: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Task groups tell of the loss alone, and the daemon waited for ever for a robot that it had told to end."""
+    play("exec cat")
+    listened: list[Conversation] = []
+
+    async def listen(conversation: Conversation) -> None:
+        assert not listened, "it was started again"
+        listened.append(conversation)
+        # Until those beside it have begun.
+        await asyncio.sleep(0)
+        raise LostError("crashed", "The robot's process died.")
+
+    async def keep_alive(_: Conversation) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            run.cancel()
+
+    monkeypatch.setattr(Conversation, "listen", listen)
+    monkeypatch.setattr(Conversation, "keep_alive", keep_alive)
+    run = asyncio.create_task(UrRobot(settings_for("127.0.0.254")).run())
+    with pytest.raises(asyncio.CancelledError):
+        await run
+    assert len(listened) == 1

@@ -1,6 +1,7 @@
 """The tracker that follows one session with a calibration: frames in, estimates out, causally."""
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,7 @@ from bank.estimators.values import BoolArray, Estimate, FloatArray, Measured, Ta
 from bank.gaussian import TWO_SIDED_95
 
 _UNITS = {"torque": "N·m", "diameter": "mm"}
+_REPEATED = ("the board sent the same frame again",)
 _AMBIGUOUS = ("two places of the bank far apart fit the frame equally well",)
 # In which what stands for unusable channels may be off, where nothing stands for any.
 _NO_WAYS: FloatArray = np.zeros((0, 1, N_CHANNELS))
@@ -96,6 +98,16 @@ class Tracker:
         if calibration.kind == "raw":
             self._memory = Memory(calibration.guards, calibration.motion, self._period_s, idle_frames)
         self._difference: FloatArray | None = None
+        self._latest: list[bytes] = []
+
+    def _repeats(self, channels: FloatArray) -> bool:
+        """Return whether a side of a (m, 896) frame is that of the frame before to the last digit, and so no new one.
+
+        Noise rules that out in a new one.
+        """
+        # Bytes that differ are told from each other at the first that does; arrays are compared to their ends.
+        before, self._latest = self._latest, [side.tobytes() for side in channels]
+        return any(map(operator.eq, self._latest, before))
 
     @property
     def taking_idle(self) -> bool:
@@ -121,6 +133,8 @@ class Tracker:
         if self._memory is None:
             difference = np.abs(frame.channels)
             return self._read(difference, None, frame.usable, frame.t_s)
+        if self._repeats(frame.channels):
+            return Estimate(valid=False, why=_REPEATED)
         moment = self._memory.see(frame)
         if moment.why:
             return Estimate(valid=False, why=moment.why)

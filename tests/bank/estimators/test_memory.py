@@ -14,11 +14,11 @@ UP, DOWN = np.linspace(0, 1, 21), np.linspace(1, 0, 21)[1:]
 
 @pytest.fixture
 def like(fused_calibration):
-    """Return what makes a frame at a time, so far from idle to gripped."""
+    """Return what makes a frame at a time, so far from idle to gripped; no two are the same to the last digit."""
     idle, gripped = (
         np.array([getattr(guard, name) for guard in fused_calibration.guards]) for name in ("idle", "gripped")
     )
-    return lambda t_s, share: TactileFrame.of(t_s, 1.1 * (idle + share * (gripped - idle)))
+    return lambda t_s, share: TactileFrame.of(t_s, 1.1 * (idle + share * (gripped - idle)) + 1e-13 * t_s)
 
 
 def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(fused_calibration, like):

@@ -329,3 +329,18 @@ def test_after_frames_that_were_left_out_the_interval_holds_a_load_that_rises_me
                 inside.append(low_nm <= series.torque_at_frames()[i] <= high_nm)
     assert len(inside) > 80
     assert np.mean(inside) >= 0.95
+
+
+@pytest.mark.parametrize("sides", [[0, 1], [1]])
+def test_a_frame_that_a_board_sends_again_is_no_new_one(fused_calibration, twisting, sides):
+    """A board that hung told the torque of long ago, valid for ever; the next frame is read as if it had not been."""
+    whole = twisting(seed=5)
+    frozen, expected = whole.channels.copy(), follow(fused_calibration, whole)
+    hung = np.flatnonzero([one.valid for one in expected])[10]
+    frozen[hung : hung + 30, sides] = frozen[hung, sides]
+    told = follow(fused_calibration, changed(whole, channels=frozen))
+    assert told[hung] == expected[hung]
+    assert all(one.why == ("the board sent the same frame again",) for one in told[hung + 1 : hung + 30])
+    times = np.delete(np.arange(len(whole.t_s)), np.arange(hung + 1, hung + 30))
+    without = changed(whole, t_s=whole.t_s[times], channels=whole.channels[times], diameter_mm=whole.diameter_mm[times])
+    assert told[hung + 30 :] == follow(fused_calibration, without)[hung + 1 :]

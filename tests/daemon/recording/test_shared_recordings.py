@@ -6,14 +6,16 @@ and the reason stands in docs/decisions/0042-default-estimator.md.
 
 import json
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bank.errors import CalibrationError
-from bank.estimators import Calibration, FrameSeries, fit
+from bank.estimators import Calibration, FrameSeries, Name, fit
 from bank.estimators import alignment as alignments
 from bank.estimators.alignment import alignment, doubt, is_filtered
 from bank.estimators.familiar import DifferenceGuard
@@ -40,6 +42,19 @@ def twists_file(shared, tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def twists(twists_file) -> FrameSeries:
     return series_of(read_recording(twists_file))
+
+
+@pytest.fixture(scope="module")
+def slices(shared) -> FrameSeries:
+    """The forty-nine torque slices."""
+    (series,) = read_series(shared / "recordings/torque_slices")
+    return series
+
+
+@pytest.fixture(scope="module")
+def earlier(slices) -> Callable[[Name, int], Calibration]:
+    """Return what an estimator is calibrated to by the first n torque slices, which several tests judge."""
+    return cache(lambda name, n: fit(name, [slices.between(0, n)], "earlier"))
 
 
 @pytest.fixture(scope="module")
@@ -133,12 +148,11 @@ def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(
     assert judge([follow(of_all_twists, other)])["valid_fraction"] == 0
 
 
-def test_later_torque_slices(shared):
+def test_later_torque_slices(slices, earlier):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
-    (series,) = read_series(shared / "recordings/torque_slices")
     errors, covered, widths_nm = [], [], []
     for n in (19, 24, 29, 34, 39, 44):
-        followed = follow(fit("fused", [series.between(0, n)], "earlier"), series.between(n, 49))
+        followed = follow(earlier("fused", n), slices.between(n, 49))
         figures = judge([followed])
         r, rmse_nm, coverage = LATER_SLICES.get(n, (0.96, 0.018, 0.0))
         assert figures["r"] >= r
@@ -154,23 +168,22 @@ def test_later_torque_slices(shared):
     # Which they would in any that are wide enough: the slices span 0.131 N·m.
     assert np.median(widths_nm) <= 0.12
     # Intervals of torques near the ends reach beyond them, unless somebody vouches for the range: 0.091 N·m after 29.
-    vouched = follow(fit("fused", [series.between(0, 29)], "earlier", all_torques=True), series.between(29, 49))
+    vouched = follow(fit("fused", [slices.between(0, 29)], "earlier", all_torques=True), slices.between(29, 49))
     assert np.median([one.torque_high_nm - one.torque_low_nm for one in vouched.estimates]) <= 0.085
 
 
 @pytest.mark.parametrize(
     ("name", "low_nm", "high_nm"), [("fused", 0.0, 0.08), ("fused", 0.07, 1.0), ("regression", 0.05, 1.0)]
 )
-def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_nm, high_nm, shared):
+def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_nm, high_nm, slices):
     """They are read within the range, and up to nine tenths of them were false-valid; far beyond it some still are."""
-    (series,) = read_series(shared / "recordings/torque_slices")
-    inside = (low_nm <= series.torque_nm) & (series.torque_nm < high_nm)
-    calibration = fit(name, [_some(series, inside)], "a part of the torques")
-    figures = judge([follow(calibration, _some(series, ~inside))])
+    inside = (low_nm <= slices.torque_nm) & (slices.torque_nm < high_nm)
+    calibration = fit(name, [_some(slices, inside)], "a part of the torques")
+    figures = judge([follow(calibration, _some(slices, ~inside))])
     assert figures["valid_fraction"] > 0.9, "or nothing would be tested"
     assert figures["coverage_95"] >= 0.9
-    vouched = fit(name, [_some(series, inside)], "no other will come", all_torques=True)
-    assert judge([follow(vouched, _some(series, ~inside))])["coverage_95"] < 0.8, "or there was nothing to hold"
+    vouched = fit(name, [_some(slices, inside)], "no other will come", all_torques=True)
+    assert judge([follow(vouched, _some(slices, ~inside))])["coverage_95"] < 0.8, "or there was nothing to hold"
 
 
 def _some(series: FrameSeries, chosen) -> FrameSeries:
@@ -181,10 +194,9 @@ def _some(series: FrameSeries, chosen) -> FrameSeries:
 
 
 @pytest.mark.parametrize("name", ["fused", "regression"])
-def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(name, shared):
+def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(name, slices, earlier):
     """No guard can see it; with `fused` a quarter of the slices, and a fifth with `regression`, were false-valid."""
-    (series,) = read_series(shared / "recordings/torque_slices")
-    calibration, later = fit(name, [series.between(0, 29)], "earlier"), series.between(29, 49)
+    calibration, later = earlier(name, 29), slices.between(29, 49)
     foreign = later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
     spoilt = replace(later, channels=0.9 * later.channels + 0.1 * foreign)
     figures = judge([follow(calibration, spoilt)])
@@ -201,14 +213,12 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
 
 
 @pytest.mark.parametrize("name", ["fused", "regression"])
-def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_intervals(name, shared):
+def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_intervals(name, slices, earlier, shared):
     """A cylinder responds weakly: 21 of 100 of these were false-valid with `fused`, 16 with `regression`."""
-    (series,), (cylinders,) = (
-        read_series(shared / "recordings" / each) for each in ("torque_slices", "diameter_slices")
-    )
+    (cylinders,) = read_series(shared / "recordings/diameter_slices")
     missed = []
-    for n in (20, 29, 39):
-        calibration, later = fit(name, [series.between(0, n)], "earlier"), series.between(n, 49)
+    for n in (19, 29, 39):
+        calibration, later = earlier(name, n), slices.between(n, 49)
         for diameter_mm in (10, 20, 30, 40):
             foreign = cylinders.channels[cylinders.diameter_mm == diameter_mm].mean(axis=0)
             figures = judge([follow(calibration, replace(later, channels=0.8 * later.channels + 0.2 * foreign))])
@@ -326,9 +336,8 @@ def test_no_good_recording_is_doubted(shared, twists_file, tmp_path):
 
 
 @pytest.mark.parametrize("n", [19, 24, 29, 34, 39, 44])
-def test_no_later_slice_is_strange_and_a_third_of_a_foreign_one_is(shared, n):
-    (series,) = read_series(shared / "recordings/torque_slices")
-    frames, usable = series.channels[:, 0], np.ones(896, dtype=np.bool_)
+def test_no_later_slice_is_strange_and_a_third_of_a_foreign_one_is(slices, n):
+    frames, usable = slices.channels[:, 0], np.ones(896, dtype=np.bool_)
     guard = DifferenceGuard.fit(frames[:n])
     later = frames[n:]
     foreign = later.mean(axis=0)[np.random.default_rng(7).permutation(896)]

@@ -53,6 +53,14 @@ def fonts() -> None:
     figure.savefig(io.BytesIO(), format="svg")
 
 
+@pytest.fixture
+def few_mixtures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have slices mixed with two foreign frames in place of fifteen: most of a fit, where no interval is judged."""
+    from bank.estimators import mixtures
+
+    monkeypatch.setattr(mixtures, "_NUMBERINGS", mixtures._NUMBERINGS[:2])
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """For `-m real_time` do not import the nine files of ten that have no such test, in each worker."""
     wanted = config.getoption("markexpr") == "real_time" and collection_path.match("test_*.py")

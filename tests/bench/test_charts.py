@@ -89,7 +89,7 @@ def test_errors_fall_in_proportion_to_the_mesh_size_towards_what_two_meshes_fore
     assert errors[0] > 1.5 * errors[1] > 2.0 * errors[2] > 0
 
 
-@pytest.mark.usefixtures("fonts")
+@pytest.mark.usefixtures("fonts", "few_mixtures")
 def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Path, tmp_path: Path) -> None:
     mesh = own_fingertip(0.4).mesh()
     bank = bank_of(None, mesh, scratch, Grid(np.linspace(3.0, 3.6, 7), np.linspace(1.0, 2.1, 12)))

@@ -60,7 +60,7 @@ def test_chosen_slices_keep_their_own_torques(slices: FrameSeries) -> None:
     np.testing.assert_array_equal(chosen.channels, slices.channels[rows])
 
 
-@pytest.mark.usefixtures("fonts")
+@pytest.mark.usefixtures("few_mixtures")
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
     slices: FrameSeries, bank: Bank, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -72,6 +72,7 @@ def test_frames_of_a_stream_are_taken_from_the_grip_as_differences_to_the_idle_o
             assert np.corrcoef(frame, np.abs(stream.channels[number, layer] - idle))[0, 1] > 0.99
 
 
+@pytest.mark.usefixtures("few_mixtures")
 def test_what_is_counted_is_what_the_estimator_says_of_mixed_slices(recordings, scratch) -> None:
     slices = recordings["difference"].whole
     bank = bank_of(None, own_fingertip(0.4).mesh(), scratch, Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8)))

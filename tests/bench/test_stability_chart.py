@@ -94,7 +94,7 @@ def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts,
     assert found.levels[-1].valid == 0.0
 
 
-@pytest.mark.usefixtures("fonts")
+@pytest.mark.usefixtures("fonts", "few_mixtures")
 def test_the_mean_of_cells_alike_does_not_hop_and_the_rims_are_walked(parts, bank, scratch) -> None:
     slices = parts[0]
     calibrations = fitted(slices, ("bank", "fused"), Physics(bank, None))

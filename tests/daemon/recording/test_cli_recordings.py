@@ -17,7 +17,7 @@ KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction
 KEYS |= {"latency_ms_p50", "latency_ms_p99"}
 
 
-@pytest.mark.usefixtures("fonts")
+@pytest.mark.usefixtures("fonts", "few_mixtures")
 def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_path, capsys):
     first, second = tmp_path / "a.cal", tmp_path / "b.cal"
     for out, form in ((first, []), (second, ["--json"])):
@@ -46,6 +46,7 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     assert "diameter" not in text
 
 
+@pytest.mark.usefixtures("few_mixtures")
 @pytest.mark.parametrize("misses_loads", [True, False])
 def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tmp_path, capsys, monkeypatch):
     def blind(*arguments, **options):
@@ -66,6 +67,7 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tm
     assert json.loads(capsys.readouterr().out)["sees_loads"] is not misses_loads
 
 
+@pytest.mark.usefixtures("few_mixtures")
 def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, capsys, monkeypatch):
     fitted = []
     monkeypatch.setattr("bank.estimators.fit", lambda *a, **options: fitted.append(fit(*a, **options)) or fitted[-1])
@@ -88,6 +90,7 @@ def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, 
     assert json.loads(capsys.readouterr().out)["vouched"] == ["all torques"]
 
 
+@pytest.mark.usefixtures("few_mixtures")
 def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_folder, tmp_path, capsys):
     recording, calibration = tmp_path / "a.mcap", tmp_path / "a.cal"
     assert main(["import", "mat", str(mat_folder()), "--out", str(recording)]) == 0
@@ -191,6 +194,7 @@ def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, t
     assert f"{second} holds exactly what {first} does; leave copies out" in refused(first, second)
 
 
+@pytest.mark.usefixtures("few_mixtures")
 def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folder, tmp_path, capsys):
     slices, copy, calibration = slices_folder / "torque_slices", tmp_path / "copy", tmp_path / "a.cal"
     assert main(["calibrate", str(slices), "--estimator", "regression", "--out", str(calibration)]) == 0

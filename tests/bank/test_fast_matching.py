@@ -203,12 +203,16 @@ def recorded_differences(shared: Path) -> Iterator[np.ndarray]:
                 yield from channels[20::701] - channels[:10].mean(axis=0)
 
 
+@pytest.fixture(scope="module")
+def recorded_frames(shared: Path) -> list[np.ndarray]:
+    return list(recorded_differences(shared))
+
+
 @both
-def test_recorded_frames(shared: Path, slow, fast) -> None:
+def test_recorded_frames(recorded_frames: list[np.ndarray], slow, fast) -> None:
     """Far from anything in this bank, as they are from every bank: a hard case."""
-    frames = list(recorded_differences(shared))
-    assert len(frames) > 60
-    for frame in frames:
+    assert len(recorded_frames) > 60
+    for frame in recorded_frames:
         assert_same(fast.match(frame), slow.match(frame))
 
 

@@ -109,6 +109,12 @@ def fused_calibration(recorded: FrameSeries) -> Calibration:
 
 
 @pytest.fixture(scope="session")
+def sliced_calibration() -> Calibration:
+    """An estimator calibrated on fifty slices."""
+    return fit("fused", [slices()], "all")
+
+
+@pytest.fixture(scope="session")
 def bank(tmp_path_factory) -> Bank:
     """Signals that move smoothly along the channels with k and widen with sigma."""
     k, sigma = np.linspace(1, 3, 21), np.linspace(0.5, 2, 16)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bank.estimators import FrameSeries, TactileFrame, Tracker, fit
+from bank.estimators import FrameSeries, TactileFrame, Tracker
 from bank.estimators.familiar import DifferenceGuard
 from bank.estimators.fitting_reader import fit_reader
 from bank.estimators.heads import Ridge
@@ -39,8 +39,8 @@ def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced
 
 
 @pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
-def test_a_foreign_frame_mixed_in_is_refused(sliced, share):
-    calibration, later = fit("fused", [sliced()], "all"), sliced(seed=3)
+def test_a_foreign_frame_mixed_in_is_refused(sliced, sliced_calibration, share):
+    calibration, later = sliced_calibration, sliced(seed=3)
     foreign = later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
     assert not any(one.valid for one in follow(calibration, (1 - share) * later.channels + share * foreign))
     assert all(one.valid for one in follow(calibration, later.channels))
@@ -173,14 +173,13 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
 
 
-def test_a_slice_is_measured_against_the_calibration_once(sliced, monkeypatch):
+def test_a_slice_is_measured_against_the_calibration_once(sliced, sliced_calibration, monkeypatch):
     """What lets it pass and its interval go by the same misfits: looked for twice they were a third of the time."""
     series, looked = sliced(), []
-    calibration = fit("fused", [series], "all")
     for kind in (DifferenceGuard, Twins):
         found = kind.misfit
         monkeypatch.setattr(kind, "misfit", lambda *args, found=found: (looked.append(type(args[0])), found(*args))[1])
-    assert all(one.valid for one in follow(calibration, series.channels[20:23]))
+    assert all(one.valid for one in follow(sliced_calibration, series.channels[20:23]))
     assert looked == [DifferenceGuard, Twins] * 3
 
 
@@ -234,8 +233,8 @@ def test_what_may_be_missing_widens_to_the_side_where_it_would_be_read(sign):
     assert (low, high) == (pytest.approx(plain[0]), pytest.approx(plain[1] + 0.2, abs=0.01))
 
 
-def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced):
-    task = replace(fit("fused", [sliced()], "all").torque, ks=np.array([3.12, 3.17]))
+def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced_calibration):
+    task = replace(sliced_calibration.torque, ks=np.array([3.12, 3.17]))
     place = Place(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
     assert task.refuse_place(place) == ()
     assert task.refuse_place(None) == ()

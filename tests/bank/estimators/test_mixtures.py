@@ -63,8 +63,8 @@ def test_what_a_guard_cannot_see_lies_within_the_interval():
     assert np.mean(pure, axis=0)[1] <= 0.1
 
 
-def test_where_it_is_seen_intervals_are_as_wide_as_without(sliced):
-    calibration = fit("fused", [sliced()], "all")
+def test_where_it_is_seen_intervals_are_as_wide_as_without(sliced, sliced_calibration):
+    calibration = sliced_calibration
     reader = calibration.torque.reader
     without = replace(calibration, torque=replace(calibration.torque, reader=replace(reader, hidden_below=0.0)))
     later = sliced(seed=3)
@@ -73,9 +73,10 @@ def test_where_it_is_seen_intervals_are_as_wide_as_without(sliced):
 
 
 @pytest.mark.parametrize("name", ["fused", "regression"])
-def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced):
+def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced, sliced_calibration):
     """It only makes the own response smaller, which is what another torque does: no misfit tells of it."""
-    calibration, later = fit(name, [sliced()], "all"), sliced(seed=3)
+    calibration = sliced_calibration if name == "fused" else fit(name, [sliced()], "all")
+    later = sliced(seed=3)
     guard = calibration.torque.guard
     blind = replace(calibration, torque=replace(calibration.torque, guard=replace(guard, largest_own=0.0)))
     foreign = 0.2 * later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
@@ -127,9 +128,9 @@ def test_the_interval_reaches_to_the_side_on_which_the_truth_is_hidden(sign):
     assert at_limit[other] == plain[other] < 0.01
 
 
-def test_a_calibration_from_before_is_read_as_it_was(sliced, tmp_path):
+def test_a_calibration_from_before_is_read_as_it_was(sliced, sliced_calibration, tmp_path):
     """Its file has no such numbers: intervals are as they were when it was made."""
-    calibration = fit("fused", [sliced()], "all")
+    calibration = sliced_calibration
     old = replace(calibration, torque=replace(calibration.torque, reader=_without(calibration.torque.reader)))
     old.save(tmp_path / "old.cal")
     _remove_from_header(tmp_path / "old.cal", "hidden_below", "hidden_above", "lowest", "highest")

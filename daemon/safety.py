@@ -5,7 +5,7 @@ with the robot still as well, because the task that meets it dies, and `TASK_DIE
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, IntEnum
 
 from drivers.values import value
@@ -41,6 +41,7 @@ class Event(Enum):
     ROBOT_LOST = "robot lost"
     ROBOT_BLOCKED = "robot blocked"
     TASK_DIED = "task died"
+    DAEMON_PAUSED = "daemon paused"
     LOOP_LATE = "loop late"
     HELD_TOO_LONG = "held too long"
     RECORDING_FAILED = "recording failed"
@@ -54,7 +55,8 @@ class Rule:
     """One row: the response, what the operator reads, and how long a hold may last before it becomes a stop.
 
     A hold that comes back counts on: see `FORGETS`. What is `told_afterwards` has been so since the judgement before,
-    and is over when it is told, as that the loop was away.
+    and is over when it is told, as that the loop was away. What `explains` is told first of all that is wrong from then
+    on until nothing is, for that may follow from it.
     """
 
     response: Response
@@ -62,6 +64,7 @@ class Rule:
     cure: str
     hold_at_most_s: float | None = None
     told_afterwards: bool = False
+    explains: bool = False
 
 
 # Of how long an event has held, so much is forgotten for each second in which it does not: what is wrong for more than
@@ -161,10 +164,18 @@ TABLE: Mapping[Event, Rule] = {
         "a task of the daemon died and is being started again: {detail}.",
         "Read the log above this line; report it when it comes back.",
     ),
+    Event.DAEMON_PAUSED: Rule(
+        _HOLD,
+        "the daemon itself was not running: {detail}.",
+        "Let nothing pause it (SIGSTOP, Ctrl-Z) or suspend the computer while an experiment runs.",
+        hold_at_most_s=5.0,
+        told_afterwards=True,
+        explains=True,
+    ),
     Event.LOOP_LATE: Rule(
         _HOLD,
-        "the daemon did not keep up with its devices: {detail}.",
-        "Let nothing pause it or suspend the computer, end other programs, or see the service's real-time options.",
+        "the daemon is too slow for its devices: {detail}.",
+        "End other programs on this computer, or see the service's real-time options.",
         hold_at_most_s=5.0,
         told_afterwards=True,
     ),
@@ -196,6 +207,9 @@ TABLE: Mapping[Event, Rule] = {
 }
 
 
+# So long after what explains, all that only holds the wrist follows from it: then what waited has been read, and boards
+# that were thought to be gone have sent again, each half second.
+SETTLES_S = 2.0
 # Several causes that take turns hold the wrist no longer than one alone may.
 HELD_AT_MOST_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold_at_most_s is not None)
 
@@ -204,7 +218,7 @@ HELD_AT_MOST_S = max(rule.hold_at_most_s for rule in TABLE.values() if rule.hold
 class Trouble:
     """One event with what is particular to this occurrence.
 
-    It `follows` where it is so only because the loop was late, which is told: then it goes without saying.
+    Where it `follows` from what is told first, it goes without saying.
     """
 
     event: Event
@@ -248,6 +262,8 @@ class SafetyGate:
         self._of_each_ns: dict[Event, int] = {}
         self._holding: frozenset[Event] = frozenset()
         self._judged_ns: int | None = None
+        # What explained all that is wrong, and when.
+        self._cause: tuple[Trouble, int] | None = None
         self._stopped: Verdict | None = None
 
     def judge(self, troubles: Iterable[Trouble], t_ns: int) -> Verdict:
@@ -261,6 +277,10 @@ class SafetyGate:
         if response is Response.HOLD and self._wrist_ns > HELD_AT_MOST_S * 1e9:
             active = (*active, Trouble(Event.HELD_TOO_LONG, self._told_of_holds()))
             response = TABLE[Event.HELD_TOO_LONG].response
+        if active:
+            active = self._explained(active, t_ns)
+        else:
+            self._cause = None
         verdict = Verdict(response, active)
         if response >= Response.STOP_AND_KEEP_GRIP and (self._stopped is None or response > self._stopped.response):
             self._stopped = verdict
@@ -285,6 +305,21 @@ class SafetyGate:
     def stopped(self) -> bool:
         """Whether a stop waits for the operator."""
         return self._stopped is not None
+
+    def _explained(self, active: tuple[Trouble, ...], t_ns: int) -> tuple[Trouble, ...]:
+        """Return the troubles of t_ns, first what they may follow from; what stops is told in any case."""
+        own = next((trouble for trouble in active if trouble.rule.explains), None)
+        if own is not None:
+            self._cause = own, t_ns
+        if self._cause is None:
+            return active
+        cause, since_ns = self._cause
+        settled = t_ns - since_ns > SETTLES_S * 1e9
+        others = (trouble for trouble in active if trouble is not own)
+        return cause, *(
+            one if settled or self._response(one) >= Response.STOP_AND_KEEP_GRIP else replace(one, follows=True)
+            for one in others
+        )
 
     @staticmethod
     def _with_the_stop(stop: Verdict, active: tuple[Trouble, ...]) -> Verdict:
@@ -313,7 +348,7 @@ class SafetyGate:
     def _forget(self) -> None:
         self._held_ns.clear()
         self._of_each_ns.clear()
-        self._wrist_ns, self._holding, self._judged_ns = 0, frozenset(), None
+        self._wrist_ns, self._holding, self._judged_ns, self._cause = 0, frozenset(), None, None
 
     def _response(self, trouble: Trouble) -> Response:
         rule = trouble.rule

@@ -49,11 +49,9 @@ class Watched:
 
 
 def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int) -> list[Trouble]:
-    """Return everything that is wrong at t_ns, in the order of the table, and before it that the loop was away."""
+    """Return everything that is wrong at t_ns, in the order of the table."""
     # In each of the robot's cycles, and nearly always nothing: generators would cost more than what they look at.
     found: list[Trouble] = []
-    if senses.late_s > AWAY_S:
-        found.append(Trouble(Event.LOOP_LATE, f"the daemon itself was not running for {senses.late_s:.1f} s"))
     if watched.torque_needed:
         found += _torque(senses, watched, settings, t_ns)
     found += _limits(senses, watched, settings, t_ns)
@@ -64,7 +62,9 @@ def troubles(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: in
             found.append(Trouble(*lost))
     for name, why in senses.died.items():
         found.append(Trouble(Event.TASK_DIED, f"{name}: {why}"))
-    if AWAY_S >= senses.late_s > LATEST_LOOP_S:
+    if senses.late_s > AWAY_S:
+        found.append(Trouble(Event.DAEMON_PAUSED, f"it stood still for {senses.late_s:.1f} s"))
+    elif senses.late_s > LATEST_LOOP_S:
         found.append(Trouble(Event.LOOP_LATE, f"the loop was woken {senses.late_s * 1e3:.0f} ms late"))
     if senses.recording_failed:
         found.append(Trouble(Event.RECORDING_FAILED, senses.recording_failed))
@@ -98,17 +98,11 @@ def _torque(senses: Senses, watched: Watched, settings: WatchSettings, t_ns: int
 def _unusable(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> list[Trouble]:
     """Return why a source says nothing about the torque of now: it is silent, late or gone, or what it says is void."""
     if why := _not_fresh(senses, source, settings, t_ns):
-        before_ns = t_ns - _away_ns(senses)
-        return [Trouble(Event.ESTIMATE_STALE, why, follows=not _not_fresh(senses, source, settings, before_ns))]
+        return [Trouble(Event.ESTIMATE_STALE, why)]
     latest = senses.torques[source.name]
     if latest.torque_nm is None and source.measures_torque:
         return [Trouble(Event.ESTIMATE_INVALID, f"{source.name} says: {latest.why or 'nothing'}")]
     return []
-
-
-def _away_ns(senses: Senses) -> int:
-    """Return for how long the loop was away, where that is told: what came meanwhile waits to be read."""
-    return round(senses.late_s * 1e9) if senses.late_s > LATEST_LOOP_S else 0
 
 
 def _not_fresh(senses: Senses, source: Source, settings: WatchSettings, t_ns: int) -> str:
@@ -194,17 +188,15 @@ def _arm_and_hand(senses: Senses, watched: Watched, t_ns: int) -> list[Trouble]:
         told = (f"{name}, {senses.lost[name].removesuffix('.')}" if name in senses.lost else name for name in awaited)
         found.append(Trouble(Event.DEVICE_AWAITED, "; ".join(told)))
     if arm is not None:
-        found += _arm(senses, arm, t_ns)
+        found += _arm(arm, t_ns)
     if hand is not None and "gripper" in watched.required:
-        found += _hand(senses, hand, t_ns, gripped=watched.gripped)
+        found += _hand(hand, t_ns, gripped=watched.gripped)
     return found
 
 
-def _arm(senses: Senses, arm: Arm, t_ns: int) -> list[Trouble]:
-    age_ns = t_ns - arm.t_ns
-    if age_ns > ARM_STALE_S * 1e9:
-        follows = age_ns - _away_ns(senses) <= ARM_STALE_S * 1e9
-        return [Trouble(Event.STATE_STALE, f"the robot last reported its state {age_ns / 1e9:.2f} s ago", follows)]
+def _arm(arm: Arm, t_ns: int) -> list[Trouble]:
+    if t_ns - arm.t_ns > ARM_STALE_S * 1e9:
+        return [Trouble(Event.STATE_STALE, f"the robot last reported its state {(t_ns - arm.t_ns) / 1e9:.2f} s ago")]
     if arm.emergency_stop:
         return [Trouble(Event.EMERGENCY_STOP, arm.blocked or "the controller reports it")]
     if arm.protective_stop:
@@ -214,11 +206,9 @@ def _arm(senses: Senses, arm: Arm, t_ns: int) -> list[Trouble]:
     return []
 
 
-def _hand(senses: Senses, hand: Hand, t_ns: int, *, gripped: bool) -> list[Trouble]:
-    age_ns = t_ns - hand.t_ns
-    if age_ns > HAND_STALE_S * 1e9:
-        follows = age_ns - _away_ns(senses) <= HAND_STALE_S * 1e9
-        return [Trouble(Event.STATE_STALE, f"the gripper last reported its state {age_ns / 1e9:.1f} s ago", follows)]
+def _hand(hand: Hand, t_ns: int, *, gripped: bool) -> list[Trouble]:
+    if t_ns - hand.t_ns > HAND_STALE_S * 1e9:
+        return [Trouble(Event.STATE_STALE, f"the gripper last reported its state {(t_ns - hand.t_ns) / 1e9:.1f} s ago")]
     if hand.fault:
         return [Trouble(Event.GRIPPER_FAULT, hand.fault)]
     if gripped and not hand.holding:

@@ -155,7 +155,7 @@ async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_
             cell.robot.cycle(read=False)
         await cell.cycles(1)
         assert cell.phase is Phase.STOPPED
-        assert cell.why == Trouble(Event.LOOP_LATE, "the daemon itself was not running for 6.0 s").sentence
+        assert cell.why == Trouble(Event.DAEMON_PAUSED, "it stood still for 6.0 s").sentence
 
 
 async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -> None:

@@ -218,3 +218,28 @@ def test_two_things_of_one_kind_are_both_told() -> None:
     gate = SafetyGate()
     for seen in (gate.judge(both, 0), gate.judge([], SECOND), gate.look([])):
         assert [found.detail for found in seen.troubles] == ["the gripper", "the load cell"]
+
+
+def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_leads_to_is_not_repeated() -> None:
+    """Torques and states are old to one who was away, boards are thought to be gone, the robot's process was ended."""
+    paused, old = Trouble(Event.DAEMON_PAUSED, "it stood still for 3.0 s"), Trouble(Event.STATE_STALE, "the gripper")
+    invalid, lost = Trouble(Event.ESTIMATE_INVALID, "too lately"), Trouble(Event.ROBOT_LOST, "its process was ended")
+    gate = SafetyGate()
+    assert gate.judge([], 0).response is Response.NOTE
+    away = gate.judge([old, paused], 3 * SECOND)
+    assert (away.response, away.reasons) == (Response.HOLD, (paused.sentence,))
+    stopped = gate.judge([invalid, old, lost], 3 * SECOND + 1)
+    assert (stopped.response, stopped.reasons) == (Response.STOP_AND_KEEP_GRIP, (paused.sentence, lost.sentence))
+    assert {one.event for one in stopped.troubles} == {one.event for one in (paused, invalid, old, lost)}
+    # Without a stop: what holds for longer than it takes to settle is told beside it, until nothing holds.
+    gate = SafetyGate()
+    gate.judge([paused], 0)
+    assert gate.judge([invalid], SECOND).reasons == (paused.sentence,)
+    assert gate.judge([invalid], 3 * SECOND).reasons == (paused.sentence, invalid.sentence)
+    held = gate.judge([invalid], 7 * SECOND)
+    assert (held.response, held.reasons) == (Response.STOP_AND_KEEP_GRIP, (paused.sentence, invalid.sentence))
+    gate.acknowledge()
+    assert gate.judge([invalid], 8 * SECOND).reasons == (invalid.sentence,)
+    gate.judge([paused], 9 * SECOND)
+    gate.judge([], 10 * SECOND)
+    assert gate.judge([invalid], 11 * SECOND).reasons == (invalid.sentence,)

@@ -28,7 +28,7 @@ from tests.emulator_process import own_address
 pytestmark = pytest.mark.real_time
 
 HOST = own_address(4)
-SPEED = 5
+SPEED = 8
 Write = Callable[..., Path]
 
 

@@ -23,8 +23,6 @@ from daemon.wire.subscriber import messages
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
-pytestmark = pytest.mark.real_time
-
 Write = Callable[..., Path]
 HOST = own_address(5)
 SPEED = 8
@@ -52,6 +50,7 @@ async def examined(path: Path, seconds: float) -> dict[str, Finding]:
     return {finding.subject: finding for finding in findings}
 
 
+@pytest.mark.real_time
 async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, tiny_bank: Path) -> None:
     found = await examined(rig_config, 0.1)
     assert "There is no serial port" in found["port of right"].found

@@ -109,9 +109,6 @@ def nothing_left_over(request: pytest.FixtureRequest) -> Iterator[None]:
     for name in request.fixturenames:
         if name != "nothing_left_over" and _is_shared(request, name):
             request.getfixturevalue(name)
-    if not gc.get_freeze_count():
-        # All that was imported: to look through it takes a quarter of a second, each time. A daemon ends with a thaw.
-        gc.freeze()
     niceness = os.getpriority(os.PRIO_PROCESS, 0)
     threads, files = set(threading.enumerate()), _open_files()
     yield
@@ -123,6 +120,8 @@ def nothing_left_over(request: pytest.FixtureRequest) -> Iterator[None]:
     if _left(threads, files) != ([], {}):
         # What hangs in a cycle is no leak; looking for cycles after each of a thousand tests would double their time.
         gc.collect()
+        # To look through all that was imported takes a quarter of a second, each time.
+        gc.freeze()
         for ending in _left(threads, files)[0]:
             # asyncio's own for a child process ends just after it.
             ending.join(timeout=1.0)

@@ -118,9 +118,15 @@ def flood(bank: Path, n_frames: int) -> dict[str, Any]:
 
 
 def rated(
-    bank: Path, rig_bank: Path, seconds: float, *, recording: bool = True, twisting: bool = False
+    bank: Path,
+    rig_bank: Path,
+    seconds: float,
+    *,
+    recording: bool = True,
+    gripper: bool = True,
+    twisting: bool = False,
 ) -> dict[str, Any]:
-    """Return processor time, of every thread too, and memory with the whole emulated rig at its rated speeds.
+    """Return processor time, of every thread too, and memory with the emulated rig at its rated speeds.
 
     No experiment runs, or one that is `twisting` a tool to and fro. Memory is told at the beginning and at the end, so
     that one that grows is seen to.
@@ -137,7 +143,7 @@ def rated(
             "fingertips": {side: {"device": {"path": f"eit-{side}"}, **fingertip} for side in ("left", "right")},
             "load_cell": {"device": {"path": "load-cell"}},
             "robot": "ur.yaml",
-            "gripper": {"socket": {"host": host}},
+            **({"gripper": {"socket": {"host": host}}} if gripper else {}),
             **({"recording": {"folder": str(folder / "recordings")}} if recording else {}),
         }
         config = folder / "daemon.yaml"
@@ -180,6 +186,7 @@ def rated(
     return {
         "ready_s": ready_s,
         "recording": recording,
+        "gripper": gripper,
         "twisting": twisting,
         "seconds": took_s,
         "cpu_share_of_one_core": shares[pid],
@@ -295,6 +302,7 @@ def main() -> None:
     if "rated" in wanted:
         rig_bank = args.rig_bank or args.bank
         found["rated"] = rated(args.bank, rig_bank, args.rated_s)
+        found["rated_without_gripper"] = rated(args.bank, rig_bank, args.rated_s, gripper=False)
         found["rated_without_recording"] = rated(args.bank, rig_bank, args.rated_s, recording=False)
         found["rated_twisting"] = rated(args.bank, rig_bank, args.rated_s, twisting=True)
     if "shared" in wanted:

@@ -30,9 +30,13 @@ _AT_END, _MAY_BE_MISSING = 0.2, 0.5
 # What is left out is taken for no less far beyond the rest than so many spans of the range: where torques that are
 # nearly equal are parted, their noise would be read as a way.
 _LEAST_TRIED = 0.05
-# As far beyond the range, in spans of it, as frames still pass for familiar ones: slices of 0.14 N·m do where those
-# below 0.08 were calibrated on (`extrapolation-torque-slices` of docs/charts.md).
-_UNSEEN = 1.0
+# As far beyond the range, in spans of it, as frames still pass for familiar ones. Slices of 0.14 N·m do where those
+# below 0.06 were calibrated on, 1.6 spans beyond, and no slice lies further (`extrapolation-torque-slices` of
+# docs/charts.md).
+_UNSEEN = 2.0
+# What is read inside the range is taken for so far beyond it, when it is asked from where on readings may be of that:
+# with more of it the end lies further inside, and more of what was read well is doubted.
+_LIKELY_UNSEEN = 0.5
 # Loads above this share of the largest count as loads, and this share of them must lie within their intervals.
 _LOADED_SHARE, _LEAST_COVERED = 0.1, 0.75
 
@@ -148,8 +152,8 @@ def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[
     """Return the value at or below which (for the sign −1: above which) a reading may be of anything further out.
 
     The outermost values are left out and read by what is left. If they are read at its end instead of beyond it, or
-    even within it, then so will be what lies beyond the whole range, and the more, the further it lies: here the middle
-    of all that passes unseen. Otherwise it is the end of the range itself.
+    even within it, then so will be what lies beyond the whole range, and the more, the further it lies: asked here is
+    what lies `_LIKELY_UNSEEN` beyond. Otherwise it is the end of the range itself.
     """
     outward = sign * values
     order = np.argsort(outward, kind="stable")
@@ -170,9 +174,8 @@ def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[
         span = float(np.ptp(values))
         # By what lies hardly beyond the rest nothing tells how it goes on.
         short = (seen - inside) / max(inside - true, _LEAST_TRIED * span)
-        middle = _UNSEEN / 2 * span
         # At least as far inside as the outermost are read now.
-        found = max(found, found + short * middle, read_now)
+        found = max(found, found + short * _LIKELY_UNSEEN * span, read_now)
     return sign * found
 
 

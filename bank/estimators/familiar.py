@@ -13,6 +13,7 @@ import numpy as np
 
 from bank.channels import N_CHANNELS
 from bank.errors import CalibrationError
+from bank.estimators.directions import coordinates
 from bank.estimators.guard import LARGEST_UNUSABLE_SHARE
 from bank.estimators.heads import left_out_blocks
 from bank.estimators.intervals import LEVEL
@@ -118,14 +119,13 @@ class DifferenceGuard:
 
     def misfit(self, difference: FloatArray, usable: BoolArray) -> tuple[float, float]:
         """Return the mean squared residual of a (896,) difference, and the share of channels that are far off."""
-        v, x = self.directions[:, usable], self._scaled(difference, usable)
-        residual = x - np.linalg.lstsq(v.T, x, rcond=None)[0] @ v
+        x = self._scaled(difference)
+        residual = (x - coordinates(self.directions, x, usable) @ self.directions)[usable]
         return float((residual**2).mean()), float((np.abs(residual) > _OUTLYING_SPREADS).mean())
 
     def reach(self, difference: FloatArray, usable: BoolArray) -> float:
         """Return how far out a (896,) difference lies along the main directions: a sum of squares of unit variance."""
-        v = self.directions[:_REACHING, usable]
-        scores = np.linalg.lstsq(v.T, self._scaled(difference, usable), rcond=None)[0]
+        scores = coordinates(self.directions[:_REACHING], self._scaled(difference), usable)
         return float((scores**2 / self.variances[:_REACHING]).sum())
 
     def own_share(self, difference: FloatArray, usable: BoolArray) -> float:
@@ -134,10 +134,10 @@ class DifferenceGuard:
         A response that is smaller, as where something foreign has taken its place, moves a difference along the main
         directions as another torque does; but a torque leaves alone what is beside them, which then is smaller too.
         """
-        v, mean = self.directions[:, usable], (self.mean / self.spread)[usable]
+        mean = self.mean / self.spread
         # Partial regression (Frisch–Waugh): what it leaves of the mean, a torque does not move.
-        beside = mean - np.linalg.lstsq(v @ v.T, v @ mean, rcond=None)[0] @ v
-        return float((difference / self.spread)[usable] @ beside / (mean @ beside))
+        beside = (mean - coordinates(self.directions, mean, usable) @ self.directions)[usable]
+        return float((difference / self.spread)[usable] @ beside / (mean[usable] @ beside))
 
     def _missing(self, difference: FloatArray, usable: BoolArray) -> float:
         if self.largest_own <= 0:
@@ -147,11 +147,11 @@ class DifferenceGuard:
 
     def filled(self, difference: FloatArray, usable: BoolArray) -> FloatArray:
         """Return a (896,) difference with unusable channels where the usable ones say, along the main directions."""
-        scores = np.linalg.lstsq(self.directions[:, usable].T, self._scaled(difference, usable), rcond=None)[0]
+        scores = coordinates(self.directions, self._scaled(difference), usable)
         return np.where(usable, difference, np.maximum(self.mean + self.spread * (scores @ self.directions), 0.0))
 
-    def _scaled(self, difference: FloatArray, usable: BoolArray) -> FloatArray:
-        return np.asarray(((difference - self.mean) / self.spread)[usable])
+    def _scaled(self, difference: FloatArray) -> FloatArray:
+        return np.asarray((difference - self.mean) / self.spread)
 
     def widening(self, difference: FloatArray, usable: BoolArray) -> float:
         """Return by how much an interval grows because a difference is explained less well than is typical."""

@@ -12,6 +12,7 @@ from typing import Self
 import numpy as np
 
 from bank.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from bank.estimators.directions import coordinates
 from bank.estimators.heads import left_out_blocks
 from bank.estimators.values import BoolArray, FloatArray
 
@@ -57,8 +58,8 @@ class Twins:
     def misfit(self, difference: FloatArray, usable: BoolArray) -> float:
         """Return the median square by which a (896,) difference is off to the side of the directions."""
         both = usable[_FIRST] & usable[_SECOND]
-        x, v = ((paired(difference) - self.mean) / self.spread)[both], self.directions[:, both]
-        return float(np.median((x - np.linalg.lstsq(v.T, x, rcond=None)[0] @ v) ** 2))
+        x = (paired(difference) - self.mean) / self.spread
+        return float(np.median((x - coordinates(self.directions, x, both) @ self.directions)[both] ** 2))
 
 
 def paired(differences: FloatArray) -> FloatArray:

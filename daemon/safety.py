@@ -278,7 +278,7 @@ class SafetyGate:
             active = (*active, Trouble(Event.HELD_TOO_LONG, self._told_of_holds()))
             response = TABLE[Event.HELD_TOO_LONG].response
         if active:
-            active = self._explained(active, t_ns)
+            active = self._explained(active, t_ns, held=response >= Response.HOLD)
         else:
             self._cause = None
         verdict = Verdict(response, active)
@@ -306,7 +306,7 @@ class SafetyGate:
         """Whether a stop waits for the operator."""
         return self._stopped is not None
 
-    def _explained(self, active: tuple[Trouble, ...], t_ns: int) -> tuple[Trouble, ...]:
+    def _explained(self, active: tuple[Trouble, ...], t_ns: int, *, held: bool) -> tuple[Trouble, ...]:
         """Return the troubles of t_ns, first what they may follow from; what stops is told in any case."""
         own = next((trouble for trouble in active if trouble.rule.explains), None)
         if own is not None:
@@ -315,11 +315,16 @@ class SafetyGate:
             return active
         cause, since_ns = self._cause
         settled = t_ns - since_ns > SETTLES_S * 1e9
+        if settled and not held:
+            # A full disk may stay so for hours, and what stops an experiment then does not come of the pause.
+            self._cause = None
+            return active
         others = (trouble for trouble in active if trouble is not own)
-        return cause, *(
-            one if settled or self._response(one) >= Response.STOP_AND_KEEP_GRIP else replace(one, follows=True)
-            for one in others
-        )
+        return cause, *(replace(one, follows=True) if not settled and self._may_follow(one) else one for one in others)
+
+    def _may_follow(self, trouble: Trouble) -> bool:
+        """Return whether a trouble may be no more than what comes of a pause: a full disk and a refusal are not."""
+        return trouble.event is Event.COMMAND_UNANSWERED or self._response(trouble) is Response.HOLD
 
     @staticmethod
     def _with_the_stop(stop: Verdict, active: tuple[Trouble, ...]) -> Verdict:

@@ -243,3 +243,33 @@ def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_
     gate.judge([paused], 9 * SECOND)
     gate.judge([], 10 * SECOND)
     assert gate.judge([invalid], 11 * SECOND).reasons == (invalid.sentence,)
+
+
+@pytest.mark.parametrize("event", [Event.RECORDING_FAILED, Event.COMMAND_REFUSED])
+def test_what_neither_holds_the_wrist_nor_comes_of_a_pause_is_told_and_does_not_keep_the_pause(event: Event) -> None:
+    """A refusal is told once, and was never; a disk that stays full had the pause told first of a stop hours later."""
+    paused, other, limit = trouble(Event.DAEMON_PAUSED), trouble(event), trouble(Event.TORQUE_LIMIT)
+    gate = SafetyGate()
+    assert gate.judge([other, paused], 0).reasons == (paused.sentence, other.sentence)
+    assert gate.judge([other, trouble(Event.COMMAND_UNANSWERED)], SECOND).reasons == (paused.sentence, other.sentence)
+    assert gate.judge([other], 3 * SECOND).reasons == (other.sentence,)
+    assert gate.judge([other, limit], 3600 * SECOND).reasons == (other.sentence, limit.sentence)
+
+
+TIMES = st.sampled_from([8_000_000, SECOND // 5, SECOND, 2 * SECOND, 2 * SECOND + 1, 3 * SECOND, 6 * SECOND])
+MOMENTS = st.lists(st.tuples(TIMES, st.sets(st.sampled_from(list(Event)), max_size=4)), max_size=20)
+
+
+@given(MOMENTS)
+def test_what_explains_changes_what_is_told_and_never_what_is_done(moments: list[tuple[int, set[Event]]]) -> None:
+    """Beside a gate that takes a pause of the daemon for a loop that is late, which explains nothing."""
+    explaining, plain, t_ns = SafetyGate(), SafetyGate(), 0
+    for passed_ns, events in moments:
+        t_ns += passed_ns
+        verdict = explaining.judge(map(trouble, events), t_ns)
+        late = {Event.LOOP_LATE if event is Event.DAEMON_PAUSED else event for event in events}
+        assert verdict.response >= plain.judge(map(trouble, late), t_ns).response
+        told = [one for one in verdict.troubles if not one.follows]
+        assert told or not events
+        for one in verdict.troubles:
+            assert one in told or TABLE[one.event].response in (Response.NOTE, Response.HOLD)

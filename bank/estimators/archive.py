@@ -11,7 +11,7 @@ import zipfile
 from collections.abc import Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
@@ -133,7 +133,11 @@ def _restored(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]])
         # Of several dataclasses, the one whose fields these are.
         chosen = next(choice for choice in choices if {item.name for item in fields(choice)} == set(plain))
         return _restored(chosen, plain, path, arrays)
+    if origin is Literal and plain not in get_args(kind):
+        raise ValueError(f"{path.strip('/')} is {plain!r}, which this version does not know")
     if origin is tuple:
+        if not isinstance(plain, list):
+            raise TypeError(f"{path.strip('/')} is no list")
         inner = get_args(kind)[0]
         return tuple(_restored(inner, item, f"{path}/{i}", arrays) for i, item in enumerate(plain))
     if isinstance(plain, dict) and set(plain) == {"array"}:

@@ -116,3 +116,27 @@ def test_what_was_taken_on_somebodys_word_is_kept_and_older_files_do_not_tell(
             written.writestr(name, new.read(name))
     assert Calibration.load(older).vouched is None
     assert Calibration.load(older).word == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("vouched", ["the moon"]),
+        ("vouched", [["load times"]]),
+        ("vouched", "load times"),
+        ("kind", "volts"),
+        ("sides", "r"),
+    ],
+)
+def test_a_word_that_this_version_does_not_know_is_refused_where_it_is_read(fused_calibration, tmp_path, name, value):
+    """One of a newer version ended `run` in a KeyError, and raw frames were taken for slices of another kind."""
+    path, other = tmp_path / "own.cal", tmp_path / "other.cal"
+    fused_calibration.save(path)
+    with zipfile.ZipFile(path) as own, zipfile.ZipFile(other, "w") as written:
+        header = yaml.safe_load(own.read("calibration.yaml"))
+        header["content"][name] = value
+        written.writestr("calibration.yaml", yaml.safe_dump(header))
+        for member in header["sha256"]:
+            written.writestr(member, own.read(member))
+    with pytest.raises(CalibrationError, match=name):
+        Calibration.load(other)

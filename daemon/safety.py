@@ -167,7 +167,7 @@ TABLE: Mapping[Event, Rule] = {
     Event.DAEMON_PAUSED: Rule(
         _HOLD,
         "the daemon itself was not running: {detail}.",
-        "Let nothing pause it (SIGSTOP, Ctrl-Z) or suspend the computer while an experiment runs.",
+        "Let nothing pause it (SIGSTOP, Ctrl-Z), nor suspend or overload the computer, while an experiment runs.",
         hold_at_most_s=5.0,
         told_afterwards=True,
         explains=True,

@@ -17,7 +17,7 @@ HAND_STALE_S = stale_after_s("gripper.state")
 LONGEST_TICK_S = 0.03
 # Later than this, and the state that was last decided upon had become stale while the wrist turned on it.
 LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
-# A loop that is away for longer was not slow: its process was paused. The robot's process has stopped the arm
+# A loop that is away for longer was hardly slow: its process was paused. The robot's process has stopped the arm
 # meanwhile. While the computer is suspended CLOCK_MONOTONIC stands still: of that devices tell that were lost by it.
 AWAY_S = 1.0
 

@@ -178,6 +178,7 @@ def test_a_loop_that_was_away_for_long_was_not_too_slow() -> None:
         (trouble,) = troubles(senses, replace(watched(EIT, ()), torque_needed=False), WatchSettings(), NOW_NS)
         assert trouble.event is event
     assert "the daemon itself was not running: it stood still for 3.0 s" in trouble.sentence
+    assert "overload" in trouble.rule.cure, "what follows from it is not told, and may be all that would say so"
 
 
 def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wrist() -> None:

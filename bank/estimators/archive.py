@@ -134,7 +134,8 @@ def _restored(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]])
         chosen = next(choice for choice in choices if {item.name for item in fields(choice)} == set(plain))
         return _restored(chosen, plain, path, arrays)
     if origin is Literal and plain not in get_args(kind):
-        raise ValueError(f"{path.strip('/')} is {plain!r}, which this version does not know")
+        name = path.strip("/")
+        raise ValueError(f"{name} is {plain!r}, which this version does not know")
     if origin is tuple:
         if not isinstance(plain, list):
             raise TypeError(f"{path.strip('/')} is no list")

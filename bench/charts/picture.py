@@ -68,9 +68,13 @@ def lay_out(made: Figure) -> None:
 
 
 # Where a name may stand beside its point, in points, the first ones liked best.
-_BESIDE = [
-    (dx, dy) for far in (7, 16, 26, 38) for dx, dy in ((far, 4), (far, -4), (-far, 4), (-far, -4), (0, far), (0, -far))
-]
+_NEAR, *_FURTHER = (7, 16, 26, 38)
+_SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
+_CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+_BESIDE = [(_NEAR, 4), (_NEAR, -4), (-_NEAR, 4), (-_NEAR, -4), (0, _NEAR), (0, -_NEAR)]
+_BESIDE += [(far * dx, far * dy) for far in _FURTHER for dx, dy in (*_CORNERS, *_SIDES)]
+# From a name that does not stand next to its point, lest it be taken for its neighbour's.
+_LEADER = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
 _MARK_PX = 7.0
 # Between two names, so that they do not read as one.
 _GAP_PX = 4.0
@@ -90,12 +94,7 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize
     for x, y, name in sorted(points):
         tried: list[tuple[float, int, Annotation, Bbox]] = []
         for dx, dy in _BESIDE:
-            note = axes.annotate(
-                name, (x, y), xytext=(dx, dy), textcoords="offset points", fontsize=fontsize,
-                ha="center" if dx == 0 else "left" if dx > 0 else "right",
-                va="center" if dx else "bottom" if dy > 0 else "top",
-            )  # fmt: skip
-            note.set_in_layout(False)
+            note = _note(axes, (x, y, name), (dx, dy), fontsize)
             box = note.get_window_extent()
             within = Bbox.intersection(box, inside)
             outside = _area(box) - (_area(within) if within is not None else 0.0)
@@ -108,6 +107,23 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize
         for _, _, note, _ in tried:
             if note is not chosen:
                 note.remove()
+        if max(map(abs, chosen.get_position())) > _NEAR:
+            # Only now: the room that a name takes is asked for without its line.
+            chosen.remove()
+            _note(axes, (x, y, name), chosen.get_position(), fontsize, arrowprops=_LEADER)
+
+
+def _note(
+    axes: Axes, point: tuple[float, float, str], offset: tuple[float, float], fontsize: float, **line: Any
+) -> Annotation:
+    (x, y, name), (dx, dy) = point, offset
+    note = axes.annotate(
+        name, (x, y), xytext=(dx, dy), textcoords="offset points", fontsize=fontsize,
+        ha="center" if dx == 0 else "left" if dx > 0 else "right",
+        va="center" if dx else "bottom" if dy > 0 else "top", **line,
+    )  # fmt: skip
+    note.set_in_layout(False)
+    return note
 
 
 def _area(box: Bbox) -> float:

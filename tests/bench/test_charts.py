@@ -8,6 +8,7 @@ from typing import NoReturn
 
 import numpy as np
 import pytest
+from matplotlib.text import Annotation, Text
 
 from bank.channels import N_CHANNELS
 from bank.estimators import FrameSeries
@@ -230,11 +231,16 @@ def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark(points: 
     axes.set(xlim=(0.5, 2), ylim=(0.5, 2))
     lay_out(made)
     write_names(axes, points)
-    # Two that stand closer together read as one.
-    boxes = [note.get_window_extent().padded(1.9) for note in axes.texts]
+    made.draw_without_rendering()
+    # Two that stand closer together read as one. Of a text alone, without the line that leads to it.
+    boxes = [Text.get_window_extent(note).padded(1.9) for note in axes.texts]
     assert sorted(note.get_text() for note in axes.texts) == sorted(name for *_, name in points)
     for i, box in enumerate(boxes):
         assert not any(box.overlaps(other) for other in boxes[:i])
         assert not any(box.contains(*axes.transData.transform(point[:2])) for point in points)
         assert axes.get_window_extent().containsx(box.x0)
         assert axes.get_window_extent().containsx(box.x1)
+    # One that does not stand next to its own is led to it.
+    led = [isinstance(note, Annotation) and note.arrow_patch is not None for note in axes.texts]
+    assert led == [max(map(abs, note.get_position())) > 7 for note in axes.texts]
+    assert any(led) == (points is ROW)

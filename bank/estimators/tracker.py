@@ -198,7 +198,7 @@ class Tracker:
         return died(self.calibration.guards, usable) if older else ()
 
     def _read_one(
-        self, name: str, task: Task, judged: Judgement, frame: "_Frame"
+        self, name: str, task: Task, judged: Judgement, frame: _Frame
     ) -> tuple[tuple[float, float, float], tuple[str, ...]]:
         """Return one quantity with how far its interval reaches below and above, and why it is not to be believed."""
         features = read_from(self.calibration, name, frame.seen.features, frame.held)
@@ -219,12 +219,12 @@ class Tracker:
         why = unread or task.refuse_place(frame.seen.place) or task.reader.refuse(read[0], features, name, _UNITS[name])
         return read, why
 
-    def _unsure(self, name: str, task: Task, value: float, frame: "_Frame") -> float:
+    def _unsure(self, name: str, task: Task, value: float, frame: _Frame) -> float:
         """Return how far a value may be off at 95 % because of what stands for unusable channels."""
         off = [self._features(name, frame.difference + way, frame) for way in frame.ways]
         return TWO_SIDED_95 * math.hypot(*(task.reader.read(one)[0] - value for one in off))
 
-    def _features(self, name: str, difference: FloatArray, frame: "_Frame") -> FloatArray:
+    def _features(self, name: str, difference: FloatArray, frame: _Frame) -> FloatArray:
         """Return what a quantity would be read from, were this the frame's difference."""
         seen = features_of(self.calibration, self._locator, difference, frame.moved, frame.t_s)
         return read_from(self.calibration, name, seen.features, frame.held)

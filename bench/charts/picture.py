@@ -110,17 +110,21 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize
         if max(map(abs, chosen.get_position())) > _NEAR:
             # Only now: the room that a name takes is asked for without its line.
             chosen.remove()
-            _note(axes, (x, y, name), chosen.get_position(), fontsize, arrowprops=_LEADER)
+            _note(axes, (x, y, name), chosen.get_position(), fontsize, _LEADER)
 
 
 def _note(
-    axes: Axes, point: tuple[float, float, str], offset: tuple[float, float], fontsize: float, **line: Any
+    axes: Axes,
+    point: tuple[float, float, str],
+    offset: tuple[float, float],
+    fontsize: float,
+    line: dict[str, Any] | None = None,
 ) -> Annotation:
     (x, y, name), (dx, dy) = point, offset
     note = axes.annotate(
         name, (x, y), xytext=(dx, dy), textcoords="offset points", fontsize=fontsize,
         ha="center" if dx == 0 else "left" if dx > 0 else "right",
-        va="center" if dx else "bottom" if dy > 0 else "top", **line,
+        va="center" if dx else "bottom" if dy > 0 else "top", arrowprops=line,
     )  # fmt: skip
     note.set_in_layout(False)
     return note

@@ -158,6 +158,7 @@ SECTIONS = (
 )
 # What to do about sentences that do not say it themselves, by words of theirs.
 CURES = (
+    ("which this version does not know", "Use the version that wrote it, or calibrate again."),
     ("was made from slices;", "Calibrate on a recording, `shearloop run --record` or `shearloop import mat`."),
     ("taking the homogeneous frame", "Leave the fingertip untouched until it is taken, some five seconds."),
     ("taking the zero, ", "Leave the skin untouched until it is taken, two seconds."),

@@ -250,15 +250,16 @@ async def test_a_process_that_is_lost_while_the_daemon_ends_is_not_started_again
     """Task groups tell of the loss alone, and the daemon waited for ever for a robot that it had told to end."""
     play("exec cat")
     listened: list[Conversation] = []
+    kept_alive = asyncio.Event()
 
     async def listen(conversation: Conversation) -> None:
         assert not listened, "it was started again"
         listened.append(conversation)
-        # Until those beside it have begun.
-        await asyncio.sleep(0)
+        await kept_alive.wait()
         raise LostError("crashed", "The robot's process died.")
 
     async def keep_alive(_: Conversation) -> None:
+        kept_alive.set()
         try:
             await asyncio.Event().wait()
         finally:

@@ -1,0 +1,83 @@
+"""A loop that is late or was away: over the real pilot, with an arm and a gripper of this process."""
+
+from typing import Any
+
+import pytest
+
+from daemon.experiment.machine import Phase
+from daemon.safety import Event, Trouble
+from tests.daemon.cell import driven
+from tests.drivers.ur.flight import CYCLE_NS
+
+TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}
+
+
+async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with driven() as cell:
+        await cell.start(TWIST)
+        await cell.cycles(50)
+        decide = cell.brain.tick
+
+        def at_length(t_ns: int) -> Any:
+            monkeypatch.undo()
+            orders = decide(t_ns)
+            cell.robot.flight.now_ns += 200_000_000
+            return orders
+
+        monkeypatch.setattr(cell.brain, "tick", at_length)
+        await cell.cycles(2)
+        assert Event.LOOP_LATE in [trouble.event for trouble in cell.brain.standing.verdict.troubles]
+
+
+@pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2), (12, 1)])
+async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read: int) -> None:
+    """Though it then reads many states at once, or decides in time before it is late again."""
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        for _ in range(60):
+            for _ in range(missed):
+                cell.robot.cycle(read=False)
+            await cell.cycles(read)
+            if cell.phase is not Phase.RUNNING:
+                break
+        assert "loop was woken" in cell.why
+
+
+async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_it() -> None:
+    """Of as many as eight sentences the cause was the last: torques and states are old to one who was away."""
+    async with driven() as cell:
+        await cell.start(TWIST)
+        await cell.cycles(50)
+        for _ in range(6_000_000_000 // CYCLE_NS):
+            cell.robot.cycle(read=False)
+        await cell.cycles(1)
+        assert cell.phase is Phase.STOPPED
+        assert cell.why == Trouble(Event.DAEMON_PAUSED, "it stood still for 6.0 s").sentence
+
+
+async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -> None:
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        for _ in range(100):
+            for _ in range(11):
+                cell.robot.cycle(read=False)
+            await cell.cycles(1)
+            assert cell.brain.standing.verdict.troubles == ()
+
+
+async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with driven() as cell:
+        await cell.start({"do": "wait", "wait_s": 60})
+        decided: list[int] = []
+        decide = cell.brain.tick
+
+        def tick(t_ns: int) -> Any:
+            assert cell.brain.senses.arm is not None
+            decided.append(cell.brain.senses.arm.t_ns)
+            return decide(t_ns)
+
+        monkeypatch.setattr(cell.brain, "tick", tick)
+        for _ in range(5):
+            cell.robot.cycle(read=False)
+        await cell.cycles(1)
+        assert decided == [cell.state.t_mono_ns]

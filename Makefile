@@ -40,8 +40,8 @@ demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
 	$(BIN)/shearloop run $(DEMO) --show
 
 # Recordings of the emulated rig, and the calibrations of its fingertips that are made from them.
-run/rig.cal: run/demo.bank bench/rig_twists.py | install
-	$(BIN)/python -m bench.rig_twists --bank $< --out run
+run/rig.cal: run/demo.bank benchmarks/rig_twists.py | install
+	$(BIN)/python -m benchmarks.rig_twists --bank $< --out run
 
 run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
 	mkdir -p run
@@ -68,7 +68,7 @@ format: install-dev
 
 # The pages that are written from the code.
 docs: install
-	$(BIN)/python -m daemon.handbook
+	$(BIN)/python -m shearloop.daemon.docgen
 
 clean:
 	rm -rf $(VENV) build dist *.egg-info .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis

@@ -13,38 +13,38 @@ import structlog
 import zmq
 import zmq.asyncio
 
-from bank.channels import ZERO_SLOTS
-from daemon import sd_notify
-from daemon.clock import Clock
-from daemon.commands import Commands, needed
-from daemon.config import DaemonConfig, Fingertip
-from daemon.configured_experiment import ConfiguredExperiment
-from daemon.eit.both import BOTH, BothTask
-from daemon.eit.estimation import Estimation
-from daemon.eit.fingertip import FingertipTask
-from daemon.eit.opening import AnyEstimator, open_both, open_estimator
-from daemon.eit.tool_diameter import FingertipDiameters
-from daemon.eit.tracking import TrackedEstimator
-from daemon.ending_signals import ending_signals
-from daemon.health import HealthReporter, TaskFacts
-from daemon.links import log_link
-from daemon.load_cell_task import LOAD_CELL
-from daemon.loop.senses import Source
-from daemon.recording.identity import Attached, identity_of, notes_of
-from daemon.recording.recorder import Recorder
-from daemon.rig import Rig, make_load_cell
-from daemon.rig_check import checked_experiment
-from daemon.skin.setup import make_skin
-from daemon.skin.task import SKIN, SKIN_SOURCE, SkinTask
-from daemon.supervisor import Supervisor
-from daemon.torque_sources import torque_sources
-from daemon.wire.addresses import open_stop_address
-from daemon.wire.command_server import CommandServer
-from daemon.wire.keys import Gatekeeper, load_server_keys
-from daemon.wire.publisher import Listener, Publisher
-from drivers.eit_kit import EitKit
-from drivers.raw_input import Tap, no_tap
-from drivers.serial_port import LinkEvent
+from shearloop.bank.eit.channels import ZERO_SLOTS
+from shearloop.daemon import sd_notify
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.commands import Commands, needed
+from shearloop.daemon.config import DaemonConfig, FingertipConfig
+from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.ending_signals import ending_signals
+from shearloop.daemon.health import HealthReporter, TaskFacts
+from shearloop.daemon.links import log_link
+from shearloop.daemon.messaging.addresses import open_stop_address
+from shearloop.daemon.messaging.command_server import CommandServer
+from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
+from shearloop.daemon.messaging.publisher import Listener, Publisher
+from shearloop.daemon.recording.identity import Attached, identity_of, notes_of
+from shearloop.daemon.recording.recorder import Recorder
+from shearloop.daemon.rig import Rig, make_load_cell
+from shearloop.daemon.rig_check import checked_experiment
+from shearloop.daemon.sensing.both import BOTH, CombinedFingertipTask
+from shearloop.daemon.sensing.estimation import EstimatorTask
+from shearloop.daemon.sensing.fingertip import FingertipTask
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
+from shearloop.daemon.sensing.skin_setup import make_skin
+from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
+from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
+from shearloop.daemon.sensing.torque_sources import torque_sources
+from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.daemon.supervisor import Supervisor
+from shearloop.drivers.eit_kit import EitKit
+from shearloop.drivers.raw_event import Tap, no_tap
+from shearloop.drivers.serial_port import LinkEvent
 
 
 class Daemon:
@@ -64,9 +64,9 @@ class Daemon:
         checked_experiment(config, sources)
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
-            self._gate: Gatekeeper | None = None
+            self._gate: CurveAuthenticator | None = None
             if config.curve is not None and config.network_addresses:
-                self._gate = Gatekeeper(context, config.curve.clients)
+                self._gate = CurveAuthenticator(context, config.curve.clients)
                 opened.callback(self._gate.close)
             self.publisher = Publisher(context, config.publish, self._clock, keys)
             opened.callback(self.publisher.close)
@@ -86,7 +86,7 @@ class Daemon:
             self._close = opened.pop_all().close
 
     def _wire(
-        self, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None, sources: Mapping[str, Source]
+        self, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None, sources: Mapping[str, TorqueSource]
     ) -> None:
         """Make the task of every device and of every estimator; none is opened yet."""
         config = self._config
@@ -116,18 +116,18 @@ class Daemon:
         if self._rig is not None and self._rig.gripper is not None:
             self._rig.gripper.fingertips_say = diameters.at
 
-        def estimation(name: str, estimator: AnyEstimator, period_s: Callable[[], float]) -> Estimation:
-            made = Estimation(
+        def estimation(name: str, estimator: AnyEstimator, period_s: Callable[[], float]) -> EstimatorTask:
+            made = EstimatorTask(
                 name, estimator, self.publisher, self._clock, period_s, hear, diameters.hear, self._tap(name)
             )
             if self._rig is not None and self._rig.gripper is not None:
                 made.held_tool = self._rig.gripper.held_tool
             return made
 
-        self._both: BothTask | None = None
+        self._both: CombinedFingertipTask | None = None
         if both is not None:
             period_s = config.fingertips[both.sides[0]].frame_period_s
-            self._both = BothTask(estimation(BOTH, both, lambda: period_s), both.sides, period_s)
+            self._both = CombinedFingertipTask(estimation(BOTH, both, lambda: period_s), both.sides, period_s)
 
         def fingertip(name: str, estimator: AnyEstimator) -> FingertipTask:
             board = _board(config.fingertips[name], name, self._link_of(name), self._tap(name), self._both)
@@ -337,7 +337,11 @@ def _recorder(
 
 
 def _board(
-    config: Fingertip, name: str, on_event: Callable[[LinkEvent], None], tap: Tap, both: BothTask | None
+    config: FingertipConfig,
+    name: str,
+    on_event: Callable[[LinkEvent], None],
+    tap: Tap,
+    both: CombinedFingertipTask | None,
 ) -> EitKit:
     return EitKit(
         path=config.device.path,

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator, model_validator
 
-from bank.errors import GeometryError
-from bank.fingertip import ElectrodePlace, Fingertip, Side
-from bank.mesh import Mesh, load_mesh
-from bank.models import PLAIN, QUARTER_DEG, Variation
-from daemon.config_file import ConfigModel, load_yaml_model, mistakes
-from daemon.errors import UserError
+from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, Side
+from shearloop.bank.eit.mesh import Mesh, load_mesh
+from shearloop.bank.eit.models import PLAIN, QUARTER_DEG, Variation
+from shearloop.bank.errors import GeometryError
+from shearloop.daemon.config_file import ConfigModel, load_yaml_model, mistakes
+from shearloop.daemon.errors import UserError
 
 ModelName = Literal["step", "linear", "cut_linear", "gaussian_derivative", "modulated_gaussian"]
 MeshSize = Annotated[float, Field(ge=0.005, le=10)]
@@ -128,7 +128,7 @@ class ElectrodeRunConfig(ConfigModel):
     centres_cm: Annotated[list[Annotated[float, Field(ge=0, le=100)]], Field(min_length=1)]
 
 
-class FingertipConfig(ConfigModel):
+class FingertipGeometryConfig(ConfigModel):
     """A rectangular fingertip with electrodes along its edge."""
 
     width_cm: Measure
@@ -152,7 +152,7 @@ class FingertipConfig(ConfigModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BankPlan:
-    """All that `bank.build.build_bank` needs to know: k_grid (K,) and sigma_grid (S,) in the model's units."""
+    """All that `shearloop.bank.eit.build.build_bank` needs to know: k_grid (K,) and sigma_grid (S,) in the model's units."""
 
     mesh: Mesh
     model: str
@@ -216,11 +216,11 @@ def load_geometry(path: Path) -> Mesh:
 
 
 def _fingertip_mesh(path: Path, **changed: float) -> Mesh:
-    config = load_yaml_model(path, FingertipConfig)
+    config = load_yaml_model(path, FingertipGeometryConfig)
     try:
-        return FingertipConfig.model_validate(config.model_dump() | changed).fingertip().mesh()
+        return FingertipGeometryConfig.model_validate(config.model_dump() | changed).fingertip().mesh()
     except ValidationError as error:
-        raise UserError(f"{path}, with {_shown(changed)}: {mistakes(error, FingertipConfig)}") from error
+        raise UserError(f"{path}, with {_shown(changed)}: {mistakes(error, FingertipGeometryConfig)}") from error
     except GeometryError as error:
         raise GeometryError(f"{path}{f', with {_shown(changed)}' if changed else ''}: {error}") from error
 

@@ -5,10 +5,10 @@ from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.eit.fingertip import FingertipTask
-from daemon.errors import UserError
-from daemon.rig import Rig
-from daemon.wire.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
+from shearloop.daemon.rig import Rig
+from shearloop.daemon.sensing.fingertip import FingertipTask
 
 # Until the reply to the `stop` that ends the daemon is out.
 FAREWELL_S = 0.05

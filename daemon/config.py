@@ -7,8 +7,8 @@ from typing import Annotated, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, model_validator
 
-from daemon.config_file import ConfigModel, load_yaml_model
-from daemon.wire.addresses import (
+from shearloop.daemon.config_file import ConfigModel, load_yaml_model
+from shearloop.daemon.messaging.addresses import (
     COMMAND_ADDRESS,
     LARGEST_PORT,
     PUBLISH_ADDRESS,
@@ -68,7 +68,7 @@ class CreepConfig(ConfigModel):
     time_s: float = Field(gt=0, le=3600, description="time constant")
 
 
-class Fingertip(ConfigModel):
+class FingertipConfig(ConfigModel):
     """One EIT fingertip: its board, its bank and its calibration."""
 
     device: SerialDevice
@@ -83,14 +83,14 @@ class Fingertip(ConfigModel):
     creep: CreepConfig | None = Field(
         None, description="of the gel, where the calibration gives its shear; the loop is driven by what is left"
     )
-    # drivers.eit_format.FRAME_PERIOD_S, which comes with NumPy: a configuration is read without.
+    # shearloop.drivers.eit_format.FRAME_PERIOD_S, which comes with NumPy: a configuration is read without.
     frame_period_s: float = Field(0.5408, gt=0, le=60, description="the board's frame period before it is measured")
     heatmap: Literal["on_request", "always"] = Field(
         "on_request", description="whether eit.heatmap is computed only while somebody subscribes to it"
     )
 
 
-class Both(ConfigModel):
+class CombinedConfig(ConfigModel):
     """One estimate from several fingertips on one tool; they are named as the sides of the calibration."""
 
     calibration: Path = Field(description="made by `shearloop calibrate` on recordings of all these sides")
@@ -231,7 +231,7 @@ class RecordingConfig(ConfigModel):
     folder: Path = Field(description="made where it is not there; a rig with one fingertip writes some 50 MB an hour")
 
 
-class Happening(ConfigModel):
+class EventConfig(ConfigModel):
     """What befalls an emulated device in the course of an experiment."""
 
     step: int = Field(ge=1, description="number of the experiment's step, from 1")
@@ -239,13 +239,13 @@ class Happening(ConfigModel):
     say: str = Field(min_length=1, pattern=r"^[^\n]*$", description="a command of the emulator, see its --help")
 
 
-class Emulator(ConfigModel):
+class EmulatorConfig(ConfigModel):
     """A device that is played by a process of its own, for demonstrations."""
 
     device: str
     arguments: tuple[str, ...] = ()
     synthetic: tuple[str, ...] = Field((), description="further arguments where no recording is played")
-    happenings: tuple[Happening, ...] = ()
+    happenings: tuple[EventConfig, ...] = ()
 
 
 class DaemonConfig(ConfigModel):
@@ -254,8 +254,12 @@ class DaemonConfig(ConfigModel):
     publish: Address = PUBLISH_ADDRESS
     commands: Address = COMMAND_ADDRESS
     curve: CurveConfig | None = Field(None, description="keys, for addresses that are not on this machine alone")
-    fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], Fingertip] = Field(default_factory=dict)
-    both: Both | None = Field(None, description="an estimate from both fingertips together, published as `both`")
+    fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], FingertipConfig] = Field(
+        default_factory=dict
+    )
+    both: CombinedConfig | None = Field(
+        None, description="an estimate from both fingertips together, published as `both`"
+    )
     skin: SkinConfig | None = None
     load_cell: LoadCellConfig | None = None
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
@@ -267,7 +271,7 @@ class DaemonConfig(ConfigModel):
     )
     recording: RecordingConfig | None = Field(None, description="without one, nothing is recorded")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
-    emulators: tuple[Emulator, ...] = ()
+    emulators: tuple[EmulatorConfig, ...] = ()
 
     @model_validator(mode="after")
     def _loop_is_whole(self) -> "DaemonConfig":

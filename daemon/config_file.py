@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 from pydantic_core import ErrorDetails
 
-from daemon.errors import UserError
-from drivers.errors import DriverError
-from drivers.yaml_file import read_yaml
+from shearloop.daemon.errors import UserError
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.yaml_file import read_yaml
 
 _LONGEST_VALUE = 60
 

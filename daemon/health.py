@@ -8,11 +8,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from daemon import sd_notify
-from daemon.clock import Clock
-from daemon.messages import Health, Scalar
-from daemon.supervisor import Supervisor
-from daemon.wire.publisher import Publisher
+from shearloop.daemon import sd_notify
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import Health, Scalar
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.supervisor import Supervisor
 
 HEALTH_PERIOD_S = 1.0
 TaskFacts = Mapping[str, Scalar | Mapping[str, int]]

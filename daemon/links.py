@@ -2,7 +2,7 @@
 
 import structlog
 
-from drivers.serial_port import LinkEvent
+from shearloop.drivers.serial_port import LinkEvent
 
 
 def log_link(device: str, event: LinkEvent) -> None:

@@ -9,11 +9,11 @@ from typing import TextIO, cast
 
 import structlog
 
-from daemon.outlet import Outlet
+from shearloop.daemon.nonblocking_writer import NonBlockingWriter
 
 
 @contextmanager
-def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.INFO) -> Iterator[Outlet]:
+def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.INFO) -> Iterator[NonBlockingWriter]:
     """Configure structlog for as long as the context lasts; nobody who logs waits for whoever reads it.
 
     JSON is chosen by itself when systemd has connected the log to its journal.
@@ -34,7 +34,7 @@ def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.IN
     ]
     if json_lines:
         processors.append(structlog.processors.format_exc_info)
-    with closing(Outlet(sys.stderr)) as outlet:
+    with closing(NonBlockingWriter(sys.stderr)) as outlet:
         structlog.configure(
             processors=[*processors, renderer],
             wrapper_class=structlog.make_filtering_bound_logger(level),

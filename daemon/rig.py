@@ -6,34 +6,33 @@ from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
-from daemon.clock import Clock
-from daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, LoopConfig
-from daemon.control.creep import Creep
-from daemon.control.tuning import RequiredMargins
-from daemon.eit.both import BOTH
-from daemon.gripper_task import GripperTask
-from daemon.links import log_event, log_link
-from daemon.load_cell_task import LOAD_CELL, LoadCellTask
-from daemon.loop.brain import Brain
-from daemon.loop.senses import Hand, Source, Torque
-from daemon.loop.tune import TuneSettings, tuned
-from daemon.loop.watch import WatchSettings
-from daemon.loop.wrist import Wrist, WristSettings
-from daemon.loop_task import WRENCH, LoopTask, wrench_source
-from daemon.rig_check import read_experiment
-from daemon.wire.publisher import Publisher
-from drivers.calibration_file import load_calibration
-from drivers.hx711 import LoadCalibration
-from drivers.load_cell import LoadCell
-from drivers.raw_input import Tap, no_tap
-from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import GripperClient
-from drivers.robotiq.socket_client import SocketClient
-from drivers.robotiq.width import WidthCalibration
-from drivers.serial_port import LinkEvent
-from drivers.ur.client import LinkEvent as UrLinkEvent
-from drivers.ur.client import UrRobot
-from drivers.ur.settings import read_settings
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, LoopConfig
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.creep import Creep
+from shearloop.daemon.control.fault_detection import MonitorSettings
+from shearloop.daemon.control.gripper_task import GripperTask
+from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSample, TorqueSource
+from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
+from shearloop.daemon.control.tune import TuneSettings, tuned
+from shearloop.daemon.control.tuning import RequiredMargins
+from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.daemon.links import log_event, log_link
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.rig_check import read_experiment
+from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
+from shearloop.drivers.calibration_file import load_calibration
+from shearloop.drivers.hx711 import LoadCalibration
+from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.raw_event import Tap, no_tap
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.messages import GripperClient
+from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.width import WidthCalibration
+from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
+from shearloop.drivers.ur.settings import read_settings
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -47,7 +46,7 @@ def make_load_cell(
     config: LoadCellConfig,
     publisher: Publisher,
     clock: Clock,
-    hear: Callable[[Torque], None],
+    hear: Callable[[TorqueSample], None],
     on_event: Callable[[LinkEvent], None],
     tap: Tap = no_tap,
 ) -> LoadCellTask:
@@ -71,7 +70,7 @@ def make_gripper_client(config: GripperConfig) -> GripperClient:
         return SocketClient(config.socket.host, config.socket.port)
     if config.modbus is not None:
         # Here, for pymodbus takes long to import, and most grippers are reached by their socket.
-        from drivers.robotiq.modbus_client import ModbusClient
+        from shearloop.drivers.robotiq.modbus_client import ModbusClient
 
         path = str(config.modbus.path) if config.modbus.path is not None else None
         return ModbusClient(serial_number=config.modbus.serial_number, path=path)
@@ -86,7 +85,10 @@ def gripper_calibration(config: GripperConfig) -> WidthCalibration:
 
 
 def make_gripper(
-    config: GripperConfig, publisher: Publisher, feel: Callable[[Hand], None], on_event: Callable[[LinkEvent], None]
+    config: GripperConfig,
+    publisher: Publisher,
+    feel: Callable[[GripperStatus], None],
+    on_event: Callable[[LinkEvent], None],
 ) -> GripperTask:
     """Return the gripper's task; raises DriverError when its calibration cannot be used."""
     client = make_gripper_client(config)
@@ -96,10 +98,10 @@ def make_gripper(
 
 def make_brain(
     config: LoopConfig,
-    sources: Mapping[str, Source],
+    sources: Mapping[str, TorqueSource],
     required: tuple[str, ...],
     creep: Mapping[str, Creep] = MappingProxyType({}),
-) -> Brain:
+) -> ControlLoop:
     """Return the brain for these torques; every one of them may drive that is measured at all."""
     tune = TuneSettings(
         allowed_noise_nm=config.allowed_noise_nm,
@@ -115,11 +117,11 @@ def make_brain(
         required=RequiredMargins(gain=config.gain_margin, phase_deg=config.phase_margin_deg),
     )
     measured = {name: source for name, source in sources.items() if source.measures_torque}
-    wrists = {name: Wrist(source, settings, partial(tuned, tune)) for name, source in measured.items()}
-    watch = WatchSettings(
+    wrists = {name: WristController(source, settings, partial(tuned, tune)) for name, source in measured.items()}
+    watch = MonitorSettings(
         disagreement_nm=config.disagreement_nm, jump_nm=config.jump_nm, freshness_s=config.freshness_s
     )
-    return Brain(wrists, watch, dict(sources), required, creep)
+    return ControlLoop(wrists, watch, dict(sources), required, creep)
 
 
 class Rig:
@@ -130,7 +132,7 @@ class Rig:
         config: DaemonConfig,
         publisher: Publisher,
         clock: Clock,
-        fingertips: Mapping[str, Source],
+        fingertips: Mapping[str, TorqueSource],
         tare_fingertips: Callable[[], Awaitable[str]],
         died: Callable[[], Mapping[str, str]],
         tap: Callable[[str], Tap] = lambda _: no_tap,
@@ -160,7 +162,7 @@ class Rig:
         if config.gripper is not None:
             self.gripper = make_gripper(config.gripper, publisher, self._feel, self.link_of("gripper"))
         self.robot = UrRobot(robot, on_link=self._robot_link)
-        self.loop = LoopTask(
+        self.loop = ControlLoopRunner(
             self.brain,
             self.robot,
             self.gripper,
@@ -232,10 +234,10 @@ class Rig:
             self.brain.senses.lost[device] = sentence
             self.loop.decide_now()
 
-    def _hear(self, torque: Torque) -> None:
+    def _hear(self, torque: TorqueSample) -> None:
         self.brain.hear(torque)
 
-    def _feel(self, hand: Hand) -> None:
+    def _feel(self, hand: GripperStatus) -> None:
         known = self.brain.senses.hand
         if known is None or hand.t_ns >= known.t_ns:
             self.brain.senses.hand = hand

@@ -3,15 +3,23 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from daemon.config import DaemonConfig
-from daemon.config_file import load_yaml_model
-from daemon.eit.both import BOTH
-from daemon.errors import UserError
-from daemon.experiment.steps import ExperimentFile, Grip, HoldTorque, Identify, Release, Tare, beyond_limits
-from daemon.load_cell_task import LOAD_CELL
-from daemon.loop.senses import Source
-from daemon.loop_task import WRENCH
-from daemon.skin.task import SKIN
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control.experiment_schema import (
+    ExperimentFile,
+    GripStep,
+    HoldTorqueStep,
+    IdentifyStep,
+    ReleaseStep,
+    TareStep,
+    beyond_limits,
+)
+from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.control.runner import WRENCH
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
+from shearloop.daemon.sensing.skin_task import SKIN
 
 
 def read_experiment(path: Path) -> ExperimentFile:
@@ -22,7 +30,7 @@ def read_experiment(path: Path) -> ExperimentFile:
     return file
 
 
-def checked_experiment(config: DaemonConfig, sources: Mapping[str, Source]) -> ExperimentFile | None:
+def checked_experiment(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ExperimentFile | None:
     """Return the configured experiment, None where there is none; UserError where it can never be carried out.
 
     `sources` are the torques of fingertips and skin.
@@ -37,7 +45,7 @@ def checked_experiment(config: DaemonConfig, sources: Mapping[str, Source]) -> E
         raise UserError(f"{path}: `drive: {file.drive}` {_why_not(file.drive, config)}; there are {', '.join(driving)}")
     if config.gripper is None:
         for number, step in enumerate(file.steps, 1):
-            if isinstance(step, Grip | Release):
+            if isinstance(step, GripStep | ReleaseStep):
                 raise UserError(
                     f"{path}: step {number} is `{step.do}`, and no gripper is configured; "
                     "add a `gripper` section to the configuration, or take the step out"
@@ -58,11 +66,11 @@ def _held_unknown(file: ExperimentFile) -> int | None:
     known = False
     for number, step in enumerate(file.steps, 1):
         match step:
-            case Identify():
+            case IdentifyStep():
                 known = True
-            case Tare() | Grip() | Release():
+            case TareStep() | GripStep() | ReleaseStep():
                 known = False
-            case HoldTorque() if not known:
+            case HoldTorqueStep() if not known:
                 return number
     return None
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.load_cell_task import LOAD_CELL
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 
 FloatArray = NDArray[np.float64]
 

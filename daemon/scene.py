@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.design import ALLOWED, Choice, Design, Scene, designed
-from bank.estimators.gripped import gripped_part
-from bank.estimators.guard import channel_noise
-from bank.estimators.values import FrameSeries
-from daemon.bank_config import FingertipConfig
-from daemon.config_file import load_yaml_model
-from daemon.errors import UserError
-from daemon.recording.series import read_series
-from daemon.reproduce.banks import OWN_FINGERTIP
+from shearloop.bank.eit.design import ALLOWED, Choice, Design, Scene, designed
+from shearloop.bank.estimation.fingertip_validator import channel_noise
+from shearloop.bank.estimation.grip_segmentation import gripped_part
+from shearloop.bank.estimation.values import FrameSeries
+from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
+from shearloop.daemon.analysis.series import read_series
+from shearloop.daemon.bank_config import FingertipGeometryConfig
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.errors import UserError
 
 # Main directions in which slices of one contact vary; what they leave is noise.
 _N_DIRECTIONS = 4
@@ -35,7 +35,7 @@ def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> t
         raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
     # Slices do not tell their side, and are not asked for it above.
     one = series[0] if sides is None else series[0].of_sides(sides)
-    return path, designed(scene_of(one), load_yaml_model(path, FingertipConfig).fingertip())
+    return path, designed(scene_of(one), load_yaml_model(path, FingertipGeometryConfig).fingertip())
 
 
 def scene_of(series: FrameSeries) -> Scene:

@@ -7,12 +7,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.bank_file import BankDefinition
-from bank.build import RowSolver
-from bank.channels import LINE_SLOTS, N_ELECTRODES, line_of_channels
-from bank.mesh import Mesh
-from daemon.errors import UserError
-from drivers.eit_format import ADC_STEP_V
+from shearloop.bank.eit.bank_file import BankDefinition
+from shearloop.bank.eit.build import RowSolver
+from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channels
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.daemon.errors import UserError
+from shearloop.drivers.eit_format import ADC_STEP_V
 
 # Of the recorded frames: their mean, and the standard deviation of a channel from frame to frame.
 MEAN_V = 0.13
@@ -27,7 +27,7 @@ INJECTIONS: NDArray[np.int64] = LINE_SLOTS // N_ELECTRODES
 
 
 class Signals(Protocol):
-    """What is needed of a bank: `bank.bank_file.Bank` has it."""
+    """What is needed of a bank: `shearloop.bank.eit.bank_file.Bank` has it."""
 
     @property
     def k_grid(self) -> NDArray[np.float64]:

@@ -10,10 +10,10 @@ from random import Random
 
 import numpy as np
 
-from bank.skin.calibration import CalibrationTable
-from bank.skin.membrane import UNSTRETCHED, Membrane, paper_membrane
-from bank.skin.section import PAPER_SECTION
-from bank.skin.synthetic import loop
+from shearloop.bank.skin.calibration import CalibrationTable
+from shearloop.bank.skin.membrane import UNSTRETCHED, Membrane, paper_membrane
+from shearloop.bank.skin.section import PAPER_SECTION
+from shearloop.bank.skin.synthetic import loop
 
 # Two gauges as they come off the wafer: never quite alike, which tells them apart.
 REST_OHM = (24.6, 25.3)

@@ -19,8 +19,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
-from daemon.ending_signals import ending_signals
-from daemon.errors import UserError
+from shearloop.daemon.ending_signals import ending_signals
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from distributed import Client, LocalCluster
@@ -48,7 +48,7 @@ class Workers(Protocol):
         """
 
 
-class InTurn:
+class SerialExecutor:
     """One after the other, in this process."""
 
     def map(self, function: Callable[[S, T], R], shared: S, items: Sequence[T]) -> Iterator[tuple[int, R]]:
@@ -161,7 +161,7 @@ def workers(cluster: str | None, jobs: int | None = None) -> "Iterator[Workers]"
     which no scheduler answers, and for one that is given without the extra.
     """
     if cluster is None:
-        yield InTurn() if jobs in (None, 1) else Processes(jobs)
+        yield SerialExecutor() if jobs in (None, 1) else Processes(jobs)
         return
     n_local = len(os.sched_getaffinity(0)) if jobs is None else jobs
     try:

@@ -8,7 +8,7 @@ from types import ModuleType
 from zlib import crc32
 
 try:
-    from drivers import _cells as cells
+    from shearloop.drivers import _cells as cells
 except ImportError:
     # No compiler, or none that could build it; docs/speed.md tells what that costs.
     cells = None  # type: ignore[assignment]
@@ -17,7 +17,7 @@ except ImportError:
 def is_stale(module: ModuleType) -> bool:
     """Return whether a module is compiled from another source than lies beside it, for that has changed since.
 
-    As `bank.compiled` asks of its own: neither package imports the other.
+    As `shearloop.bank.eit.compiled` asks of its own: neither package imports the other.
     """
     source = Path(__file__).with_name("_cells.c")
     return source.exists() and crc32(source.read_bytes()) != getattr(module, "SOURCES", None)

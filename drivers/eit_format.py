@@ -13,7 +13,7 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.compiled import cells
+from shearloop.drivers.compiled import cells
 
 N_VALUES = 1024
 CELL_BYTES = len(b"0.1234, ")
@@ -42,7 +42,7 @@ _PLACES = np.array([10_000, 0, 1_000, 100, 10, 1, 0, 0], dtype=np.float32)
 _TEN_THOUSANDTHS = 10_000.0
 
 
-class RefusalKind(Enum):
+class FrameErrorKind(Enum):
     """Why a line was refused; the value is the sentence for the operator."""
 
     TOO_LONG = f"a line of more than {LONGEST_LINE_BYTES} bytes: newlines are being lost, or this is not an EIT-kit"
@@ -56,10 +56,10 @@ class RefusalKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class FrameError:
     """A refused line: why, from which value on (0…1023) where that can be said, and what stands there."""
 
-    kind: RefusalKind
+    kind: FrameErrorKind
     excerpt: bytes
     position: int | None = None
 
@@ -69,7 +69,7 @@ class Refusal:
         return f"refused {self.kind.value} (read {self.excerpt.decode('ascii', 'backslashreplace')!r}{where})"
 
 
-def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64] | Refusal:
+def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64] | FrameError:
     """Return the (1024,) values, in volts, of a line without its end, or why it is refused.
 
     `zero_slots` (1024,) is true where the board writes 0. A value is read only in the board's own form, `d.dddd`.
@@ -81,7 +81,7 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
     return _read_by_numpy(line, zero_slots)
 
 
-def _read_by_numpy(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64] | Refusal:
+def _read_by_numpy(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64] | FrameError:
     values = _cells(line)
     if values is None:
         return _what_is_wrong(line)
@@ -89,9 +89,9 @@ def _read_by_numpy(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.flo
     if zeros.tobytes() == zero_slots.tobytes() and np.maximum.reduce(values) <= ADC_REFERENCE_V:
         return values
     for kind, bad in (
-        (RefusalKind.OUT_OF_RANGE, values > ADC_REFERENCE_V),
-        (RefusalKind.NONZERO_SLOT, ~zeros & zero_slots),
-        (RefusalKind.ZERO_CHANNEL, zeros & ~zero_slots),
+        (FrameErrorKind.OUT_OF_RANGE, values > ADC_REFERENCE_V),
+        (FrameErrorKind.NONZERO_SLOT, ~zeros & zero_slots),
+        (FrameErrorKind.ZERO_CHANNEL, zeros & ~zero_slots),
     ):
         if bad.any():
             return _refusal_at(kind, line, int(bad.argmax()))
@@ -107,22 +107,22 @@ def _cells(line: bytes) -> NDArray[np.float64] | None:
     return np.asarray(np.divide(numbers.astype(np.float32).dot(_PLACES), _TEN_THOUSANDTHS, dtype=np.float64))
 
 
-def _what_is_wrong(line: bytes) -> Refusal:
+def _what_is_wrong(line: bytes) -> FrameError:
     *values, rest = line.split(_SEPARATOR)
     if rest or len(values) != N_VALUES:
-        return Refusal(RefusalKind.WRONG_COUNT, line[:EXCERPT_BYTES])
+        return FrameError(FrameErrorKind.WRONG_COUNT, line[:EXCERPT_BYTES])
     for position, value in enumerate(values):
         if value.lower().lstrip(b"-") == b"nan":
-            return Refusal(RefusalKind.NAN, value, position)
+            return FrameError(FrameErrorKind.NAN, value, position)
         if not _DECIMAL.fullmatch(value):
-            return Refusal(RefusalKind.NOT_A_NUMBER, value[:EXCERPT_BYTES], position)
+            return FrameError(FrameErrorKind.NOT_A_NUMBER, value[:EXCERPT_BYTES], position)
         if value.startswith(b"-"):
-            return Refusal(RefusalKind.NEGATIVE, value[:EXCERPT_BYTES], position)
+            return FrameError(FrameErrorKind.NEGATIVE, value[:EXCERPT_BYTES], position)
         if len(value) + len(_SEPARATOR) != CELL_BYTES:
-            return Refusal(RefusalKind.OUT_OF_RANGE, value[:EXCERPT_BYTES], position)
+            return FrameError(FrameErrorKind.OUT_OF_RANGE, value[:EXCERPT_BYTES], position)
     raise AssertionError("a line of sound cells only is read, not refused")
 
 
-def _refusal_at(kind: RefusalKind, line: bytes, position: int) -> Refusal:
+def _refusal_at(kind: FrameErrorKind, line: bytes, position: int) -> FrameError:
     start = position * CELL_BYTES
-    return Refusal(kind, line[start : start + CELL_BYTES - len(_SEPARATOR)], position)
+    return FrameError(kind, line[start : start + CELL_BYTES - len(_SEPARATOR)], position)

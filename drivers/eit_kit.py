@@ -7,11 +7,11 @@ from collections.abc import AsyncGenerator, Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.board import Board
-from drivers.eit_line import NOMINAL_PERIOD_NS, Frame, LineParser
-from drivers.errors import DeviceLostError
-from drivers.raw_input import InputKind, RawInput, Tap, no_tap
-from drivers.serial_port import LinkEvent, Port, SerialLink
+from shearloop.drivers.eit_line import NOMINAL_PERIOD_NS, Frame, FrameParser
+from shearloop.drivers.errors import DeviceLostError
+from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
+from shearloop.drivers.serial_port import LinkEvent, Port, SerialLink
+from shearloop.drivers.serial_sensor import SerialSensor
 
 __all__ = ["EitKit", "Frame"]
 
@@ -24,7 +24,7 @@ SHORTEST_SILENCE_S = 0.5
 STARTS_BEFORE_REOPENING = 5
 
 
-class EitKit(Board[Frame]):
+class EitKit(SerialSensor[Frame]):
     """One board, named by USB serial number or path.
 
     `zero_slots` (1024,) is true where its injection pattern makes a value 0; `frame_period_s` serves until the period
@@ -46,7 +46,7 @@ class EitKit(Board[Frame]):
         path = None if path is None else os.fspath(path)
         super().__init__(SerialLink(serial_number=serial_number, path=path, on_event=on_event), self._frames_of, tap)
         self._on_frame = on_frame
-        self._parser = LineParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
+        self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
         self._expected_hz = 1.0 / frame_period_s
         self._unanswered = 0
         self._silences = 0
@@ -77,7 +77,7 @@ class EitKit(Board[Frame]):
         self.tell(InputKind.STARTED, time.monotonic_ns())
         await port.write(START)
 
-    def _frames_of(self, told: RawInput) -> list[Frame]:
+    def _frames_of(self, told: RawEvent) -> list[Frame]:
         frames = self._parser.take(told)
         for frame in frames:
             self._on_frame(frame)

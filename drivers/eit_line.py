@@ -6,19 +6,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.compiled import cells
-from drivers.eit_format import (
+from shearloop.drivers.compiled import cells
+from shearloop.drivers.eit_format import (
     EXCERPT_BYTES,
     FULL_SCALE_SINE_RMS_V,
     LINE_BYTES,
     LONGEST_LINE_BYTES,
     N_VALUES,
-    Refusal,
-    RefusalKind,
+    FrameError,
+    FrameErrorKind,
     read_line,
 )
-from drivers.frame_clock import FrameClock
-from drivers.raw_input import InputKind, RawInput
+from shearloop.drivers.frame_clock import FrameClock
+from shearloop.drivers.raw_event import InputKind, RawEvent
 
 # The board's own period, 1.85 frames/s; the one in use is learned from the frames as they come.
 NOMINAL_PERIOD_NS = 541_000_000
@@ -28,7 +28,7 @@ TRANSFER_NS = 1_000_000
 # moves, the noise of a small signal stays below one step of the ADC.
 DEAD_AFTER_FRAMES = 200
 # What the rest of a line, begun before the port was opened, looks like.
-_PARTIAL = (RefusalKind.WRONG_COUNT, RefusalKind.NOT_A_NUMBER)
+_PARTIAL = (FrameErrorKind.WRONG_COUNT, FrameErrorKind.NOT_A_NUMBER)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +54,7 @@ class Frame:
     repeated: bool
 
 
-class LineParser:
+class FrameParser:
     """Turns bytes, in any slicing, into frames; refuses what is no frame, counts it by kind and names the last.
 
     `zero_slots` (1024,) is true where the injection pattern makes the value 0. Counted apart from `refused`, being
@@ -75,8 +75,8 @@ class LineParser:
             raise ValueError(f"the mask of zero slots has the shape {zero_slots.shape} instead of ({N_VALUES},)")
         self.clock = FrameClock(nominal_period_ns)
         self.frames = 0
-        self.refused: Counter[RefusalKind] = Counter()
-        self.last_refusal: Refusal | None = None
+        self.refused: Counter[FrameErrorKind] = Counter()
+        self.last_refusal: FrameError | None = None
         self.first_partials = 0
         self.unfinished = 0
         # As compiled code takes it.
@@ -101,7 +101,7 @@ class LineParser:
         self._no_channels = np.zeros(len(self._slots), np.bool_)
         self._no_channels.setflags(write=False)
 
-    def take(self, told: RawInput) -> list[Frame]:
+    def take(self, told: RawEvent) -> list[Frame]:
         """Do what an input says, live or recorded; return the frames that it completes: a tare or a tool, none."""
         match told.kind:
             case InputKind.OPENED:
@@ -155,19 +155,19 @@ class LineParser:
             return
         self._begun += data[: LONGEST_LINE_BYTES + 1]
         if len(self._begun) > LONGEST_LINE_BYTES:
-            self._refuse(Refusal(RefusalKind.TOO_LONG, bytes(self._begun[:EXCERPT_BYTES])))
+            self._refuse(FrameError(FrameErrorKind.TOO_LONG, bytes(self._begun[:EXCERPT_BYTES])))
             self._begun.clear()
             self._flooded = True
 
     def _read(self, line: bytes) -> tuple[bytes, NDArray[np.float64]] | None:
         values = read_line(line, self._zero_slots)
-        if isinstance(values, Refusal) and self._started_at:
+        if isinstance(values, FrameError) and self._started_at:
             fresh = line[self._started_at :]
             fresh_values = read_line(fresh, self._zero_slots)
-            if not isinstance(fresh_values, Refusal):
+            if not isinstance(fresh_values, FrameError):
                 self.unfinished += 1
                 return fresh, fresh_values
-        if not isinstance(values, Refusal):
+        if not isinstance(values, FrameError):
             return line, values
         if self._first and values.kind in _PARTIAL and len(line) < LINE_BYTES:
             self.first_partials += 1
@@ -213,7 +213,7 @@ class LineParser:
             self._none_dead_before = int(self._changed_in.min()) - 1 + self._dead_after
         return dead
 
-    def _refuse(self, refusal: Refusal) -> None:
+    def _refuse(self, refusal: FrameError) -> None:
         self.refused[refusal.kind] += 1
         self.last_refusal = refusal
         self._missed = True

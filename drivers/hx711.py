@@ -15,10 +15,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Self
 
-from drivers.calibration_file import CalibrationModel, Finite, Positive
-from drivers.lines import LineCutter, transfer_ns
-from drivers.raw_input import InputKind, RawInput
-from drivers.values import value
+from shearloop.drivers.calibration_file import CalibrationModel, Finite, Positive
+from shearloop.drivers.line_splitter import LineSplitter, transfer_ns
+from shearloop.drivers.raw_event import InputKind, RawEvent
 
 BAUD_RATE = 115200
 # Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second, nominally.
@@ -84,7 +83,7 @@ class LoadLimits:
     settle_samples: int = 3
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class LoadSample:
     """One line of the board. Every decimal becomes one, flagged where it is not to be believed.
 
@@ -170,14 +169,14 @@ class LoadParser:
         self._period_ns = round(1e9 / rate_hz)
         # As long as that takes at the usual rate, and no fewer.
         self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / RATE_HZ))
-        self._lines = LineCutter(MAX_LINE_BYTES)
+        self._lines = LineSplitter(MAX_LINE_BYTES)
         self._refused: Counter[str] = Counter()
         self._seq = 0
         self._last_mid_ns: int | None = None
         self.calibration = calibration
         self.restart()
 
-    def take(self, told: RawInput) -> list[LoadSample]:
+    def take(self, told: RawEvent) -> list[LoadSample]:
         """Do what an input says, live or recorded; return the samples that it completes. A tare brings its raw zero."""
         match told.kind:
             case InputKind.OPENED:

@@ -10,8 +10,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivers.calibration_file import CalibrationError
-from drivers.hx711 import LoadCalibration, LoadSample
+from shearloop.drivers.calibration_file import CalibrationError
+from shearloop.drivers.hx711 import LoadCalibration, LoadSample
 
 STANDARD_GRAVITY = 9.80665
 # Before the scale is known, no value can be told from a load by its size: only by the noise that it adds.

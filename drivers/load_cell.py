@@ -5,10 +5,10 @@ import time
 from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import aclosing
 
-from drivers.hx711 import BAUD_RATE, RATE_HZ, LoadCalibration, LoadParser, LoadSample, refusals
-from drivers.raw_input import InputKind, Tap, no_tap
-from drivers.sending_board import SendingBoard
-from drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
+from shearloop.drivers.hx711 import BAUD_RATE, RATE_HZ, LoadCalibration, LoadParser, LoadSample, refusals
+from shearloop.drivers.raw_event import InputKind, Tap, no_tap
+from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
+from shearloop.drivers.streaming_sensor import StreamingSensor
 
 
 class LoadCell:
@@ -37,7 +37,7 @@ class LoadCell:
             on_event=on_event,
         )
         self._parser = LoadParser(calibration, rate_hz)
-        self._board = SendingBoard(
+        self._board = StreamingSensor(
             link,
             self._parser.take,
             # One that is quicker is not silent yet where this computer was late; opening it anew would reset it.

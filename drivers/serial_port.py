@@ -17,8 +17,7 @@ from typing import Protocol, Self
 import serial
 from serial.tools import list_ports
 
-from drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError, DriverError
-from drivers.values import value
+from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError, DriverError
 
 DEFAULT_BAUD = 115_200
 # One read takes what the kernel keeps for a port (4 kB for a pseudo-terminal, 64 kB at most for a USB port); after
@@ -61,7 +60,7 @@ def _ports_there_are() -> str:
     return f"there are {', '.join(ports)}" if ports else "no USB serial port is plugged in"
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Received:
     """Bytes, and when (monotonic, ns) all of them had arrived."""
 

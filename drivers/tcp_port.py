@@ -4,8 +4,8 @@ import asyncio
 import time
 from collections.abc import Callable
 
-from drivers.errors import DeviceLostError, DeviceNotFoundError
-from drivers.serial_port import WRITE_TIMEOUT_S, Link, LinkEvent, Port, Received, ReconnectPolicy
+from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError
+from shearloop.drivers.serial_port import WRITE_TIMEOUT_S, Link, LinkEvent, Port, Received, ReconnectPolicy
 
 CONNECT_DEADLINE_S = 2.0
 # Replies of instruments are lines; what comes in longer pieces comes in several reads.

@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from drivers.errors import DriverError
+from shearloop.drivers.errors import DriverError
 
 
 class _UniqueKeyLoader(yaml.SafeLoader):

@@ -57,7 +57,7 @@ def fonts() -> None:
 @pytest.fixture
 def few_mixtures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have slices mixed with two foreign frames in place of fifteen: most of a fit, where no interval is judged."""
-    from bank.estimators import mixtures
+    from shearloop.bank.estimation import contamination as mixtures
 
     monkeypatch.setattr(mixtures, "_NUMBERINGS", mixtures._NUMBERINGS[:2])
 

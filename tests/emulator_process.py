@@ -29,7 +29,7 @@ class EmulatorProcess:
         self.events: list[Event] = []
         self._unread = b""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "daemon", "emulate", device, "--host", self.host, *options],
+            [sys.executable, "-m", "shearloop", "emulate", device, "--host", self.host, *options],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
         )

@@ -15,8 +15,8 @@ from scipy.sparse.linalg import splu
 from skfem.helpers import grad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from bank.errors import GeometryError
-from bank.skin.section import Section
+from shearloop.bank.errors import GeometryError
+from shearloop.bank.skin.section import Section
 
 Floats = NDArray[np.float64]
 

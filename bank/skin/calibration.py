@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.errors import CalibrationError
-from bank.skin.membrane import Direction, Membrane, ShearInterval
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin.membrane import Direction, Membrane, ShearInterval
 
 Floats = NDArray[np.float64]
 

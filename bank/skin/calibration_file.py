@@ -8,9 +8,9 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from bank.errors import CalibrationError
-from bank.skin.calibration import CalibrationTable, SkinCalibration
-from bank.stored import replaced
+from shearloop.bank.eit.stored import replaced
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration
 
 FORMAT = "shearloop skin calibration 1"
 # A load cell at rest may read a little less than nothing; a skin cannot be pulled off its core.

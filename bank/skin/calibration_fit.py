@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar, nnls
 from scipy.stats import t as student
 
-from bank.errors import CalibrationError
-from bank.skin import gauge
-from bank.skin.calibration import CalibrationTable, SkinCalibration
-from bank.skin.closed_form import gauge_angle_rad
-from bank.skin.membrane import UNSTRETCHED, Membrane
-from bank.skin.section import PAPER_SECTION
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin import gauge
+from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration
+from shearloop.bank.skin.closed_form import gauge_angle_rad
+from shearloop.bank.skin.membrane import UNSTRETCHED, Membrane
+from shearloop.bank.skin.section import PAPER_SECTION
 
 Floats = NDArray[np.float64]
 # The paper's response is straight up to here and rises faster beyond.

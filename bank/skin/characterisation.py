@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.skin import closed_form, statistics
-from bank.skin.annulus import CondensedSkin, condense
-from bank.skin.contact import ContactState, follow, gauge_strains, load, midline_strain, unloaded
-from bank.skin.gauge import Gauge, response_of_strains
-from bank.skin.membrane import Membrane, paper_membrane
-from bank.skin.section import PAPER_SECTION, Section
-from bank.skin.synthetic import Figures, loading, loop, recover, responses
+from shearloop.bank.skin import closed_form, statistics
+from shearloop.bank.skin.annulus import CondensedSkin, condense
+from shearloop.bank.skin.contact import ContactState, follow, gauge_strains, load, midline_strain, unloaded
+from shearloop.bank.skin.gauge import Gauge, response_of_strains
+from shearloop.bank.skin.membrane import Membrane, paper_membrane
+from shearloop.bank.skin.section import PAPER_SECTION, Section
+from shearloop.bank.skin.synthetic import Figures, loading, loop, recover, responses
 
 Floats = NDArray[np.float64]
 NORMAL_FORCES_N = (0.5, 1.0, 1.5, 2.0)

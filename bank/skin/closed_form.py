@@ -7,8 +7,8 @@ into strain. The core's friction takes e^(−μφ) on the way to the gauge and �
 
 import math
 
-from bank.skin.gauge import gauge_factor
-from bank.skin.section import Section
+from shearloop.bank.skin.gauge import gauge_factor
+from shearloop.bank.skin.section import Section
 
 
 def gauge_angle_rad(section: Section) -> float:

@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.errors import BankError
-from bank.skin.annulus import CondensedSkin
+from shearloop.bank.errors import BankError
+from shearloop.bank.skin.annulus import CondensedSkin
 
 Floats = NDArray[np.float64]
 

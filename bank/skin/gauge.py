@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.errors import CalibrationError
+from shearloop.bank.errors import CalibrationError
 
 Floats = NDArray[np.float64]
 EXCITATION_A = 5e-3

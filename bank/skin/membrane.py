@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
-from bank.errors import CalibrationError
-from bank.skin.closed_form import gauge_angle_rad, sensitivity_per_n
-from bank.skin.gauge import gauge_factor
-from bank.skin.section import PAPER_SECTION, Section
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin.closed_form import gauge_angle_rad, sensitivity_per_n
+from shearloop.bank.skin.gauge import gauge_factor
+from shearloop.bank.skin.section import PAPER_SECTION, Section
 
 # The paper's own estimate of F/(EA); its E and width would make the skin 0.88 mm thick.
 PAPER_SENSITIVITY_PER_N = 0.088

@@ -7,7 +7,7 @@ towards larger θ, so that the skin below 90° is stretched.
 
 from dataclasses import dataclass
 
-from bank.errors import GeometryError
+from shearloop.bank.errors import GeometryError
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
-from bank.errors import CalibrationError
+from shearloop.bank.errors import CalibrationError
 
 Floats = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from bank.skin import statistics
-from bank.skin.membrane import UNSTRETCHED, Membrane
+from shearloop.bank.skin import statistics
+from shearloop.bank.skin.membrane import UNSTRETCHED, Membrane
 
 Floats = NDArray[np.float64]
 

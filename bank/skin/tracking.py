@@ -8,8 +8,8 @@ it was last known to be, moved no further than the band demands (the inverse of 
 import math
 from collections import deque
 
-from bank.skin.calibration import SkinCalibration
-from bank.skin.membrane import Direction, ShearInterval, direction_of
+from shearloop.bank.skin.calibration import SkinCalibration
+from shearloop.bank.skin.membrane import Direction, ShearInterval, direction_of
 
 # A response counts as having moved when it differs by so many standard deviations of what is compared: by chance about
 # once in a week at ten responses a second.

@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from typing import NamedTuple, NoReturn, Protocol
 
-from daemon.cli.interruption import ended, interrupts_heard
+from shearloop.daemon.cli.interruption import ended, interrupts_heard
 
 # Many small solves and products: a BLAS that spreads each over all cores is slower. Before numpy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -26,29 +26,44 @@ class Command(NamedTuple):
 
 
 COMMANDS = {
-    "run": Command("daemon.cli.run", "run the daemon that a configuration describes"),
-    "import": Command("daemon.cli.import_", "bring the paper's MATLAB streams into a recording"),
-    "recording": Command("daemon.cli.recording", "look into recordings, repair them, and export them as tables"),
-    "replay": Command("daemon.cli.replay", "send a recording through the same estimators again, as if live"),
-    "evaluate": Command("daemon.cli.evaluate", "judge a calibrated estimator on recordings or slices"),
-    "chart": Command("bench.charts.command", "chart speed against accuracy, stability, and how much model is needed"),
-    "check": Command("daemon.cli.check", "say whether a configuration and the files it names are in order"),
-    "listen": Command("daemon.cli.listen", "print what a running daemon publishes"),
-    "command": Command(
-        "daemon.cli.command", "ask a running daemon to do something: tare, start, pause, stop, unlock …"
+    "run": Command("shearloop.daemon.cli.run", "run the daemon that a configuration describes"),
+    "import": Command("shearloop.daemon.cli.import_", "bring the paper's MATLAB streams into a recording"),
+    "recording": Command(
+        "shearloop.daemon.cli.recording", "look into recordings, repair them, and export them as tables"
     ),
-    "view": Command("daemon.cli.view", "show a running daemon as a page in the browser, with a stop button"),
-    "calibrate": Command("daemon.cli.calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"),
-    "emulate": Command("daemon.cli.emulate", "play a device, byte for byte, on a port of its own"),
-    "bank": Command("daemon.cli.bank", "solve, build, inspect and draw banks of simulated signals"),
-    "doctor": Command("daemon.cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"),
-    "ports": Command("daemon.cli.ports", "list the serial ports with their serial numbers"),
-    "keys": Command("daemon.cli.keys", "make the keys for daemon and clients on a network"),
-    "completion": Command("daemon.cli.completion", "print what bash, zsh or tcsh needs to complete the command line"),
-    "install": Command("daemon.cli.install", "make the daemon a service of this computer"),
-    "uninstall": Command("daemon.cli.uninstall", "take the service away again"),
-    "skin": Command("daemon.cli.skin", "hold the shear skin's models against its paper, and calibrate a skin"),
-    "reproduce": Command("daemon.cli.reproduce", "compute the paper's numbers and figures anew from recorded slices"),
+    "replay": Command("shearloop.daemon.cli.replay", "send a recording through the same estimators again, as if live"),
+    "evaluate": Command("shearloop.daemon.cli.evaluate", "judge a calibrated estimator on recordings or slices"),
+    "chart": Command(
+        "shearloop.daemon.analysis.charts.command",
+        "chart speed against accuracy, stability, and how much model is needed",
+    ),
+    "check": Command("shearloop.daemon.cli.check", "say whether a configuration and the files it names are in order"),
+    "listen": Command("shearloop.daemon.cli.listen", "print what a running daemon publishes"),
+    "command": Command(
+        "shearloop.daemon.cli.command", "ask a running daemon to do something: tare, start, pause, stop, unlock …"
+    ),
+    "view": Command("shearloop.daemon.cli.view", "show a running daemon as a page in the browser, with a stop button"),
+    "calibrate": Command(
+        "shearloop.daemon.cli.calibrate", "calibrate an estimator, a gel's creep, the load cell or the gripper"
+    ),
+    "emulate": Command("shearloop.daemon.cli.emulate", "play a device, byte for byte, on a port of its own"),
+    "bank": Command("shearloop.daemon.cli.bank", "solve, build, inspect and draw banks of simulated signals"),
+    "doctor": Command(
+        "shearloop.daemon.cli.doctor", "find out what is wrong: files, ports, devices, robot, clock, disk, keys"
+    ),
+    "ports": Command("shearloop.daemon.cli.ports", "list the serial ports with their serial numbers"),
+    "keys": Command("shearloop.daemon.cli.keys", "make the keys for daemon and clients on a network"),
+    "completion": Command(
+        "shearloop.daemon.cli.completion", "print what bash, zsh or tcsh needs to complete the command line"
+    ),
+    "install": Command("shearloop.daemon.cli.install", "make the daemon a service of this computer"),
+    "uninstall": Command("shearloop.daemon.cli.uninstall", "take the service away again"),
+    "skin": Command(
+        "shearloop.daemon.cli.skin", "hold the shear skin's models against its paper, and calibrate a skin"
+    ),
+    "reproduce": Command(
+        "shearloop.daemon.cli.reproduce", "compute the paper's numbers and figures anew from recorded slices"
+    ),
 }
 
 EXIT_OK, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
@@ -100,9 +115,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _user_errors() -> tuple[type[Exception], ...]:
-    from bank.errors import BankError
-    from daemon.errors import UserError
-    from drivers.errors import DriverError
+    from shearloop.bank.errors import BankError
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.errors import DriverError
 
     return (BankError, DriverError, UserError)
 

@@ -3,7 +3,7 @@
 `shearloop calibrate REC… --estimator NAME --out CAL` is `shearloop calibrate recording REC…`: an estimator is fitted to
 what was recorded. A recording called as a THING is written with its folder, `./load`.
 
-A thing is a module in `daemon.cli.calibrated` with `configure(parser)` and `run(args) -> exit status`, as a command is.
+A thing is a module in `shearloop.daemon.cli.calibrated` with `configure(parser)` and `run(args) -> exit status`, as a command is.
 """
 
 import argparse
@@ -11,10 +11,10 @@ import importlib
 from collections.abc import Sequence
 
 THINGS = {
-    "recording": ("daemon.cli.calibrated.recording", "an estimator, on recordings or folders of slices"),
-    "creep": ("daemon.cli.calibrated.creep", "what a gel's torque loses under a held twist, on recordings"),
-    "load": ("daemon.cli.calibrated.load", "the load cell, with known masses on it"),
-    "gripper": ("daemon.cli.calibrated.gripper", "the gripper's width, with objects of known diameter"),
+    "recording": ("shearloop.daemon.cli.calibrated.recording", "an estimator, on recordings or folders of slices"),
+    "creep": ("shearloop.daemon.cli.calibrated.creep", "what a gel's torque loses under a held twist, on recordings"),
+    "load": ("shearloop.daemon.cli.calibrated.load", "the load cell, with known masses on it"),
+    "gripper": ("shearloop.daemon.cli.calibrated.gripper", "the gripper's width, with objects of known diameter"),
 }
 
 

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from daemon.config import CurveConfig, DaemonConfig, SkinConfig
-    from daemon.eit.opening import AnyEstimator
+    from shearloop.daemon.config import CurveConfig, DaemonConfig, SkinConfig
+    from shearloop.daemon.sensing.opening import AnyEstimator
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -20,11 +20,11 @@ def run(args: argparse.Namespace) -> int:
     """Load everything that `run` would load, and open no device."""
     import json
 
-    from daemon.cli.run import checked_emulators
-    from daemon.config import load_daemon_config
-    from daemon.eit.opening import open_both, open_estimator
-    from daemon.rig_check import checked_experiment
-    from daemon.torque_sources import torque_sources
+    from shearloop.daemon.cli.run import checked_emulators
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.rig_check import checked_experiment
+    from shearloop.daemon.sensing.opening import open_both, open_estimator
+    from shearloop.daemon.sensing.torque_sources import torque_sources
 
     config = load_daemon_config(args.config)
     checked_emulators(config.emulators, args.config)
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _torque(estimator: "AnyEstimator", *, calibrated: bool) -> str:
-    from daemon.eit.opening import on_word
+    from shearloop.daemon.sensing.opening import on_word
 
     if estimator.measures_torque:
         return f"with torque{on_word(estimator)}"
@@ -66,8 +66,8 @@ def _torque(estimator: "AnyEstimator", *, calibrated: bool) -> str:
 
 def _rig(config: "DaemonConfig") -> dict[str, str]:
     """Return what is told of load cell, gripper and robot."""
-    from daemon.rig import gripper_calibration, load_cell_calibration
-    from drivers.ur.settings import read_settings
+    from shearloop.daemon.rig import gripper_calibration, load_cell_calibration
+    from shearloop.drivers.ur.settings import read_settings
 
     told = {}
     if config.load_cell is not None:
@@ -84,7 +84,7 @@ def _rig(config: "DaemonConfig") -> dict[str, str]:
 
 
 def _clients(curve: "CurveConfig") -> str:
-    from daemon.wire.keys import admitted_clients, load_server_keys
+    from shearloop.daemon.messaging.keys import admitted_clients, load_server_keys
 
     load_server_keys(curve.server_key)
     return ", ".join(sorted(admitted_clients(curve.clients).values()))
@@ -94,9 +94,9 @@ def _skin(config: "SkinConfig") -> str:
     """Return what is told of the skin: its calibration, and what its calibration cannot tell."""
     import math
 
-    from bank.skin.calibration_file import load_calibration
-    from daemon.skin.setup import check_circuit
-    from daemon.skin.zero import MOST_CHANGE
+    from shearloop.bank.skin.calibration_file import load_calibration
+    from shearloop.daemon.sensing.skin_setup import check_circuit
+    from shearloop.daemon.sensing.skin_zero import MOST_CHANGE
 
     calibration = load_calibration(config.calibration)
     check_circuit(config, calibration)

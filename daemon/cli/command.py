@@ -3,9 +3,9 @@
 import argparse
 from pathlib import Path
 
-from daemon.cli.connection import add_connection, client_keys
-from daemon.wire.addresses import COMMAND_ADDRESS, needs_keys, stop_address
-from daemon.wire.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
+from shearloop.daemon.cli.connection import add_connection, client_keys
+from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, needs_keys, stop_address
+from shearloop.daemon.messaging.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
 
 COMMANDS = {
     "tare": "take the zero of the torque sensors anew: nothing gripped, no experiment running",
@@ -65,8 +65,8 @@ def run(args: argparse.Namespace) -> int:
     import json
     import sys
 
-    from daemon.wire.request import request
-    from daemon.wire.subscriber import checked_timeout_s
+    from shearloop.daemon.messaging.request import request
+    from shearloop.daemon.messaging.subscriber import checked_timeout_s
 
     arguments = {} if args.source is None else {"source": args.source}
     if args.heatmap is not None:

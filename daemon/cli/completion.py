@@ -28,7 +28,7 @@ def whole_parser() -> argparse.ArgumentParser:
     """Return one parser of every command with all its options, which tells the shell where a file is meant."""
     import importlib
 
-    from daemon.cli import COMMANDS
+    from shearloop.daemon.cli import COMMANDS
 
     parser = argparse.ArgumentParser(prog="shearloop")
     parser.add_argument("--version", action="store_true", help="show the version and exit")

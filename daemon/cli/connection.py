@@ -5,10 +5,10 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.wire.addresses import needs_keys
+from shearloop.daemon.messaging.addresses import needs_keys
 
 if TYPE_CHECKING:
-    from daemon.wire.keys import ClientKeys
+    from shearloop.daemon.messaging.keys import ClientKeys
 
 
 def own_key_folder() -> Path:
@@ -28,12 +28,12 @@ def add_connection(parser: argparse.ArgumentParser, default: str, what: str) -> 
 
 def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
     """Return the keys to connect with, or None for an address on this machine; UserError for keys that are no good."""
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     given = (args.key, args.server_key)
     if given == (None, None) and not needs_keys(args.connect):
         return None
-    from daemon.wire.keys import ClientKeys, load_key_pair, load_public_key
+    from shearloop.daemon.messaging.keys import ClientKeys, load_key_pair, load_public_key
 
     folder = own_key_folder()
     key = args.key or folder / "client.key_secret"

@@ -13,8 +13,8 @@ import numpy as np
 import structlog
 
 if TYPE_CHECKING:
-    from daemon.config import Emulator
-    from daemon.run_summary import Known
+    from shearloop.daemon.config import EmulatorConfig
+    from shearloop.daemon.run_summary import Known
 
 RIG = "rig"
 
@@ -22,7 +22,7 @@ RIG = "rig"
 class Truth:
     """The file in which an emulated rig writes what is really so; removed with `close`."""
 
-    def __init__(self, emulators: "tuple[Emulator, ...]") -> None:
+    def __init__(self, emulators: "tuple[EmulatorConfig, ...]") -> None:
         """Make room for it where a rig is emulated that does not write one anyway."""
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.path: Path | None = None
@@ -37,7 +37,7 @@ class Truth:
 
     def torques(self) -> "Known | None":
         """Return the true torque so far; None where nobody knows it."""
-        from daemon.run_summary import Known
+        from shearloop.daemon.run_summary import Known
 
         if self.path is None or not self.path.exists():
             return None
@@ -56,7 +56,7 @@ class Truth:
 class Happenings:
     """Says to the emulators what the configuration wants to befall them, at a step of the experiment."""
 
-    def __init__(self, emulators: "tuple[Emulator, ...]", processes: Sequence["Popen[bytes]"]) -> None:
+    def __init__(self, emulators: "tuple[EmulatorConfig, ...]", processes: Sequence["Popen[bytes]"]) -> None:
         """Take the emulators and their processes, in the same order."""
         self._left = [
             (happening, process)
@@ -90,7 +90,7 @@ class Happenings:
 class Deaths:
     """Says once, for each emulated device, that its process has ended while the daemon runs."""
 
-    def __init__(self, emulators: "tuple[Emulator, ...]", processes: Sequence["Popen[bytes]"]) -> None:
+    def __init__(self, emulators: "tuple[EmulatorConfig, ...]", processes: Sequence["Popen[bytes]"]) -> None:
         """Take the emulators and their processes, in the same order."""
         self._alive = [(emulator.device, process) for emulator, process in zip(emulators, processes, strict=True)]
 

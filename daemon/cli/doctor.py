@@ -38,9 +38,9 @@ def run(args: argparse.Namespace) -> int:
     import math
     from dataclasses import asdict
 
-    from daemon.doctor.examination import examine
-    from daemon.errors import UserError
-    from daemon.logs import logging_to_stderr
+    from shearloop.daemon.doctor.examination import examine
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.logs import logging_to_stderr
 
     if not (math.isfinite(args.seconds) and 0 < args.seconds <= 600):
         raise UserError(f"--seconds {args.seconds:g} is not a time to listen; give seconds above 0, up to 600")

@@ -1,6 +1,6 @@
 """`shearloop emulate DEVICE`: plays one device on a port or socket of its own.
 
-A device is a module in `daemon.cli.emulated` with `configure(parser)` and `run(args) -> exit status`, as a command is.
+A device is a module in `shearloop.daemon.cli.emulated` with `configure(parser)` and `run(args) -> exit status`, as a command is.
 """
 
 import argparse
@@ -18,15 +18,19 @@ class Device(NamedTuple):
 
 
 DEVICES = {
-    "eit-kit": Device("daemon.cli.emulated.eit_kit", "the EIT board of a fingertip, on a pseudo-terminal"),
-    "hx711": Device("daemon.cli.emulated.hx711", "the load cell's board, on a pseudo-terminal"),
-    "gripper-socket": Device("daemon.cli.emulated.gripper_socket", "a 2F-140 behind the URCap's socket"),
-    "gripper-modbus": Device("daemon.cli.emulated.gripper_modbus", "a 2F-140 on Modbus RTU, on a pseudo-terminal"),
-    "skin": Device("daemon.cli.emulated.skin", "the shear skin with source and DAQ, and the robot that turns it"),
-    "skin-source": Device("daemon.cli.emulated.skin_source", "the Keithley 6430 that feeds the shear skin"),
-    "skin-daq": Device("daemon.cli.emulated.skin_daq", "what reads the voltages of the shear skin"),
-    "ur": Device("daemon.cli.emulated.ur", "a UR robot's controller, on an address of this machine"),
-    "rig": Device("daemon.cli.emulated.rig", "all devices of the rig, tied by one physics"),
+    "eit-kit": Device("shearloop.daemon.cli.emulated.eit_kit", "the EIT board of a fingertip, on a pseudo-terminal"),
+    "hx711": Device("shearloop.daemon.cli.emulated.hx711", "the load cell's board, on a pseudo-terminal"),
+    "gripper-socket": Device("shearloop.daemon.cli.emulated.gripper_socket", "a 2F-140 behind the URCap's socket"),
+    "gripper-modbus": Device(
+        "shearloop.daemon.cli.emulated.gripper_modbus", "a 2F-140 on Modbus RTU, on a pseudo-terminal"
+    ),
+    "skin": Device(
+        "shearloop.daemon.cli.emulated.skin", "the shear skin with source and DAQ, and the robot that turns it"
+    ),
+    "skin-source": Device("shearloop.daemon.cli.emulated.skin_source", "the Keithley 6430 that feeds the shear skin"),
+    "skin-daq": Device("shearloop.daemon.cli.emulated.skin_daq", "what reads the voltages of the shear skin"),
+    "ur": Device("shearloop.daemon.cli.emulated.ur", "a UR robot's controller, on an address of this machine"),
+    "rig": Device("shearloop.daemon.cli.emulated.rig", "all devices of the rig, tied by one physics"),
 }
 
 
@@ -42,7 +46,7 @@ class _Refusing(argparse.ArgumentParser):
     """Raises UserError where a parser would end the program."""
 
     def error(self, message: str) -> NoReturn:
-        from daemon.errors import UserError
+        from shearloop.daemon.errors import UserError
 
         raise UserError(message)
 
@@ -52,7 +56,7 @@ def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> ar
 
     Raises UserError for arguments that its command would not take, and for a bank that is not there.
     """
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     parser = _Refusing(prog=device, allow_abbrev=False, add_help=False)
     importlib.import_module(DEVICES[device].module).configure(parser)

@@ -5,7 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-from daemon.cli.cluster import add_cluster
+from shearloop.daemon.cli.cluster import add_cluster
 
 _FIGURES = (".png", ".svg", ".pdf")
 
@@ -37,15 +37,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate, print, and draw where that is asked for."""
-    from bank.bank_file import Bank
-    from bank.estimators import Calibration
-    from bank.estimators.alignment import doubt
-    from daemon.cli.recorded import check_kind, parsed_part
-    from daemon.errors import UserError
-    from daemon.recording.copies import check_no_copies, check_paths_differ
-    from daemon.recording.evaluation import followed, judge, reasons
-    from daemon.recording.series import part_of, read_series
-    from daemon.workers import in_order, workers
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.bank.estimation import Calibration
+    from shearloop.bank.estimation.alignment import doubt
+    from shearloop.daemon.analysis.copies import check_no_copies, check_paths_differ
+    from shearloop.daemon.analysis.evaluation import followed, judge, reasons
+    from shearloop.daemon.analysis.series import part_of, read_series
+    from shearloop.daemon.cli.recorded import check_kind, parsed_part
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.workers import in_order, workers
 
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
     if args.plot or args.out:
         out = args.out or args.calibration.with_suffix(".png")
         try:
-            from daemon.recording.figure import draw
+            from shearloop.daemon.analysis.figure import draw
         except ModuleNotFoundError as error:
             raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
         try:

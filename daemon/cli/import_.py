@@ -19,8 +19,8 @@ def run(args: argparse.Namespace) -> int:
 
     from mcap.writer import MCAP0_MAGIC
 
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.recording.importing import import_mat
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.recording.importing import import_mat
 
     check_writes_over(args.out, "a recording", MCAP0_MAGIC)
     imported = import_mat(args.sources, args.out)

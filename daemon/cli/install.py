@@ -6,10 +6,10 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
-    from daemon.service.steps import Step
+    from shearloop.daemon.service.steps import Step
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,8 +33,8 @@ def add_place(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Put unit, user, udev rules, folders and an example configuration in place, saying each."""
-    from daemon.errors import UserError
-    from daemon.service.installation import find_program, install_steps
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.service.installation import find_program, install_steps
 
     program = find_program() if args.program is None else args.program.absolute()
     if not program.is_file():
@@ -51,7 +51,7 @@ def systemd_runs(root: Path) -> bool:
 
 def carry_out(steps: "Iterable[Step]", root: Path, args: argparse.Namespace) -> int:
     """Say and do each step, or only say it; as JSON all of them at the end."""
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if not args.dry_run and root == Path("/") and os.geteuid() != 0:
         raise UserError("this changes the system: run it with sudo, or see what it would do with --dry-run")

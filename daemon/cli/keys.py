@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from daemon.cli.connection import own_key_folder
-from daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.connection import own_key_folder
+from shearloop.daemon.cli.result import add_json, tell
 
 SERVER_FOLDER = Path("/etc/shearloop/keys")
 
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _server(args: argparse.Namespace) -> None:
-    from daemon.wire.keys import cannot_write, make_key_pair
+    from shearloop.daemon.messaging.keys import cannot_write, make_key_pair
 
     public, secret = make_key_pair(args.dir, "server")
     clients = args.dir / "clients"
@@ -58,7 +58,7 @@ def _server(args: argparse.Namespace) -> None:
 
 
 def _client(args: argparse.Namespace) -> None:
-    from daemon.wire.keys import make_key_pair
+    from shearloop.daemon.messaging.keys import make_key_pair
 
     public, secret = make_key_pair(args.dir, "client")
     sentences = [
@@ -70,8 +70,8 @@ def _client(args: argparse.Namespace) -> None:
 
 
 def _allow(args: argparse.Namespace) -> None:
-    from daemon.errors import UserError
-    from daemon.wire.keys import allowed_clients, cannot_write, load_public_key, write_public_key
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.messaging.keys import allowed_clients, cannot_write, load_public_key, write_public_key
 
     public = load_public_key(args.key)
     name, clients = args.name or args.key.stem, args.dir / "clients"
@@ -91,8 +91,8 @@ def _allow(args: argparse.Namespace) -> None:
 
 
 def _revoke(args: argparse.Namespace) -> None:
-    from daemon.errors import UserError
-    from daemon.wire.keys import allowed_clients, cannot_write
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.messaging.keys import allowed_clients, cannot_write
 
     clients = args.dir / "clients"
     _check_name(args.name)
@@ -108,7 +108,7 @@ def _revoke(args: argparse.Namespace) -> None:
 
 
 def _list(args: argparse.Namespace) -> None:
-    from daemon.wire.keys import allowed_clients, load_public_key
+    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key
 
     server = load_public_key(args.dir / "server.key").decode()
     clients = {name: key.decode() for key, name in allowed_clients(args.dir / "clients").items()}
@@ -121,7 +121,7 @@ def _list(args: argparse.Namespace) -> None:
 def _check_name(name: str) -> None:
     import re
 
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
         raise UserError(f"{name!r} is not a client's name; use letters, digits, `-`, `_` and `.`")

@@ -3,10 +3,10 @@
 import argparse
 import sys
 
-from daemon.cli import EXIT_OK
-from daemon.cli.connection import add_connection, client_keys
-from daemon.cli.interruption import status_of
-from daemon.wire.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.cli import EXIT_OK
+from shearloop.daemon.cli.connection import add_connection, client_keys
+from shearloop.daemon.cli.interruption import status_of
+from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 
 EPILOG = """
 examples:
@@ -32,10 +32,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print messages until interrupted, or until enough have come."""
-    from daemon.cli.readable import as_json, as_line
-    from daemon.errors import UserError
-    from daemon.topics import TOPICS
-    from daemon.wire.subscriber import QUIET_S, checked_timeout_s, messages
+    from shearloop.daemon.cli.readable import as_json, as_line
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.messaging.subscriber import QUIET_S, checked_timeout_s, messages
+    from shearloop.daemon.messaging.topics import TOPICS
 
     for topic in args.topics:
         if not any(known.startswith(topic) for known in TOPICS):

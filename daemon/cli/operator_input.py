@@ -39,7 +39,7 @@ class Operator:
 
     async def ask(self, prompt: str) -> str:
         """Return the line that is typed after the prompt; UserError when the input has ended."""
-        from daemon.errors import UserError
+        from shearloop.daemon.errors import UserError
 
         self.say(prompt)
         line = await self._lines.get()

@@ -14,7 +14,7 @@ def run(args: argparse.Namespace) -> int:
     import json
     from dataclasses import asdict
 
-    from daemon.ports import ports_there
+    from shearloop.daemon.ports import ports_there
 
     ports = ports_there()
     if args.json:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from daemon.topics import TOPICS
+from shearloop.daemon.messaging.topics import TOPICS
 
 _ENVELOPE = ("timestamp", "t_mono_ns", "seq", "source", "topic")
 

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.errors import UserError
-from daemon.recording.schema import SIDES
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.schema import SIDES
 
 if TYPE_CHECKING:
-    from bank.estimators import Calibration, FrameSeries
+    from shearloop.bank.estimation import Calibration, FrameSeries
 
 
 def parsed_part(text: str) -> tuple[float, float]:

@@ -5,11 +5,11 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.progress import progress_bar
-from daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.progress import progress_bar
+from shearloop.daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
-    from daemon.recording.summary import Summary
+    from shearloop.daemon.recording.summary import Summary
 
 FORMS = ("csv", "parquet", "mat")
 
@@ -48,7 +48,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _info(args: argparse.Namespace) -> int:
-    from daemon.recording.summary import summarise
+    from shearloop.daemon.recording.summary import summarise
 
     for path in args.recordings:
         with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
@@ -60,7 +60,7 @@ def _info(args: argparse.Namespace) -> int:
 def _told(found: "Summary") -> str:
     from datetime import datetime
 
-    from daemon.recording.identity import software_version
+    from shearloop.daemon.recording.identity import software_version
 
     lines = [str(found.path)]
     if found.first_ns is not None:
@@ -89,7 +89,7 @@ def _told(found: "Summary") -> str:
 
 
 def _repair(args: argparse.Namespace) -> int:
-    from daemon.recording.salvage import condition_of, repair
+    from shearloop.daemon.recording.repair import condition_of, repair
 
     size = condition_of(args.recording).size
     with progress_bar(args.recording.name, size, "B") as progress:
@@ -110,9 +110,9 @@ def _repair(args: argparse.Namespace) -> int:
 
 
 def _export(args: argparse.Namespace) -> int:
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.errors import UserError
-    from daemon.recording.export import export, topics_of
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.recording.export import export, topics_of
 
     stem = args.recording.name.partition(".mcap")[0]
     out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")

@@ -8,13 +8,13 @@ from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.result import add_json, tell
-from daemon.wire.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 
 if TYPE_CHECKING:
-    from daemon.config import DaemonConfig
-    from daemon.recording.recorded_run import RecordedRun
-    from daemon.recording.replay import Comparison
+    from shearloop.daemon.config import DaemonConfig
+    from shearloop.daemon.recording.recorded_run import RecordedRun
+    from shearloop.daemon.recording.replay import Comparison
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -40,10 +40,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay to the end, and say whether it came to the same."""
-    from daemon.config import load_daemon_config
-    from daemon.errors import UserError
-    from daemon.recording.identity import code_digest
-    from daemon.recording.recorded_run import RecordedRun
+    from shearloop.daemon.config import load_daemon_config
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.recording.identity import code_digest
+    from shearloop.daemon.recording.recorded_run import RecordedRun
 
     speed = parsed_speed(args.speed)
     if args.more:
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 def parsed_speed(text: str) -> float:
     """Return a speed; UserError for what is neither a number above 0 nor max."""
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if text == "max":
         return math.inf
@@ -84,17 +84,17 @@ def parsed_speed(text: str) -> float:
 async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, args: argparse.Namespace) -> "Comparison":
     import zmq.asyncio
 
-    from daemon.cli.progress import progress_bar
-    from daemon.cli.run import Show
-    from daemon.recording.chain import Chain
-    from daemon.recording.replay import Replay, ReplayClock
-    from daemon.wire.publisher import Publisher
+    from shearloop.daemon.cli.progress import progress_bar
+    from shearloop.daemon.cli.run import Show
+    from shearloop.daemon.messaging.publisher import Publisher
+    from shearloop.daemon.recording.replay import Replay, ReplayClock
+    from shearloop.daemon.recording.replay_pipeline import ReplayPipeline
 
     clock = ReplayClock()
     with ExitStack() as opened:
         publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), args.publish, clock)
         opened.callback(publisher.close)
-        replay = Replay(run, Chain(config, run.asides(), publisher), publisher, clock)
+        replay = Replay(run, ReplayPipeline(config, run.asides(), publisher), publisher, clock)
         if args.show:
             publisher.listen(Show(sys.stdout))
         while args.wait and not publisher.subscribed:  # noqa: ASYNC110 - it is told when it is asked

@@ -6,14 +6,14 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn, Self
 
-from daemon.errors import UserError
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
-    from bank.bank_file import Bank
-    from daemon.reproduce.banks import Grid
-    from daemon.reproduce.report import Reproduction
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.daemon.analysis.reproduce.banks import Grid
+    from shearloop.daemon.analysis.reproduce.report import Reproduction
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -41,10 +41,10 @@ def run(args: argparse.Namespace) -> int:
     if jobs < 1:
         raise UserError(f"--jobs must be 1 or more, not {jobs}")
     try:
-        from daemon.reproduce.figures import draw_all
+        from shearloop.daemon.analysis.reproduce.figures import draw_all
     except ModuleNotFoundError as error:
         raise UserError(f"the figures need {error.name}; install it with `pip install 'shearloop[plot]'`") from error
-    from daemon.reproduce.report import json_text, save_calibrations, table, write_json
+    from shearloop.daemon.analysis.reproduce.report import json_text, save_calibrations, table, write_json
 
     found, banks = _reproduce(args, jobs)
     try:
@@ -63,10 +63,15 @@ def run(args: argparse.Namespace) -> int:
 def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict[str, Bank]]":
     from scipy import fft
 
-    from daemon.reproduce.analysis import analyse_diameter, analyse_torque, match_slices, score_models
-    from daemon.reproduce.banks import GRIDS, cached_bank, choose_mesh, focused_grid
-    from daemon.reproduce.inputs import read_inputs
-    from daemon.reproduce.report import Reproduction, moved_focus
+    from shearloop.daemon.analysis.reproduce.analysis import (
+        analyse_diameter,
+        analyse_torque,
+        match_slices,
+        score_models,
+    )
+    from shearloop.daemon.analysis.reproduce.banks import GRIDS, cached_bank, choose_mesh, focused_grid
+    from shearloop.daemon.analysis.reproduce.inputs import read_inputs
+    from shearloop.daemon.analysis.reproduce.report import Reproduction, moved_focus
 
     inputs = read_inputs(args.recordings)
     chosen = choose_mesh(args.recordings, args.mesh, args.bank_config)

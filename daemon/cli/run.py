@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
-    from daemon.cli.demonstration import Truth
-    from daemon.config import Emulator
-    from daemon.matlab.slices import SliceRecorder
-    from daemon.outlet import Outlet
-    from daemon.wire.publisher import Listener
+    from shearloop.daemon.cli.demonstration import Truth
+    from shearloop.daemon.config import EmulatorConfig
+    from shearloop.daemon.messaging.publisher import Listener
+    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
+    from shearloop.daemon.recording.matlab_slices import SliceRecorder
 
 # Long enough for an emulator to remove its port's link, short enough for a clean stop within a second.
 EMULATOR_STOP_S = 0.5
@@ -51,10 +51,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal, `shearloop command stop`, or the end of the experiment (`stop_when_done`)."""
-    from daemon.collector import kept_from_lasting_objects
-    from daemon.ending_signals import ending_signals
-    from daemon.logs import logging_to_stderr
-    from daemon.outlet import Outlet
+    from shearloop.daemon.ending_signals import ending_signals
+    from shearloop.daemon.gc_control import kept_from_lasting_objects
+    from shearloop.daemon.logs import logging_to_stderr
+    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
 
     # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
     for number in ending_signals():
@@ -63,21 +63,23 @@ def run(args: argparse.Namespace) -> int:
     with (
         kept_from_lasting_objects() as collect_what_comes,
         logging_to_stderr(json_lines=args.json_log) as log,
-        closing(Outlet(sys.stdout)) as out,
+        closing(NonBlockingWriter(sys.stdout)) as out,
     ):
         return _run(args, log, out, collect_what_comes)
 
 
-def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet", on_ready: Callable[[], None]) -> int:
+def _run(
+    args: argparse.Namespace, log: "NonBlockingWriter", out: "NonBlockingWriter", on_ready: Callable[[], None]
+) -> int:
     from structlog import get_logger
 
-    from daemon.app import run_daemon
-    from daemon.cli import EXIT_OK, EXIT_UNFINISHED
-    from daemon.cli.demonstration import Deaths, Happenings, Truth
-    from daemon.config import RecordingConfig, load_daemon_config
-    from daemon.errors import UserError
-    from daemon.run_summary import RunSummary
-    from daemon.service.priority import first_in_line
+    from shearloop.daemon.app import run_daemon
+    from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
+    from shearloop.daemon.cli.demonstration import Deaths, Happenings, Truth
+    from shearloop.daemon.config import RecordingConfig, load_daemon_config
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.run_summary import RunSummary
+    from shearloop.daemon.service.priority import first_in_line
 
     config = load_daemon_config(args.config)
     if args.recording is not None and not any(emulator.device == "eit-kit" for emulator in config.emulators):
@@ -85,12 +87,12 @@ def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet", on_ready: Calla
     if args.record is not None:
         config = config.model_copy(update={"recording": RecordingConfig(folder=args.record)})
     if config.lock_memory:
-        from daemon.service.locked_memory import lock_memory
+        from shearloop.daemon.service.locked_memory import lock_memory
 
         lock_memory()
     checked_emulators(config.emulators, args.config)
     if args.recording is not None:
-        from daemon.matlab.recordings import read_stream
+        from shearloop.daemon.recording.matlab_streams import read_stream
 
         for emulator in config.emulators:
             if emulator.device == "eit-kit":
@@ -126,10 +128,10 @@ def _run(args: argparse.Namespace, log: "Outlet", out: "Outlet", on_ready: Calla
     return EXIT_OK if finished else EXIT_UNFINISHED
 
 
-def checked_emulators(emulators: "tuple[Emulator, ...]", config: Path) -> None:
+def checked_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> None:
     """Raise UserError for an emulator of a device that there is none of, or with arguments that it does not take."""
-    from daemon.cli.emulate import DEVICES, checked_arguments
-    from daemon.errors import UserError
+    from shearloop.daemon.cli.emulate import DEVICES, checked_arguments
+    from shearloop.daemon.errors import UserError
 
     for number, emulator in enumerate(emulators):
         if emulator.device not in DEVICES:
@@ -144,7 +146,7 @@ def checked_emulators(emulators: "tuple[Emulator, ...]", config: Path) -> None:
 
 def _slice_recorder(folder: Path) -> "SliceRecorder":
     # Only where it is wanted: scipy.io takes long to import.
-    from daemon.matlab.slices import SliceRecorder
+    from shearloop.daemon.recording.matlab_slices import SliceRecorder
 
     return SliceRecorder(folder)
 
@@ -160,13 +162,13 @@ def _side(arguments: tuple[str, ...]) -> str | None:
 class Show:
     """A listener that prints the estimates."""
 
-    def __init__(self, out: "TextIO | Outlet") -> None:
+    def __init__(self, out: "TextIO | NonBlockingWriter") -> None:
         self._out = out
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
         """Print one message."""
         if topic in ("eit.estimate", "skin.shear"):
-            from daemon.cli.readable import as_line
+            from shearloop.daemon.cli.readable import as_line
 
             self._out.write(as_line(topic, content) + "\n")
             self._out.flush()
@@ -180,7 +182,7 @@ def _same_code() -> dict[str, str]:
 
 @contextmanager
 def _emulators(
-    emulators: "tuple[Emulator, ...]", folder: Path, recording: Path | None, truth: "Truth"
+    emulators: "tuple[EmulatorConfig, ...]", folder: Path, recording: Path | None, truth: "Truth"
 ) -> Iterator[list["subprocess.Popen[bytes]"]]:
     """Keep the configuration's emulated devices running, each as a process of its own."""
     processes: list[subprocess.Popen[bytes]] = []
@@ -191,7 +193,7 @@ def _emulators(
                 played = ("--recording", str(recording.resolve()))
             if emulator.device == "rig":
                 played = (*played, *truth.arguments)
-            command = [sys.executable, "-m", "daemon", "emulate", emulator.device, *emulator.arguments, *played]
+            command = [sys.executable, "-m", "shearloop", "emulate", emulator.device, *emulator.arguments, *played]
             # Their standard input stays open and silent: a closed one would end them.
             processes.append(
                 subprocess.Popen(

@@ -7,10 +7,10 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
-    from bank.skin.characterisation import Row
+    from shearloop.bank.skin.characterisation import Row
 
 SEED = 2017
 COLUMNS = ("quantity", "unit", "paper: computed", "measured", "closed form", "1-D", "2-D", "synthetic")
@@ -49,11 +49,11 @@ def run(args: argparse.Namespace) -> int:
 def _characterise(out: Path | None, as_json: bool) -> int:
     import numpy as np
 
-    from bank.skin.characterisation import characterise
+    from shearloop.bank.skin.characterisation import characterise
 
     if out is not None:
         # Before the work: a missing library is then told at once.
-        from daemon.cli.skin_figures import draw
+        from shearloop.daemon.cli.skin_figures import draw
     found = characterise(np.random.default_rng(SEED))
     if as_json:
         print(json.dumps([asdict(row) for row in found.rows], indent=1, ensure_ascii=False))
@@ -84,11 +84,11 @@ def _cell(value: str | float | None) -> str:
 
 
 def _calibrate(args: argparse.Namespace) -> int:
-    from bank.errors import CalibrationError
-    from bank.skin.calibration_file import read_table, save_calibration
-    from bank.skin.calibration_fit import fit_calibration
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.errors import UserError
+    from shearloop.bank.errors import CalibrationError
+    from shearloop.bank.skin.calibration_file import read_table, save_calibration
+    from shearloop.bank.skin.calibration_fit import fit_calibration
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.errors import UserError
 
     if args.friction is not None and not 0 <= args.friction <= 1:
         raise UserError(f"--friction is {args.friction}; a coefficient of friction lies between 0 and 1.")

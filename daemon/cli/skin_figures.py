@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.skin.characterisation import Characterisation, Curve
-from bank.skin.section import PAPER_SECTION
-from daemon.errors import UserError
+from shearloop.bank.skin.characterisation import Characterisation, Curve
+from shearloop.bank.skin.section import PAPER_SECTION
+from shearloop.daemon.errors import UserError
 
 try:
     from matplotlib.axes import Axes

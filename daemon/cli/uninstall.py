@@ -2,7 +2,7 @@
 
 import argparse
 
-from daemon.cli.install import add_place, carry_out, systemd_runs
+from shearloop.daemon.cli.install import add_place, carry_out, systemd_runs
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -12,7 +12,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Take away what `install` put in place, saying each; your own files stay."""
-    from daemon.service.installation import uninstall_steps
+    from shearloop.daemon.service.installation import uninstall_steps
 
     root = args.root.absolute()
     return carry_out(uninstall_steps(root, running=systemd_runs(root)), root, args)

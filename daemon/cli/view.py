@@ -4,11 +4,11 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.connection import add_connection, client_keys
-from daemon.wire.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys, stop_address
+from shearloop.daemon.cli.connection import add_connection, client_keys
+from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys, stop_address
 
 if TYPE_CHECKING:
-    from bank.fingertip import Fingertip
+    from shearloop.bank.eit.fingertip import Fingertip
 
 PORT = 7760
 
@@ -48,16 +48,16 @@ def run(args: argparse.Namespace) -> int:
     import json
     from importlib.util import find_spec
 
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if find_spec("aiohttp") is None:
         raise UserError("the live view needs aiohttp; install it with `pip install 'shearloop[view]'`")
     if not 0 <= args.port <= 65535:
         raise UserError(f"--port {args.port} is not a port; give one from 1 to 65535, or 0 for any that is free")
-    from daemon.logs import logging_to_stderr
-    from daemon.view.bridge import Place
-    from daemon.view.serve import serve
-    from daemon.view.token_file import default_path, kept_token
+    from shearloop.daemon.logs import logging_to_stderr
+    from shearloop.daemon.web.bridge import Place
+    from shearloop.daemon.web.serve import serve
+    from shearloop.daemon.web.token_file import default_path, kept_token
 
     keys = client_keys(args)
     # Of a daemon on this machine a stop is heard whatever becomes of our keys.
@@ -86,10 +86,10 @@ def _fingertip(path: Path | None) -> "Fingertip":
     """Return the fingertip that is drawn; raises UserError and GeometryError for a file that describes none."""
     from importlib import resources
 
-    from daemon.bank_config import FingertipConfig
-    from daemon.config_file import load_yaml_model
+    from shearloop.daemon.bank_config import FingertipGeometryConfig
+    from shearloop.daemon.config_file import load_yaml_model
 
     if path is not None:
-        return load_yaml_model(path, FingertipConfig).fingertip()
-    with resources.as_file(resources.files("daemon.view") / "assets" / "fingertip.yaml") as paper:
-        return load_yaml_model(paper, FingertipConfig).fingertip()
+        return load_yaml_model(path, FingertipGeometryConfig).fingertip()
+    with resources.as_file(resources.files("shearloop.daemon.web") / "assets" / "fingertip.yaml") as paper:
+        return load_yaml_model(paper, FingertipGeometryConfig).fingertip()

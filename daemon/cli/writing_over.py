@@ -7,7 +7,7 @@ nobody can record it again.
 import codecs
 from pathlib import Path
 
-from daemon.errors import UserError
+from shearloop.daemon.errors import UserError
 
 # As much of a file as tells whether it is text: beyond the 124 characters with which a MATLAB file begins.
 _LOOKED_AT_BYTES = 512

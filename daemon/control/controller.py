@@ -24,12 +24,12 @@ still while less was sent than was wanted.
 import math
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import StrEnum
 
-from daemon.control.history import AngleHistory
-from daemon.control.settings import ControllerSettings
-from daemon.errors import UserError
-from drivers.values import value
+from shearloop.daemon.control.history import AngleHistory
+from shearloop.daemon.control.settings import ControllerSettings
+from shearloop.daemon.errors import UserError
 
 # A ramp does not catch up on a loop that was late for longer than this.
 _LONGEST_STEP_NS = 50_000_000
@@ -44,7 +44,7 @@ _KNOWN_AFTER_JUMP = 3.0
 _MOST_MISSED = 4
 
 
-class Reason(StrEnum):
+class ControllerReason(StrEnum):
     """Why the wrist does not do what the torque asks for; the text is for the operator."""
 
     NOT_STARTED = "the controller has not been started"
@@ -58,7 +58,7 @@ class Reason(StrEnum):
     SPEED = "the wrist turns at its speed limit"
 
 
-class Refusal(StrEnum):
+class ControllerRefusal(StrEnum):
     """Why a measurement was not used."""
 
     NOT_A_NUMBER = "not a number"
@@ -69,15 +69,15 @@ class Refusal(StrEnum):
     NO_ANGLE = "from a time at which the wrist angle is not known"
 
 
-_CLIPPED = frozenset({Reason.TRAVEL, Reason.SPEED})
+_CLIPPED = frozenset({ControllerReason.TRAVEL, ControllerReason.SPEED})
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class WristCommand:
     """The wrist speed that is wanted now, and every reason why it is not the one that the torque asks for."""
 
     speed_rad_per_s: float
-    reasons: tuple[Reason, ...] = ()
+    reasons: tuple[ControllerReason, ...] = ()
 
     @property
     def holds(self) -> bool:
@@ -85,7 +85,7 @@ class WristCommand:
         return any(reason not in _CLIPPED for reason in self.reasons)
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class ControllerState:
     """What the controller believes; torques in N·m. None before the start."""
 
@@ -102,7 +102,7 @@ class TwistController:
 
     def __init__(self, settings: ControllerSettings) -> None:
         self.settings = settings
-        self._refused: Counter[Refusal] = Counter()
+        self._refused: Counter[ControllerRefusal] = Counter()
         span_s = settings.age_limit_s + settings.window_s + abs(settings.lag_s)
         self._history = AngleHistory(int(1e9 * (span_s + 1.0)))
         self._started = self._held = self._measured = self._moving = self._lost = False
@@ -116,7 +116,7 @@ class TwistController:
         self._wanted = self._sent = 0.0
 
     @property
-    def refused(self) -> Mapping[Refusal, int]:
+    def refused(self) -> Mapping[ControllerRefusal, int]:
         """Return how many measurements were refused, by kind."""
         return self._refused
 
@@ -179,7 +179,7 @@ class TwistController:
         self._first_offset_nm = self._offset_nm
         self._rest()
 
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> Refusal | None:
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
         """Take in a torque that belongs to t_mid_ns and became known at t_ns; return why it was refused, or None."""
         refusal = self._use(torque_nm, t_mid_ns, t_ns)
         if refusal is not None:
@@ -204,22 +204,22 @@ class TwistController:
         """Tell what was really sent for the last command, after all clipping by driver and safety gate."""
         self._sent = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
 
-    def _use(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> Refusal | None:
+    def _use(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
         own = self.settings
         if torque_nm is None or not math.isfinite(torque_nm):
-            return Refusal.NOT_A_NUMBER
+            return ControllerRefusal.NOT_A_NUMBER
         if not self._started:
-            return Refusal.NOT_STARTED
+            return ControllerRefusal.NOT_STARTED
         if t_mid_ns > t_ns:
-            return Refusal.FROM_THE_FUTURE
+            return ControllerRefusal.FROM_THE_FUTURE
         if t_mid_ns <= self._t_mid_ns:
-            return Refusal.OUT_OF_ORDER
+            return ControllerRefusal.OUT_OF_ORDER
         if t_ns - t_mid_ns > own.age_limit_s * 1e9:
-            return Refusal.LATE
+            return ControllerRefusal.LATE
         middle_ns, half_ns = t_mid_ns - int(own.lag_s * 1e9), int(own.window_s * 0.5e9)
         angle = self._history.mean(middle_ns - half_ns, middle_ns + half_ns)
         if angle is None:
-            return Refusal.NO_ANGLE
+            return ControllerRefusal.NO_ANGLE
         missed = min(round((t_mid_ns - self._t_mid_ns) * 1e-9 / own.sample_period_s) - 1, _MOST_MISSED)
         if self._measured and missed > 0:
             self._offset_nm += self._creep_nm * missed
@@ -250,27 +250,27 @@ class TwistController:
             self._sum_up = self._sum_down = 0.0
         return jumped
 
-    def _against_motion(self, t_ns: int, wrist_angle_rad: float) -> tuple[Reason, ...]:
+    def _against_motion(self, t_ns: int, wrist_angle_rad: float) -> tuple[ControllerReason, ...]:
         """Take the angle in, and return everything that forbids motion at present."""
         if not self._started:
-            return (Reason.NOT_STARTED,)
+            return (ControllerReason.NOT_STARTED,)
         stale_ns = self.settings.stale_periods * self.settings.sample_period_s * 1e9
         reasons = []
         if math.isfinite(wrist_angle_rad):
             self._angle_rad = wrist_angle_rad
             self._history.add(t_ns, wrist_angle_rad)
         else:
-            reasons.append(Reason.NO_ANGLE)
+            reasons.append(ControllerReason.NO_ANGLE)
         if self._held:
-            reasons.append(Reason.HELD)
+            reasons.append(ControllerReason.HELD)
         if self._set_point_nm is None:
-            reasons.append(Reason.NO_SET_POINT)
+            reasons.append(ControllerReason.NO_SET_POINT)
         if not self._measured:
-            reasons.append(Reason.NOT_MEASURED)
+            reasons.append(ControllerReason.NOT_MEASURED)
         elif t_ns - self._fresh_ns > stale_ns:
-            reasons.append(Reason.STALE)
+            reasons.append(ControllerReason.STALE)
         if self._lost:
-            reasons.append(Reason.NOT_FOLLOWING)
+            reasons.append(ControllerReason.NOT_FOLLOWING)
         return tuple(reasons)
 
     def _rest(self) -> None:
@@ -311,12 +311,12 @@ class TwistController:
         self._moving = slope_nm_per_s != 0.0 or abs(missing_nm) > bound
         return not self._moving
 
-    def _clip(self, wanted: float, elapsed_s: float) -> tuple[float, tuple[Reason, ...]]:
+    def _clip(self, wanted: float, elapsed_s: float) -> tuple[float, tuple[ControllerReason, ...]]:
         own = self.settings
         reasons = []
         speed = max(-own.speed_limit_rad_per_s, min(own.speed_limit_rad_per_s, wanted))
         if speed != wanted:
-            reasons.append(Reason.SPEED)
+            reasons.append(ControllerReason.SPEED)
         # Only speeding up is limited: the robot brakes as it can, and a stop is never softened.
         turning = abs(self._sent) if speed * self._sent > 0.0 else 0.0
         fastest = turning + own.acceleration_limit_rad_per_s2 * elapsed_s
@@ -326,7 +326,7 @@ class TwistController:
         room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
         if abs(speed) > own.wrist_bandwidth_per_s * room:
             speed = math.copysign(own.wrist_bandwidth_per_s * room, speed)
-            reasons.append(Reason.TRAVEL)
+            reasons.append(ControllerReason.TRAVEL)
         return speed, tuple(reasons)
 
     def _is_clipped(self) -> bool:

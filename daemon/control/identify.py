@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import UserError
+from shearloop.daemon.errors import UserError
 
 FloatArray = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class Record:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Identified:
+class ToolModel:
     """The tool in the grip and the way of its torque, with standard deviations.
 
     lag_s: by how much the torque lags behind its own stamps. age_s: from the middle of an acquisition until its
@@ -95,7 +95,7 @@ class _Fit:
         return float(self.residuals @ self.residuals)
 
 
-def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> Identified:
+def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> ToolModel:
     """Return what the record says of the tool, whose torques are means over `window_s`.
 
     For every lag on a grid the torques are fitted, by least squares, to the mean angles of their windows with an
@@ -117,7 +117,7 @@ def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> I
     _refuse_bad(best, torque_nm, noise_nm, stiffness_share)
     lag_s, lag_std_s = _lag(fits, noise_nm)
     now = np.array([record.angle_rad[-1], 1.0, 1.0])
-    return Identified(
+    return ToolModel(
         stiffness_nm_per_rad=float(best.coefficients[0]),
         stiffness_std=math.sqrt(best.covariance[0, 0]),
         lag_s=lag_s,

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass, fields
 
-from daemon.errors import UserError
+from shearloop.daemon.errors import UserError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

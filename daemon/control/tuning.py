@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
-from daemon.control.identify import Identified
-from daemon.control.margins import LoopModel, Margins, margins, with_gain
-from daemon.control.settings import ControllerSettings
+from shearloop.daemon.control.identify import ToolModel
+from shearloop.daemon.control.margins import LoopModel, Margins, margins, with_gain
+from shearloop.daemon.control.settings import ControllerSettings
 
 # Above this the loop answers single measurements rather than what they have in common.
 MOST_GAIN = 0.5
 LEAST_GAIN = 1e-3
-# The longest stretch between two decisions, of a wrist that turns slowly (`drivers.ur.pace`).
+# The longest stretch between two decisions, of a wrist that turns slowly (`shearloop.drivers.ur.pace`).
 COMMAND_PERIOD_S = 0.024
 
 
@@ -53,7 +53,7 @@ def gain_for_noise(noise_nm: float, allowed_nm: float) -> float:
     return max(fitting, default=LEAST_GAIN)
 
 
-def loop_model(settings: ControllerSettings, found: Identified) -> LoopModel:
+def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
     """Return the loop that these settings close around the tool that was identified.
 
     An actuation delay that was not identified counts as one command period. A torque that seems to be ahead of its
@@ -91,7 +91,7 @@ def passing_gain(model: LoopModel, required: RequiredMargins) -> float | None:
     return best
 
 
-def refusal(settings: ControllerSettings, found: Identified, required: RequiredMargins) -> str | None:
+def refusal(settings: ControllerSettings, found: ToolModel, required: RequiredMargins) -> str | None:
     """Return None for a controller with the required margins, or else the sentence that refuses it.
 
     The sentence has the margins, what they should be, from which stiffness and delay, and the gain that would pass.

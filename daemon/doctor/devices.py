@@ -8,19 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from bank.channels import ZERO_SLOTS
-from daemon.config import DaemonConfig, Fingertip, GripperConfig, LoadCellConfig, SerialDevice
-from daemon.doctor.finding import Finding, from_sentence, good, note, trouble
-from daemon.ports import access_trouble
-from daemon.rig import make_gripper_client
-from drivers.eit_kit import EitKit, Frame
-from drivers.errors import DriverError
-from drivers.hx711 import LoadCalibration
-from drivers.load_cell import LoadCell
-from drivers.robotiq.messages import ActivationStatus
-from drivers.serial_port import find_port
-from drivers.ur.look import look
-from drivers.ur.settings import read_settings
+from shearloop.bank.eit.channels import ZERO_SLOTS
+from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
+from shearloop.daemon.doctor.finding import Finding, from_sentence, good, note, trouble
+from shearloop.daemon.ports import access_trouble
+from shearloop.daemon.rig import make_gripper_client
+from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.hx711 import LoadCalibration
+from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.robotiq.messages import ActivationStatus
+from shearloop.drivers.serial_port import find_port
+from shearloop.drivers.ur.controller_query import look
+from shearloop.drivers.ur.settings import read_settings
 
 # A measured rate that is further from the configured one is told.
 RATE_TOLERANCE = 0.1
@@ -107,7 +107,7 @@ def channels_finding(name: str, saturated: int, dead: int, frames: int) -> Findi
     )
 
 
-async def _fingertip(name: str, config: Fingertip, seconds: float) -> list[Finding]:
+async def _fingertip(name: str, config: FingertipConfig, seconds: float) -> list[Finding]:
     port = port_finding(name, config.device)
     if port.state == "trouble":
         return [port]

@@ -5,15 +5,15 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from daemon.config import DaemonConfig, load_daemon_config
-from daemon.doctor.devices import examine_devices
-from daemon.doctor.files import examine_files
-from daemon.doctor.finding import Finding, from_file, good, note
-from daemon.doctor.live import examine_daemon, listen, tasks_of_daemon
-from daemon.doctor.machine import disk_finding, examine_machine
-from daemon.errors import UserError
-from daemon.ports import ports_there
-from daemon.wire.addresses import stop_address
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.doctor.devices import examine_devices
+from shearloop.daemon.doctor.files import examine_files
+from shearloop.daemon.doctor.finding import Finding, from_file, good, note
+from shearloop.daemon.doctor.live import examine_daemon, listen, tasks_of_daemon
+from shearloop.daemon.doctor.machine import disk_finding, examine_machine
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.addresses import stop_address
+from shearloop.daemon.ports import ports_there
 
 
 def examine(config_path: Path | None, seconds: float, geometry: Path | None = None) -> Iterator[Finding]:

@@ -3,18 +3,18 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from bank.bank_file import Bank
-from bank.channels import CHANNEL_TABLE_HASH, N_CHANNELS
-from bank.errors import BankError
-from daemon.config import Both, CurveConfig, DaemonConfig, Fingertip
-from daemon.config_file import load_yaml_model
-from daemon.doctor.finding import Finding, from_file, from_sentence, good, note, trouble
-from daemon.eit.opening import on_word, open_both, open_estimator
-from daemon.eit.tracking import TrackedEstimator
-from daemon.errors import UserError
-from daemon.experiment.steps import ExperimentFile
-from drivers.errors import DriverError
-from drivers.ur.settings import read_settings
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
+from shearloop.bank.errors import BankError
+from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, FingertipConfig
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.doctor.finding import Finding, from_file, from_sentence, good, note, trouble
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.sensing.opening import on_word, open_both, open_estimator
+from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.settings import read_settings
 
 
 def examine_files(config: DaemonConfig, geometry: Path | None) -> Iterator[Finding]:
@@ -33,7 +33,7 @@ def examine_files(config: DaemonConfig, geometry: Path | None) -> Iterator[Findi
     yield keys_finding(config.curve, config.network_addresses)
 
 
-def bank_finding(name: str, fingertip: Fingertip, geometry: Path | None = None) -> Finding:
+def bank_finding(name: str, fingertip: FingertipConfig, geometry: Path | None = None) -> Finding:
     """Hold a bank against its own checksums, the channel table, and the fingertip's geometry where that is given."""
     subject = f"bank of {name}"
     if fingertip.bank is None:
@@ -48,7 +48,7 @@ def bank_finding(name: str, fingertip: Fingertip, geometry: Path | None = None) 
     )
     if geometry is None:
         return good(subject, found)
-    from daemon.bank_config import load_geometry
+    from shearloop.daemon.bank_config import load_geometry
 
     try:
         digest = load_geometry(geometry).digest
@@ -64,7 +64,7 @@ def bank_finding(name: str, fingertip: Fingertip, geometry: Path | None = None) 
     return good(subject, f"{found}, which is {geometry}")
 
 
-def calibration_finding(name: str, fingertip: Fingertip) -> Finding:
+def calibration_finding(name: str, fingertip: FingertipConfig) -> Finding:
     """Say whether the calibration is there and of this bank."""
     subject = f"calibration of {name}"
     if fingertip.calibration is None:
@@ -81,7 +81,7 @@ def calibration_finding(name: str, fingertip: Fingertip) -> Finding:
     return good(subject, f"{fingertip.calibration} belongs to this bank")
 
 
-def both_finding(both: Both, fingertips: dict[str, Fingertip]) -> Finding:
+def both_finding(both: CombinedConfig, fingertips: dict[str, FingertipConfig]) -> Finding:
     """Say whether the calibration of several fingertips together is there and of these."""
     try:
         estimator = open_both(both, fingertips)
@@ -93,7 +93,7 @@ def both_finding(both: Both, fingertips: dict[str, Fingertip]) -> Finding:
 
 def keys_finding(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
     """Say who may connect from the network, and whether a secret key is one."""
-    from daemon.wire.keys import admitted_clients, load_server_keys, server_key_file
+    from shearloop.daemon.messaging.keys import admitted_clients, load_server_keys, server_key_file
 
     if curve is None:
         return good("keys", "none are needed: every address is of this machine alone")
@@ -122,7 +122,7 @@ def keys_finding(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
 
 
 def _skin_finding(path: Path) -> Finding:
-    from bank.skin.calibration_file import load_calibration
+    from shearloop.bank.skin.calibration_file import load_calibration
 
     try:
         calibration = load_calibration(path)

@@ -6,12 +6,12 @@ from typing import Any
 
 import zmq
 
-from daemon.config import DaemonConfig
-from daemon.doctor.devices import channels_finding, rate_finding
-from daemon.doctor.finding import Finding, good, note, trouble
-from daemon.errors import UserError
-from daemon.messages import decode
-from daemon.wire.request import request
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.doctor.devices import channels_finding, rate_finding
+from shearloop.daemon.doctor.finding import Finding, good, note, trouble
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.messages import decode
+from shearloop.daemon.messaging.request import request
 
 ANSWER_TIMEOUT_S = 1.0
 

@@ -9,9 +9,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import bank.compiled
-import drivers.compiled
-from daemon.doctor.finding import Finding, good, note, trouble
+from shearloop.bank.eit import compiled as bank_compiled
+from shearloop.daemon.doctor.finding import Finding, good, note, trouble
+from shearloop.drivers import compiled as drivers_compiled
 
 # An hour of recording is some 80 MB.
 LITTLE_DISK_BYTES, NO_DISK_BYTES = 2e9, 2e8
@@ -102,7 +102,7 @@ def robot_library_finding() -> Finding:
 
 def compiled_finding() -> Finding:
     """Say whether the way from a frame to its estimate is compiled, for which installing needs a C compiler."""
-    if bank.compiled.IS_COMPILED and drivers.compiled.cells is not None:
+    if bank_compiled.IS_COMPILED and drivers_compiled.cells is not None:
         return good("compiled parts", "reading a frame and matching it are compiled")
     return note(
         "compiled parts",

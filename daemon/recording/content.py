@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from pydantic_core import to_json
 
-from daemon.messages import EitFrame
-from drivers.raw_input import InputKind, RawInput
+from shearloop.daemon.messaging.messages import EitFrame
+from shearloop.drivers.raw_event import InputKind, RawEvent
 
 # Of arrays, which are float32 on the wire: a microvolt, a microradian.
 _DECIMALS = 6
@@ -42,14 +42,14 @@ def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> byte
     return as_json(plain)
 
 
-def input_json(told: RawInput) -> bytes:
+def input_json(told: RawEvent) -> bytes:
     """Return a raw input as JSON, each byte a character."""
     return as_json({"t_mono_ns": told.t_ns, "kind": told.kind.value, "data": told.data.decode("latin-1")})
 
 
-def input_of(content: Mapping[str, Any]) -> RawInput:
+def input_of(content: Mapping[str, Any]) -> RawEvent:
     """Return the raw input of a recorded message; raises KeyError, TypeError or ValueError for what is none."""
-    return RawInput(InputKind(content["kind"]), int(content["t_mono_ns"]), content["data"].encode("latin-1"))
+    return RawEvent(InputKind(content["kind"]), int(content["t_mono_ns"]), content["data"].encode("latin-1"))
 
 
 def as_json(content: Mapping[str, Any]) -> bytes:

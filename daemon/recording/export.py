@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.io import savemat
 
-from daemon.errors import UserError
-from daemon.recording.opened import opened
-from daemon.recording.schema import completed, schema_of
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.opened import opened
+from shearloop.daemon.recording.schema import completed, schema_of
 
 # A MATLAB name is at most 63 characters long; ours are far shorter.
 _LOG_TIME = "log_time_ns"

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 from pydantic_core import PydanticSerializationError
 
-from bank.bank_file import Bank
-from bank.channels import CHANNEL_TABLE_HASH
-from daemon.config import DaemonConfig
-from daemon.config_file import ConfigModel
-from daemon.errors import UserError
-from daemon.experiment.steps import ExperimentFile
-from daemon.recording.schema import CONFIGURATION, DIAMETER_NOTE, FORMAT_VERSION
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.config_file import ConfigModel
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.schema import CONFIGURATION, DIAMETER_NOTE, FORMAT_VERSION
 
 _PACKAGES = ("bank", "drivers", "daemon")
 # Keys of the configuration whose files are attached. Never a secret key; and a bank is named by its hash.

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
-from bank.estimators.values import LARGEST_TORQUE_NM
-from daemon.errors import UserError
-from daemon.matlab.recordings import LoadStream, Stream, contents, read_load_stream, read_stream
-from daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
-from daemon.recording.writer import RecordingWriter
-from drivers.frame_clock import slope_below
+from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.matlab_streams import LoadStream, Stream, contents, read_load_stream, read_stream
+from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
+from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.drivers.frame_clock import slope_below
 
 FloatArray = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ def middles(arrivals_ns: Sequence[int]) -> list[int]:
     """Return when the middle of each frame's acquisition was, from when each was read, all in nanoseconds.
 
     A frame is sent when it is complete and is read then or later, never earlier: the board's clock is the line below
-    the stamps (`drivers.frame_clock`), here with the frames after it known as well. Its height is that of the earliest
+    the stamps (`shearloop.drivers.frame_clock`), here with the frames after it known as well. Its height is that of the earliest
     of the frames around, so that a board which paused is followed.
     """
     numbered = list(enumerate(arrivals_ns))

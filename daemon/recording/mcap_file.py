@@ -9,8 +9,8 @@ from typing import Protocol
 
 from mcap.writer import CompressionType, Writer
 
-from bank.stored import sync_directory
-from daemon.recording.schema import PROFILE, schema_of, schemas
+from shearloop.bank.eit.stored import sync_directory
+from shearloop.daemon.recording.schema import PROFILE, schema_of, schemas
 
 PARTIAL = ".partial"
 # Far above what comes between two flushes: chunks end where a flush ends them.

@@ -15,7 +15,7 @@ from mcap.records import Channel, Message
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
-from daemon.errors import UserError
+from shearloop.daemon.errors import UserError
 
 # The end of an MCAP file: the footer's opcode and length, where summary and its offsets begin, their checksum, and the
 # magic bytes once more (https://mcap.dev/spec#footer-op0x02).

@@ -11,13 +11,12 @@ import numpy as np
 from mcap.records import Channel, Message
 from numpy.typing import NDArray
 
-from bank.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
-from bank.estimators import Measured
-from daemon.eit.tool_diameter import from_text
-from daemon.errors import UserError
-from daemon.recording.content import as_json, input_of
-from daemon.recording.opened import opened
-from daemon.recording.schema import (
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
+from shearloop.bank.estimation import Measured
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.content import as_json, input_of
+from shearloop.daemon.recording.opened import opened
+from shearloop.daemon.recording.schema import (
     DIAMETER_NOTE,
     EXPERIMENT_METADATA,
     FORMAT_VERSION,
@@ -26,7 +25,8 @@ from daemon.recording.schema import (
     METADATA,
     input_topic,
 )
-from drivers.raw_input import InputKind
+from shearloop.daemon.sensing.tool_diameter import from_text
+from shearloop.drivers.raw_event import InputKind
 
 # What every recording says of itself, beside the notes of this one.
 _IDENTITIES = ("format_version", "channel_table_hash", "software", "code_sha256")

@@ -11,16 +11,15 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import ValidationError
 
-from bank.channels import N_LINE_VALUES
-from bank.estimators import Measured
-from daemon.config import DaemonConfig
-from daemon.config_file import ConfigModel, mistakes
-from daemon.eit.tool_diameter import from_text
-from daemon.errors import UserError
-from daemon.messages import EitFrame
-from daemon.recording.content import input_of
-from daemon.recording.opened import damaged, opened
-from daemon.recording.schema import (
+from shearloop.bank.eit.channels import N_LINE_VALUES
+from shearloop.bank.estimation import Measured
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.config_file import ConfigModel, mistakes
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.messages import EitFrame
+from shearloop.daemon.recording.content import input_of
+from shearloop.daemon.recording.opened import damaged, opened
+from shearloop.daemon.recording.schema import (
     CLOCK_TOPIC,
     CONFIGURATION,
     FRAME_TOPIC,
@@ -30,13 +29,14 @@ from daemon.recording.schema import (
     input_topic,
     schema_of,
 )
-from drivers.raw_input import InputKind, RawInput
+from shearloop.daemon.sensing.tool_diameter import from_text
+from shearloop.drivers.raw_event import InputKind, RawEvent
 
 Model = TypeVar("Model", bound=ConfigModel)
 
 
 @dataclass(frozen=True, slots=True)
-class Asides:
+class ReplayEvents:
     """What estimators were told beside their frames, by source and the number of the frame that it was told before.
 
     Zeros are asked for before the frame has come, and tools are held by the gripper: neither follows from the frames.
@@ -47,7 +47,7 @@ class Asides:
     tools: dict[str, dict[int, Measured | None]] = field(default_factory=dict)
     numbers: dict[str, dict[int, int]] = field(default_factory=dict)
 
-    def note(self, source: str, told: RawInput) -> None:
+    def note(self, source: str, told: RawEvent) -> None:
         """Take in a raw input, if it is one of these."""
         if told.kind is InputKind.TARE and told.data.isdigit():
             self.tares.setdefault(source, set()).add(int(told.data))
@@ -62,14 +62,14 @@ class Asides:
 
 
 @dataclass(frozen=True, slots=True)
-class Happened:
+class RecordedEvent:
     """One message of a recording; of a raw input `told` is set, of a published message `topic` is the wire's."""
 
     topic: str
     t_mono_ns: int
     content: Mapping[str, Any]
     source: str = ""
-    told: RawInput | None = None
+    told: RawEvent | None = None
 
 
 class RecordedRun:
@@ -118,7 +118,7 @@ class RecordedRun:
                 written[Path(name)].write_bytes(data)
             yield _with_files(config, written)
 
-    def happenings(self) -> Iterator[Happened]:
+    def happenings(self) -> Iterator[RecordedEvent]:
         """Yield everything in the order in which it was recorded."""
         with opened(self.path) as recording:
             # An imported recording has a side after the other; one made live is in order as it is.
@@ -126,9 +126,9 @@ class RecordedRun:
             for number, (channel, message) in enumerate(messages):
                 yield from self._happened(channel.topic, json.loads(message.data), message.log_time, number)
 
-    def asides(self) -> Asides:
+    def asides(self) -> ReplayEvents:
         """Return what the estimators were told beside their frames."""
-        found = Asides()
+        found = ReplayEvents()
         if self.has_inputs:
             for one in self.happenings():
                 with damaged(self.path):
@@ -138,15 +138,15 @@ class RecordedRun:
                         found.note_frame(one.source, one.content)
         return found
 
-    def _happened(self, topic: str, content: dict[str, Any], log_ns: int, number: int) -> Iterator[Happened]:
+    def _happened(self, topic: str, content: dict[str, Any], log_ns: int, number: int) -> Iterator[RecordedEvent]:
         if topic == CLOCK_TOPIC:
-            yield Happened(topic, content["t_mono_ns"], content)
+            yield RecordedEvent(topic, content["t_mono_ns"], content)
         elif topic.startswith(f"{INPUT}."):
             told = input_of(content)
-            yield Happened(topic, told.t_ns, content, topic.removeprefix(f"{INPUT}."), told)
+            yield RecordedEvent(topic, told.t_ns, content, topic.removeprefix(f"{INPUT}."), told)
         elif self.has_inputs:
             wire = schema_of(topic)
-            yield Happened(wire, content["t_mono_ns"], completed(wire, content), content["source"])
+            yield RecordedEvent(wire, content["t_mono_ns"], completed(wire, content), content["source"])
         elif topic.startswith(f"{FRAME_TOPIC}."):
             yield from _line_as_input(topic.removeprefix(f"{FRAME_TOPIC}."), content)
         else:
@@ -162,17 +162,17 @@ class RecordedRun:
                 "t_mono_ns": log_ns,
                 "seq": number,
             }
-            yield Happened(topic, log_ns, complete, complete["source"])
+            yield RecordedEvent(topic, log_ns, complete, complete["source"])
 
 
-def _line_as_input(side: str, content: Mapping[str, Any]) -> Iterator[Happened]:
+def _line_as_input(side: str, content: Mapping[str, Any]) -> Iterator[RecordedEvent]:
     """Yield a recorded line's values as the board sent them: four decimals, each followed by a comma and a space."""
     values = np.asarray(content["line"], dtype=np.float64)
     if values.shape != (N_LINE_VALUES,):
         raise ValueError(f"a line of {values.size} values")
     text = "".join(f"{value:.4f}, " for value in values.tolist()) + "\r\n"
     t_ns = int(content["arrival_unix_ns"])
-    yield Happened(input_topic(side), t_ns, {}, side, RawInput(InputKind.DATA, t_ns, text.encode()))
+    yield RecordedEvent(input_topic(side), t_ns, {}, side, RawEvent(InputKind.DATA, t_ns, text.encode()))
 
 
 def _with_files(section: Model, written: Mapping[Path, Path]) -> Model:

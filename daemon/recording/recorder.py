@@ -16,13 +16,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
-from daemon.clock import Clock
-from daemon.errors import UserError
-from daemon.messages import Scalar
-from daemon.recording.content import NoJsonError, as_json, input_json, message_json
-from daemon.recording.identity import Attached, Identity
-from daemon.recording.mcap_file import McapFile
-from daemon.recording.schema import (
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.messages import Scalar
+from shearloop.daemon.recording.content import NoJsonError, as_json, input_json, message_json
+from shearloop.daemon.recording.identity import Attached, Identity
+from shearloop.daemon.recording.mcap_file import McapFile
+from shearloop.daemon.recording.schema import (
     CLOCK_TOPIC,
     END_METADATA,
     EXPERIMENT_METADATA,
@@ -30,8 +30,7 @@ from daemon.recording.schema import (
     input_topic,
     recorded_topic,
 )
-from drivers.raw_input import InputKind, RawInput, Tap
-from drivers.values import value
+from shearloop.drivers.raw_event import InputKind, RawEvent, Tap
 
 # A kill costs what came since the last flush: below a second, and so even where the machine is busy.
 FLUSH_S = 0.5
@@ -44,7 +43,7 @@ _OVERHEAD_BYTES = 1000
 _MOST_ALIKE = 100
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class _Message:
     topic: str
     content: Mapping[str, Any]
@@ -52,10 +51,10 @@ class _Message:
     now_ns: int
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class _Input:
     source: str
-    told: RawInput
+    told: RawEvent
     offset_ns: int
 
 
@@ -107,7 +106,7 @@ class Recorder:
         # How many of both before the file being written began.
         self._lost_before = 0
         # Which tool each source was told of last.
-        self._tools: dict[str, RawInput] = {}
+        self._tools: dict[str, RawEvent] = {}
         # One thread at a time writes: a flush that was cancelled may still be under way when the end comes.
         self._writing = threading.Lock()
         self._ended = False
@@ -135,7 +134,7 @@ class Recorder:
     def tap(self, source: str) -> Tap:
         """Return what hears of all that a source's parser is told."""
 
-        def hear(told: RawInput) -> None:
+        def hear(told: RawEvent) -> None:
             self._add(_Input(source, told, self._clock.offset_ns), _OVERHEAD_BYTES + len(told.data))
 
         return hear

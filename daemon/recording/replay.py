@@ -14,13 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from daemon.clock import Clock
-from daemon.messages import EitHeatmap
-from daemon.recording.chain import MADE_ANEW, Chain
-from daemon.recording.content import message_json
-from daemon.recording.recorded_run import Happened, RecordedRun
-from daemon.recording.schema import CLOCK_TOPIC, recorded_topic
-from daemon.wire.publisher import Publisher
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import EitHeatmap
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.recording.content import message_json
+from shearloop.daemon.recording.recorded_run import RecordedEvent, RecordedRun
+from shearloop.daemon.recording.replay_pipeline import MADE_ANEW, ReplayPipeline
+from shearloop.daemon.recording.schema import CLOCK_TOPIC, recorded_topic
 
 # These two say when a message was made and by which reading of the clocks, and not what was measured.
 NOT_COMPARED = ("latency_s", "timestamp")
@@ -76,7 +76,7 @@ class Comparison:
             plain = json.loads(message_json(topic, content, 0))
             self._made.setdefault((topic, content["source"]), deque()).append(plain)
 
-    def recorded(self, happened: Happened) -> None:
+    def recorded(self, happened: RecordedEvent) -> None:
         """Take in a message as it was recorded, after all that led to it."""
         waiting = self._made.get((happened.topic, happened.source))
         self.compared[happened.topic] += 1
@@ -97,7 +97,7 @@ class Comparison:
         """Messages made now that were not recorded."""
         return self._foreign + sum(map(len, self._made.values()))
 
-    def _differs(self, happened: Happened, why: str) -> None:
+    def _differs(self, happened: RecordedEvent, why: str) -> None:
         self.different[happened.topic] += 1
         if len(self.examples) < _MOST_SHOWN:
             self.examples.append(f"{happened.topic} of {happened.source}, number {happened.content['seq']}: {why}")
@@ -106,7 +106,7 @@ class Comparison:
 class Replay:
     """Replays one recording through a chain, to a publisher whose clock is `clock`."""
 
-    def __init__(self, run: RecordedRun, chain: Chain, publisher: Publisher, clock: ReplayClock) -> None:
+    def __init__(self, run: RecordedRun, chain: ReplayPipeline, publisher: Publisher, clock: ReplayClock) -> None:
         self._run = run
         self._chain = chain
         self._publisher = publisher
@@ -133,7 +133,7 @@ class Replay:
                 # Signals and sockets have their turn.
                 await asyncio.sleep(0)
 
-    async def _happen(self, happened: Happened) -> None:
+    async def _happen(self, happened: RecordedEvent) -> None:
         if happened.topic == CLOCK_TOPIC:
             self._clock.set(happened.t_mono_ns, int(happened.content["offset_ns"]))
         elif happened.told is not None:

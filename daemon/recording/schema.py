@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from daemon.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque
-from daemon.topics import TOPICS
+from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque
+from shearloop.daemon.messaging.topics import TOPICS
 
 FRAME_TOPIC = EitFrame.topic
 LOAD_TOPIC = LoadTorque.topic

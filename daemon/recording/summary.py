@@ -6,9 +6,9 @@ from typing import Any
 
 from mcap.records import Attachment, Channel, Message, Metadata
 
-from daemon.recording.identity import code_digest
-from daemon.recording.salvage import Progress, condition_of, records
-from daemon.recording.schema import DIAMETER_NOTE, END_METADATA, EXPERIMENT_METADATA, METADATA
+from shearloop.daemon.recording.identity import code_digest
+from shearloop.daemon.recording.repair import Progress, condition_of, records
+from shearloop.daemon.recording.schema import DIAMETER_NOTE, END_METADATA, EXPERIMENT_METADATA, METADATA
 
 
 @dataclass(slots=True)

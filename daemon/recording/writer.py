@@ -7,11 +7,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from daemon.errors import UserError
-from daemon.recording.content import as_json
-from daemon.recording.identity import basic_identity
-from daemon.recording.mcap_file import PARTIAL, McapFile
-from daemon.recording.schema import LOAD_TOPIC, METADATA, frame_topic
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.content import as_json
+from shearloop.daemon.recording.identity import basic_identity
+from shearloop.daemon.recording.mcap_file import PARTIAL, McapFile
+from shearloop.daemon.recording.schema import LOAD_TOPIC, METADATA, frame_topic
 
 # Decimals of a volt: the board sends four.
 _DECIMALS = 6

@@ -5,8 +5,8 @@ from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 
-from daemon.errors import UserError
-from daemon.service.steps import PutFile, RunProgram, Step, TakeEmptyFolder, TakeFile, Tell
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.service.steps import PutFile, RunProgram, Step, TakeEmptyFolder, TakeFile, Tell
 
 UNIT = "shearloop.service"
 EXAMPLE = "etc/shearloop/shearloop.yaml"

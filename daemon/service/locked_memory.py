@@ -4,7 +4,7 @@ import ctypes
 import os
 import resource
 
-from daemon.errors import UserError
+from shearloop.daemon.errors import UserError
 
 _MCL_CURRENT, _MCL_FUTURE = 1, 2
 

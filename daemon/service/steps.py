@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from daemon.errors import UserError
+from shearloop.daemon.errors import UserError
 
 
 class Step(Protocol):

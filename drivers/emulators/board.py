@@ -7,7 +7,7 @@ from pathlib import Path
 from random import Random
 from typing import Generic, TypeVar
 
-from drivers.emulators.pty_port import PtyPort
+from shearloop.drivers.emulators.pty_port import PtyPort
 
 FaultT = TypeVar("FaultT")
 

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.eit_format import FRAME_PERIOD_S
-from drivers.emulators.board import PlayedBoard
-from drivers.emulators.outage import Outage
+from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.drivers.emulators.board import PlayedBoard
+from shearloop.drivers.emulators.outage import Outage
 
 N_VALUES = 1024
 FLOOD_BYTES = 100_000

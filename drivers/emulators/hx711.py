@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
-from drivers.emulators.board import PlayedBoard
+from shearloop.drivers.emulators.board import PlayedBoard
 
 # The mean over 4882 lines of the paper's rig.
 PERIOD_S = 1 / 10.9

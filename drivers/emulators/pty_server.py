@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 
-from drivers.emulators.pty_port import PtyPort
+from shearloop.drivers.emulators.pty_port import PtyPort
 
 
 class PtyServer(ABC):

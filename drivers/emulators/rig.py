@@ -11,22 +11,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from drivers.eit_format import FRAME_PERIOD_S
-from drivers.emulators import eit_kit, hx711
-from drivers.emulators.eit_kit import EitKitBoard
-from drivers.emulators.hx711 import Hx711Board, Sketch
-from drivers.emulators.robotiq.gripper import Gripper
-from drivers.emulators.robotiq.modbus_face import ModbusServer
-from drivers.emulators.robotiq.player import GripperPlayer
-from drivers.emulators.robotiq.urcap_face import PORT, UrcapServer
-from drivers.emulators.scene import FloatArray, Scene, Truth
-from drivers.emulators.skin.circuit import Gauges
-from drivers.emulators.skin.instruments import SkinInstruments
-from drivers.emulators.twin import Joint, TwinSettings
-from drivers.emulators.ur.faults import FAULTS, obey
-from drivers.emulators.ur.make import Make
-from drivers.emulators.ur.robot import Event, Robot
-from drivers.emulators.ur.server import Controller
+from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.drivers.emulators import eit_kit, hx711
+from shearloop.drivers.emulators.eit_kit import EitKitBoard
+from shearloop.drivers.emulators.hx711 import Hx711Board, Sketch
+from shearloop.drivers.emulators.robotiq.gripper import Gripper
+from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
+from shearloop.drivers.emulators.robotiq.player import GripperPlayer
+from shearloop.drivers.emulators.robotiq.urcap_face import PORT, UrcapServer
+from shearloop.drivers.emulators.scene import FloatArray, Scene, Truth
+from shearloop.drivers.emulators.skin.circuit import Gauges
+from shearloop.drivers.emulators.skin.instruments import SkinInstruments
+from shearloop.drivers.emulators.twin import Joint, TwinSettings
+from shearloop.drivers.emulators.ur.faults import FAULTS, obey
+from shearloop.drivers.emulators.ur.make import Make
+from shearloop.drivers.emulators.ur.robot import Robot, RobotEvent
+from shearloop.drivers.emulators.ur.server import Controller
 
 # A frame (1024,) in volts, from what its injections saw, (32,) each: grip 0…1 and shear torque in N·m; and the tool's
 # diameter in mm.
@@ -86,7 +86,7 @@ class RigSettings:
         return {device: self.run_dir / name for device, name in names.items()}
 
 
-class Rig:
+class EmulatedRig:
     """All devices. `run` plays them, `command` lets something befall them, `scene` is what is really so.
 
     `on_event` hears what happens to the robot, `on_truth` the truth ten times a second of the scene's time, and
@@ -99,7 +99,7 @@ class Rig:
         frame_of: FrameOf,
         *,
         skin: RigSkin | None = None,
-        on_event: Callable[[Event], None] | None = None,
+        on_event: Callable[[RobotEvent], None] | None = None,
         on_truth: Callable[[Truth], None] | None = None,
         on_ready: Callable[[], None] = lambda: None,
     ) -> None:

@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.emulators.robotiq.gripper import Gripper
-from drivers.emulators.twin import Joint, Twin, TwinSettings
+from shearloop.drivers.emulators.robotiq.gripper import Gripper
+from shearloop.drivers.emulators.twin import Joint, Twin, TwinSettings
 
 FloatArray = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from drivers.errors import DriverError
+from shearloop.drivers.errors import DriverError
 
 # From this code on the gripper takes no command until it is activated anew: a rising edge of ACT.
 FIRST_MAJOR_CODE = 10
@@ -17,7 +17,7 @@ class GripperRefusedError(DriverError):
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class GripperFault:
     """What a fault is called, what it means, and what the operator can do about it."""
 
     code: int
@@ -30,35 +30,45 @@ class Fault:
         return self.code >= FIRST_MAJOR_CODE
 
 
-NO_FAULT = Fault(0, "none", "")
+NO_FAULT = GripperFault(0, "none", "")
 
 _FAULTS = {
     fault.code: fault
     for fault in (
         NO_FAULT,
-        Fault(5, "activation not finished", "The gripper is still activating; wait until it has opened and closed."),
-        Fault(7, "not activated", "The gripper has to be activated before it moves."),
-        Fault(8, "over-temperature", "The gripper is too hot; let it cool down, it takes commands again by itself."),
-        Fault(
+        GripperFault(
+            5, "activation not finished", "The gripper is still activating; wait until it has opened and closed."
+        ),
+        GripperFault(7, "not activated", "The gripper has to be activated before it moves."),
+        GripperFault(
+            8, "over-temperature", "The gripper is too hot; let it cool down, it takes commands again by itself."
+        ),
+        GripperFault(
             9, "no communication", "The gripper heard nothing for a second; check its cable and who else talks to it."
         ),
-        Fault(10, "undervoltage", "The gripper's supply is too low; check its 24 V, then activate it again."),
-        Fault(11, "automatic release running", "The gripper is releasing automatically; wait, then activate it again."),
-        Fault(12, "internal fault", "The gripper reports an internal fault; activate it again, else ask its maker."),
-        Fault(13, "activation fault", "The activation failed; clear what blocks the fingers, then activate it again."),
-        Fault(
+        GripperFault(10, "undervoltage", "The gripper's supply is too low; check its 24 V, then activate it again."),
+        GripperFault(
+            11, "automatic release running", "The gripper is releasing automatically; wait, then activate it again."
+        ),
+        GripperFault(
+            12, "internal fault", "The gripper reports an internal fault; activate it again, else ask its maker."
+        ),
+        GripperFault(
+            13, "activation fault", "The activation failed; clear what blocks the fingers, then activate it again."
+        ),
+        GripperFault(
             14, "overcurrent", "The motor drew too much current; clear the fingers, then activate the gripper again."
         ),
-        Fault(15, "automatic release done", "The gripper has released automatically; activate it again."),
+        GripperFault(15, "automatic release done", "The gripper has released automatically; activate it again."),
     )
 }
 
 
-def fault_of(code: int) -> Fault:
+def fault_of(code: int) -> GripperFault:
     """Return the fault with this code (gFLT, 0…15); one that the manual does not list is called unknown."""
     if code in _FAULTS:
         return _FAULTS[code]
     cure = "activate it again" if code >= FIRST_MAJOR_CODE else "wait or activate it again"
-    return Fault(
+    return GripperFault(
         code, f"unknown fault {code}", f"The gripper reports the fault {code}, which is not in its manual; {cure}."
     )

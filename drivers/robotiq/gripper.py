@@ -6,29 +6,29 @@ import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
 from typing import TypeVar
 
-from drivers.errors import DriverError
-from drivers.robotiq.faults import GripperFaultError, GripperRefusedError, fault_of
-from drivers.robotiq.messages import (
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.robotiq.faults import GripperFaultError, GripperRefusedError, fault_of
+from shearloop.drivers.robotiq.messages import (
     FORCE_MAX_N,
     FORCE_MIN_N,
     MA_PER_COUNT,
     SPEED_MAX_MM_S,
     SPEED_MIN_MM_S,
     ActivationStatus,
-    GoTo,
     GripperClient,
     GripperCommand,
+    GripperHalt,
+    GripperMove,
     GripperState,
-    Halt,
     ObjectStatus,
     Readout,
     Request,
     Reset,
     SentCommand,
 )
-from drivers.robotiq.sequences import ActivationSequence, MotionWatch, blocking_fault, object_status
-from drivers.robotiq.width import COUNTS_MAX, WidthCalibration
-from drivers.serial_port import LinkEvent, ReconnectPolicy
+from shearloop.drivers.robotiq.sequences import ActivationSequence, MotionWatch, blocking_fault, object_status
+from shearloop.drivers.robotiq.width import COUNTS_MAX, WidthCalibration
+from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy
 
 T = TypeVar("T")
 
@@ -64,7 +64,7 @@ class RobotiqGripper:
         self._clock_ns = clock_ns
         self._exchange = asyncio.Lock()
         self._seq = 0
-        self._last_request: GoTo | None = None
+        self._last_request: GripperMove | None = None
         self._openings = 0
         # The latest readout of a gripper that stands and of which nothing was asked since.
         self._standing: Readout | None = None
@@ -170,7 +170,7 @@ class RobotiqGripper:
         An activation moves them by itself, and is ended by a reset: the gripper has to be activated again.
         """
         self._last_request = None
-        await _whole(self._write(Halt()))
+        await _whole(self._write(GripperHalt()))
         readout, _ = await _whole(self._read())
         if readout.sta is ActivationStatus.ACTIVATING:
             await _whole(self._write(Reset()))
@@ -224,7 +224,7 @@ class RobotiqGripper:
         width_mm = _clip("width", command.width_mm, narrowest_mm, widest_mm, "mm", clipped)
         speed_mm_s = _clip("speed", command.speed_mm_s, SPEED_MIN_MM_S, SPEED_MAX_MM_S, "mm/s", clipped)
         force_n = _clip("force", command.force_n, FORCE_MIN_N, FORCE_MAX_N, "N", clipped)
-        request = GoTo(
+        request = GripperMove(
             calibration.counts(width_mm),
             round((speed_mm_s - SPEED_MIN_MM_S) / (SPEED_MAX_MM_S - SPEED_MIN_MM_S) * COUNTS_MAX),
             round((force_n - FORCE_MIN_N) / (FORCE_MAX_N - FORCE_MIN_N) * COUNTS_MAX),

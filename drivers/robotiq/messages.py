@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
-from drivers.robotiq.faults import Fault
-from drivers.values import value
+from shearloop.drivers.robotiq.faults import GripperFault
 
 # Instruction manual of the 2F-140, specifications; the counts between are taken as evenly spaced.
 SPEED_MIN_MM_S, SPEED_MAX_MM_S = 30.0, 250.0
@@ -37,7 +36,7 @@ class ActivationStatus(IntEnum):
     ACTIVE = 3
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Readout:
     """The gripper's status registers, all from one exchange; `current` is None where the way in has none."""
 
@@ -62,12 +61,12 @@ class Activate:
 
 
 @dataclass(frozen=True, slots=True)
-class Halt:
+class GripperHalt:
     """GTO to 0: the fingers stop where they are."""
 
 
 @dataclass(frozen=True, slots=True)
-class GoTo:
+class GripperMove:
     """Go to a position (0 open … 255 closed) at a speed and up to a force, in counts of 0…255."""
 
     position: int
@@ -75,7 +74,7 @@ class GoTo:
     force: int
 
 
-Request = Reset | Activate | Halt | GoTo
+Request = Reset | Activate | GripperHalt | GripperMove
 
 
 class GripperClient(Protocol):
@@ -121,11 +120,11 @@ class SentCommand:
     width_mm: float
     speed_mm_s: float
     force_n: float
-    request: GoTo
+    request: GripperMove
     clipped: tuple[str, ...]
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class GripperState:
     """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were asked for). It is never repeated as a new one.
 
@@ -145,7 +144,7 @@ class GripperState:
     activation: ActivationStatus
     current_ma: float | None
     current_t_ns: int
-    fault: Fault
+    fault: GripperFault
 
     @property
     def diameter_mm(self) -> float | None:

@@ -9,10 +9,10 @@ from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
-from drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
-from drivers.robotiq import registers
-from drivers.robotiq.messages import GoTo, Readout, Request
-from drivers.serial_port import find_port
+from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
+from shearloop.drivers.robotiq import registers
+from shearloop.drivers.robotiq.messages import GripperMove, Readout, Request
+from shearloop.drivers.serial_port import find_port
 
 T = TypeVar("T")
 
@@ -40,7 +40,7 @@ class ModbusClient:
         self._path = path
         self._deadline_s = reply_deadline_s
         self._client: AsyncModbusSerialClient | None = None
-        self._last = GoTo(0, 0, 0)
+        self._last = GripperMove(0, 0, 0)
 
     @property
     def name(self) -> str:
@@ -70,7 +70,7 @@ class ModbusClient:
         except BaseException:
             await self.close()
             raise
-        self._last = GoTo(readout.pre, self._last.speed, self._last.force)
+        self._last = GripperMove(readout.pre, self._last.speed, self._last.force)
 
     async def close(self) -> None:
         """Close the port; closing twice is allowed."""
@@ -90,7 +90,7 @@ class ModbusClient:
     async def write(self, request: Request) -> None:
         """Write the command registers; DeviceLostError or ProtocolError."""
         await self._exchange(registers.command_registers(request, self._last))
-        if isinstance(request, GoTo):
+        if isinstance(request, GripperMove):
             self._last = request
 
     async def _exchange(self, command: list[int] | None) -> ModbusPDU:

@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 
-from drivers.errors import ProtocolError
-from drivers.robotiq.messages import (
+from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.robotiq.messages import (
     Activate,
     ActivationStatus,
-    GoTo,
-    Halt,
+    GripperHalt,
+    GripperMove,
     ObjectStatus,
     Readout,
     Request,
@@ -23,7 +23,7 @@ N_STATUS_REGISTERS = 3
 _ACT, _GTO = 1 << 0, 1 << 3
 
 
-def command_registers(request: Request, last: GoTo) -> list[int]:
+def command_registers(request: Request, last: GripperMove) -> list[int]:
     """Return the three registers from 0x03E8 that carry a request.
 
     All three are written each time; where a request has no target, the last one stays.
@@ -31,9 +31,9 @@ def command_registers(request: Request, last: GoTo) -> list[int]:
     match request:
         case Reset():
             action = 0
-        case Activate() | Halt():
+        case Activate() | GripperHalt():
             action = _ACT
-        case GoTo():
+        case GripperMove():
             action, last = _ACT | _GTO, request
     return [action << 8, last.position, last.speed << 8 | last.force]
 

@@ -3,8 +3,16 @@
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
-from drivers.robotiq.faults import FIRST_MAJOR_CODE, GripperFaultError, fault_of
-from drivers.robotiq.messages import Activate, ActivationStatus, GoTo, ObjectStatus, Readout, Request, Reset
+from shearloop.drivers.robotiq.faults import FIRST_MAJOR_CODE, GripperFaultError, fault_of
+from shearloop.drivers.robotiq.messages import (
+    Activate,
+    ActivationStatus,
+    GripperMove,
+    ObjectStatus,
+    Readout,
+    Request,
+    Reset,
+)
 
 # The rest between reset and activation that Robotiq's own clients keep.
 PAUSE_NS = 500_000_000
@@ -76,7 +84,7 @@ class ActivationSequence:
 class MotionWatch:
     """Waits for the end of one motion, begun at `since_ns`."""
 
-    request: GoTo
+    request: GripperMove
     since_ns: int
 
     def finished(self, readout: Readout, t_ns: int) -> bool:
@@ -91,7 +99,7 @@ class MotionWatch:
         return False
 
 
-def object_status(readout: Readout, last: GoTo | None) -> ObjectStatus:
+def object_status(readout: Readout, last: GripperMove | None) -> ObjectStatus:
     """Return what the fingers met, in the motion that was asked for last.
 
     Until the gripper has taken up a target (GTO is 1 and the echo PRE equals it), OBJ speaks of the motion before. One

@@ -4,9 +4,9 @@ import asyncio
 from collections import deque
 from collections.abc import Sequence
 
-from drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
-from drivers.robotiq.messages import Readout, Request
-from drivers.robotiq.urcap import (
+from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
+from shearloop.drivers.robotiq.messages import Readout, Request
+from shearloop.drivers.robotiq.urcap import (
     PORT,
     READ_ORDER,
     STANDING_ORDER,

@@ -4,12 +4,12 @@
 or with `POS ?` when the controller has no value, for example because the gripper has no power.
 """
 
-from drivers.errors import DeviceLostError, ProtocolError
-from drivers.robotiq.messages import (
+from shearloop.drivers.errors import DeviceLostError, ProtocolError
+from shearloop.drivers.robotiq.messages import (
     Activate,
     ActivationStatus,
-    GoTo,
-    Halt,
+    GripperHalt,
+    GripperMove,
     ObjectStatus,
     Readout,
     Request,
@@ -36,9 +36,9 @@ def set_lines(request: Request) -> list[bytes]:
             return [b"SET ACT 0\n", b"SET ATR 0\n"]
         case Activate():
             return [b"SET ACT 1\n"]
-        case Halt():
+        case GripperHalt():
             return [b"SET GTO 0\n"]
-        case GoTo(position, speed, force):
+        case GripperMove(position, speed, force):
             return [f"SET POS {position} SPE {speed} FOR {force} GTO 1\n".encode()]
 
 

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from drivers.calibration_file import CalibrationError, CalibrationModel, Finite, Positive
+from shearloop.drivers.calibration_file import CalibrationError, CalibrationModel, Finite, Positive
 
 COUNTS_MAX = 255
 STROKE_MM = 140.0

@@ -5,11 +5,11 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
 from contextlib import aclosing
 
-from drivers.lines import LineCutter, transfer_ns
-from drivers.raw_input import InputKind, RawInput, Tap, no_tap
-from drivers.sending_board import SendingBoard
-from drivers.serial_port import Link
-from drivers.shear_skin.daq import RATE_HZ, Voltages
+from shearloop.drivers.line_splitter import LineSplitter, transfer_ns
+from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
+from shearloop.drivers.serial_port import Link
+from shearloop.drivers.shear_skin.daq import RATE_HZ, Voltages
+from shearloop.drivers.streaming_sensor import StreamingSensor
 
 BAUD_RATE = 115200
 # "-0.123456,-0.123456" is 19 characters; anything longer than this is several lines run together.
@@ -36,7 +36,7 @@ class PairParser:
     """
 
     def __init__(self, rate_hz: float = RATE_HZ, full_scale_v: float = FULL_SCALE_V) -> None:
-        self._lines = LineCutter(MAX_LINE_BYTES)
+        self._lines = LineSplitter(MAX_LINE_BYTES)
         self._refused: Counter[str] = Counter()
         self.first_partials = 0
         self._period_ns = round(1e9 / rate_hz)
@@ -54,7 +54,7 @@ class PairParser:
         """What was not made voltages, by kind."""
         return self._refused + Counter({"too long": self._lines.too_long, "unfinished": self._lines.unfinished})
 
-    def take(self, told: RawInput) -> list[Voltages]:
+    def take(self, told: RawEvent) -> list[Voltages]:
         """Be told what happened, live or from a recording; return the voltages that it leads to."""
         if told.kind is InputKind.OPENED:
             self.restart()
@@ -111,7 +111,7 @@ class AdcBoard:
         """Take the link to it; nothing is opened yet. `tap` hears of all that the parser is told."""
         self._period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
-        self._board = SendingBoard(link, self._parser.take, period_s=self._period_s, silent=_silent, tap=tap)
+        self._board = StreamingSensor(link, self._parser.take, period_s=self._period_s, silent=_silent, tap=tap)
         self._lines = 0
 
     @property

@@ -5,11 +5,11 @@ from collections import Counter
 from dataclasses import dataclass
 from enum import StrEnum
 
-from drivers.shear_skin.daq import Voltages
-from drivers.shear_skin.source import SourceReading
+from shearloop.drivers.shear_skin.daq import Voltages
+from shearloop.drivers.shear_skin.source import SourceReading
 
 
-class Fault(StrEnum):
+class SkinFault(StrEnum):
     """What can be wrong with the circuit; the text is for the person at the bench."""
 
     SOURCE_LOST = "the current source does not answer: see its cable, its address and whether it is on"
@@ -73,7 +73,7 @@ class SkinSample:
     t_arrival_ns: int
     seq: int
     missed: int = 0
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[SkinFault, ...] = ()
 
     @property
     def trusted(self) -> bool:
@@ -86,7 +86,7 @@ class SkinSample:
         return "; ".join(self.faults)
 
 
-class Judge:
+class SampleValidator:
     """Judges reading by reading; knows what came before, and nothing of clocks or ports."""
 
     def __init__(
@@ -106,7 +106,7 @@ class Judge:
         self._good: tuple[float, float] | None = None
         self._candidates: list[tuple[float, float]] = []
         # What was last wrong with the source, and since when it is right again.
-        self._without_source = Fault.SOURCE_LOST
+        self._without_source = SkinFault.SOURCE_LOST
         self._source_since_ns: int | None = None
 
     def sample(self, voltages: Voltages, source: SourceReading | None) -> SkinSample:
@@ -117,7 +117,7 @@ class Judge:
         if not faults and source is not None:
             pair = voltages.v1_v / source.current_a, voltages.v2_v / source.current_a
             if self._is_spike(pair, missed):
-                faults = [Fault.SPIKE]
+                faults = [SkinFault.SPIKE]
             else:
                 r1_ohm, r2_ohm = pair
         self.faults.update(fault.name.lower() for fault in faults)
@@ -146,13 +146,13 @@ class Judge:
         self.missed += missed
         return missed
 
-    def _faults(self, voltages: Voltages, source: SourceReading | None) -> list[Fault]:
+    def _faults(self, voltages: Voltages, source: SourceReading | None) -> list[SkinFault]:
         if source is None or voltages.t_arrival_ns - source.t_ns > self._stale_ns:
-            self._without_source, self._source_since_ns = Fault.SOURCE_LOST, None
-            return [Fault.SOURCE_LOST]
+            self._without_source, self._source_since_ns = SkinFault.SOURCE_LOST, None
+            return [SkinFault.SOURCE_LOST]
         if not source.output_on:
-            self._without_source, self._source_since_ns = Fault.SOURCE_OFF, None
-            return [Fault.SOURCE_OFF]
+            self._without_source, self._source_since_ns = SkinFault.SOURCE_OFF, None
+            return [SkinFault.SOURCE_OFF]
         if self._source_since_ns is None:
             self._source_since_ns = source.t_ns
         if voltages.t_mid_ns < self._source_since_ns:
@@ -161,19 +161,19 @@ class Judge:
         gauges = self._of_gauges(voltages)
         if source.compliance:
             # In compliance the circuit is what is wrong; where the voltage lies tells which part of it.
-            return [Fault.COMPLIANCE, *(fault for fault in gauges if fault in (Fault.OPEN_1, Fault.OPEN_2))]
+            return [SkinFault.COMPLIANCE, *(fault for fault in gauges if fault in (SkinFault.OPEN_1, SkinFault.OPEN_2))]
         if abs(source.current_a - self._current_a) > self._limits.current_share * self._current_a:
-            return [Fault.CURRENT, *gauges]
+            return [SkinFault.CURRENT, *gauges]
         if gauges:
             return gauges
         stuck = [
             fault
-            for fault, repeats in zip((Fault.STUCK_1, Fault.STUCK_2), self._repeats, strict=True)
+            for fault, repeats in zip((SkinFault.STUCK_1, SkinFault.STUCK_2), self._repeats, strict=True)
             if repeats >= self._limits.stuck_after
         ]
         return stuck or self._of_sum(voltages, source)
 
-    def _of_gauges(self, voltages: Voltages) -> list[Fault]:
+    def _of_gauges(self, voltages: Voltages) -> list[SkinFault]:
         limits, nominal_v = self._limits, self._limits.resistance_ohm * self._current_a
         values = (voltages.v1_v, voltages.v2_v)
         overranges = (voltages.over_1, voltages.over_2)
@@ -183,24 +183,24 @@ class Judge:
             dead_elsewhere = abs(values[1 - i]) < limits.short_share * nominal_v
             if is_open[i] and dead_elsewhere:
                 # Without a current nothing lies across the other gauge, and all of the compliance across this one.
-                found.append((Fault.OPEN_1, Fault.OPEN_2)[i])
+                found.append((SkinFault.OPEN_1, SkinFault.OPEN_2)[i])
             elif over:
-                found.append((Fault.OVERRANGE_1, Fault.OVERRANGE_2)[i])
+                found.append((SkinFault.OVERRANGE_1, SkinFault.OVERRANGE_2)[i])
             elif abs(v) < limits.short_share * nominal_v:
                 if not is_open[1 - i]:
-                    found.append((Fault.SHORT_1, Fault.SHORT_2)[i])
+                    found.append((SkinFault.SHORT_1, SkinFault.SHORT_2)[i])
             elif v < 0:
-                found.append((Fault.REVERSED_1, Fault.REVERSED_2)[i])
+                found.append((SkinFault.REVERSED_1, SkinFault.REVERSED_2)[i])
             elif not limits.least_share * nominal_v <= v <= limits.most_share * nominal_v:
-                found.append((Fault.IMPLAUSIBLE_1, Fault.IMPLAUSIBLE_2)[i])
+                found.append((SkinFault.IMPLAUSIBLE_1, SkinFault.IMPLAUSIBLE_2)[i])
         return found
 
-    def _of_sum(self, voltages: Voltages, source: SourceReading) -> list[Fault]:
+    def _of_sum(self, voltages: Voltages, source: SourceReading) -> list[SkinFault]:
         limits = self._limits
         across_v = voltages.v1_v + voltages.v2_v
         slack_v = limits.sum_share * across_v
         leads_v = limits.lead_ohm * self._current_a
-        return [] if -slack_v <= source.voltage_v - across_v <= leads_v + slack_v else [Fault.SUM]
+        return [] if -slack_v <= source.voltage_v - across_v <= leads_v + slack_v else [SkinFault.SUM]
 
     def _is_spike(self, pair: tuple[float, float], missed: int) -> bool:
         """Tell a disturbance from a load: readings that agree with each other become the new level after a few."""

@@ -6,10 +6,10 @@ from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
 from typing import Generic, TypeVar
 
-from drivers.errors import DriverError, ProtocolError
-from drivers.raw_input import Tap, no_tap
-from drivers.serial_port import Link
-from drivers.shear_skin.scpi import ScpiSession
+from shearloop.drivers.errors import DriverError, ProtocolError
+from shearloop.drivers.raw_event import Tap, no_tap
+from shearloop.drivers.serial_port import Link
+from shearloop.drivers.shear_skin.scpi import ScpiSession
 
 # Replies that are not understood, in a row, before the connection is opened anew.
 STRIKES = 3
@@ -17,7 +17,7 @@ STRIKES = 3
 ReadingT = TypeVar("ReadingT")
 
 
-class Polled(ABC, Generic[ReadingT]):
+class PolledInstrument(ABC, Generic[ReadingT]):
     """One instrument behind a link."""
 
     def __init__(self, link: Link, what: str, period_s: float, reply_deadline_s: float, tap: Tap = no_tap) -> None:

@@ -1,11 +1,11 @@
 """A scanning multimeter on a socket (Keysight 34970A/34972A/DAQ970A and what speaks like them): two channels a scan."""
 
-from drivers.errors import ProtocolError
-from drivers.raw_input import RawInput, Tap, no_tap
-from drivers.serial_port import Link
-from drivers.shear_skin.daq import RATE_HZ, Voltages
-from drivers.shear_skin.polled import Polled
-from drivers.shear_skin.scpi import OVERLOAD, REPLY_DEADLINE_S, RecordedAnswers, Reply, numbers
+from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.raw_event import RawEvent, Tap, no_tap
+from shearloop.drivers.serial_port import Link
+from shearloop.drivers.shear_skin.daq import RATE_HZ, Voltages
+from shearloop.drivers.shear_skin.polled import PolledInstrument
+from shearloop.drivers.shear_skin.scpi import OVERLOAD, REPLY_DEADLINE_S, RecordedAnswers, Reply, numbers
 
 SOCKET_PORT = 5025
 CHANNELS = (101, 102)
@@ -37,7 +37,7 @@ class RecordedScanner:
         """Know of no answer."""
         self._answers = RecordedAnswers()
 
-    def take(self, told: RawInput) -> list[Voltages]:
+    def take(self, told: RawEvent) -> list[Voltages]:
         """Return the voltages that an input leads to; a scan that was not understood then is none now either."""
         answer = self._answers.take(told)
         if answer is None or answer[0] != READ:
@@ -48,7 +48,7 @@ class RecordedScanner:
             return []
 
 
-class ScpiScanner(Polled[Voltages]):
+class ScpiScanner(PolledInstrument[Voltages]):
     """One scanner behind a link, asked for a scan at a steady rate; see `Daq`."""
 
     def __init__(

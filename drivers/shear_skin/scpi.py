@@ -5,10 +5,10 @@ from collections import Counter
 from dataclasses import dataclass
 from time import monotonic_ns
 
-from drivers.errors import DeviceLostError, DeviceSilentError, ProtocolError
-from drivers.lines import LineCutter
-from drivers.raw_input import InputKind, RawInput, Tap, no_tap
-from drivers.serial_port import Link, Port
+from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, ProtocolError
+from shearloop.drivers.line_splitter import LineSplitter
+from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
+from shearloop.drivers.serial_port import Link, Port
 
 # A reading of five elements is 70 characters long; what is longer without an end is no reply.
 LONGEST_REPLY = 512
@@ -25,7 +25,7 @@ class ReplyLines:
     """Cuts bytes, in whatever slices they come, into replies: instruments end them with CR, LF or both. No I/O."""
 
     def __init__(self) -> None:
-        self._lines = LineCutter(LONGEST_REPLY)
+        self._lines = LineSplitter(LONGEST_REPLY)
         self._refused: Counter[str] = Counter()
         self.unasked = 0
 
@@ -73,7 +73,7 @@ class RecordedAnswers:
         """Know of no question."""
         self._query, self._asked_ns = "", 0
 
-    def take(self, told: RawInput) -> tuple[str, Reply] | None:
+    def take(self, told: RawEvent) -> tuple[str, Reply] | None:
         """Return the question and its reply, once it is there."""
         if told.kind is InputKind.ASKED:
             self._query, self._asked_ns = told.data.decode("latin-1"), told.t_ns
@@ -136,8 +136,8 @@ class ScpiSession:
         await self.tell(query)
         reply = await self._next(asked_ns, query)
         # Both together: a question without an answer says nothing.
-        self._tap(RawInput(InputKind.ASKED, asked_ns, query.encode()))
-        self._tap(RawInput(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
+        self._tap(RawEvent(InputKind.ASKED, asked_ns, query.encode()))
+        self._tap(RawEvent(InputKind.DATA, reply.t_arrival_ns, reply.text.encode()))
         return reply
 
     async def ask_until(self, query: str, answer: str, deadline_s: float) -> None:

@@ -3,9 +3,9 @@
 import contextlib
 from collections.abc import AsyncGenerator, Mapping
 
-from drivers.shear_skin.daq import Daq
-from drivers.shear_skin.judge import CircuitLimits, Judge, SkinSample
-from drivers.shear_skin.source import Keithley6430, SourceReading
+from shearloop.drivers.shear_skin.daq import Daq
+from shearloop.drivers.shear_skin.judge import CircuitLimits, SampleValidator, SkinSample
+from shearloop.drivers.shear_skin.source import Keithley6430, SourceReading
 
 
 class ShearSkin:
@@ -15,7 +15,7 @@ class ShearSkin:
         """Take both instruments; nothing is opened yet."""
         self._source = source
         self._daq = daq
-        self._judge = Judge(source.current_a, source.period_s, daq.period_s, limits)
+        self._judge = SampleValidator(source.current_a, source.period_s, daq.period_s, limits)
         self._latest: SourceReading | None = None
         self._samples = 0
 

@@ -6,11 +6,11 @@ Voltage and current are both measured: the current of a source that sits in comp
 
 from dataclasses import dataclass
 
-from drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
-from drivers.raw_input import RawInput, Tap, no_tap
-from drivers.serial_port import Link
-from drivers.shear_skin.polled import Polled
-from drivers.shear_skin.scpi import NOT_A_NUMBER, REPLY_DEADLINE_S, RecordedAnswers, Reply, numbers
+from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
+from shearloop.drivers.raw_event import RawEvent, Tap, no_tap
+from shearloop.drivers.serial_port import Link
+from shearloop.drivers.shear_skin.polled import PolledInstrument
+from shearloop.drivers.shear_skin.scpi import NOT_A_NUMBER, REPLY_DEADLINE_S, RecordedAnswers, Reply, numbers
 
 MODELS = ("MODEL 6430", "MODEL 24")
 # The factory's rate of the RS-232 interface.
@@ -69,7 +69,7 @@ class RecordedSource:
         """Know of no answer."""
         self._answers = RecordedAnswers()
 
-    def take(self, told: RawInput) -> list[SourceReading]:
+    def take(self, told: RawEvent) -> list[SourceReading]:
         """Return the readings that an input leads to; one that was not understood then leads to none now either."""
         answer = self._answers.take(told)
         if answer is None or answer[0] not in (OUTPUT, READ):
@@ -81,7 +81,7 @@ class RecordedSource:
         return [] if reading is None else [reading]
 
 
-class Keithley6430(Polled[SourceReading]):
+class Keithley6430(PolledInstrument[SourceReading]):
     """One source behind a link: set up, switched on, and read until it is no longer wanted; then switched off."""
 
     def __init__(

@@ -15,21 +15,21 @@ import dashboard_client
 import rtde_control
 import script_client
 
-from drivers.errors import DriverError
-from drivers.ur.connections import connections_to
-from drivers.ur.messages import MoveLinear, Reading, WristSpeed
-from drivers.ur.probe import RTDE_PORT
-from drivers.ur.ready import Ready
-from drivers.ur.receiver import Receiver
-from drivers.ur.sample_age import SampleAge
-from drivers.ur.script import in_a_file, watched
-from drivers.ur.settings import UrSettings
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.connections import connections_to
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
+from shearloop.drivers.ur.probe import RTDE_PORT
+from shearloop.drivers.ur.ready import Ready
+from shearloop.drivers.ur.receiver import Receiver
+from shearloop.drivers.ur.sample_age import SampleAge
+from shearloop.drivers.ur.script import in_a_file, watched
+from shearloop.drivers.ur.settings import UrSettings
 
 # A thread of the client asks its socket for data, sleeps for 0.1 ms, and asks again: 5 % of a core. Woken up to so much
 # later it takes two samples at a time. What is sent over and over (a wrist speed, a sign of life) does not wait for it.
 # What is done once (beginning or stopping a straight move, ending the turning of a wrist at rest, zeroing the wrench,
 # setting the watchdog) waits until it has seen that done, and what comes next until it has seen the robot ready again
-# (see `drivers.ur.ready`): each so much longer at most, and a robot that hears nothing meanwhile has patience for six.
+# (see `shearloop.drivers.ur.ready`): each so much longer at most, and a robot that hears nothing meanwhile has patience for six.
 _LONGEST_POLL_SLACK_NS, _SLACKS_IN_PATIENCE = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
 
@@ -38,7 +38,7 @@ class DashboardRefusedError(DriverError):
     """The dashboard server did not do what it was asked."""
 
 
-class Arm:
+class UrArm:
     """One connection to a controller for reading, one for control; the dashboard when needed."""
 
     def __init__(self, settings: UrSettings, version: str) -> None:
@@ -70,11 +70,11 @@ class Arm:
         self._age = SampleAge()
         self._ready = Ready(self._receiver, 1.0 / settings.watchdog_hz)
 
-    def read(self) -> Reading:
+    def read(self) -> RtdeSample:
         """Return the controller's latest sample and its age."""
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
-        return Reading(
+        return RtdeSample(
             sample.timestamp_s,
             sample.q_rad,
             sample.qd_rad_per_s,
@@ -107,7 +107,7 @@ class Arm:
         return self._once(self._control.speedStop, deceleration_rad_per_s2)
 
     def move(self, command: MoveLinear) -> bool:
-        """Begin a linear move; `Reading.moving_linearly` tells its end."""
+        """Begin a linear move; `RtdeSample.moving_linearly` tells its end."""
         self._may_move_linearly = True
         speed, acceleration = command.speed_m_per_s, command.acceleration_m_per_s2
         return self._once(self._control.moveL, [*command.pose], speed, acceleration, asynchronous=True)

@@ -15,13 +15,20 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from drivers.cancelled import is_cancelled
-from drivers.errors import DriverError
-from drivers.ur import sentences
-from drivers.ur.conversation import HEARTBEAT, Conversation, Descriptor, LossKind, LostError, output
-from drivers.ur.messages import Command, Ease, Failed, Message, Reply, RobotState
-from drivers.ur.settings import UrSettings
-from drivers.ur.wire import encode
+from shearloop.drivers.cancelled import is_cancelled
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur import error_messages as sentences
+from shearloop.drivers.ur.messages import Command, CommandReply, Ease, Failed, Message, RobotState
+from shearloop.drivers.ur.settings import UrSettings
+from shearloop.drivers.ur.wire import encode
+from shearloop.drivers.ur.worker_connection import (
+    HEARTBEAT,
+    Descriptor,
+    LossKind,
+    LostError,
+    WorkerConnection,
+    output,
+)
 
 LinkStatus = Literal["starting", "up", "down"]
 
@@ -33,7 +40,7 @@ TAKES_OVER_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class LinkEvent:
+class UrLinkEvent:
     """The link to the robot came up or went down; `sentence` is for the operator."""
 
     t_mono_ns: int
@@ -46,10 +53,10 @@ class LinkEvent:
 class UrRobot:
     """A UR arm: `run` in a task, `send` commands, look at `state`."""
 
-    def __init__(self, settings: UrSettings, on_link: Callable[[LinkEvent], None] | None = None) -> None:
+    def __init__(self, settings: UrSettings, on_link: Callable[[UrLinkEvent], None] | None = None) -> None:
         """Take the settings; `on_link` hears of every loss and every return."""
         self.settings = settings
-        self.link = LinkEvent(time.monotonic_ns(), "starting", "The robot's process has not been started.")
+        self.link = UrLinkEvent(time.monotonic_ns(), "starting", "The robot's process has not been started.")
         self.losses: Counter[str] = Counter()
         self.pid: int | None = None
         self._on_link = on_link or (lambda _event: None)
@@ -61,7 +68,7 @@ class UrRobot:
         self._stdin: asyncio.StreamWriter | None = None
         # When the process was told anything last: whatever it hears is a sign of life.
         self.told_s = -math.inf
-        self._waiting: dict[int, Callable[[Reply], None]] = {}
+        self._waiting: dict[int, Callable[[CommandReply], None]] = {}
         self._number = 0
         self._lost_s = -math.inf
         # How many times our program was paused, asked to stop, and did not.
@@ -132,25 +139,25 @@ class UrRobot:
             if timer is not None:
                 timer.cancel()
 
-    async def send(self, command: Command) -> Reply:
+    async def send(self, command: Command) -> CommandReply:
         """Return the one reply to a command; `tell` says which."""
-        replied: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        replied: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
 
-        def answered(reply: Reply) -> None:
+        def answered(reply: CommandReply) -> None:
             if not replied.done():
                 replied.set_result(reply)
 
         self.tell(command, answered)
         return await replied
 
-    def tell(self, command: Command, answered: Callable[[Reply], None]) -> None:
+    def tell(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
         """Send a command; `answered` hears the one reply: what is sent after clipping, or why nothing is.
 
         A command whose process dies before it replied is answered as refused, and is not sent again. What `answered`
         raises ends the conversation with the process; where that is over already, the event loop's handler hears of it.
         """
         if self._stdin is None or self._state is None:
-            answered(Reply(refused=f"The robot is not connected. {self.link.sentence}"))
+            answered(CommandReply(refused=f"The robot is not connected. {self.link.sentence}"))
             return
         self._number += 1
         self._waiting[self._number] = answered
@@ -191,13 +198,13 @@ class UrRobot:
 
     async def _converse(self, stdout: int, its_stdout: Descriptor) -> None:
         process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "drivers.ur.child",
+            sys.executable, "-m", "shearloop.drivers.ur.worker",
             stdin=asyncio.subprocess.PIPE, stdout=its_stdout.number, stderr=asyncio.subprocess.PIPE,
         )  # fmt: skip
         # Held by the process alone, it ends with it.
         its_stdout.close()
         self.pid = process.pid
-        conversation = Conversation(self, process, stdout)
+        conversation = WorkerConnection(self, process, stdout)
         loss: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -231,7 +238,7 @@ class UrRobot:
         waiting, self._waiting = self._waiting, {}
         for answered in waiting.values():
             try:
-                answered(Reply(refused="The robot's process ended before it answered; nothing is sent again."))
+                answered(CommandReply(refused="The robot's process ended before it answered; nothing is sent again."))
             except Exception as error:  # noqa: BLE001 - the others are told all the same, and the process is ended
                 said = {"message": "who waited for a reply of the robot's process died of its end", "exception": error}
                 asyncio.get_running_loop().call_exception_handler(said)
@@ -260,7 +267,7 @@ class UrRobot:
                 for arrived in self._awaiting:
                     if not arrived.done():
                         arrived.set_result(message)
-            case Reply():
+            case CommandReply():
                 answered = self._waiting.pop(number, None)
                 if answered is not None:
                     answered(message)
@@ -268,7 +275,7 @@ class UrRobot:
                 raise LostError(message.kind, message.sentence)
 
     def _tell(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
-        self.link = LinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
+        self.link = UrLinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
         self._on_link(self.link)
 
 

@@ -4,8 +4,8 @@ import math
 from operator import le
 from typing import NamedTuple
 
-from drivers.ur.messages import MoveLinear, Reading, Stop, WristSpeed
-from drivers.ur.settings import Bound, Limits
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
+from shearloop.drivers.ur.settings import Bound, UrLimits
 
 WRIST = 5
 # However gently a stop is asked for.
@@ -29,7 +29,7 @@ class ClippedMove(NamedTuple):
     reasons: tuple[str, ...]
 
 
-def clip_wrist(asked: WristSpeed, reading: Reading, limits: Limits, reaction_s: float) -> Clipped:
+def clip_wrist(asked: WristSpeed, reading: RtdeSample, limits: UrLimits, reaction_s: float) -> Clipped:
     """Return the wrist speed that keeps speed, acceleration, force and the wrist's range.
 
     Near the end of the range the speed is what can still be braked within it, the brake taking hold late:
@@ -62,7 +62,7 @@ def clip_wrist(asked: WristSpeed, reading: Reading, limits: Limits, reaction_s: 
     return Clipped(WristSpeed(target, ramp), tuple(reasons))
 
 
-def clip_stop(asked: Stop, reading: Reading, limits: Limits, reaction_s: float) -> Stop:
+def clip_stop(asked: Stop, reading: RtdeSample, limits: UrLimits, reaction_s: float) -> Stop:
     """Return the stop with a deceleration between what is needed and the hard limit of acceleration.
 
     Needed is what keeps the wrist's range, and what ends the fastest joint's motion within `LONGEST_STOP_S`.
@@ -72,7 +72,7 @@ def clip_stop(asked: Stop, reading: Reading, limits: Limits, reaction_s: float) 
     return Stop(min(safe, limits.wrist_acceleration_rad_per_s2.hard))
 
 
-def clip_linear(asked: MoveLinear, limits: Limits) -> ClippedMove:
+def clip_linear(asked: MoveLinear, limits: UrLimits) -> ClippedMove:
     """Return the linear move with its end within the inner workspace and its speed and acceleration within theirs.
 
     The box is convex: a line to a point inside it, from a point inside it, stays inside.
@@ -94,12 +94,12 @@ def clip_linear(asked: MoveLinear, limits: Limits) -> ClippedMove:
     return ClippedMove(MoveLinear((x, y, z, *asked.pose[3:]), speed, acceleration), tuple(reasons))
 
 
-def violation(reading: Reading, limits: Limits) -> str:
+def violation(reading: RtdeSample, limits: UrLimits) -> str:
     """Return a sentence naming the hard limit that the measured state is beyond, or the empty string."""
     return "" if within(reading, limits) else beyond(reading, limits)
 
 
-def beyond(reading: Reading, limits: Limits) -> str:
+def beyond(reading: RtdeSample, limits: UrLimits) -> str:
     """Return what `violation` does; it looks at every value in turn, which is worth while only when one is beyond."""
     if not all(map(math.isfinite, (*reading.q_rad, *reading.qd_rad_per_s, *reading.tcp_pose, *reading.wrench))):
         return "The controller reports values that are no numbers."
@@ -120,7 +120,7 @@ def beyond(reading: Reading, limits: Limits) -> str:
     return ""
 
 
-def within(reading: Reading, limits: Limits) -> bool:
+def within(reading: RtdeSample, limits: UrLimits) -> bool:
     """Return whether all is finite and within the hard limits, at a tenth of the price of saying what is not."""
     joints, box, wrench = limits.joints, limits.workspace, reading.wrench
     position = reading.tcp_pose[:3]
@@ -137,7 +137,7 @@ def within(reading: Reading, limits: Limits) -> bool:
     )
 
 
-def line_violation(reading: Reading, limits: Limits) -> str:
+def line_violation(reading: RtdeSample, limits: UrLimits) -> str:
     """Return a sentence naming the inner limit that a linear move has come to, or the empty string.
 
     Where a line takes the joints and what it meets is known only under way, so that it is watched and stopped at the
@@ -161,7 +161,7 @@ def _at_most(asked: float, bound: Bound, name: str) -> tuple[float, list[str]]:
     return bound.inner, [f"{name} is limited to {bound.inner:g}"]
 
 
-def _safe_ramp(asked: float, target: float, reading: Reading, limits: Limits, reaction_s: float) -> float:
+def _safe_ramp(asked: float, target: float, reading: RtdeSample, limits: UrLimits, reaction_s: float) -> float:
     """Return the acceleration asked for, or the full braking one where the gentle one would end beyond the range."""
     speed = reading.qd_rad_per_s[WRIST]
     if target * math.copysign(1.0, speed) >= abs(speed):
@@ -172,14 +172,14 @@ def _safe_ramp(asked: float, target: float, reading: Reading, limits: Limits, re
     return asked if asked >= 2 * needed else max(asked, limits.wrist_acceleration_rad_per_s2.inner)
 
 
-def _room(direction: float, reading: Reading, limits: Limits) -> float:
+def _room(direction: float, reading: RtdeSample, limits: UrLimits) -> float:
     margin = limits.joints.margin_rad
     if direction >= 0:
         return limits.joints.upper_rad[WRIST] - margin - reading.wrist_rad
     return reading.wrist_rad - limits.joints.lower_rad[WRIST] - margin
 
 
-def _fading(reading: Reading, limits: Limits) -> list[tuple[float, str]]:
+def _fading(reading: RtdeSample, limits: UrLimits) -> list[tuple[float, str]]:
     found = []
     for name, value, bound, unit in (
         ("force", _norm(reading.wrench[:3]), limits.force_n, "N"),

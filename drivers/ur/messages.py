@@ -1,10 +1,9 @@
-"""What crosses the pipe between the daemon and the robot's own process, as values; `drivers.ur.wire` has the bytes."""
+"""What crosses the pipe between the daemon and the robot's own process, as values; `shearloop.drivers.ur.wire` has the bytes."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal
 
-from drivers.ur.settings import Six, UrSettings
-from drivers.values import value
+from shearloop.drivers.ur.settings import Six, UrSettings
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal["not-installed", "unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
@@ -14,7 +13,7 @@ _FINITE: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan"
 _STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "ser_json_inf_nan": "constants"}
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class WristSpeed:
     """Turn the tool about its axis; holds for `command_timeout_s`, then has to be commanded again."""
 
@@ -75,8 +74,8 @@ class Disconnect:
 Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | Disconnect
 
 
-@value(frozen=True, slots=True)
-class Reply:
+@dataclass(frozen=True, slots=True)
+class CommandReply:
     """The one answer to a command: what is sent to the robot after clipping, or why nothing is."""
 
     __pydantic_config__: ClassVar = _STRICT
@@ -91,7 +90,7 @@ class Reply:
         return not self.refused
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Sample:
     """What the controller says of itself at one time: SI units, base frame, joints from base to wrist 3."""
 
@@ -109,8 +108,8 @@ class Sample:
     speed_scaling: float
 
 
-@value(frozen=True, slots=True)
-class Reading(Sample):
+@dataclass(frozen=True, slots=True)
+class RtdeSample(Sample):
     """The controller's latest sample as it was read here, and what is known of the connection."""
 
     t_mono_ns: int
@@ -145,8 +144,8 @@ class Reading(Sample):
         return self.q_rad[5]
 
 
-@value(frozen=True, slots=True)
-class RobotState(Reading):
+@dataclass(frozen=True, slots=True)
+class RobotState(RtdeSample):
     """A reading and what the driver makes of it; published as `robot.state`."""
 
     # Torque about the tool's own axis, from wrench and pose.
@@ -203,7 +202,7 @@ class Ease:
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
+class RobotPhase:
     """What the process is about to do, said before doing it: it may hang or crash there."""
 
     __pydantic_config__: ClassVar = _STRICT
@@ -221,7 +220,7 @@ class Failed:
     sentence: str
 
 
-Message = Command | Reply | RobotState | Configure | Heartbeat | Ease | Phase | Failed
+Message = Command | CommandReply | RobotState | Configure | Heartbeat | Ease | RobotPhase | Failed
 
 # Why a motion ended that did as it was asked, or was told to stop; any other reason is a sentence of its own.
 ARRIVED: Final = "arrived"

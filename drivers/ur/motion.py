@@ -2,8 +2,8 @@
 
 import math
 
-from drivers.ur.messages import MoveLinear, Reading, Stop
-from drivers.ur.settings import Six
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop
+from shearloop.drivers.ur.settings import Six
 
 # How long a linear move may take beyond its nominal time before it is stopped.
 MOVE_SLACK, MOVE_SLACK_S = 1.5, 2.0
@@ -13,7 +13,7 @@ STOP_SLACK, STOP_SLACK_S = 1.5, 1.0
 SLOWEST_SCALING = 0.05
 
 
-def longest_move_s(move: MoveLinear, reading: Reading) -> float:
+def longest_move_s(move: MoveLinear, reading: RtdeSample) -> float:
     """Return how long a linear move may take: distance or turn at its speed, the pendant's speed slider, and slack."""
     distance_m = math.dist(move.pose[:3], reading.tcp_pose[:3])
     # At most half a turn; a move that only turns takes its speed as rad/s.
@@ -22,7 +22,7 @@ def longest_move_s(move: MoveLinear, reading: Reading) -> float:
     return MOVE_SLACK * nominal_s / max(SLOWEST_SCALING, reading.speed_scaling) + MOVE_SLACK_S
 
 
-def longest_stop_s(stop: Stop, reading: Reading) -> float:
+def longest_stop_s(stop: Stop, reading: RtdeSample) -> float:
     """Return how long a stop may take: the fastest joint's speed at this deceleration, the speed slider, and slack."""
     nominal_s = reading.fastest_rad_per_s / stop.deceleration_rad_per_s2
     if not math.isfinite(nominal_s):
@@ -31,7 +31,7 @@ def longest_stop_s(stop: Stop, reading: Reading) -> float:
     return STOP_SLACK * nominal_s / max(SLOWEST_SCALING, reading.speed_scaling) + STOP_SLACK_S
 
 
-def tool_axis_torque(reading: Reading) -> float:
+def tool_axis_torque(reading: RtdeSample) -> float:
     """Return the torque about the tool's z axis: the third column of the pose's rotation, times the torque."""
     x, y, z = reading.tcp_pose[3:]
     angle = math.sqrt(x * x + y * y + z * z)

@@ -4,7 +4,7 @@ The torque comes with a frame or a sample, the wrench with every fifth cycle: of
 far the wrist has turned, and whether anything has happened.
 """
 
-from drivers.ur.messages import RobotState
+from shearloop.drivers.ur.messages import RobotState
 
 # What a wrist at the full speed of an experiment (0.5 rad/s) turns in half of a cycle at 125 Hz: then each is told. The
 # narrowest limit on a twist in the experiments that come along (0.3 rad) is 150 times as far.

@@ -3,13 +3,13 @@
 Each waking costs, here and in the daemon, whatever is done then. While the daemon needs few states and nothing moves,
 all that can come between two of them is a message, and that is answered when it comes. The robot needs its signs of
 life more often than the daemon needs a state: not every cycle at ease tells one. Nor does every cycle of a wrist that
-turns: of those that say nothing new two in five are told (`drivers.ur.news`).
+turns: of those that say nothing new two in five are told (`shearloop.drivers.ur.news`).
 """
 
 import math
 
-from drivers.ur.messages import Ease, Message
-from drivers.ur.settings import UrSettings
+from shearloop.drivers.ur.messages import Ease, Message
+from shearloop.drivers.ur.settings import UrSettings
 
 # Of the robot's patience with a silent client (1/watchdog_hz), at rest and while it turns on as before: the three
 # quarters left are for a busy computer. Once they are over the robot's program ends, and waits for the operator.

@@ -4,10 +4,10 @@ No clock and no ur-rtde: the arm is a port and the time an argument. Where the d
 again, less and less often and not for ever; what became of it is told.
 """
 
-from drivers.errors import DriverError
-from drivers.ur import sentences
-from drivers.ur.ports import CureArm
-from drivers.ur.recovery import ENDS_ITSELF_S
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur import error_messages as sentences
+from shearloop.drivers.ur.ports import CureArm
+from shearloop.drivers.ur.recovery import ENDS_ITSELF_S
 
 # After so long it is asked again, while the program is paused still. A dashboard that hangs takes 2.5 s more each time.
 AGAIN_S = (1.0, 2.0, 5.0, 10.0, 10.0)
@@ -49,7 +49,7 @@ class PausedProgram:
         self.why = sentences.still_paused(why)
 
 
-class Unkicked:
+class ForeignProgramDetector:
     """Tells a program that is somebody else's by its going on without a sign of life from us: ours ends by itself."""
 
     def __init__(self) -> None:

@@ -1,8 +1,8 @@
-"""What recovering and flying need of the robot; `drivers.ur.arm.Arm` has it. False: the robot did not take it."""
+"""What recovering and flying need of the robot; `shearloop.drivers.ur.arm.Arm` has it. False: the robot did not take it."""
 
 from typing import Protocol
 
-from drivers.ur.messages import MoveLinear, WristSpeed
+from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
 
 
 class CureArm(Protocol):

@@ -8,9 +8,9 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from drivers.errors import DriverError
-from drivers.ur import sentences
-from drivers.ur.messages import FailureKind
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur import error_messages as sentences
+from shearloop.drivers.ur.messages import FailureKind
 
 RTDE_PORT = 30004
 _PROTOCOL, _CONTROLLER_VERSION = ord("V"), ord("v")

@@ -11,14 +11,14 @@ import math
 import time
 from typing import Final, Protocol
 
-from drivers.ur.messages import RUNTIME_PLAYING
-from drivers.ur.receiver import Received
+from shearloop.drivers.ur.messages import RUNTIME_PLAYING
+from shearloop.drivers.ur.receiver import Received
 
 READY: Final = 1
 
 
 class Samples(Protocol):
-    """What is needed of a connection to the controller; `drivers.ur.receiver.Receiver` has it."""
+    """What is needed of a connection to the controller; `shearloop.drivers.ur.receiver.Receiver` has it."""
 
     connected: bool
 

@@ -8,11 +8,11 @@ UR's RTDE guide, protocol 2: setting up outputs, start, and the data package.
 import select
 import socket
 import struct
+from dataclasses import dataclass
 
-from drivers.errors import ProtocolError
-from drivers.ur.messages import Sample
-from drivers.ur.probe import HEADER, RTDE_PORT, agree_on_protocol, explained, request
-from drivers.values import value
+from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.ur.messages import Sample
+from shearloop.drivers.ur.probe import HEADER, RTDE_PORT, agree_on_protocol, explained, request
 
 _OUTPUTS, _START, _DATA = ord("O"), ord("S"), ord("U")
 # The outputs, with their types, in the order of a sample's fields.
@@ -36,7 +36,7 @@ _RATE = struct.Struct(">d")
 _READ_BYTES = 1 << 15
 
 
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Received(Sample):
     """A sample, and what ur-rtde's control script says there of itself: 1 for ready, 2 for done with a command."""
 

@@ -8,8 +8,8 @@ stands against that, such as a program that somebody else runs.
 import enum
 from typing import Protocol
 
-from drivers.errors import DriverError
-from drivers.ur.messages import (
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.messages import (
     ROBOT_MODE_IDLE,
     ROBOT_MODE_POWER_OFF,
     ROBOT_MODE_RUNNING,
@@ -18,9 +18,9 @@ from drivers.ur.messages import (
     SAFETY_NORMAL,
     SAFETY_PROTECTIVE_STOP,
     SAFETY_REDUCED,
-    Reading,
+    RtdeSample,
 )
-from drivers.ur.ports import CureArm
+from shearloop.drivers.ur.ports import CureArm
 
 
 class Outcome(enum.Enum):
@@ -66,7 +66,7 @@ class Recovery:
         """Whether nothing more is done, whatever the robot says."""
         return bool(self.why) or now_ns > self._deadline_ns
 
-    def advance(self, reading: Reading, now_ns: int) -> Outcome:
+    def advance(self, reading: RtdeSample, now_ns: int) -> Outcome:
         """Do what is due in this cycle."""
         if self.why:
             return Outcome.REFUSED
@@ -80,7 +80,7 @@ class Recovery:
         except DriverError as error:
             return self._refuse(f"The controller refused: {error}")
 
-    def _step(self, reading: Reading, now_ns: int) -> Outcome:
+    def _step(self, reading: RtdeSample, now_ns: int) -> Outcome:
         safe = reading.safety_mode in (SAFETY_NORMAL, SAFETY_REDUCED)
         if not (safe and reading.robot_mode == ROBOT_MODE_RUNNING):
             return self._make_safe(reading, now_ns)
@@ -110,7 +110,7 @@ class Recovery:
         since_ns = self._asked_ns.setdefault("end", now_ns)
         return self._refuse("") if now_ns > since_ns + int(ENDS_ITSELF_S * 1e9) else Outcome.UNDER_WAY
 
-    def _make_safe(self, reading: Reading, now_ns: int) -> Outcome:
+    def _make_safe(self, reading: RtdeSample, now_ns: int) -> Outcome:
         if not self._operator_asked:
             return self._refuse("")
         if reading.safety_mode in SAFETY_EMERGENCY_STOPS:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
-from drivers.errors import DriverError
+from shearloop.drivers.errors import DriverError
 
 Six = tuple[float, float, float, float, float, float]
 Three = tuple[float, float, float]
@@ -75,7 +75,7 @@ class Workspace:
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class UrLimits:
     """Everything that a command or a measured state is held against."""
 
     __pydantic_config__: ClassVar = _CHECKED
@@ -106,7 +106,7 @@ class UrSettings:
     __pydantic_config__: ClassVar = _CHECKED
 
     host: str
-    limits: Limits
+    limits: UrLimits
     rate_hz: float = 125.0
     # The robot ends its program when it hears nothing for 1/watchdog_hz.
     watchdog_hz: float = 10.0
@@ -165,7 +165,7 @@ def read_settings(path: Path) -> UrSettings:
     """
     from pydantic import TypeAdapter, ValidationError
 
-    from drivers.yaml_file import read_yaml
+    from shearloop.drivers.yaml_file import read_yaml
 
     content = read_yaml(path)
     try:

@@ -13,8 +13,9 @@ from typing import Final, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from drivers.errors import ProtocolError
-from drivers.ur.messages import (
+from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.ur.messages import (
+    CommandReply,
     Configure,
     Disconnect,
     Ease,
@@ -24,8 +25,7 @@ from drivers.ur.messages import (
     Message,
     MotionKind,
     MoveLinear,
-    Phase,
-    Reply,
+    RobotPhase,
     RobotState,
     Stop,
     Unlock,
@@ -50,7 +50,7 @@ _NO_NUMBERS: Final = (0.0,) * 8
 
 _KINDS: Final[tuple[type[Message], ...]] = (
     WristSpeed, MoveLinear, Stop, ZeroForceTorque, Enable, Unlock, Disconnect,
-    Reply, RobotState, Configure, Heartbeat, Ease, Phase, Failed,
+    CommandReply, RobotState, Configure, Heartbeat, Ease, RobotPhase, Failed,
 )  # fmt: skip
 _ADAPTERS: Final[tuple[TypeAdapter[Message], ...]] = tuple(TypeAdapter(kind) for kind in _KINDS)
 _CODES: Final = {kind: code for code, kind in enumerate(_KINDS)}
@@ -67,7 +67,7 @@ def encode(message: Message, number: int = 0) -> bytes:
     match message:
         case RobotState():
             body = _state_body(message)
-        case Reply():
+        case CommandReply():
             body = _sent_body(message.sent) + _words_of_reply_body(message.refused, message.clipped)
         case WristSpeed():
             body = _WRIST_SPEED.pack(message.rad_per_s, message.acceleration_rad_per_s2)
@@ -111,10 +111,10 @@ def _decode(code: int, body: bytes) -> Message:
     try:
         if kind is RobotState:
             return _state(body)
-        if kind is Reply:
+        if kind is CommandReply:
             sent = _sent(body[: _SENT.size])
             refused, clipped = _words_of_reply(body[_SENT.size :])
-            return Reply(refused, sent, clipped)
+            return CommandReply(refused, sent, clipped)
         if kind is WristSpeed:
             return _wrist_speed(*_WRIST_SPEED.unpack(body))
     except struct.error as error:
@@ -199,7 +199,7 @@ def _words_of_reply_body(refused: str, clipped: tuple[str, ...]) -> bytes:
 
 @lru_cache(maxsize=4)
 def _words_of_reply(body: bytes) -> tuple[str, tuple[str, ...]]:
-    return _checked(_WORDS_OF_REPLY, body, Reply.__name__)
+    return _checked(_WORDS_OF_REPLY, body, CommandReply.__name__)
 
 
 def _state(body: bytes) -> RobotState:

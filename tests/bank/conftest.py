@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bank.forward import ForwardModel
-from bank.mesh import Mesh, load_mesh
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import Mesh, load_mesh
 
 
 def rectangle(columns: int, rows: int, width_cm: float, height_cm: float) -> tuple[NDArray, NDArray]:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from bank import compiled
-from bank.channels import N_CHANNELS
-from bank.fast_matching import FastMatcher, FastZeroLagMatcher
-from bank.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
+from shearloop.bank.eit.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher
 
 SHAPE = (22, 20)
 

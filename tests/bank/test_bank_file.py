@@ -8,9 +8,9 @@ import os
 import numpy as np
 import pytest
 
-from bank.bank_file import FORMAT_VERSION, Bank, BankDefinition, write_bank
-from bank.channels import CHANNEL_TABLE_HASH
-from bank.errors import BankFileError, ModelError
+from shearloop.bank.eit.bank_file import FORMAT_VERSION, Bank, BankDefinition, write_bank
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
+from shearloop.bank.errors import BankFileError, ModelError
 
 GEOMETRY = "ab" * 32
 CURE = "make it anew with `shearloop bank build"

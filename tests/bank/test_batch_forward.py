@@ -13,13 +13,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank.batch_forward import LARGEST_LEAK, BatchForwardModel, rounding_leaks
-from bank.elimination import Elimination
-from bank.errors import BankError, ConductivityError, GeometryError
-from bank.fronts import Pattern
-from bank.mesh import Mesh
-from bank.models import MODELS, conductivity
-from bank.tiles import LANES
+from shearloop.bank.eit.batch_forward import LARGEST_LEAK, BatchForwardModel, rounding_leaks
+from shearloop.bank.eit.elimination import Elimination
+from shearloop.bank.eit.fronts import Pattern
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.bank.eit.tiles import LANES
+from shearloop.bank.errors import BankError, ConductivityError, GeometryError
 from tests.bank.conftest import rectangle
 
 
@@ -89,7 +89,7 @@ def test_without_a_compiler_it_is_said_what_to_do(fingertip, monkeypatch):
 
 # For registers that hold four numbers, whatever this machine's do: prints what is left of some matrices.
 NARROW = """
-from bank.tiles import LANES
+from shearloop.bank.eit.tiles import LANES
 from tests.bank.test_batch_forward import what_is_left
 assert LANES == 4
 print(what_is_left().tobytes().hex())

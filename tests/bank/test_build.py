@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank import bank_file
-from bank.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
-from bank.build import RowSolver, build_bank
-from bank.errors import BankFileError, ConductivityError
-from bank.journal import RowJournal
-from bank.mesh import Mesh
-from bank.models import conductivity
+from shearloop.bank.eit import bank_file
+from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
+from shearloop.bank.eit.build import RowSolver, build_bank
+from shearloop.bank.eit.journal import RowJournal
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.models import conductivity
+from shearloop.bank.errors import BankFileError, ConductivityError
 
 MODEL = "gaussian_derivative"
 K, SIGMA = np.linspace(0.4, 9.0, 5), np.linspace(0.3, 1.2, 4)
@@ -25,7 +25,7 @@ K, SIGMA = np.linspace(0.4, 9.0, 5), np.linspace(0.3, 1.2, 4)
 BUILDER = """
 import sys
 from pathlib import Path
-from bank.build import build_bank
+from shearloop.bank.eit.build import build_bank
 from tests.bank.conftest import small_fingertip
 from tests.bank.test_build import K, MODEL, SIGMA
 

@@ -7,10 +7,10 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank.calibration import Calibration
-from bank.channels import CHANNEL_TABLE_HASH
-from bank.errors import CalibrationError
-from bank.polynomial import Polynomial
+from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
+from shearloop.bank.eit.polynomial import Polynomial
+from shearloop.bank.errors import CalibrationError
 
 BANK = "ab" * 32
 SIGMA, K = np.linspace(1.2, 1.9, 30), np.linspace(3.4, 3.8, 12)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bank import channels
+from shearloop.bank.eit import channels
 
 
 def test_the_table_has_896_channels_and_128_zero_slots() -> None:

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 from scipy.linalg import cython_blas
 
 import bank
-from bank import compiled, compiled_frames, compiled_search
-from bank.channels import N_CHANNELS
-from bank.compression import FloatArray
-from drivers.compiled import cells
-from drivers.compiled import is_stale as are_cells_stale
+from shearloop.bank.eit import compiled, compiled_frames, compiled_search
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.compression import FloatArray
+from shearloop.drivers.compiled import cells
+from shearloop.drivers.compiled import is_stale as are_cells_stale
 
 
 @pytest.mark.skipif(

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.linalg import cython_blas
 
-from bank import compiled, compiled_search, fast_matching
-from bank.channels import N_CHANNELS
+from shearloop.bank.eit import compiled, compiled_search, fast_matching
+from shearloop.bank.eit.channels import N_CHANNELS
 from tests.bank.small_banks import (
     BANK,
     COMPILED,

@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.batch_forward import BatchForwardModel
-from bank.channels import CHANNELS
-from bank.design import ALLOWED, Choice, Scene, Step, _board_choices, designed
-from bank.errors import CalibrationError
-from bank.fingertip import Fingertip
-from bank.forward import ForwardModel
-from bank.models import conductivity
-from daemon.bank_config import FingertipConfig
-from daemon.config_file import load_yaml_model
+from shearloop.bank.eit.batch_forward import BatchForwardModel
+from shearloop.bank.eit.channels import CHANNELS
+from shearloop.bank.eit.design import ALLOWED, Choice, Scene, Step, _board_choices, designed
+from shearloop.bank.eit.fingertip import Fingertip
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.models import conductivity
+from shearloop.bank.errors import CalibrationError
+from shearloop.daemon.bank_config import FingertipGeometryConfig
+from shearloop.daemon.config_file import load_yaml_model
 
 FINGERTIP = Path(__file__).parents[2] / "config" / "fingertips" / "paper.yaml"
 PLACES = [(3.1 + 0.02 * i, 1.3 + 0.04 * i) for i in range(10)]
@@ -22,7 +22,7 @@ PLACES = [(3.1 + 0.02 * i, 1.3 + 0.04 * i) for i in range(10)]
 
 @pytest.fixture(scope="module")
 def fingertip() -> Fingertip:
-    return load_yaml_model(FINGERTIP, FingertipConfig).fingertip()
+    return load_yaml_model(FINGERTIP, FingertipGeometryConfig).fingertip()
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
-from bank import compiled, compression, fast_matching
-from bank.channels import N_CHANNELS, channels_of_line
-from bank.errors import MatchingError
-from bank.fast_matching import FastMatcher
-from bank.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.eit import compiled, compression, fast_matching
+from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
+from shearloop.bank.eit.fast_matching import FastMatcher
+from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.errors import MatchingError
 from tests.bank.small_banks import (
     BANK,
     COMPILED,

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank.errors import GeometryError
-from bank.fingertip import ElectrodePlace, Fingertip
-from bank.forward import ForwardModel
-from bank.mesh import boundary_edges, doubled_areas
-from bank.models import conductivity
+from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import boundary_edges, doubled_areas
+from shearloop.bank.eit.models import conductivity
+from shearloop.bank.errors import GeometryError
 
 CENTRES = 0.1 + 0.4 * np.arange(8)
 # A square with eight electrodes on each side, in order around it from the lower left corner.

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from bank.channels import CHANNELS, N_CHANNELS
-from bank.errors import ConductivityError, GeometryError
-from bank.forward import CompleteElectrodeModel, ForwardModel
-from bank.mesh import Mesh
-from bank.models import MODELS, conductivity
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
+from shearloop.bank.eit.forward import CompleteElectrodeModel, ForwardModel
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.bank.errors import ConductivityError, GeometryError
 from tests.bank.conftest import rectangle, small_fingertip
 
 

@@ -4,9 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from bank.channels import N_CHANNELS
-from bank.errors import MatchingError
-from bank.matching import (
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.matching import (
     Match,
     Matcher,
     NoSignal,
@@ -15,6 +14,7 @@ from bank.matching import (
     best_match,
     signal_above_noise,
 )
+from shearloop.bank.errors import MatchingError
 
 K_GRID, SIGMA_GRID = np.linspace(3.1, 3.4, 7), np.linspace(1.2, 1.9, 8)
 VALID = np.ones((7, 8), dtype=np.bool_)

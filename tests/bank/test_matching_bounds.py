@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank import bounds, fast_matching
-from bank.channels import N_CHANNELS
-from bank.compression import COARSE_RANK, ROUNDING, columns
-from bank.fast_matching import FastMatcher
-from bank.matching import Matcher, unit_magnitude, unit_magnitudes
+from shearloop.bank.eit import bounds, fast_matching
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.compression import COARSE_RANK, ROUNDING, columns
+from shearloop.bank.eit.fast_matching import FastMatcher
+from shearloop.bank.eit.matching import Matcher, unit_magnitude, unit_magnitudes
 from tests.bank.small_banks import BANK, PAIRS, assert_same, by_numpy, cells, without_runner_up
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from bank.errors import GeometryError
-from bank.forward import ForwardModel
-from bank.mesh import Mesh, doubled_areas, load_mesh
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import Mesh, doubled_areas, load_mesh
+from shearloop.bank.errors import GeometryError
 
 FIELDS = ("nodes", "triangles", "electrode_edges", "electrode_of_edge", "contact_impedance")
 

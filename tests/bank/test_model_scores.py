@@ -6,11 +6,10 @@ import yaml
 from scipy.io import loadmat
 from scipy.stats import spearmanr
 
-from bank.channels import N_CHANNELS, channels_of_line
-from bank.errors import MatchingError
-from bank.forward import ForwardModel
-from bank.mesh import load_mesh
-from bank.model_scores import (
+from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import load_mesh
+from shearloop.bank.eit.model_scores import (
     Setting,
     centred_settings,
     envelope,
@@ -20,7 +19,8 @@ from bank.model_scores import (
     searched_settings,
     simulated_signals,
 )
-from bank.models import MODELS, conductivity
+from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.bank.errors import MatchingError
 
 CHANNEL = np.arange(N_CHANNELS)
 # Fourteen equal periods of 64 channels, under a slow change of size.

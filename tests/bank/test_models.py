@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bank.errors import ModelError
-from bank.mesh import Mesh
-from bank.models import MODELS, Conductivities, Variation, averaging_points, conductivity
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.models import MODELS, Conductivities, Variation, averaging_points, conductivity
+from shearloop.bank.errors import ModelError
 
 
 def test_the_averaging_points_are_those_of_the_reference(shared):

@@ -10,20 +10,35 @@ import numpy as np
 import pytest
 from matplotlib.text import Annotation, Text
 
-from bank.channels import N_CHANNELS
-from bank.estimators import FrameSeries
-from bank.mesh import Mesh
-from bench.charts import scene
-from bench.charts.command import NAMES
-from bench.charts.forwards import CELLS, converged, direct, error_of, forwards
-from bench.charts.methods import Measured
-from bench.charts.picture import check_takes_pictures, figure, frontier, lay_out, plain_log, write_names
-from bench.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
-from bench.charts.speed_accuracy import Compared, _draw_loop, _draw_methods, _short, measured, often_valid, write
-from bench.charts.windows import LOOPS, Followed, followed
-from daemon.cli import main
-from daemon.reproduce.banks import Grid
-from daemon.workers import InTurn
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.estimation import FrameSeries
+from shearloop.daemon.analysis.charts import scene
+from shearloop.daemon.analysis.charts.command import NAMES
+from shearloop.daemon.analysis.charts.forwards import CELLS, converged, direct, error_of, forwards
+from shearloop.daemon.analysis.charts.methods import Measured
+from shearloop.daemon.analysis.charts.picture import (
+    check_takes_pictures,
+    figure,
+    frontier,
+    lay_out,
+    plain_log,
+    write_names,
+)
+from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
+from shearloop.daemon.analysis.charts.speed_accuracy import (
+    Compared,
+    _draw_loop,
+    _draw_methods,
+    _short,
+    measured,
+    often_valid,
+    write,
+)
+from shearloop.daemon.analysis.charts.windows import LOOPS, Followed, followed
+from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.cli import main
+from shearloop.daemon.workers import SerialExecutor
 
 
 @pytest.fixture(scope="module")
@@ -145,8 +160,8 @@ def test_a_chart_that_is_interrupted_leaves_no_empty_folder(
         scratch.mkdir(parents=True)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("bench.charts.sources.splits", interrupted)
-    monkeypatch.setattr("bench.charts.sources.mesh_of", lambda _: None)
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.splits", interrupted)
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.mesh_of", lambda _: None)
     assert main(["chart", name, "--out", str(tmp_path / "some" / "out")]) == 130
     assert list(tmp_path.iterdir()) == []
 
@@ -161,7 +176,7 @@ def test_a_place_that_takes_no_chart_is_told_before_anything_is_measured(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # Were anything read, it would be what fails.
-    monkeypatch.setattr("bench.charts.sources.splits", None)
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.splits", None)
     for name in NAMES:
         assert main(["chart", name, "--out", "/dev/null"]) == 2
         said = capsys.readouterr().err
@@ -183,7 +198,7 @@ def test_why_a_design_may_not_be_worth_building_is_told_with_the_chart_of_it(
 
     monkeypatch.setattr(scene, "designed_on", designed_on)
     monkeypatch.setattr(scene, "write", lambda title, _, out: [out / title])
-    assert scene.chart(parts, tmp_path, InTurn()) == [tmp_path / "good", tmp_path / "bad"]
+    assert scene.chart(parts, tmp_path, SerialExecutor()) == [tmp_path / "good", tmp_path / "bad"]
     first, second = capsys.readouterr().err.splitlines()
     assert first.startswith("shearloop chart: bad: even the best model leaves 90.0% of a frame unexplained")
     assert second.startswith("shearloop chart: bad: the noise is 50.0% of a difference frame")
@@ -198,7 +213,7 @@ def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(
     def solver(mesh: Mesh) -> Callable[[object], object] | None:
         return (lambda _: solved.append(len(mesh.triangles))) if there else None
 
-    monkeypatch.setattr("bench.charts.forwards.pyeit_solver", solver)
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.forwards.pyeit_solver", solver)
     rows = forwards(2, None, (0.4, 0.2), (0.2, 0.1))
     (pyeit,) = (row for row in rows if row.family == "pyEIT")
     assert (pyeit.name, pyeit.cited) == (("pyEIT", False) if there else ("pyEIT (cited)", True))
@@ -211,7 +226,7 @@ def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(
     # Its time is that of the paper's mesh, which is not here.
     assert (eidors.cited, eidors.error) == (True, None)
     if not there:
-        monkeypatch.setattr("bench.charts.forwards.PAPER_TRIANGLES", rows[2].triangles)
+        monkeypatch.setattr("shearloop.daemon.analysis.charts.forwards.PAPER_TRIANGLES", rows[2].triangles)
         again = forwards(1, None, (0.4, 0.2), (0.2, 0.1))
         assert [row.error for row in again if row.family == "EIDORS"] == [rows[2].error]
 

@@ -10,11 +10,11 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from bench import stability_map, step_response, twin_step
-from bench.closed_loop import nanoseconds, run
-from bench.control_charts import draw_answers
-from bench.plant import LOAD_CELL, Plant, Sensor, Tool
-from daemon.control.controller import WristCommand
+from benchmarks import stability_map, step_response, twin_step
+from benchmarks.closed_loop import nanoseconds, run
+from benchmarks.control_charts import draw_answers
+from benchmarks.plant import LOAD_CELL, Plant, Sensor, Tool
+from shearloop.daemon.control.controller import WristCommand
 
 
 @pytest.fixture(autouse=True, scope="module")

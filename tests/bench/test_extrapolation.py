@@ -6,16 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.bank_file import Bank
-from bank.estimators import FrameSeries, Physics, fit
-from bench.charts import extrapolation
-from bench.charts.extrapolation import LARGER, SMALLER, Extrapolation, extrapolated, of_rows, parts
-from bench.charts.sources import Split, bank_of, own_fingertip, splits
-from bench.charts.stability import Level, curve
-from bench.charts.stability_picture import extrapolation_figure
-from daemon.recording.evaluation import follow, judge
-from daemon.reproduce.banks import Grid
-from daemon.workers import InTurn
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.estimation import FrameSeries, Physics, fit
+from shearloop.daemon.analysis.charts import extrapolation
+from shearloop.daemon.analysis.charts.extrapolation import (
+    LARGER,
+    SMALLER,
+    Extrapolation,
+    extrapolated,
+    of_rows,
+    parts,
+)
+from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
+from shearloop.daemon.analysis.charts.stability import Level, curve
+from shearloop.daemon.analysis.charts.stability_picture import extrapolation_figure
+from shearloop.daemon.analysis.evaluation import follow, judge
+from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.workers import SerialExecutor
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +79,7 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
     torque_nm[3] = np.nan
     whole = replace(some, torque_nm=torque_nm)
     split = Split("slices", whole.between(0, 30), whole.between(30, 40), whole)
-    found = extrapolated(split, ("regression",), bank, None, InTurn())
+    found = extrapolated(split, ("regression",), bank, None, SerialExecutor())
     assert [one.curve.fault for one in found] == [SMALLER, LARGER]
     assert capsys.readouterr().out.count("is left out") == 2
     known = np.delete(np.arange(40), 3)

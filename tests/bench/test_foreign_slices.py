@@ -6,9 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.estimators import fit
-from bench.charts.sources import Split, bank_of, own_fingertip, splits
-from bench.foreign_slices import (
+from benchmarks.foreign_slices import (
     CYLINDERS,
     FINGERTIPS,
     GOOD,
@@ -23,9 +21,11 @@ from bench.foreign_slices import (
     main,
     tables,
 )
-from daemon.recording.evaluation import follow, judge
-from daemon.reproduce.banks import Grid
-from daemon.synthetic import TwistProgramme
+from shearloop.bank.estimation import fit
+from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
+from shearloop.daemon.analysis.evaluation import follow, judge
+from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.synthetic import TwistProgramme
 
 # So long nothing is gripped in the synthetic stream.
 IDLE_S = TwistProgramme().idle_s

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.bank_file import BankDefinition, write_bank
-from bench.fused_loop import SETTLED_S, calibrated, held
-from bench.step_response import PERIOD_S, TARGET_NM
+from benchmarks.fused_loop import SETTLED_S, calibrated, held
+from benchmarks.step_response import PERIOD_S, TARGET_NM
+from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 
 
 @pytest.fixture(scope="module")

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from bank.bank_file import Bank, BankDefinition, write_bank
-from bench import peers
-from daemon.workers import InTurn
+from benchmarks import peers
+from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
+from shearloop.daemon.workers import SerialExecutor
 from tests.bank.conftest import small_fingertip
 
 
@@ -51,7 +51,7 @@ def test_two_processes_match_a_batch_as_one_does(bank, monkeypatch) -> None:
     frames = peers.frames_of(bank, None)[:5]
     parts: list[int] = []
 
-    class Counted(InTurn):
+    class Counted(SerialExecutor):
         def map(self, function, shared, items):
             parts.append(len(items))
             for number, found in super().map(function, shared, items):

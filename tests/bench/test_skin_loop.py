@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from bank.skin.calibration import SkinCalibration
-from bank.skin.calibration_file import load_calibration
-from bench import held_shear
-from bench.charts import limit_cycle
-from bench.held_shear import CALIBRATION, Case, SkinLoop, judge
-from daemon.config import load_daemon_config
-from daemon.config_file import load_yaml_model
-from daemon.experiment.machine import Phase
-from daemon.experiment.steps import ExperimentFile, HoldTorque
-from daemon.workers import InTurn
+from benchmarks import held_shear
+from benchmarks.held_shear import CALIBRATION, Case, SkinLoop, judge
+from shearloop.bank.skin.calibration import SkinCalibration
+from shearloop.bank.skin.calibration_file import load_calibration
+from shearloop.daemon.analysis.charts import limit_cycle
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control.experiment_schema import ExperimentFile, HoldTorqueStep
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.workers import SerialExecutor
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -64,7 +64,7 @@ def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_p
 
     loop.skin.resistances_ohm = drifting  # type: ignore[method-assign]
     said = loop.run(60.0)
-    assert said.startswith(Phase.STOPPED.value)
+    assert said.startswith(ExperimentPhase.STOPPED.value)
     assert max(loop.truth_n) < 2.0, "half of what the drift would have had it push by then"
 
 
@@ -75,7 +75,7 @@ def test_the_stability_chart_shows_the_limit_cycle(tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(limit_cycle, "over_delays", lambda: [replace(case, name="not told", band=False)])
     monkeypatch.setattr(held_shear, "SEEDS", 1)
     heard: list[str] = []
-    paths = limit_cycle.chart(tmp_path, InTurn(), "stability-skin", lambda held: heard.append(held.case.name))
+    paths = limit_cycle.chart(tmp_path, SerialExecutor(), "stability-skin", lambda held: heard.append(held.case.name))
     assert heard == ["told the band", "not told"]
     assert [path.name for path in paths] == ["stability-skin.json", "stability-skin.svg", "stability-skin.png"]
     told, not_told = json.loads(paths[0].read_text())["held"]
@@ -90,7 +90,7 @@ def test_the_demo_holds_the_force_that_it_says() -> None:
     assert config.experiment is not None
     assert config.skin.tool_radius_mm is not None
     file = load_yaml_model(config.experiment, ExperimentFile)
-    (hold,) = [step for step in file.steps if isinstance(step, HoldTorque)]
+    (hold,) = [step for step in file.steps if isinstance(step, HoldTorqueStep)]
     assert file.drive == "skin"
     assert hold.torque_nm / config.skin.tool_radius_mm * 1e3 == pytest.approx(1.0)
     assert [step.do for step in file.steps] == ["tare", "identify", "hold_torque"]

@@ -7,21 +7,21 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from bank.bank_file import Bank
-from bank.channels import CHANNELS
-from bank.estimators import Estimate, FrameSeries, Physics, Tracker
-from bank.estimators.twins import Twins
-from bench.charts.continuity import walks
-from bench.charts.detectability import detectability_figure, detected
-from bench.charts.faults import FAULTS, lost_channels
-from bench.charts.rims import at_rims
-from bench.charts.sources import Split, bank_of, own_fingertip, splits
-from bench.charts.stability import Level, balanced, curve, fitted, judged, scene_for, sweep
-from bench.charts.stability_chart import chart
-from bench.charts.stability_picture import continuity_figure, sweeps_figure
-from daemon.errors import UserError
-from daemon.reproduce.banks import Grid
-from daemon.workers import InTurn
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import CHANNELS
+from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics
+from shearloop.bank.estimation.reciprocity import ReciprocityCheck
+from shearloop.daemon.analysis.charts.continuity import walks
+from shearloop.daemon.analysis.charts.detectability import detectability_figure, detected
+from shearloop.daemon.analysis.charts.faults import FAULTS, lost_channels
+from shearloop.daemon.analysis.charts.rims import at_rims
+from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
+from shearloop.daemon.analysis.charts.stability import Level, balanced, curve, fitted, judged, scene_for, sweep
+from shearloop.daemon.analysis.charts.stability_chart import chart
+from shearloop.daemon.analysis.charts.stability_picture import continuity_figure, sweeps_figure
+from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.workers import SerialExecutor
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts,
     (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
     scene = scene_for(stream, bank)
     lost = next(fault for fault in FAULTS if fault.name == "lost electrodes, not told")
-    found = sweep(Tracker(calibration, bank), scene, lost)
+    found = sweep(EstimatorSession(calibration, bank), scene, lost)
     assert found.levels[0].valid > 0.7
     assert found.breaks_at is None
     assert found.levels[-1].valid == 0.0
@@ -136,7 +136,7 @@ def test_the_share_of_a_foreign_frame_that_passes_is_the_one_that_its_size_allow
         scaled = (frames[..., order].mean(axis=-2) - pairs.mean(axis=0)) / spread
         return scaled - scaled @ directions.T @ directions
 
-    limit = Twins.fit(past).largest_misfit
+    limit = ReciprocityCheck.fit(past).largest_misfit
     own = [one for one in found if one.kind == "another fingertip"]
     # What is off adds channel by channel: the two, in their shares.
     expected = [
@@ -158,5 +158,5 @@ def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
     slices = next(one for one in splits([], 0.6, tmp_path) if one.past.kind == "difference")
     one = Split(slices.title, slices.past.between(0, 1), slices.future, slices.whole)
     with pytest.raises(UserError, match="no estimator can be calibrated on it"):
-        chart([one], bank, own_fingertip(0.4).mesh(), tmp_path, tmp_path, InTurn())
+        chart([one], bank, own_fingertip(0.4).mesh(), tmp_path, tmp_path, SerialExecutor())
     assert "fused is left out" in capsys.readouterr().out

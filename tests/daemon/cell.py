@@ -7,18 +7,18 @@ from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
 
-from daemon.clock import Clock
-from daemon.experiment.machine import Phase
-from daemon.experiment.steps import ExperimentFile
-from daemon.experiment.wishes import GripTo
-from daemon.loop.brain import Brain, Orders
-from daemon.loop.senses import Hand
-from daemon.loop.tune import TuneSettings, tuned
-from daemon.loop.watch import WatchSettings
-from daemon.loop.wrist import Wrist, WristSettings
-from daemon.loop_task import WRENCH, LoopTask, wrench_source
-from drivers.ur.client import UrRobot
-from drivers.ur.messages import Command, Message, MoveLinear, Reply, RobotState, WristSpeed
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.fault_detection import MonitorSettings
+from shearloop.daemon.control.loop_inputs import GripperStatus
+from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
+from shearloop.daemon.control.step_commands import GripTo
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.control.tune import TuneSettings, tuned
+from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import Command, CommandReply, Message, MoveLinear, RobotState, WristSpeed
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
 
 SPEED_M_PER_S = 0.1
@@ -36,7 +36,7 @@ class Robot(UrRobot):
         # How many cycles a straight move goes on after it was told to stop, ever slower than a joint at rest.
         self.brakes_for = 0
         self.flight.fly(5)
-        self._held: list[tuple[Callable[[Reply], None], Reply]] = []
+        self._held: list[tuple[Callable[[CommandReply], None], CommandReply]] = []
         self._unread: list[tuple[int, Message]] = []
         # Of how many cycles the daemon needs one.
         self.of_cycles = 1
@@ -49,17 +49,17 @@ class Robot(UrRobot):
     def hurry(self) -> None:
         self.of_cycles = 1
 
-    def tell(self, command: Command, answered: Callable[[Reply], None]) -> None:
+    def tell(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
         self.hurry()
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
         if self.gone_for:
-            answered(Reply(refused="The robot is not connected."))
+            answered(CommandReply(refused="The robot is not connected."))
             return
         asyncio.get_running_loop().call_soon(self._obey, command, answered)
 
-    def _obey(self, command: Command, answered: Callable[[Reply], None]) -> None:
+    def _obey(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
         if isinstance(command, MoveLinear):
             self._goal = command
         reply = self.flight.ask(command)
@@ -75,7 +75,7 @@ class Robot(UrRobot):
         held, self._held, self._unread = self._held, [], []
         self._disconnected()
         for answered, _ in held:
-            answered(Reply(refused="The robot's process ended before it answered."))
+            answered(CommandReply(refused="The robot's process ended before it answered."))
 
     def cycle(self, *, read: bool = True) -> None:
         """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""
@@ -177,14 +177,14 @@ class Cell:
     def __init__(self) -> None:
         self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
         source = wrench_source(SETTINGS.rate_hz)
-        wrist = Wrist(source, WristSettings(), partial(tuned, TuneSettings()))
-        self.brain = Brain({WRENCH: wrist}, WatchSettings(), {WRENCH: source}, ("robot",))
+        wrist = WristController(source, WristSettings(), partial(tuned, TuneSettings()))
+        self.brain = ControlLoop({WRENCH: wrist}, MonitorSettings(), {WRENCH: source}, ("robot",))
         self.died: Mapping[str, str] = {}
 
         async def no_zero() -> str:
             return ""
 
-        self.loop = LoopTask(
+        self.loop = ControlLoopRunner(
             self.brain,
             self.robot,
             self.gripper,  # type: ignore[arg-type]
@@ -200,7 +200,7 @@ class Cell:
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):
-            self.brain.senses.hand = Hand(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
+            self.brain.senses.hand = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
             self.robot.cycle()
             # A state is sensed, decided upon and answered within a few turns of the event loop.
             for _ in range(8):
@@ -216,12 +216,12 @@ class Cell:
     async def until_ended(self, most: int = 500) -> None:
         for _ in range(most):
             await self.cycles(1)
-            if self.phase not in (Phase.RUNNING, Phase.PAUSED):
+            if self.phase not in (ExperimentPhase.RUNNING, ExperimentPhase.PAUSED):
                 return
         raise AssertionError("the experiment goes on and on")
 
     @property
-    def phase(self) -> Phase:
+    def phase(self) -> ExperimentPhase:
         assert self.brain.experiment is not None
         return self.brain.experiment.phase
 
@@ -235,7 +235,7 @@ class Cell:
         return self.robot.flight.state
 
 
-def no_tick(_t_ns: int) -> Orders:
+def no_tick(_t_ns: int) -> ControlOutput:
     """Die, in place of the brain's `tick`."""
     raise ZeroDivisionError("a tick went wrong")
 

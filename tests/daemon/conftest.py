@@ -12,8 +12,8 @@ import structlog
 import yaml
 import zmq
 
-from bank.bank_file import Bank, BankDefinition, write_bank
-from bank.calibration import Calibration
+from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
+from shearloop.bank.eit.calibration import Calibration
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60
@@ -115,7 +115,7 @@ async def shearloop(*arguments: str, stdin: int | None = None) -> AsyncIterator[
     """Run a command as a process of its own; it is ended at the end, whatever becomes of the test."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
-        *("-m", "daemon", *arguments),
+        *("-m", "shearloop", *arguments),
         stdin=stdin,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,

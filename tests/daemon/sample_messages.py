@@ -6,7 +6,7 @@ from typing import Any, get_type_hints
 
 import numpy as np
 
-from daemon.messages import Message
+from shearloop.daemon.messaging.messages import Message
 
 
 def sample(kind: type[Message]) -> Message:

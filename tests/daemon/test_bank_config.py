@@ -6,11 +6,11 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from bank.errors import GeometryError
-from bank.forward import ForwardModel
-from bank.models import MODELS
-from daemon.bank_config import GridConfig, ModelName, load_bank_plan, load_bank_plans, load_geometry
-from daemon.errors import UserError
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.models import MODELS
+from shearloop.bank.errors import GeometryError
+from shearloop.daemon.bank_config import GridConfig, ModelName, load_bank_plan, load_bank_plans, load_geometry
+from shearloop.daemon.errors import UserError
 
 CONFIG = Path(__file__).parents[2] / "config"
 
@@ -58,7 +58,7 @@ def test_the_papers_fingertip_gives_the_papers_voltages_within_the_error_of_its_
 
 
 def test_the_papers_electrodes_are_where_the_papers_mesh_has_them(shared):
-    from bank.mesh import load_mesh
+    from shearloop.bank.eit.mesh import load_mesh
 
     ours = load_geometry(CONFIG / "fingertips" / "paper.yaml")
     theirs = load_mesh(shared / "reference" / "fingertip_mesh.npz")

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from drivers.calibration_file import load_calibration
-from drivers.hx711 import LoadCalibration
-from drivers.robotiq.width import WidthCalibration
+from shearloop.drivers.calibration_file import load_calibration
+from shearloop.drivers.hx711 import LoadCalibration
+from shearloop.drivers.robotiq.width import WidthCalibration
 
-SHEARLOOP = (sys.executable, "-m", "daemon")
+SHEARLOOP = (sys.executable, "-m", "shearloop")
 COUNTS_PER_NM = 420e3 / (9.80665 * 0.035)
 
 
@@ -175,7 +175,7 @@ def test_a_mistake_ends_in_one_sentence(
     capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from daemon.cli import main
+    from shearloop.daemon.cli import main
 
     monkeypatch.chdir(tmp_path)
     assert main(["calibrate", *arguments]) == 2
@@ -225,7 +225,7 @@ def test_the_end_of_the_input_ends_the_calibration_with_a_sentence(tmp_path: Pat
 def test_an_emulator_that_cannot_be_played_says_why(
     arguments: tuple[str, ...], said: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    from daemon.cli import main
+    from shearloop.daemon.cli import main
 
     assert main(["emulate", *arguments]) == 2
     assert said in capfd.readouterr().err

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.estimators import Estimate, FrameSeries
-from daemon.cli import main
-from daemon.config import CreepConfig
-from daemon.recording.evaluation import Track
-from daemon.recording.grips import grips_of
+from shearloop.bank.estimation import Estimate, FrameSeries
+from shearloop.daemon.analysis.evaluation import EstimateTrack
+from shearloop.daemon.analysis.grips import grips_of
+from shearloop.daemon.cli import main
+from shearloop.daemon.config import CreepConfig
 from tests.daemon.control.test_creep import twisted
 
 
-def track(valid: np.ndarray | None = None) -> Track:
+def track(valid: np.ndarray | None = None) -> EstimateTrack:
     """Return estimates that see the shear of the rig's gel, beside its torque."""
     times, shears, torques = twisted(600.0, 0.002)
     valid = np.ones(times.size, bool) if valid is None else valid
@@ -27,7 +27,7 @@ def track(valid: np.ndarray | None = None) -> Track:
         else Estimate(valid=False)
         for shear, good in zip(shears, valid, strict=True)
     ]
-    return Track(series, tuple(estimates), np.zeros(times.size))
+    return EstimateTrack(series, tuple(estimates), np.zeros(times.size))
 
 
 def test_a_grip_is_a_stretch_of_torques_and_single_frames_do_not_end_it() -> None:
@@ -50,9 +50,9 @@ def test_it_prints_the_line_of_the_configuration(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     found = track()
-    monkeypatch.setattr("bank.estimators.Calibration.load", lambda _: Loaded())
-    monkeypatch.setattr("daemon.recording.series.read_series", lambda *_: [found.series])
-    monkeypatch.setattr("daemon.recording.evaluation.follow", lambda *_: found)
+    monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
+    monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
+    monkeypatch.setattr("shearloop.daemon.analysis.evaluation.follow", lambda *_: found)
     arguments = ["calibrate", "creep", str(tmp_path / "held.mcap"), "--calibration", "right.cal"]
     assert main([*arguments, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -71,9 +71,9 @@ def test_a_recording_without_held_twists_is_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = track(np.arange(1109) < 10)
-    monkeypatch.setattr("bank.estimators.Calibration.load", lambda _: Loaded())
-    monkeypatch.setattr("daemon.recording.series.read_series", lambda *_: [found.series])
-    monkeypatch.setattr("daemon.recording.evaluation.follow", lambda *_: found)
+    monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
+    monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
+    monkeypatch.setattr("shearloop.daemon.analysis.evaluation.follow", lambda *_: found)
     assert main(["calibrate", "creep", "held.mcap", "--calibration", "right.cal"]) == 2
     assert "10 readings are too few to learn it from; hold a twist for a minute" in capsys.readouterr().err
 
@@ -81,8 +81,8 @@ def test_a_recording_without_held_twists_is_refused(
 def test_twists_that_are_given_twice_are_refused(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("bank.estimators.Calibration.load", lambda _: Loaded())
-    monkeypatch.setattr("daemon.recording.series.read_series", lambda *_: [track().series])
+    monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
+    monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [track().series])
     told_of = {"held.mcap": "is given twice; name it once", "copy.mcap": "holds exactly what held.mcap does"}
     for copy, told in told_of.items():
         assert main(["calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal"]) == 2

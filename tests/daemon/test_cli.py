@@ -17,19 +17,19 @@ import pytest
 import yaml
 import zmq.asyncio
 
-from bank.bank_file import Bank
-from bank.calibration import Calibration
-from bank.models import MODELS
-from daemon.app import Daemon
-from daemon.cli import COMMANDS, main
-from daemon.cli.bank.build import MODELS as MODELS_IN_HELP
-from daemon.cli.completion import whole_parser
-from daemon.cli.readable import as_json, as_line
-from daemon.config import TAKEN_NAMES, load_daemon_config
-from daemon.eit.both import BOTH
-from daemon.loop_task import WRENCH
-from daemon.messages import decode, encode
-from daemon.skin.task import SKIN
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.eit.models import MODELS
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli import COMMANDS, main
+from shearloop.daemon.cli.bank.build import MODELS as MODELS_IN_HELP
+from shearloop.daemon.cli.completion import whole_parser
+from shearloop.daemon.cli.readable import as_json, as_line
+from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
+from shearloop.daemon.control.runner import WRENCH
+from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.skin_task import SKIN
 
 Write = Callable[..., Path]
 
@@ -138,7 +138,7 @@ def test_a_calibration_of_another_bank_is_refused_by_name(
 ) -> None:
     import numpy as np
 
-    from bank.calibration import Calibration
+    from shearloop.bank.eit.calibration import Calibration
 
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)
@@ -198,10 +198,10 @@ def test_what_a_signal_interrupts_says_so_except_listening_which_ends_so(
         signal.raise_signal(number)
         raise AssertionError
 
-    monkeypatch.setattr("daemon.cli.evaluate.run", interrupted)
+    monkeypatch.setattr("shearloop.daemon.cli.evaluate.run", interrupted)
     assert main(["evaluate", "a.cal", "b.mcap"]) == status
     assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
-    monkeypatch.setattr("daemon.wire.subscriber.messages", interrupted)
+    monkeypatch.setattr("shearloop.daemon.messaging.subscriber.messages", interrupted)
     assert main(["listen"]) == status
     assert capsys.readouterr() == ("", "")
 
@@ -213,7 +213,7 @@ def test_at_the_end_of_the_terminal_a_sentence_that_goes_nowhere_is_no_traceback
         monkeypatch.setattr(sys.stderr, "write", Mock(side_effect=OSError(5, "Input/output error")))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("daemon.cli.evaluate.run", interrupted)
+    monkeypatch.setattr("shearloop.daemon.cli.evaluate.run", interrupted)
     assert main(["evaluate", "a.cal", "b.mcap"]) == 130
     assert capsys.readouterr() == ("", "")
 
@@ -230,7 +230,7 @@ def test_a_signal_in_what_compiled_code_calls_is_not_lost(
         threading.Event().wait(10)
         return 0
 
-    monkeypatch.setattr("daemon.cli.evaluate.run", loads)
+    monkeypatch.setattr("shearloop.daemon.cli.evaluate.run", loads)
     assert main(["evaluate", "a.cal", "b.mcap"]) == status
     assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
 
@@ -293,7 +293,7 @@ def test_an_unknown_command_is_refused_with_those_that_there_are(capsys: pytest.
 def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
     heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml")
     program = (
-        "import sys; from daemon.cli import main\n"
+        "import sys; from shearloop.daemon.cli import main\n"
         f"try: main({arguments!r})\nexcept SystemExit: pass\n"
         f"print(*[name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
     )
@@ -369,7 +369,7 @@ def test_unlocking_is_waited_for_and_an_absent_daemon_is_told_at_once(
         asked.append((content["command"], timeout_s))
         return {"ok": True}
 
-    monkeypatch.setattr("daemon.wire.request.request", answers)
+    monkeypatch.setattr("shearloop.daemon.messaging.request.request", answers)
     assert main(["command", "unlock"]) == 0
     assert main(["command", "unlock", "--timeout", "5"]) == 0
     assert main(["command", "stop"]) == 0

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.bank_file import Bank
-from bank.forward import ForwardModel
-from bank.journal import RowJournal
-from bank.mesh import load_mesh
-from bank.models import conductivity
-from daemon.bank_config import load_bank_plans
-from daemon.cli import main
-from daemon.cli.bank import build as build_command
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.journal import RowJournal
+from shearloop.bank.eit.mesh import load_mesh
+from shearloop.bank.eit.models import conductivity
+from shearloop.daemon.bank_config import load_bank_plans
+from shearloop.daemon.cli import main
+from shearloop.daemon.cli.bank import build as build_command
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 
 SOLVE = ["solve", "--mesh", "{folder}/tip.yaml", "--model", "step", "--k", "1", "--sigma", "1", "--out", "{folder}/v"]
@@ -314,7 +314,7 @@ def test_mistakes_of_the_others_are_one_sentence(folder, capsys, arguments, part
 
 
 def test_help_comes_without_loading_what_is_heavy():
-    script = "import sys; from daemon.cli import main\ntry: main(['bank', 'build', '--help'])\nfinally: "
+    script = "import sys; from shearloop.daemon.cli import main\ntry: main(['bank', 'build', '--help'])\nfinally: "
     script += "print(sorted({'numpy', 'scipy', 'pydantic', 'skfem', 'matplotlib', 'tqdm'} & set(sys.modules)))"
     root = Path(__file__).parents[2]
     done = subprocess.run([sys.executable, "-c", script], cwd=root, capture_output=True, text=True, check=True)
@@ -336,7 +336,7 @@ def test_a_bank_is_of_the_mesh_file_that_the_configuration_names(fingertip_file,
 
 @pytest.fixture
 def fingertip_file(folder, tmp_path):
-    from daemon.bank_config import load_geometry
+    from shearloop.daemon.bank_config import load_geometry
 
     mesh = load_geometry(folder / "tip.yaml").refined()
     names = ("nodes", "triangles", "electrode_edges", "electrode_of_edge", "contact_impedance")

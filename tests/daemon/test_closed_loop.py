@@ -13,15 +13,15 @@ import yaml
 import zmq.asyncio
 from aiohttp import web
 
-from bank.bank_file import Bank
-from bank.calibration import Calibration
-from daemon.app import Daemon
-from daemon.config import load_daemon_config
-from daemon.run_summary import RunSummary
-from daemon.view.bridge import Bridge, Place
-from daemon.view.latest import Latest
-from daemon.view.server import make_app
-from daemon.wire.request import request
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.calibration import Calibration
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.messaging.request import request
+from shearloop.daemon.run_summary import RunSummary
+from shearloop.daemon.web.bridge import Bridge, Place
+from shearloop.daemon.web.latest import Latest
+from shearloop.daemon.web.server import make_app
 from tests.daemon.conftest import DEADLINE_S, Log, shearloop
 from tests.emulator_process import own_address
 

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 import zmq.asyncio
 
-from daemon import app
-from daemon.app import Daemon
-from daemon.cli import main
-from daemon.collector import kept_from_lasting_objects
-from daemon.config import load_daemon_config
+from shearloop.daemon import app
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli import main
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.gc_control import kept_from_lasting_objects
 
 
 class Cycle:

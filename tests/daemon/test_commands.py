@@ -16,18 +16,18 @@ import zmq.asyncio
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.app import Daemon
-from daemon.clock import Clock
-from daemon.commands import Commands
-from daemon.config import load_daemon_config
-from daemon.errors import UserError
-from daemon.messages import decode, encode
-from daemon.rig import Rig
-from daemon.wire.command_server import CommandRefusedError, CommandServer
-from daemon.wire.publisher import Publisher
-from daemon.wire.rate_limit import RateLimit
-from daemon.wire.request import request
-from daemon.wire.subscriber import messages
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.commands import Commands
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
+from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.rate_limit import RateLimit
+from shearloop.daemon.messaging.request import request
+from shearloop.daemon.messaging.subscriber import messages
+from shearloop.daemon.rig import Rig
 
 
 def handlers() -> Mapping[str, Any]:

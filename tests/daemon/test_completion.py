@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import COMMANDS, main
-from daemon.cli.completion import whole_parser
+from shearloop.daemon.cli import COMMANDS, main
+from shearloop.daemon.cli.completion import whole_parser
 
 
 def completed(script: Path, *words: str) -> set[str]:

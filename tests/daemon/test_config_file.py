@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, ValidationError, model_validator
 
-from daemon.config_file import ConfigModel, load_yaml_model
-from daemon.errors import UserError
-from daemon.experiment.steps import ExperimentFile
+from shearloop.daemon.config_file import ConfigModel, load_yaml_model
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.errors import UserError
 
 
 class Inner(ConfigModel):

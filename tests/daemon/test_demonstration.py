@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from daemon.cli.demonstration import Deaths, Happenings, Truth
-from daemon.config import Emulator
-from daemon.config_file import load_yaml_model
+from shearloop.daemon.cli.demonstration import Deaths, Happenings, Truth
+from shearloop.daemon.config import EmulatorConfig
+from shearloop.daemon.config_file import load_yaml_model
 
 S = 1_000_000_000
 
 
-def emulator(**changes: Any) -> Emulator:
-    return Emulator.model_validate({"device": "rig", **changes})
+def emulator(**changes: Any) -> EmulatorConfig:
+    return EmulatorConfig.model_validate({"device": "rig", **changes})
 
 
 def held(t_s: float, step: int = 7, hold: int = 1, phase: str = "running") -> dict[str, Any]:
@@ -105,4 +105,4 @@ def test_a_happening_of_two_lines_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "emulator.yaml"
     path.write_text('device: rig\nhappenings: [{step: 1, say: "slip\\nkick 3"}]\n')
     with pytest.raises(Exception, match="say"):
-        load_yaml_model(path, Emulator)
+        load_yaml_model(path, EmulatorConfig)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import COMMANDS
-from daemon.cli.completion import whole_parser
+from shearloop.daemon.cli import COMMANDS
+from shearloop.daemon.cli.completion import whole_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]

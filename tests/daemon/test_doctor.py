@@ -10,16 +10,16 @@ from typing import Any
 import pytest
 import yaml
 
-from daemon.cli import main
-from daemon.doctor import machine
-from daemon.doctor.devices import channels_finding, rate_finding
-from daemon.doctor.examination import examine, ports_finding
-from daemon.doctor.files import bank_finding, keys_finding
-from daemon.doctor.finding import Finding, from_sentence
-from daemon.doctor.live import task_finding
-from daemon.ports import PortThere
-from daemon.wire.keys import make_key_pair
-from daemon.wire.subscriber import messages
+from shearloop.daemon.cli import main
+from shearloop.daemon.doctor import machine
+from shearloop.daemon.doctor.devices import channels_finding, rate_finding
+from shearloop.daemon.doctor.examination import examine, ports_finding
+from shearloop.daemon.doctor.files import bank_finding, keys_finding
+from shearloop.daemon.doctor.finding import Finding, from_sentence
+from shearloop.daemon.doctor.live import task_finding
+from shearloop.daemon.messaging.keys import make_key_pair
+from shearloop.daemon.messaging.subscriber import messages
+from shearloop.daemon.ports import PortThere
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
@@ -151,7 +151,7 @@ def test_rates_and_channels() -> None:
 
 
 def test_a_bank_of_another_geometry_is_told(config: Write) -> None:
-    from daemon.config import load_daemon_config
+    from shearloop.daemon.config import load_daemon_config
 
     fingertip = load_daemon_config(config()).fingertips["right"]
     assert bank_finding("right", fingertip).state == "good"
@@ -161,7 +161,7 @@ def test_a_bank_of_another_geometry_is_told(config: Write) -> None:
 
 
 def test_a_secret_key_that_others_can_read_is_told(tmp_path: Path) -> None:
-    from daemon.config import CurveConfig
+    from shearloop.daemon.config import CurveConfig
 
     _, secret = make_key_pair(tmp_path, "server")
     (tmp_path / "clients").mkdir()
@@ -195,7 +195,7 @@ def test_ports_are_listed_with_what_a_configuration_names_them_by(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there: list[Any] = []
-    monkeypatch.setattr("daemon.ports.sorted", lambda ports: ports, raising=False)
+    monkeypatch.setattr("shearloop.daemon.ports.sorted", lambda ports: ports, raising=False)
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: there)
     assert main(["ports"]) == 0
     assert "no serial port is there" in capsys.readouterr().out
@@ -219,6 +219,6 @@ def test_each_port_that_is_denied_is_told_with_its_own_trouble(monkeypatch: pyte
         port("/dev/ttyUSB0", "another program holds it"),
         port("/dev/ttyUSB1", "no right"),
     ]
-    monkeypatch.setattr("daemon.doctor.examination.ports_there", lambda: there)
+    monkeypatch.setattr("shearloop.daemon.doctor.examination.ports_there", lambda: there)
     found = ports_finding()
     assert (found.state, found.means) == ("note", "/dev/ttyUSB0: another program holds it; /dev/ttyUSB1: no right")

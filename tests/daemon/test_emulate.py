@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bank.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
-from daemon.cli import EXIT_USAGE, main
-from drivers.eit_format import ADC_STEP_V
-from drivers.eit_kit import EitKit, Frame
+from shearloop.bank.eit.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
+from shearloop.daemon.cli import EXIT_USAGE, main
+from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import EitKit, Frame
 
 # Guards against a test that hangs; none of them waits for so long.
 DEADLINE_S = 60
@@ -25,7 +25,7 @@ async def emulator(*arguments: str) -> AsyncIterator[tuple[asyncio.subprocess.Pr
     """Run `shearloop emulate eit-kit` as a process of its own and hand over the path that it prints."""
     process = await asyncio.create_subprocess_exec(
         sys.executable,
-        *("-m", "daemon", "emulate", "eit-kit", *arguments),
+        *("-m", "shearloop", "emulate", "eit-kit", *arguments),
         stdin=asyncio.subprocess.PIPE,
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.PIPE,
@@ -130,7 +130,7 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
 
 
 async def test_twists_are_synthesised_from_a_bank(tmp_path: Path) -> None:
-    from bank.bank_file import BankDefinition, write_bank
+    from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 
     definition = BankDefinition("0" * 64, "gaussian_derivative", np.array([3.0, 3.5]), np.array([1.0, 2.0]))
     homogeneous = 0.5 * np.sin(CHANNELS @ [0.1, 0.2, 0.3, 0.4]) + 0.7
@@ -188,7 +188,7 @@ def test_a_mistake_is_one_sentence_and_status_two(
 
 
 def test_help_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
-    from drivers.emulators.eit_kit import FaultKind
+    from shearloop.drivers.emulators.eit_kit import FaultKind
 
     with pytest.raises(SystemExit) as ended:
         main(["emulate", "eit-kit", "--help"])
@@ -202,7 +202,7 @@ def test_the_command_runs_without_a_terminal(tmp_path: Path) -> None:
 
     path, _ = recording(tmp_path, 1)
     with subprocess.Popen(
-        [sys.executable, "-m", "daemon", "emulate", "eit-kit", "--recording", str(path)],
+        [sys.executable, "-m", "shearloop", "emulate", "eit-kit", "--recording", str(path)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
     ) as process:

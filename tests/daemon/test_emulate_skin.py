@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.cli import main
-from daemon.cli.emulated.skin_push import PushedSkin
-from drivers.emulators.rig import Rig, RigSettings, RigSkin
-from drivers.serial_port import Link, SerialLink
-from drivers.shear_skin.adc_board import AdcBoard
-from drivers.shear_skin.daq import Daq
-from drivers.shear_skin.judge import Fault, SkinSample
-from drivers.shear_skin.scanner import ScpiScanner
-from drivers.shear_skin.skin import ShearSkin
-from drivers.shear_skin.source import Keithley6430
-from drivers.tcp_port import TcpLink
+from shearloop.daemon.cli import main
+from shearloop.daemon.cli.emulated.skin_push import PushedSkin
+from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
+from shearloop.drivers.serial_port import Link, SerialLink
+from shearloop.drivers.shear_skin.adc_board import AdcBoard
+from shearloop.drivers.shear_skin.daq import Daq
+from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
+from shearloop.drivers.shear_skin.scanner import ScpiScanner
+from shearloop.drivers.shear_skin.skin import ShearSkin
+from shearloop.drivers.shear_skin.source import Keithley6430
+from shearloop.drivers.tcp_port import TcpLink
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 SPEED = 20
@@ -58,7 +58,7 @@ async def read(source: Link, daq: Daq) -> AsyncIterator["asyncio.Queue[SkinSampl
         await asyncio.wait(tasks)
 
 
-async def until(queue: "asyncio.Queue[SkinSample]", *faults: Fault, r1_ohm: float | None = None) -> SkinSample:
+async def until(queue: "asyncio.Queue[SkinSample]", *faults: SkinFault, r1_ohm: float | None = None) -> SkinSample:
     async with asyncio.timeout(DEADLINE_S):
         while True:
             sample = await queue.get()
@@ -78,7 +78,7 @@ async def test_both_instruments_tied_by_one_skin_are_read_and_obey(tmp_path: Pat
             # 0.5 N beyond the deadband, less what friction keeps on the way to the gauge.
             await until(samples, r1_ohm=24.6 * (1 + 0.088 * 0.5 / np.exp(0.04 * np.radians(60.7))))
             await told(process, "open 1")
-            await until(samples, Fault.COMPLIANCE, Fault.OPEN_1)
+            await until(samples, SkinFault.COMPLIANCE, SkinFault.OPEN_1)
             await told(process, "nonsense")
             await told(process, "normal")
             await until(samples)
@@ -99,10 +99,10 @@ async def test_source_and_scanner_are_played_alone_too() -> None:
         async with read(tcp(await line(source)), scanner) as samples:
             await until(samples, r1_ohm=24.6)
             await told(daq, "short 2")
-            await until(samples, Fault.SHORT_2)
+            await until(samples, SkinFault.SHORT_2)
             await told(daq, "mend")
             await told(source, "leads 1000")
-            await until(samples, Fault.COMPLIANCE)
+            await until(samples, SkinFault.COMPLIANCE)
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_mistakes_on_the_command_line_are_sentences(
 def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
     pushed = PushedSkin()
     skin = RigSkin(lambda nm, gripped: pushed.gripped(nm, gripped=gripped, lever_m=0.02), pushed.resistances_ohm)
-    rig = Rig(RigSettings(run_dir=tmp_path, skin=True), lambda *_: np.zeros(1024), skin=skin)
+    rig = EmulatedRig(RigSettings(run_dir=tmp_path, skin=True), lambda *_: np.zeros(1024), skin=skin)
     robot, gripper = rig.controller.robot, rig.scene.gripper
 
     def pass_s(seconds: float) -> None:

@@ -2,7 +2,7 @@
 
 import pytest
 
-from daemon.cli import main
+from shearloop.daemon.cli import main
 
 
 @pytest.mark.parametrize(

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from daemon import collector
-from daemon.cli import main, run
-from daemon.ending_signals import ending_signals
+from shearloop.daemon import gc_control as collector
+from shearloop.daemon.cli import main, run
+from shearloop.daemon.ending_signals import ending_signals
 from tests.daemon.conftest import DEADLINE_S
 
 

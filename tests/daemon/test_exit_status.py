@@ -10,12 +10,12 @@ import pytest
 import yaml
 import zmq.asyncio
 
-from daemon.app import Daemon
-from daemon.begun_mark import BegunMark
-from daemon.config import load_daemon_config
-from daemon.configured_experiment import ConfiguredExperiment
-from daemon.errors import UserError
-from daemon.experiment.machine import Phase
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.crash_marker import CrashMarker
+from shearloop.daemon.errors import UserError
 from tests.daemon.conftest import Log, deadline, shearloop
 from tests.emulator_process import own_address
 
@@ -62,19 +62,19 @@ async def ended(path: Path, log: Log, *, once: str) -> Daemon:
 
 
 async def done_experiment() -> SimpleNamespace:
-    return SimpleNamespace(phase=Phase.DONE, why="")
+    return SimpleNamespace(phase=ExperimentPhase.DONE, why="")
 
 
 async def test_after_a_crash_no_experiment_begins_by_itself(
     waiting_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Log
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    crashed = BegunMark()
+    crashed = CrashMarker()
     assert not crashed.left_behind
     crashed.set()
     assert not (await ended(waiting_config, log, once=LEFT_TO_OPERATOR)).finished
     assert any("died after it had begun an experiment" in one for one in log.said)
-    assert not BegunMark().left_behind, "this one ended in good order"
+    assert not CrashMarker().left_behind, "this one ended in good order"
 
 
 @pytest.mark.parametrize(("own", "finished"), [(True, True), (False, False)])
@@ -117,7 +117,7 @@ async def test_an_experiment_that_is_begun_by_hand_after_all_is_seen_to_its_end(
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     if crashed:
-        BegunMark().set()
+        CrashMarker().set()
     path = tmp_path / "experiment.yaml"
 
     async def not_yet(_path: Path) -> str | None:
@@ -162,12 +162,12 @@ async def test_what_was_called_off_stays_so_when_its_task_dies(by: str, tmp_path
 
 def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
-    mark = BegunMark()
+    mark = CrashMarker()
     mark.set()
     mark.clear()
-    assert not BegunMark().left_behind
+    assert not CrashMarker().left_behind
 
 
 def test_a_mark_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    BegunMark({"RUNTIME_DIRECTORY": str(tmp_path / "nowhere")}).set()
+    CrashMarker({"RUNTIME_DIRECTORY": str(tmp_path / "nowhere")}).set()
     assert "there is no mark of this one" in capsys.readouterr().out

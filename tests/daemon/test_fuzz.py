@@ -13,14 +13,14 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from daemon.app import Daemon
-from daemon.config import load_daemon_config
-from daemon.health import resident_memory_mb
-from daemon.messages import decode, encode
-from daemon.wire.command_server import MOST_AT_ONCE
-from daemon.wire.rate_limit import ALL_BURST, ALL_PER_S, PER_CLIENT_BURST, PER_CLIENT_PER_S, RateLimit
-from drivers.ur.client import UrRobot
-from drivers.ur.messages import Reply
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.health import resident_memory_mb
+from shearloop.daemon.messaging.command_server import MOST_AT_ONCE
+from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.rate_limit import ALL_BURST, ALL_PER_S, PER_CLIENT_BURST, PER_CLIENT_PER_S, RateLimit
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import CommandReply
 
 FRAMES = REQUESTS = 50_000
 DEADLINE_S = 120
@@ -90,9 +90,9 @@ class Arm:
         async def waits(_robot: UrRobot) -> Any:
             await asyncio.Event().wait()
 
-        async def send(_robot: UrRobot, command: Any) -> Reply:
+        async def send(_robot: UrRobot, command: Any) -> CommandReply:
             arm.told.append(command)
-            return Reply()
+            return CommandReply()
 
         monkeypatch.setattr(UrRobot, "run", waits)
         monkeypatch.setattr(UrRobot, "next_state", waits)

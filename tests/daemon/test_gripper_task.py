@@ -6,12 +6,12 @@ from typing import Any
 
 import pytest
 
-from bank.gaussian import TWO_SIDED_95
-from daemon import gripper_task
-from daemon.experiment.wishes import GripTo
-from daemon.gripper_task import GripperTask
-from daemon.loop.senses import Hand
-from daemon.loop.watch import HAND_STALE_S
+from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.daemon.control import gripper_task
+from shearloop.daemon.control.fault_detection import HAND_STALE_S
+from shearloop.daemon.control.gripper_task import GripperTask
+from shearloop.daemon.control.loop_inputs import GripperStatus
+from shearloop.daemon.control.step_commands import GripTo
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 
@@ -54,7 +54,7 @@ async def test_a_grip_that_is_broken_off_in_the_middle_of_an_exchange_is_opened_
 @WAYS
 async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig, asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as tasks:
-        felt: list[Hand] = []
+        felt: list[GripperStatus] = []
         publisher: Any = Silent()
         task = GripperTask(rig.driver, publisher, felt.append)
         read = tasks.create_task(task.read())

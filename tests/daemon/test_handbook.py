@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.clock import Clock
-from daemon.handbook.pages import ROOT, pages
-from daemon.handbook.sentences import raised, split, told
-from daemon.handbook.troubleshooting_page import CURES, SECTIONS, cure_of, troubleshooting_page
-from daemon.messages import EitEstimate, EitFrame
-from daemon.safety import TABLE
-from daemon.topics import TOPICS
-from daemon.wire.addresses import PUBLISH_ADDRESS
-from daemon.wire.publisher import Publisher
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.safety import TABLE
+from shearloop.daemon.docgen.pages import ROOT, pages
+from shearloop.daemon.docgen.sentences import raised, split, told
+from shearloop.daemon.docgen.troubleshooting_page import CURES, SECTIONS, cure_of, troubleshooting_page
+from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.messaging.messages import EitEstimate, EitFrame
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.topics import TOPICS
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.sample_messages import sample
 

@@ -9,21 +9,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from daemon.loop_actions import along_tool
+from shearloop.daemon.control.actions import along_tool
 
 # Each costs tens of megabytes and tenths of a second, and none is needed to run.
 HEAVY = ("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.interpolate", "skfem", "numba", "matplotlib")
 
 
 def test_the_daemon_starts_without_what_only_other_commands_need() -> None:
-    says = f"import sys, daemon.app; print([name for name in {HEAVY} if name in sys.modules])"
+    says = f"import sys, shearloop.daemon.app; print([name for name in {HEAVY} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 
 
 def test_help_loads_neither_numpy_nor_pydantic() -> None:
     says = (
-        "import sys\nfrom daemon.cli import main\n"
+        "import sys\nfrom shearloop.daemon.cli import main\n"
         "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
         "print('loaded:', [name for name in ('numpy', 'pydantic', 'zmq') if name in sys.modules])"
     )

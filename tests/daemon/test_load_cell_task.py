@@ -4,10 +4,10 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from daemon.clock import Clock
-from daemon.load_cell_task import ZERO_DEADLINE_S, ZERO_SAMPLES, LoadCellTask
-from daemon.messages import LoadTorque
-from drivers.hx711 import LoadSample
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import LoadTorque
+from shearloop.daemon.sensing.load_cell_task import ZERO_DEADLINE_S, ZERO_SAMPLES, LoadCellTask
+from shearloop.drivers.hx711 import LoadSample
 
 
 class Board:

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.experiment.machine import Phase
-from daemon.experiment.steps import ExperimentFile
-from daemon.loop.senses import Torque
-from daemon.loop_task import WRENCH
-from daemon.safety import Response
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.runner import WRENCH
+from shearloop.daemon.control.safety import Response
+from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.cell import SPEED_M_PER_S, Cell, driven
 
 TURN = {"do": "turn_to", "angle_rad": 0.5}
@@ -48,7 +48,9 @@ class Story:
 
     def look(self) -> None:
         experiment, verdict = self.cell.brain.experiment, self.cell.brain.standing.verdict
-        runs = experiment is not None and experiment.phase is Phase.RUNNING and verdict.response is Response.NOTE
+        runs = (
+            experiment is not None and experiment.phase is ExperimentPhase.RUNNING and verdict.response is Response.NOTE
+        )
         self.idle = 0 if runs and not self.dead and self.arm.reading.age_ns < 1e8 else self.idle + 1
         self.excused = max(0, self.excused - 1)
         moves = self.arm.reading.fastest_rad_per_s > 0 or self.arm.reading.moving_linearly
@@ -93,7 +95,7 @@ class Story:
 
     def beyond(self) -> None:
         now_ns = self.cell.robot.flight.now_ns
-        self.cell.brain.hear(Torque(WRENCH, 0.9, "", now_ns, now_ns))
+        self.cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
 
     def process_dies(self) -> None:
         self.cell.robot.die(50)

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from daemon.experiment.machine import Phase
-from daemon.safety import Event, Trouble
+from shearloop.daemon.control.safety import Fault, FaultCode
+from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.cell import driven
 from tests.drivers.ur.flight import CYCLE_NS
 
@@ -26,7 +26,7 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
 
         monkeypatch.setattr(cell.brain, "tick", at_length)
         await cell.cycles(2)
-        assert Event.LOOP_LATE in [trouble.event for trouble in cell.brain.standing.verdict.troubles]
+        assert FaultCode.LOOP_LATE in [trouble.event for trouble in cell.brain.standing.verdict.troubles]
 
 
 @pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2), (12, 1)])
@@ -38,7 +38,7 @@ async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read:
             for _ in range(missed):
                 cell.robot.cycle(read=False)
             await cell.cycles(read)
-            if cell.phase is not Phase.RUNNING:
+            if cell.phase is not ExperimentPhase.RUNNING:
                 break
         assert "loop was woken" in cell.why
 
@@ -51,8 +51,8 @@ async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_
         for _ in range(6_000_000_000 // CYCLE_NS):
             cell.robot.cycle(read=False)
         await cell.cycles(1)
-        assert cell.phase is Phase.STOPPED
-        assert cell.why == Trouble(Event.DAEMON_PAUSED, "it stood still for 6.0 s").sentence
+        assert cell.phase is ExperimentPhase.STOPPED
+        assert cell.why == Fault(FaultCode.DAEMON_PAUSED, "it stood still for 6.0 s").sentence
 
 
 async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -> None:

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.experiment.machine import Phase
-from daemon.experiment.steps import ExperimentFile
-from daemon.loop.senses import Torque
-from daemon.loop_actions import along_tool
-from daemon.loop_task import PUBLISH_EVERY, WRENCH
-from daemon.safety import Event
-from drivers.ur.messages import Enable, MoveLinear, Stop, WristSpeed
+from shearloop.daemon.control.actions import along_tool
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.control.runner import PUBLISH_EVERY, WRENCH
+from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, WristSpeed
 from tests.daemon.cell import SPEED_M_PER_S, driven, no_tick
 from tests.drivers.ur.flight import SETTINGS
 
@@ -56,7 +56,7 @@ async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_opera
         await cell.start({"do": "wait", "wait_s": 60})
         cell.gripper.answers = answer
         now_ns = cell.robot.flight.now_ns
-        cell.brain.hear(Torque(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.until_ended(10)
         await cell.cycles(50)
         assert "the gripper was told to open and did not" in cell.published.reasons
@@ -92,11 +92,11 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() ->
         assert abs(paused_m - end_m) > 0.05, "it is under way"
         await cell.cycles(100)
         assert cell.robot.z_m == paused_m, "it stands"
-        assert cell.phase is Phase.PAUSED
+        assert cell.phase is ExperimentPhase.PAUSED
         assert sum(isinstance(command, Stop) for command in cell.robot.commands[-20:]) == 1
         assert cell.brain.resume() is None
         await cell.until_ended()
-        assert cell.phase is Phase.DONE, cell.why
+        assert cell.phase is ExperimentPhase.DONE, cell.why
         assert cell.robot.z_m == pytest.approx(end_m), "where it was to go from the start"
 
 
@@ -112,7 +112,7 @@ async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> 
         assert not any(isinstance(command, MoveLinear) for command in cell.robot.commands)
         cell.brain.resume()
         await cell.until_ended()
-        assert cell.phase is Phase.DONE, cell.why
+        assert cell.phase is ExperimentPhase.DONE, cell.why
 
 
 async def test_who_waits_for_an_experiments_end_is_told_of_that_one() -> None:
@@ -151,10 +151,10 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         monkeypatch.undo()
         cell.drive()
         await cell.cycles(20)
-        assert cell.phase is Phase.STOPPED
+        assert cell.phase is ExperimentPhase.STOPPED
         assert "loop: ZeroDivisionError: a tick went wrong" in cell.why
         assert cell.robot.z_m == stopped_m
-        assert Event.TASK_DIED in {trouble.event for trouble in cell.brain.standing.verdict.troubles}
+        assert FaultCode.TASK_DIED in {trouble.event for trouble in cell.brain.standing.verdict.troubles}
 
 
 async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +170,7 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
 
         monkeypatch.setattr(cell.gripper, "release", at_length)
         now_ns = cell.robot.flight.now_ns
-        cell.brain.hear(Torque(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.until_ended(10)
         await heard.wait()
         tick = cell.brain.tick
@@ -250,7 +250,7 @@ async def test_a_zero_is_taken_after_a_turn() -> None:
     async with driven() as cell:
         await cell.start({"do": "turn_to", "angle_rad": 0.2}, {"do": "tare"})
         await cell.until_ended()
-        assert cell.phase is Phase.DONE, cell.why
+        assert cell.phase is ExperimentPhase.DONE, cell.why
 
 
 @pytest.mark.parametrize("cycles", [1, 2, 3])
@@ -264,7 +264,7 @@ async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_bra
         await cell.cycles(cycles)
         assert cell.brain.resume() is None
         await cell.until_ended()
-        assert cell.phase is Phase.DONE, cell.why
+        assert cell.phase is ExperimentPhase.DONE, cell.why
         assert cell.robot.z_m == pytest.approx(end_m)
 
 

@@ -6,13 +6,13 @@ import sys
 import threading
 from contextlib import closing
 
-from daemon.outlet import Outlet
+from shearloop.daemon.nonblocking_writer import NonBlockingWriter
 
 PROGRAM = """
 import os, sys
 from contextlib import closing
-from daemon.logs import logging_to_stderr
-from daemon.outlet import Outlet
+from shearloop.daemon.logs import logging_to_stderr
+from shearloop.daemon.nonblocking_writer import Outlet
 import structlog
 read, write = os.pipe()
 os.close(read)
@@ -25,7 +25,7 @@ with logging_to_stderr(), closing(Outlet(sys.stdout)) as out:
 
 def test_what_is_written_comes_out_in_order_and_all_of_it_at_the_end() -> None:
     stream = io.StringIO()
-    with closing(Outlet(stream)) as outlet:
+    with closing(NonBlockingWriter(stream)) as outlet:
         for number in range(1000):
             assert outlet.write(f"{number}\n") == len(f"{number}\n")
     assert stream.getvalue().splitlines() == [str(number) for number in range(1000)]
@@ -47,7 +47,7 @@ class Terminal(io.StringIO):
 
 def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_told_in_its_place() -> None:
     terminal = Terminal()
-    outlet = Outlet(terminal, most_waiting=5)
+    outlet = NonBlockingWriter(terminal, most_waiting=5)
     outlet.write("0\n")
     assert terminal.waited_for.wait(10)
     for number in range(1, 9):
@@ -83,7 +83,7 @@ class Slow(io.StringIO):
 
 def test_what_is_missing_is_told_before_what_came_later() -> None:
     terminal = Slow()
-    outlet = Outlet(terminal, most_waiting=4)
+    outlet = NonBlockingWriter(terminal, most_waiting=4)
     outlet.write("0\n")
     terminal.may.release()
     assert terminal.took.acquire(timeout=10)
@@ -111,7 +111,7 @@ def test_what_nobody_reads_any_longer_kills_nobody() -> None:
 
 def test_what_a_terminal_has_no_letters_for_is_spelt_and_what_follows_comes_out() -> None:
     taken = io.BytesIO()
-    with closing(Outlet(io.TextIOWrapper(taken, encoding="ascii", write_through=True))) as outlet:
+    with closing(NonBlockingWriter(io.TextIOWrapper(taken, encoding="ascii", write_through=True))) as outlet:
         outlet.write("0.10 N·m …\n")
         outlet.write("and on\n")
     assert taken.getvalue().splitlines() == [rb"0.10 N\xb7m \u2026", b"and on"]

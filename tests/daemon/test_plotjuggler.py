@@ -14,10 +14,10 @@ import msgpack
 import pytest
 import zmq
 
-from daemon.clock import Clock
-from daemon.messages import Message
-from daemon.topics import TOPICS
-from daemon.wire.publisher import Publisher
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import Message
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.topics import TOPICS
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.view.fake_daemon import MESSAGES, made
 

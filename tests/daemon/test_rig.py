@@ -6,14 +6,14 @@ import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 
-from daemon.clock import Clock
-from daemon.config import DaemonConfig
-from daemon.loop.senses import Source
-from daemon.rig import Rig
-from drivers.ur.client import LinkEvent
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.rig import Rig
+from shearloop.drivers.ur.client import UrLinkEvent
 from tests.daemon.cell import Published
 
-SOURCES = {"right": Source(name="right", period_s=0.5)}
+SOURCES = {"right": TorqueSource(name="right", period_s=0.5)}
 
 
 @contextlib.asynccontextmanager
@@ -37,13 +37,13 @@ async def a_rig() -> AsyncIterator[Rig]:
 async def test_a_robot_that_is_lost_is_told_at_once_and_not_when_its_state_is_missed() -> None:
     async with a_rig() as rig:
         assert rig.brain.standing.verdict.troubles == ()
-        rig._robot_link(LinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
+        rig._robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
         assert "the robot's process died" in " ".join(rig.brain.standing.verdict.reasons)
 
 
 async def test_a_device_that_is_lost_before_the_loop_runs_and_after_its_end_is_noted() -> None:
     async with a_rig() as rig:
         pass
-    rig._robot_link(LinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
+    rig._robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
     assert rig.brain.senses.lost == {"robot": "the robot's process died"}
     assert rig.brain.standing.verdict.troubles == ()

@@ -6,10 +6,10 @@ from typing import Any
 import pytest
 import yaml
 
-from daemon.config import DaemonConfig, load_daemon_config
-from daemon.errors import UserError
-from daemon.loop.senses import Source
-from daemon.rig_check import checked_experiment
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.rig_check import checked_experiment
 
 SERIAL = {"device": {"path": "port"}}
 STEPS = [{"do": "tare"}, {"do": "wait", "wait_s": 1}]
@@ -28,7 +28,7 @@ def config(folder: Path, experiment: dict[str, Any], **more: Any) -> DaemonConfi
 
 
 SOURCES = {
-    name: Source(name=name, period_s=0.5, measures_torque=measures)
+    name: TorqueSource(name=name, period_s=0.5, measures_torque=measures)
     for name, measures in (("right", True), ("left", False))
 }
 

@@ -16,12 +16,12 @@ import zmq
 import zmq.asyncio
 from scipy.io import savemat
 
-from bank.channels import LINE_SLOTS, line_of_channels
-from daemon.app import Daemon
-from daemon.config import load_daemon_config
-from daemon.messages import decode
-from daemon.wire.request import request
-from drivers.eit_format import ADC_STEP_V
+from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.messaging.messages import decode
+from shearloop.daemon.messaging.request import request
+from shearloop.drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
@@ -221,7 +221,7 @@ async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_h
 async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
     config: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from daemon.eit.estimator import Estimator
+    from shearloop.daemon.sensing.estimator import Estimator
 
     quickly = Estimator.quickly
     deaths = iter([True])
@@ -248,7 +248,9 @@ async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
 async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/commands"
     reader, writer = os.pipe()
-    process = await asyncio.create_subprocess_exec(sys.executable, "-m", "daemon", "run", str(config()), stderr=writer)
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, "-m", "shearloop", "run", str(config()), stderr=writer
+    )
     os.close(writer)
     try:
         async with asyncio.timeout(DEADLINE_S):
@@ -268,7 +270,7 @@ async def test_a_terminal_that_was_stopped_keeps_no_estimate_waiting(
 ) -> None:
     terminal, its_end = pty.openpty()
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-m", "daemon", "run", str(config()), "--show", stdout=its_end, stderr=its_end
+        sys.executable, "-m", "shearloop", "run", str(config()), "--show", stdout=its_end, stderr=its_end
     )
     try:
         frames = subscriber(f"ipc://{tmp_path}/publish", "eit.estimate")

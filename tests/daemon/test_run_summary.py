@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.run_summary import Known, RunSummary
+from shearloop.daemon.run_summary import Known, RunSummary
 
 S = 1_000_000_000
 

@@ -4,18 +4,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.safety import HELD_AT_MOST_S, TABLE, Event, Response, SafetyGate, Trouble
+from shearloop.daemon.control.safety import HELD_AT_MOST_S, TABLE, Fault, FaultCode, Response, SafetyMonitor
 
 STOPS = (Response.STOP_AND_KEEP_GRIP, Response.STOP_AND_RELEASE)
 SECOND = 10**9
 
 
-def trouble(event: Event) -> Trouble:
-    return Trouble(event, "on the bench")
+def trouble(event: FaultCode) -> Fault:
+    return Fault(event, "on the bench")
 
 
 def test_every_event_has_a_row_with_a_sentence_and_a_cure() -> None:
-    assert set(TABLE) == set(Event)
+    assert set(TABLE) == set(FaultCode)
     for rule in TABLE.values():
         fields = [name for _, name, _, _ in string.Formatter().parse(rule.sentence) if name]
         assert fields == ["detail"]
@@ -25,18 +25,18 @@ def test_every_event_has_a_row_with_a_sentence_and_a_cure() -> None:
 
 
 def test_nothing_wrong_is_no_more_than_a_note() -> None:
-    assert SafetyGate().judge([], 0).response is Response.NOTE
+    assert SafetyMonitor().judge([], 0).response is Response.NOTE
 
 
 def test_a_hold_goes_with_its_cause() -> None:
-    gate = SafetyGate()
-    assert gate.judge([trouble(Event.ESTIMATE_STALE)], 0).response is Response.HOLD
+    gate = SafetyMonitor()
+    assert gate.judge([trouble(FaultCode.ESTIMATE_STALE)], 0).response is Response.HOLD
     assert gate.judge([], SECOND).response is Response.NOTE
 
 
 @pytest.mark.parametrize("event", [event for event, rule in TABLE.items() if rule.response is Response.HOLD])
-def test_a_hold_that_lasts_too_long_becomes_a_stop(event: Event) -> None:
-    gate = SafetyGate()
+def test_a_hold_that_lasts_too_long_becomes_a_stop(event: FaultCode) -> None:
+    gate = SafetyMonitor()
     longest_s = TABLE[event].hold_at_most_s
     assert longest_s is not None
     assert gate.judge([trouble(event)], 0).response is Response.HOLD
@@ -47,9 +47,9 @@ def test_a_hold_that_lasts_too_long_becomes_a_stop(event: Event) -> None:
 TICK_S = 0.008
 
 
-def flapping(event: Event, held: int, gone: int, for_s: float = 60.0) -> float | None:
+def flapping(event: FaultCode, held: int, gone: int, for_s: float = 60.0) -> float | None:
     """Judge an event that is there for some ticks and gone for some; return when it became a stop, None where never."""
-    gate = SafetyGate()
+    gate = SafetyMonitor()
     for tick in range(round(for_s / TICK_S)):
         active = [trouble(event)] if tick % (held + gone) < held else []
         if gate.judge(active, round(tick * TICK_S * SECOND)).response in STOPS:
@@ -63,7 +63,7 @@ OF_THE_MOMENT = [(event, longest_s) for event, longest_s in HOLDS if not TABLE[e
 
 @pytest.mark.parametrize(("event", "longest_s"), OF_THE_MOMENT)
 @pytest.mark.parametrize(("held", "gone"), [(1, 1), (50, 50), (125, 125), (125, 12)])
-def test_a_hold_that_flaps_becomes_a_stop(event: Event, longest_s: float, held: int, gone: int) -> None:
+def test_a_hold_that_flaps_becomes_a_stop(event: FaultCode, longest_s: float, held: int, gone: int) -> None:
     """Of each cycle's time so much is held and half of the rest forgotten, until it is as long as it may be."""
     stopped_s = flapping(event, held, gone)
     assert stopped_s is not None
@@ -75,15 +75,15 @@ def test_a_hold_that_flaps_becomes_a_stop(event: Event, longest_s: float, held: 
 @pytest.mark.parametrize(("event", "longest_s"), OF_THE_MOMENT)
 @pytest.mark.parametrize(("held", "gone"), [(1, 3), (12, 36), (125, 260)])
 def test_a_hold_that_is_gone_for_more_than_two_thirds_of_the_time_stays_one(
-    event: Event, longest_s: float, held: int, gone: int
+    event: FaultCode, longest_s: float, held: int, gone: int
 ) -> None:
     assert held * TICK_S < longest_s
     assert flapping(event, held, gone) is None
 
 
-def taking_turns(*turns: tuple[Event, float], for_s: float = 60.0) -> tuple[float, SafetyGate] | None:
+def taking_turns(*turns: tuple[FaultCode, float], for_s: float = 60.0) -> tuple[float, SafetyMonitor] | None:
     """Judge events that follow each other, each for so long; return when they became a stop, None where never."""
-    gate, cycle = SafetyGate(), [event for event, for_s in turns for _ in range(round(for_s / TICK_S))]
+    gate, cycle = SafetyMonitor(), [event for event, for_s in turns for _ in range(round(for_s / TICK_S))]
     for tick in range(round(for_s / TICK_S)):
         if gate.judge([trouble(cycle[tick % len(cycle)])], round(tick * TICK_S * SECOND)).response in STOPS:
             return tick * TICK_S, gate
@@ -104,9 +104,9 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
 
 
 def test_one_cause_alone_is_told_alone() -> None:
-    stopped = taking_turns((Event.ESTIMATE_STALE, 1.0))
+    stopped = taking_turns((FaultCode.ESTIMATE_STALE, 1.0))
     assert stopped is not None
-    assert [found.event for found in stopped[1].look([]).troubles] == [Event.ESTIMATE_STALE]
+    assert [found.event for found in stopped[1].look([]).troubles] == [FaultCode.ESTIMATE_STALE]
 
 
 def test_what_does_not_hold_is_not_counted_as_a_hold() -> None:
@@ -114,13 +114,13 @@ def test_what_does_not_hold_is_not_counted_as_a_hold() -> None:
     assert taking_turns(*((event, 0.1) for event in notes)) is None
 
 
-LATE = [trouble(Event.LOOP_LATE)]
+LATE = [trouble(FaultCode.LOOP_LATE)]
 
 
 @pytest.mark.parametrize(("stall_s", "decisions"), [(0.15, 1), (0.15, 10), (0.3, 60), (1.0, 1)])
 def test_a_loop_that_is_away_for_more_than_a_third_of_the_time_is_stopped(stall_s: float, decisions: int) -> None:
     """It is found late when it is back, and in time at the next decision: what counts is the time between."""
-    gate, t_ns = SafetyGate(), SECOND
+    gate, t_ns = SafetyMonitor(), SECOND
     gate.judge([], t_ns)
     while t_ns < 60 * SECOND:
         t_ns += round(stall_s * SECOND)
@@ -130,14 +130,14 @@ def test_a_loop_that_is_away_for_more_than_a_third_of_the_time_is_stopped(stall_
             t_ns += round(TICK_S * SECOND)
             assert gate.judge([], t_ns).response not in STOPS
     held_s, gone_s = stall_s + TICK_S, (decisions - 1) * TICK_S
-    longest_s = TABLE[Event.LOOP_LATE].hold_at_most_s
+    longest_s = TABLE[FaultCode.LOOP_LATE].hold_at_most_s
     assert longest_s is not None
     cycles = (longest_s - held_s) / (held_s - 0.5 * gone_s)
     assert t_ns / SECOND - 1.0 == pytest.approx(cycles * (held_s + gone_s), abs=2 * (held_s + gone_s))
 
 
 def test_a_loop_that_is_late_now_and_then_is_held_and_goes_on() -> None:
-    gate, t_ns = SafetyGate(), 0
+    gate, t_ns = SafetyMonitor(), 0
     for _ in range(100):
         t_ns += 150_000_000
         assert gate.judge(LATE, t_ns).response is Response.HOLD
@@ -147,7 +147,7 @@ def test_a_loop_that_is_late_now_and_then_is_held_and_goes_on() -> None:
 
 
 def test_what_was_before_the_first_judgement_does_not_count() -> None:
-    gate = SafetyGate()
+    gate = SafetyMonitor()
     assert gate.judge(LATE, 3600 * SECOND).response is Response.HOLD
     gate.look([])
     assert gate.judge(LATE, 7200 * SECOND).response is Response.HOLD
@@ -159,9 +159,9 @@ STRETCHES = st.tuples(CAUSES, st.integers(1, 3 * SECOND))
 
 @given(st.lists(STRETCHES, min_size=1, max_size=60))
 def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop(
-    story: list[tuple[list[Event], int]],
+    story: list[tuple[list[FaultCode], int]],
 ) -> None:
-    gate, t_ns, held_ns = SafetyGate(), 0, 0.0
+    gate, t_ns, held_ns = SafetyMonitor(), 0, 0.0
     for events, lasts_ns in story:
         if gate.judge([trouble(event) for event in events], t_ns).response in STOPS:
             return
@@ -171,18 +171,18 @@ def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop
 
 
 def test_a_hold_begins_anew_with_the_next_experiment_and_after_the_operators_word() -> None:
-    for ends in (SafetyGate.acknowledge, lambda gate: gate.look([trouble(Event.STATE_STALE)])):
-        gate = SafetyGate()
-        gate.judge([trouble(Event.STATE_STALE)], 0)
+    for ends in (SafetyMonitor.acknowledge, lambda gate: gate.look([trouble(FaultCode.STATE_STALE)])):
+        gate = SafetyMonitor()
+        gate.judge([trouble(FaultCode.STATE_STALE)], 0)
         ends(gate)
-        assert gate.judge([trouble(Event.STATE_STALE)], 3600 * SECOND).response is Response.HOLD
-        assert gate.judge([trouble(Event.STATE_STALE)], 3602 * SECOND).response is Response.HOLD
-        assert gate.judge([trouble(Event.STATE_STALE)], 3603 * SECOND).response is Response.STOP_AND_KEEP_GRIP
+        assert gate.judge([trouble(FaultCode.STATE_STALE)], 3600 * SECOND).response is Response.HOLD
+        assert gate.judge([trouble(FaultCode.STATE_STALE)], 3602 * SECOND).response is Response.HOLD
+        assert gate.judge([trouble(FaultCode.STATE_STALE)], 3603 * SECOND).response is Response.STOP_AND_KEEP_GRIP
 
 
 def test_a_stop_outlives_its_cause_until_it_is_acknowledged() -> None:
-    gate = SafetyGate()
-    gate.judge([trouble(Event.PROTECTIVE_STOP)], 0)
+    gate = SafetyMonitor()
+    gate.judge([trouble(FaultCode.PROTECTIVE_STOP)], 0)
     later = gate.judge([], 100 * SECOND)
     assert later.response is Response.STOP_AND_KEEP_GRIP
     assert "protective stop: on the bench" in later.reasons[0]
@@ -191,17 +191,17 @@ def test_a_stop_outlives_its_cause_until_it_is_acknowledged() -> None:
 
 
 def test_acknowledging_does_not_help_against_what_is_still_wrong() -> None:
-    gate = SafetyGate()
-    gate.judge([trouble(Event.GRIPPER_FAULT)], 0)
+    gate = SafetyMonitor()
+    gate.judge([trouble(FaultCode.GRIPPER_FAULT)], 0)
     gate.acknowledge()
-    assert gate.judge([trouble(Event.GRIPPER_FAULT)], 1).response is Response.STOP_AND_KEEP_GRIP
+    assert gate.judge([trouble(FaultCode.GRIPPER_FAULT)], 1).response is Response.STOP_AND_KEEP_GRIP
 
 
-@given(st.lists(st.tuples(st.lists(st.sampled_from(Event), max_size=4), st.integers(0, 10 * SECOND)), max_size=20))
+@given(st.lists(st.tuples(st.lists(st.sampled_from(FaultCode), max_size=4), st.integers(0, 10 * SECOND)), max_size=20))
 def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(
-    story: list[tuple[list[Event], int]],
+    story: list[tuple[list[FaultCode], int]],
 ) -> None:
-    gate, t_ns, strongest = SafetyGate(), 0, Response.NOTE
+    gate, t_ns, strongest = SafetyMonitor(), 0, Response.NOTE
     for events, pause_ns in story:
         t_ns += pause_ns
         verdict = gate.judge([trouble(event) for event in events], t_ns)
@@ -214,17 +214,23 @@ def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(
 
 
 def test_two_things_of_one_kind_are_both_told() -> None:
-    both = [Trouble(Event.DEVICE_LOST, "the gripper"), Trouble(Event.DEVICE_LOST, "the load cell")]
-    gate = SafetyGate()
+    both = [Fault(FaultCode.DEVICE_LOST, "the gripper"), Fault(FaultCode.DEVICE_LOST, "the load cell")]
+    gate = SafetyMonitor()
     for seen in (gate.judge(both, 0), gate.judge([], SECOND), gate.look([])):
         assert [found.detail for found in seen.troubles] == ["the gripper", "the load cell"]
 
 
 def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_leads_to_is_not_repeated() -> None:
     """Torques and states are old to one who was away, boards are thought to be gone, the robot's process was ended."""
-    paused, old = Trouble(Event.DAEMON_PAUSED, "it stood still for 3.0 s"), Trouble(Event.STATE_STALE, "the gripper")
-    invalid, lost = Trouble(Event.ESTIMATE_INVALID, "too lately"), Trouble(Event.ROBOT_LOST, "its process was ended")
-    gate = SafetyGate()
+    paused, old = (
+        Fault(FaultCode.DAEMON_PAUSED, "it stood still for 3.0 s"),
+        Fault(FaultCode.STATE_STALE, "the gripper"),
+    )
+    invalid, lost = (
+        Fault(FaultCode.ESTIMATE_INVALID, "too lately"),
+        Fault(FaultCode.ROBOT_LOST, "its process was ended"),
+    )
+    gate = SafetyMonitor()
     assert gate.judge([], 0).response is Response.NOTE
     away = gate.judge([old, paused], 3 * SECOND)
     assert (away.response, away.reasons) == (Response.HOLD, (paused.sentence,))
@@ -232,7 +238,7 @@ def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_
     assert (stopped.response, stopped.reasons) == (Response.STOP_AND_KEEP_GRIP, (paused.sentence, lost.sentence))
     assert {one.event for one in stopped.troubles} == {one.event for one in (paused, invalid, old, lost)}
     # Without a stop: what holds for longer than it takes to settle is told beside it, until nothing holds.
-    gate = SafetyGate()
+    gate = SafetyMonitor()
     gate.judge([paused], 0)
     assert gate.judge([invalid], SECOND).reasons == (paused.sentence,)
     assert gate.judge([invalid], 3 * SECOND).reasons == (paused.sentence, invalid.sentence)
@@ -245,29 +251,34 @@ def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_
     assert gate.judge([invalid], 11 * SECOND).reasons == (invalid.sentence,)
 
 
-@pytest.mark.parametrize("event", [Event.RECORDING_FAILED, Event.COMMAND_REFUSED])
-def test_what_neither_holds_the_wrist_nor_comes_of_a_pause_is_told_and_does_not_keep_the_pause(event: Event) -> None:
+@pytest.mark.parametrize("event", [FaultCode.RECORDING_FAILED, FaultCode.COMMAND_REFUSED])
+def test_what_neither_holds_the_wrist_nor_comes_of_a_pause_is_told_and_does_not_keep_the_pause(
+    event: FaultCode,
+) -> None:
     """A refusal is told once, and was never; a disk that stays full had the pause told first of a stop hours later."""
-    paused, other, limit = trouble(Event.DAEMON_PAUSED), trouble(event), trouble(Event.TORQUE_LIMIT)
-    gate = SafetyGate()
+    paused, other, limit = trouble(FaultCode.DAEMON_PAUSED), trouble(event), trouble(FaultCode.TORQUE_LIMIT)
+    gate = SafetyMonitor()
     assert gate.judge([other, paused], 0).reasons == (paused.sentence, other.sentence)
-    assert gate.judge([other, trouble(Event.COMMAND_UNANSWERED)], SECOND).reasons == (paused.sentence, other.sentence)
+    assert gate.judge([other, trouble(FaultCode.COMMAND_UNANSWERED)], SECOND).reasons == (
+        paused.sentence,
+        other.sentence,
+    )
     assert gate.judge([other], 3 * SECOND).reasons == (other.sentence,)
     assert gate.judge([other, limit], 3600 * SECOND).reasons == (other.sentence, limit.sentence)
 
 
 TIMES = st.sampled_from([8_000_000, SECOND // 5, SECOND, 2 * SECOND, 2 * SECOND + 1, 3 * SECOND, 6 * SECOND])
-MOMENTS = st.lists(st.tuples(TIMES, st.sets(st.sampled_from(list(Event)), max_size=4)), max_size=20)
+MOMENTS = st.lists(st.tuples(TIMES, st.sets(st.sampled_from(list(FaultCode)), max_size=4)), max_size=20)
 
 
 @given(MOMENTS)
-def test_what_explains_changes_what_is_told_and_never_what_is_done(moments: list[tuple[int, set[Event]]]) -> None:
+def test_what_explains_changes_what_is_told_and_never_what_is_done(moments: list[tuple[int, set[FaultCode]]]) -> None:
     """Beside a gate that takes a pause of the daemon for a loop that is late, which explains nothing."""
-    explaining, plain, t_ns = SafetyGate(), SafetyGate(), 0
+    explaining, plain, t_ns = SafetyMonitor(), SafetyMonitor(), 0
     for passed_ns, events in moments:
         t_ns += passed_ns
         verdict = explaining.judge(map(trouble, events), t_ns)
-        late = {Event.LOOP_LATE if event is Event.DAEMON_PAUSED else event for event in events}
+        late = {FaultCode.LOOP_LATE if event is FaultCode.DAEMON_PAUSED else event for event in events}
         assert verdict.response >= plain.judge(map(trouble, late), t_ns).response
         told = [one for one in verdict.troubles if not one.follows]
         assert told or not events

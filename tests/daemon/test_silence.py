@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from daemon.silence import Silence
+from shearloop.daemon.control.watchdog_timer import WatchdogTimer
 
 
 class Loop:
@@ -50,7 +50,7 @@ def loop(monkeypatch: pytest.MonkeyPatch) -> Loop:
 
 def test_silence_is_told_when_it_has_lasted_for_what_was_said_last(loop: Loop) -> None:
     broken_s: list[float] = []
-    silence = Silence(lambda: broken_s.append(loop.now_s))
+    silence = WatchdogTimer(lambda: broken_s.append(loop.now_s))
     for number in range(20):
         silence.heard(0.02)
         loop.until(100.0 + 0.008 * (number + 1))
@@ -62,7 +62,7 @@ def test_silence_is_told_when_it_has_lasted_for_what_was_said_last(loop: Loop) -
 
 def test_a_shorter_time_counts_from_when_it_is_said(loop: Loop) -> None:
     broken_s: list[float] = []
-    silence = Silence(lambda: broken_s.append(loop.now_s))
+    silence = WatchdogTimer(lambda: broken_s.append(loop.now_s))
     silence.heard(0.1)
     loop.until(100.008)
     silence.heard(0.02)
@@ -77,7 +77,7 @@ def test_silence_goes_on_to_be_told_while_it_is_said_to_be_watched(loop: Loop) -
         broken_s.append(loop.now_s)
         silence.heard(0.02)
 
-    silence = Silence(broken)
+    silence = WatchdogTimer(broken)
     silence.heard(0.02)
     loop.until(100.05)
     assert broken_s == pytest.approx([100.02, 100.04])

@@ -3,8 +3,8 @@ import asyncio
 import pytest
 from structlog.testing import capture_logs
 
-from daemon import supervisor
-from daemon.supervisor import Supervisor, restart_pause_s
+from shearloop.daemon import supervisor
+from shearloop.daemon.supervisor import Supervisor, restart_pause_s
 
 
 def test_pauses_double_from_half_a_second_to_half_a_minute() -> None:

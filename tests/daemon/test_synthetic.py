@@ -7,11 +7,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from bank.channels import CHANNELS, N_CHANNELS, ZERO_SLOTS, channels_of_line
-from daemon.errors import UserError
-from daemon.synthetic import INJECTIONS, Synthesiser, TwistProgramme, twist_frames
-from drivers.eit_line import LineParser
-from drivers.emulators.eit_kit import format_line
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, ZERO_SLOTS, channels_of_line
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.synthetic import INJECTIONS, Synthesiser, TwistProgramme, twist_frames
+from shearloop.drivers.eit_line import FrameParser
+from shearloop.drivers.emulators.eit_kit import format_line
 
 ADC_STEP_V = 2.2 / 1024
 
@@ -47,7 +47,7 @@ def test_frames_have_the_recorded_mean_noise_and_steps_and_pass_the_parser() -> 
     steps = channels / ADC_STEP_V
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
     assert (lines[:, ZERO_SLOTS] == 0).all()
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     assert len(parser.feed(b"".join(map(format_line, lines)), 0)) == 400
 
 
@@ -143,10 +143,10 @@ def test_the_same_seed_gives_the_same_frames() -> None:
 
 
 def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared) -> None:
-    from bank.forward import ForwardModel
-    from bank.mesh import load_mesh
-    from bank.models import conductivity
-    from daemon.matlab.recordings import read_torque_slices
+    from shearloop.bank.eit.forward import ForwardModel
+    from shearloop.bank.eit.mesh import load_mesh
+    from shearloop.bank.eit.models import conductivity
+    from shearloop.daemon.recording.matlab_streams import read_torque_slices
 
     mesh = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     forward = ForwardModel(mesh)

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from daemon.experiment.machine import Phase
-from daemon.wrist_commands import RENEWED_AFTER, WristCommands
-from drivers.ur.messages import Reply, RobotState, WristSpeed
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.control.velocity_sender import RENEWED_AFTER, VelocityCommandSender
+from shearloop.drivers.ur.messages import CommandReply, RobotState, WristSpeed
 from tests.daemon.cell import driven
 from tests.drivers.ur.flight import SETTINGS
 
@@ -52,7 +52,7 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         cell.brain.senses.lost["robot"] = "The robot's process died of SIGKILL."
         cell.robot.die(50)
         cell.loop.decide_now()
-        assert cell.phase is Phase.STOPPED
+        assert cell.phase is ExperimentPhase.STOPPED
         assert "a command was refused" not in cell.why
         assert "ended before it answered" in cell.why
         assert cell.why.endswith("once the robot is connected again, `shearloop command unlock`.")
@@ -73,17 +73,17 @@ class Process:
         self.takes = TURN
         self.told: list[Any] = []
 
-    def tell(self, command: WristSpeed, answered: Callable[[Reply], None]) -> None:
+    def tell(self, command: WristSpeed, answered: Callable[[CommandReply], None]) -> None:
         self.told.append(command)
-        answered(Reply(sent=self.takes))
+        answered(CommandReply(sent=self.takes))
 
 
 @contextlib.asynccontextmanager
-async def turning() -> AsyncIterator[tuple[Process, WristCommands]]:
+async def turning() -> AsyncIterator[tuple[Process, VelocityCommandSender]]:
     """Give what tells a process that turns the wrist as it was told at time 0."""
     async with driven() as cell:
         process = Process(replace(cell.state, motion="wrist", sent=TURN, clipped=()))
-        commands = WristCommands(process, SimpleNamespace(sent=lambda _: None), 4.0, pytest.fail)  # type: ignore[arg-type]
+        commands = VelocityCommandSender(process, SimpleNamespace(sent=lambda _: None), 4.0, pytest.fail)  # type: ignore[arg-type]
         yield process, commands
 
 

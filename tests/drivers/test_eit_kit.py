@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bank.channels import LINE_SLOTS, ZERO_SLOTS, line_of_channels
-from drivers import eit_kit
-from drivers.eit_format import ADC_STEP_V, RefusalKind
-from drivers.eit_kit import EitKit, Frame
-from drivers.emulators.eit_kit import EitKitBoard, Fault, FaultKind, format_line
-from drivers.serial_port import LinkEvent
+from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, line_of_channels
+from shearloop.drivers import eit_kit
+from shearloop.drivers.eit_format import ADC_STEP_V, FrameErrorKind
+from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.emulators.eit_kit import EitKitBoard, Fault, FaultKind, format_line
+from shearloop.drivers.serial_port import LinkEvent
 
 PERIOD_S = 0.003
 # Guards against a test that hangs; none of them waits for so long.
@@ -102,18 +102,18 @@ async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("fault", "kind", "lost"),
     [
-        (FaultKind.CUT_LINE, RefusalKind.WRONG_COUNT, True),
-        (FaultKind.WRONG_COUNT, RefusalKind.WRONG_COUNT, True),
-        (FaultKind.NOT_A_NUMBER, RefusalKind.NOT_A_NUMBER, True),
-        (FaultKind.NAN, RefusalKind.NAN, True),
-        (FaultKind.NEGATIVE, RefusalKind.NEGATIVE, True),
-        (FaultKind.ZERO, RefusalKind.ZERO_CHANNEL, True),
-        (FaultKind.GARBAGE, RefusalKind.WRONG_COUNT, False),
-        (FaultKind.FLOOD, RefusalKind.TOO_LONG, False),
+        (FaultKind.CUT_LINE, FrameErrorKind.WRONG_COUNT, True),
+        (FaultKind.WRONG_COUNT, FrameErrorKind.WRONG_COUNT, True),
+        (FaultKind.NOT_A_NUMBER, FrameErrorKind.NOT_A_NUMBER, True),
+        (FaultKind.NAN, FrameErrorKind.NAN, True),
+        (FaultKind.NEGATIVE, FrameErrorKind.NEGATIVE, True),
+        (FaultKind.ZERO, FrameErrorKind.ZERO_CHANNEL, True),
+        (FaultKind.GARBAGE, FrameErrorKind.WRONG_COUNT, False),
+        (FaultKind.FLOOD, FrameErrorKind.TOO_LONG, False),
     ],
 )
 async def test_a_fault_costs_its_own_frame_at_most_and_is_counted(
-    fault: FaultKind, kind: RefusalKind, lost: bool, tmp_path: Path
+    fault: FaultKind, kind: FrameErrorKind, lost: bool, tmp_path: Path
 ) -> None:
     lines = some_lines(6)
     kit, frames, _ = await play(lines, 6 - lost, tmp_path, {3: Fault(fault)})

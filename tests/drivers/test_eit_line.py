@@ -6,19 +6,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from bank.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
-from drivers import eit_format, eit_line
-from drivers.eit_format import (
+from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
+from shearloop.drivers import eit_format, eit_line
+from shearloop.drivers.eit_format import (
     ADC_STEP_V,
     FULL_SCALE_SINE_RMS_V,
     LINE_BYTES,
     LONGEST_LINE_BYTES,
-    Refusal,
-    RefusalKind,
+    FrameError,
+    FrameErrorKind,
     read_line,
 )
-from drivers.eit_line import NOMINAL_PERIOD_NS, TRANSFER_NS, Frame, LineParser
-from drivers.emulators.eit_kit import format_line
+from shearloop.drivers.eit_line import NOMINAL_PERIOD_NS, TRANSFER_NS, Frame, FrameParser
+from shearloop.drivers.emulators.eit_kit import format_line
 
 PERIOD_NS = NOMINAL_PERIOD_NS
 
@@ -37,7 +37,7 @@ def slices(data: bytes, cuts: list[int]) -> list[bytes]:
     return [data[a:b] for a, b in pairwise(edges)]
 
 
-def feed_all(parser: LineParser, parts: list[bytes]) -> list[Frame]:
+def feed_all(parser: FrameParser, parts: list[bytes]) -> list[Frame]:
     return [frame for n, part in enumerate(parts) for frame in parser.feed(part, n)]
 
 
@@ -47,7 +47,7 @@ def with_value(position: int, value: bytes, line: bytes = GOOD) -> bytes:
     return b", ".join(values)
 
 
-def read_either_way(line: bytes, zero_slots: NDArray[np.bool_] = ZERO_SLOTS) -> NDArray[np.float64] | Refusal:
+def read_either_way(line: bytes, zero_slots: NDArray[np.bool_] = ZERO_SLOTS) -> NDArray[np.float64] | FrameError:
     """Return what numpy reads; where a compiled reader takes a line it reads the same, and it takes no other."""
     found = eit_format._read_by_numpy(line, zero_slots)
     if eit_format.cells is not None:
@@ -62,28 +62,28 @@ def read_either_way(line: bytes, zero_slots: NDArray[np.bool_] = ZERO_SLOTS) -> 
 # Each kind of refusal, and a way to earn it.
 CHANNEL, SLOT = int(LINE_SLOTS[500]), int(np.flatnonzero(ZERO_SLOTS)[60])
 BROKEN = [
-    (RefusalKind.TOO_LONG, b"0.1234, " * 5000 + b"\n"),
-    (RefusalKind.WRONG_COUNT, GOOD[:4321] + b"\n"),
-    (RefusalKind.WRONG_COUNT, GOOD[8:]),
-    (RefusalKind.WRONG_COUNT, b"0.1234, " + GOOD),
-    (RefusalKind.WRONG_COUNT, GOOD[:-3] + b"\n"),
-    (RefusalKind.WRONG_COUNT, b"Board Initialized\n"),
-    (RefusalKind.WRONG_COUNT, b"\n"),
-    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"0.1x34")),
-    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"1_0.00")),
-    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b" 0.123")),
-    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"0.12")),
-    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"1.2e-1")),
-    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, b"inf")),
-    (RefusalKind.NOT_A_NUMBER, with_value(CHANNEL, "0.١٢٣٤".encode())),
-    (RefusalKind.NAN, with_value(CHANNEL, b"nan")),
-    (RefusalKind.NAN, with_value(CHANNEL, b"-NaN")),
-    (RefusalKind.NEGATIVE, with_value(CHANNEL, b"-0.1234")),
-    (RefusalKind.NEGATIVE, with_value(SLOT, b"-0.0000")),
-    (RefusalKind.OUT_OF_RANGE, with_value(CHANNEL, b"9.1234")),
-    (RefusalKind.OUT_OF_RANGE, with_value(CHANNEL, b"10.1234")),
-    (RefusalKind.ZERO_CHANNEL, with_value(CHANNEL, b"0.0000")),
-    (RefusalKind.NONZERO_SLOT, with_value(SLOT, b"0.0021")),
+    (FrameErrorKind.TOO_LONG, b"0.1234, " * 5000 + b"\n"),
+    (FrameErrorKind.WRONG_COUNT, GOOD[:4321] + b"\n"),
+    (FrameErrorKind.WRONG_COUNT, GOOD[8:]),
+    (FrameErrorKind.WRONG_COUNT, b"0.1234, " + GOOD),
+    (FrameErrorKind.WRONG_COUNT, GOOD[:-3] + b"\n"),
+    (FrameErrorKind.WRONG_COUNT, b"Board Initialized\n"),
+    (FrameErrorKind.WRONG_COUNT, b"\n"),
+    (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, b"0.1x34")),
+    (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, b"1_0.00")),
+    (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, b" 0.123")),
+    (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, b"0.12")),
+    (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, b"1.2e-1")),
+    (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, b"inf")),
+    (FrameErrorKind.NOT_A_NUMBER, with_value(CHANNEL, "0.١٢٣٤".encode())),
+    (FrameErrorKind.NAN, with_value(CHANNEL, b"nan")),
+    (FrameErrorKind.NAN, with_value(CHANNEL, b"-NaN")),
+    (FrameErrorKind.NEGATIVE, with_value(CHANNEL, b"-0.1234")),
+    (FrameErrorKind.NEGATIVE, with_value(SLOT, b"-0.0000")),
+    (FrameErrorKind.OUT_OF_RANGE, with_value(CHANNEL, b"9.1234")),
+    (FrameErrorKind.OUT_OF_RANGE, with_value(CHANNEL, b"10.1234")),
+    (FrameErrorKind.ZERO_CHANNEL, with_value(CHANNEL, b"0.0000")),
+    (FrameErrorKind.NONZERO_SLOT, with_value(SLOT, b"0.0021")),
 ]
 
 
@@ -107,11 +107,11 @@ def test_a_cell_is_sound_with_digits_and_punctuation_in_their_places_alone() -> 
             found = read_either_way(bytes(line))
             if byte in sound:
                 # A first digit above 2 V, or digits that are all 0, are refused for what they say.
-                assert not isinstance(found, Refusal) or found.kind in (
-                    RefusalKind.OUT_OF_RANGE, RefusalKind.ZERO_CHANNEL,
+                assert not isinstance(found, FrameError) or found.kind in (
+                    FrameErrorKind.OUT_OF_RANGE, FrameErrorKind.ZERO_CHANNEL,
                 )  # fmt: skip
             else:
-                assert isinstance(found, Refusal)
+                assert isinstance(found, FrameError)
 
 
 @given(st.one_of(st.binary(max_size=9000), st.sampled_from([line.rstrip(b"\r\n") for _, line in BROKEN])))
@@ -131,7 +131,7 @@ def test_a_look_at_the_channels_notes_which_changed_and_sees_the_largest(look) -
 
 
 def test_a_line_is_read_to_the_last_digit() -> None:
-    frame, other = LineParser(ZERO_SLOTS).feed(GOOD + LINES[1], 5_000_000_000)
+    frame, other = FrameParser(ZERO_SLOTS).feed(GOOD + LINES[1], 5_000_000_000)
     expected = [float(value) for value in GOOD.decode().split(", ")[:-1]]
     assert frame.raw.tolist() == expected, "the same doubles that float() reads"
     np.testing.assert_array_equal(frame.channels, channels_of_line(frame.raw))
@@ -147,7 +147,7 @@ def test_a_line_is_read_to_the_last_digit() -> None:
 
 @given(st.lists(st.integers(0, 4 * LINE_BYTES + 4), max_size=40))
 def test_any_slicing_gives_the_same_frames(cuts: list[int]) -> None:
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     frames = feed_all(parser, slices(b"".join(LINES), cuts))
     assert [frame.line + b"\n" for frame in frames] == LINES
     assert not parser.refused
@@ -156,24 +156,24 @@ def test_any_slicing_gives_the_same_frames(cuts: list[int]) -> None:
 
 def test_one_byte_at_a_time_gives_the_same_frames() -> None:
     stream = b"".join(LINES[:2])
-    frames = feed_all(LineParser(ZERO_SLOTS), [stream[n : n + 1] for n in range(len(stream))])
+    frames = feed_all(FrameParser(ZERO_SLOTS), [stream[n : n + 1] for n in range(len(stream))])
     assert [frame.line + b"\n" for frame in frames] == LINES[:2]
 
 
 def test_a_mask_of_any_layout_serves() -> None:
-    (frame,) = LineParser(np.repeat(ZERO_SLOTS, 2)[::2]).feed(GOOD, 0)
+    (frame,) = FrameParser(np.repeat(ZERO_SLOTS, 2)[::2]).feed(GOOD, 0)
     assert frame.line + b"\n" == GOOD
 
 
 def test_carriage_returns_are_taken_as_part_of_the_line_end() -> None:
-    frames = LineParser(ZERO_SLOTS).feed(GOOD.replace(b"\n", b"\r\n") * 2, 0)
+    frames = FrameParser(ZERO_SLOTS).feed(GOOD.replace(b"\n", b"\r\n") * 2, 0)
     assert [frame.line + b"\n" for frame in frames] == [GOOD, GOOD]
 
 
 def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffected() -> None:
-    assert {kind for kind, _ in BROKEN} == set(RefusalKind)
+    assert {kind for kind, _ in BROKEN} == set(FrameErrorKind)
     for kind, broken in BROKEN:
-        parser = LineParser(ZERO_SLOTS)
+        parser = FrameParser(ZERO_SLOTS)
         frames = parser.feed(GOOD + broken + LINES[1], 0)
         assert dict(parser.refused) == {kind: 1}, broken[:20]
         assert [frame.line + b"\n" for frame in frames] == [GOOD, LINES[1]]
@@ -183,7 +183,7 @@ def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffecte
 
 def test_a_refusal_says_which_value_it_was() -> None:
     refusal = read_line(with_value(CHANNEL, b"-0.1234").rstrip(b"\n"), ZERO_SLOTS)
-    assert isinstance(refusal, Refusal)
+    assert isinstance(refusal, FrameError)
     assert refusal.position == CHANNEL
     assert f"read '-0.1234' at value {CHANNEL + 1}" in str(refusal)
 
@@ -193,7 +193,7 @@ def test_a_line_with_any_one_byte_changed_is_refused_or_reads_as_another_number(
     position = data.draw(st.integers(0, len(GOOD) - 2))
     byte = data.draw(st.integers(0, 255).filter(lambda byte: byte != GOOD[position] and byte != ord("\n")))
     changed = GOOD[:position] + bytes([byte]) + GOOD[position + 1 :]
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     frames = parser.feed(LINES[1] + changed + LINES[2], 0)
     read_either_way(changed.rstrip(b"\n"))
     is_digit = chr(byte).isdigit() and byte < 128 and chr(GOOD[position]).isdigit()
@@ -208,7 +208,7 @@ def test_every_good_line_among_broken_ones_arrives_and_every_broken_one_is_count
 ) -> None:
     stream = GOOD + b"".join(lines)
     cuts = data.draw(st.lists(st.integers(0, len(stream)), max_size=10))
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     frames = feed_all(parser, slices(stream, cuts))
     assert [frame.line + b"\n" for frame in frames] == [GOOD, *[line for line in lines if line in LINES]]
     assert parser.refused.total() == len(lines) + 1 - len(frames)
@@ -216,7 +216,7 @@ def test_every_good_line_among_broken_ones_arrives_and_every_broken_one_is_count
 
 @given(st.binary(max_size=3000), st.integers(1, 300))
 def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage: bytes, times: int) -> None:
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     for _ in range(times):
         assert parser.feed(garbage, 0) == []
         assert len(parser._begun) <= LONGEST_LINE_BYTES
@@ -225,31 +225,31 @@ def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage: bytes, times
 
 
 def test_a_flood_without_newline_is_told_when_it_happens_and_only_once() -> None:
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     for _ in range(100):
         parser.feed(b"7" * 10_000, 0)
-    assert dict(parser.refused) == {RefusalKind.TOO_LONG: 1}
+    assert dict(parser.refused) == {FrameErrorKind.TOO_LONG: 1}
     assert len(parser.feed(b"777\n" + GOOD, 0)) == 1
     assert parser.refused.total() == 1
 
 
 @given(st.integers(1, LINE_BYTES))
 def test_the_rest_of_a_line_that_was_under_way_is_no_error(start: int) -> None:
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     assert len(parser.feed(GOOD[start:] + LINES[1], 0)) == 1
     assert not parser.refused
     assert parser.first_partials == 1
 
 
 def test_a_whole_line_that_is_broken_is_refused_even_as_the_first() -> None:
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     parser.feed(with_value(CHANNEL, b"nan"), 0)
-    assert dict(parser.refused) == {RefusalKind.NAN: 1}
+    assert dict(parser.refused) == {FrameErrorKind.NAN: 1}
     assert parser.first_partials == 0
 
 
 def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> None:
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     parser.feed(GOOD + LINES[1][:3000], 0)
     parser.port_opened()
     frames = parser.feed(LINES[2], 0)
@@ -260,7 +260,7 @@ def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> N
 
 @given(st.integers(0, LINE_BYTES), st.booleans())
 def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun: int, anew: bool) -> None:
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     parser.feed(GOOD + LINES[1][:begun], 0)
     parser.board_started()
     frames = parser.feed((LINES[2] if anew else LINES[1][begun:]) + LINES[3], 0)
@@ -270,7 +270,7 @@ def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun: int, anew:
 
 
 def test_frames_that_waited_together_are_stamped_a_period_apart() -> None:
-    parser = LineParser(ZERO_SLOTS)
+    parser = FrameParser(ZERO_SLOTS)
     for number in range(30):
         parser.feed(LINES[number % 2], number * PERIOD_NS)
     # The reader was away from frame 30 to shortly after frame 34.
@@ -282,7 +282,7 @@ def test_frames_that_waited_together_are_stamped_a_period_apart() -> None:
 
 @given(st.lists(st.tuples(st.integers(1, 3), st.integers(0, 3 * PERIOD_NS)), max_size=25))
 def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts: list[tuple[int, int]]) -> None:
-    parser, now_ns, middles = LineParser(ZERO_SLOTS), 0, []
+    parser, now_ns, middles = FrameParser(ZERO_SLOTS), 0, []
     for number, pause_ns in bursts:
         now_ns += pause_ns
         frames = parser.feed(GOOD * number, now_ns)
@@ -292,7 +292,7 @@ def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts: lis
 
 
 def flagged(lines: list[NDArray[np.float64]], **settings: int) -> list[Frame]:
-    parser = LineParser(ZERO_SLOTS, **settings)
+    parser = FrameParser(ZERO_SLOTS, **settings)
     return [frame for n, line in enumerate(lines) for frame in parser.feed(format_line(line), n * PERIOD_NS)]
 
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.calibration_file import CalibrationError, load_calibration, save_calibration
-from drivers.hx711 import (
+from shearloop.drivers.calibration_file import CalibrationError, load_calibration, save_calibration
+from shearloop.drivers.hx711 import (
     COUNTS_MAX,
     COUNTS_MIN,
     MAX_LINE_BYTES,

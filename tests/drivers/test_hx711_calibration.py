@@ -7,9 +7,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.calibration_file import CalibrationError
-from drivers.hx711 import COUNTS_MAX, LoadCalibration, LoadParser, LoadSample
-from drivers.hx711_calibration import STANDARD_GRAVITY, UNCALIBRATED, CalibrationBounds, LoadCalibrator, tare
+from shearloop.drivers.calibration_file import CalibrationError
+from shearloop.drivers.hx711 import COUNTS_MAX, LoadCalibration, LoadParser, LoadSample
+from shearloop.drivers.hx711_calibration import (
+    STANDARD_GRAVITY,
+    UNCALIBRATED,
+    CalibrationBounds,
+    LoadCalibrator,
+    tare,
+)
 
 BOUNDS = CalibrationBounds()
 STEP = BOUNDS.skip_samples + BOUNDS.samples_per_step

@@ -5,7 +5,7 @@ import tracemalloc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.lines import LineCutter
+from shearloop.drivers.line_splitter import LineSplitter
 
 LONGEST = 8
 
@@ -13,7 +13,7 @@ LONGEST = 8
 @given(st.lists(st.binary(max_size=2 * LONGEST), max_size=12))
 def test_slices_change_nothing_and_every_line_is_given_or_counted(slices: list[bytes]) -> None:
     data = b"".join(slices)
-    whole, sliced = LineCutter(LONGEST), LineCutter(LONGEST)
+    whole, sliced = LineSplitter(LONGEST), LineSplitter(LONGEST)
     expected = whole.feed(data)
     assert [line for part in slices for line in sliced.feed(part)] == expected
     *ended, rest = data.split(b"\n")
@@ -23,7 +23,7 @@ def test_slices_change_nothing_and_every_line_is_given_or_counted(slices: list[b
 
 
 def test_memory_stays_bounded_where_no_line_ever_ends() -> None:
-    lines, slice_ = LineCutter(LONGEST), b"7" * 1000
+    lines, slice_ = LineSplitter(LONGEST), b"7" * 1000
     tracemalloc.start()
     for _ in range(1000):
         assert lines.feed(slice_) == []
@@ -34,7 +34,7 @@ def test_memory_stays_bounded_where_no_line_ever_ends() -> None:
 
 
 def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten() -> None:
-    lines = LineCutter(LONGEST)
+    lines = LineSplitter(LONGEST)
     lines.feed(b"1\n2")
     lines.restart()
     lines.restart()
@@ -43,7 +43,7 @@ def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten(
 
 
 def test_line_that_is_too_long_is_counted_once_where_the_port_is_opened_again_before_its_end() -> None:
-    lines = LineCutter(LONGEST)
+    lines = LineSplitter(LONGEST)
     lines.feed(b"7" * 20)
     lines.feed(b"7")
     lines.restart()

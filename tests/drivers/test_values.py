@@ -5,10 +5,8 @@ from typing import Any
 
 import pytest
 
-from drivers.values import value
 
-
-@value(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Pair:
     one: int
     other: str = ""

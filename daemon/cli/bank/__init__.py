@@ -5,7 +5,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from daemon.cli import CommandModule
+    from shearloop.daemon.cli import CommandModule
 
 _ACTIONS = {
     "build": "build a bank, or go on with one whose build was interrupted",
@@ -30,5 +30,5 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _module(action: str) -> "CommandModule":
-    module: CommandModule = importlib.import_module(f"daemon.cli.bank.{action}")
+    module: CommandModule = importlib.import_module(f"shearloop.daemon.cli.bank.{action}")
     return module

@@ -7,19 +7,19 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Self
 
-from daemon.cli.cluster import add_cluster
-from daemon.cli.interruption import ended
-from daemon.errors import UserError
+from shearloop.daemon.cli.cluster import add_cluster
+from shearloop.daemon.cli.interruption import ended
+from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from tqdm import tqdm
 
-    from bank.bank_file import BankDefinition
-    from bank.journal import BankRow
-    from bank.mesh import Mesh
-    from daemon.bank_config import BankPlan, GridConfig
+    from shearloop.bank.eit.bank_file import BankDefinition
+    from shearloop.bank.eit.journal import BankRow
+    from shearloop.bank.eit.mesh import Mesh
+    from shearloop.daemon.bank_config import BankPlan, GridConfig
 
 # In words, for `--help` loads nothing that computes.
 MODELS = "step, linear, cut_linear, gaussian_derivative or modulated_gaussian"
@@ -85,12 +85,12 @@ def _left(out: Path, before: tuple[int, int] | None) -> str:
 
 
 def _build(args: argparse.Namespace) -> int:
-    from bank.bank_file import BANK_MAGIC
-    from bank.build import build_bank, solve_row
-    from bank.errors import EmptyBankError
-    from daemon.bank_config import load_bank_plans
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.workers import workers
+    from shearloop.bank.eit.bank_file import BANK_MAGIC
+    from shearloop.bank.eit.build import build_bank, solve_row
+    from shearloop.bank.errors import EmptyBankError
+    from shearloop.daemon.bank_config import load_bank_plans
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.workers import workers
 
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
     if jobs < 1:
@@ -156,8 +156,8 @@ def _paths(out: Path, names: list[str]) -> list[Path]:
 
 def _is_built(path: Path, plan: "BankPlan") -> bool:
     """Return whether an earlier build of a folder has finished this bank of it."""
-    from bank.bank_file import Bank, BankDefinition
-    from bank.errors import BankFileError
+    from shearloop.bank.eit.bank_file import Bank, BankDefinition
+    from shearloop.bank.errors import BankFileError
 
     if not path.exists():
         return False
@@ -170,7 +170,7 @@ def _is_built(path: Path, plan: "BankPlan") -> bool:
 
 
 def _result(path: Path) -> dict[str, Any]:
-    from bank.bank_file import Bank
+    from shearloop.bank.eit.bank_file import Bank
 
     bank = Bank.open(path)
     return {
@@ -186,7 +186,7 @@ def _result(path: Path) -> dict[str, Any]:
 
 def overrides(args: argparse.Namespace) -> "tuple[str | None, GridConfig | None, GridConfig | None]":
     """Return the model and the grids given on the command line, None where the configuration's hold."""
-    from bank.models import model_named
+    from shearloop.bank.eit.models import model_named
 
     if args.model is not None:
         model_named(args.model)
@@ -196,8 +196,8 @@ def overrides(args: argparse.Namespace) -> "tuple[str | None, GridConfig | None,
 def _grid(option: str, text: str | None) -> "GridConfig | None":
     from pydantic import ValidationError
 
-    from daemon.bank_config import GridConfig
-    from daemon.config_file import mistakes
+    from shearloop.daemon.bank_config import GridConfig
+    from shearloop.daemon.config_file import mistakes
 
     if text is None:
         return None

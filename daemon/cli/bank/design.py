@@ -17,9 +17,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Design, and print or write what `bank build --config` takes."""
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.errors import UserError
-    from daemon.scene import design_yaml, designed_for, doubts
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.scene import design_yaml, designed_for, doubts
 
     if args.out is not None:
         check_writes_over(args.out, "a configuration")

@@ -9,10 +9,10 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from bank.channels import N_CHANNELS
-from bank.forward import ForwardModel
-from bank.mesh import Mesh
-from bank.models import MODELS, conductivity
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.models import MODELS, conductivity
 
 _PANELS = 10
 _BLUE, _GREY = "#1f5f99", "#8a8a8a"
@@ -138,8 +138,8 @@ def save_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
 
 def solved_grid(mesh: Mesh, model: str, k: NDArray[np.float64], sigma: NDArray[np.float64]) -> SignalGrid:
     """Solve the cells of a small grid of (K,) k and (S,) σ for drawing."""
-    from bank.bank_file import BankDefinition
-    from bank.build import RowSolver
+    from shearloop.bank.eit.bank_file import BankDefinition
+    from shearloop.bank.eit.build import RowSolver
 
     solver = RowSolver(mesh, BankDefinition(mesh.digest, model, k, sigma))
     rows = [solver.solve(row) for row in range(len(k))]

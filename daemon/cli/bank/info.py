@@ -16,8 +16,8 @@ def run(args: argparse.Namespace) -> int:
     """Read the whole bank, compare its checksums, and print what it is of."""
     import numpy as np
 
-    from bank.bank_file import FORMAT_VERSION, Bank
-    from bank.channels import CHANNEL_TABLE_HASH
+    from shearloop.bank.eit.bank_file import FORMAT_VERSION, Bank
+    from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
 
     bank = Bank.open(args.path, verify=True)
     facts = {

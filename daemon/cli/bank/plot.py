@@ -3,8 +3,8 @@
 import argparse
 from pathlib import Path
 
-from daemon.cli.bank.build import add_overrides, overrides
-from daemon.errors import UserError
+from shearloop.daemon.cli.bank.build import add_overrides, overrides
+from shearloop.daemon.errors import UserError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -26,11 +26,18 @@ def run(args: argparse.Namespace) -> int:
     if args.path is None and args.config is None:
         raise UserError("give a bank's PATH, or --config FILE, or both")
     try:
-        from daemon.cli.bank.figures import SignalGrid, models_figure, save_figure, signal_figure, solved_grid, spread
+        from shearloop.daemon.cli.bank.figures import (
+            SignalGrid,
+            models_figure,
+            save_figure,
+            signal_figure,
+            solved_grid,
+            spread,
+        )
     except ModuleNotFoundError as error:
         raise UserError(f"drawing needs {error.name}: install shearloop with the extra `plot`") from error
-    from bank.bank_file import Bank
-    from daemon.bank_config import load_bank_plan
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.daemon.bank_config import load_bank_plan
 
     figures = {}
     model, k, sigma = overrides(args)

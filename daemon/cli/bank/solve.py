@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from daemon.cli.bank.build import MODELS
+from shearloop.daemon.cli.bank.build import MODELS
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -24,13 +24,13 @@ def run(args: argparse.Namespace) -> int:
 
     import numpy as np
 
-    from bank.errors import ConductivityError
-    from bank.forward import ForwardModel
-    from bank.models import conductivity
-    from bank.stored import replaced
-    from daemon.bank_config import load_geometry
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.errors import UserError
+    from shearloop.bank.eit.forward import ForwardModel
+    from shearloop.bank.eit.models import conductivity
+    from shearloop.bank.eit.stored import replaced
+    from shearloop.bank.errors import ConductivityError
+    from shearloop.daemon.bank_config import load_geometry
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.errors import UserError
 
     check_writes_over(args.out, "an array of NumPy", np.lib.format.MAGIC_PREFIX)
     mesh = load_geometry(args.mesh)

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.result import add_json, tell
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -29,14 +29,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Estimate every frame, fit, and say what to write into the configuration."""
-    from bank.bank_file import Bank
-    from bank.estimators import Calibration
-    from daemon.cli.recorded import check_kind
-    from daemon.control.creep import fit_creep
-    from daemon.recording.copies import check_no_copies, check_paths_differ
-    from daemon.recording.evaluation import follow
-    from daemon.recording.grips import grips_of
-    from daemon.recording.series import read_series
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.bank.estimation import Calibration
+    from shearloop.daemon.analysis.copies import check_no_copies, check_paths_differ
+    from shearloop.daemon.analysis.evaluation import follow
+    from shearloop.daemon.analysis.grips import grips_of
+    from shearloop.daemon.analysis.series import read_series
+    from shearloop.daemon.cli.recorded import check_kind
+    from shearloop.daemon.control.creep import fit_creep
 
     check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)

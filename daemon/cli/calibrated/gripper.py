@@ -6,11 +6,11 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.operator_input import Operator
-from daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.operator_input import Operator
+from shearloop.daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
-    from drivers.robotiq.gripper import RobotiqGripper
+    from shearloop.drivers.robotiq.gripper import RobotiqGripper
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -42,14 +42,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Grip each object, and write the calibration."""
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.errors import UserError
-    from drivers.calibration_file import save_calibration
-    from drivers.robotiq.gripper import RobotiqGripper
-    from drivers.robotiq.messages import GripperClient
-    from drivers.robotiq.modbus_client import ModbusClient
-    from drivers.robotiq.socket_client import SocketClient
-    from drivers.robotiq.width import STROKE_MM, WidthCalibration
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.calibration_file import save_calibration
+    from shearloop.drivers.robotiq.gripper import RobotiqGripper
+    from shearloop.drivers.robotiq.messages import GripperClient
+    from shearloop.drivers.robotiq.modbus_client import ModbusClient
+    from shearloop.drivers.robotiq.socket_client import SocketClient
+    from shearloop.drivers.robotiq.width import STROKE_MM, WidthCalibration
 
     if any(not 0 < diameter < STROKE_MM for diameter in args.diameter_mm) or len(set(args.diameter_mm)) < 2:
         raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")
@@ -108,8 +108,8 @@ async def _grip(
 
 async def _contact(gripper: "RobotiqGripper", force_n: float) -> int | None:
     """Close, open again, and return the position at which the fingers stopped on something."""
-    from drivers.robotiq.messages import SPEED_MIN_MM_S, GripperCommand, ObjectStatus
-    from drivers.robotiq.width import STROKE_MM
+    from shearloop.drivers.robotiq.messages import SPEED_MIN_MM_S, GripperCommand, ObjectStatus
+    from shearloop.drivers.robotiq.width import STROKE_MM
 
     # Past the fingers' own stop, so that reaching the target is never mistaken for a contact.
     closed = await gripper.finish(await gripper.move(GripperCommand(-STROKE_MM, SPEED_MIN_MM_S, force_n)))

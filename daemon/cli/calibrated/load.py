@@ -7,12 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.operator_input import Operator
-from daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.operator_input import Operator
+from shearloop.daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
-    from drivers.hx711_calibration import LoadCalibrator
-    from drivers.serial_port import SerialPort
+    from shearloop.drivers.hx711_calibration import LoadCalibrator
+    from shearloop.drivers.serial_port import SerialPort
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -49,12 +49,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Ask for each load, measure it, and write the calibration."""
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.errors import UserError
-    from drivers.calibration_file import save_calibration
-    from drivers.hx711 import BAUD_RATE
-    from drivers.hx711_calibration import LoadCalibrator
-    from drivers.serial_port import SerialPort, find_port
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.calibration_file import save_calibration
+    from shearloop.drivers.hx711 import BAUD_RATE
+    from shearloop.drivers.hx711_calibration import LoadCalibrator
+    from shearloop.drivers.serial_port import SerialPort, find_port
 
     if not 0 < args.lever_arm_mm < 1000:
         raise UserError(f"--lever-arm-mm {args.lever_arm_mm:g} is no lever arm; give millimetres above 0")
@@ -100,11 +100,11 @@ class _Session:
         self._step: asyncio.Future[None] | None = None
 
     async def listen(self) -> None:
-        from drivers.calibration_file import CalibrationError
-        from drivers.errors import DeviceLostError
-        from drivers.hx711 import LoadParser
-        from drivers.hx711_calibration import UNCALIBRATED
-        from drivers.sending_board import BOOT_S
+        from shearloop.drivers.calibration_file import CalibrationError
+        from shearloop.drivers.errors import DeviceLostError
+        from shearloop.drivers.hx711 import LoadParser
+        from shearloop.drivers.hx711_calibration import UNCALIBRATED
+        from shearloop.drivers.streaming_sensor import BOOT_S
 
         parser = LoadParser(UNCALIBRATED)
         while (received := await self._port.read(BOOT_S)) is not None:
@@ -130,7 +130,7 @@ class _Session:
             self._step.set_exception(error)
 
     async def lead(self) -> None:
-        from drivers.calibration_file import CalibrationError
+        from shearloop.drivers.calibration_file import CalibrationError
 
         while not self._calibrator.finished:
             await self._operator.ask(f"{self._calibrator.prompt} Then press Enter.")

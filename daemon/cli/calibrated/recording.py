@@ -8,12 +8,12 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.result import add_json, tell
 
 if TYPE_CHECKING:
-    from bank.estimators import Calibration, FrameSeries
-    from bank.estimators.alignment import Aligned
-    from bank.estimators.reader import Reader
+    from shearloop.bank.estimation import Calibration, FrameSeries
+    from shearloop.bank.estimation.alignment import Aligned
+    from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 
 # A stamp that is further off belongs to another recording.
 _LARGEST_LATE_S = 600.0
@@ -61,18 +61,18 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, write, and say what was fitted."""
-    from bank.bank_file import Bank
-    from bank.estimators import Physics, fit
-    from bank.estimators.alignment import alignment, telling
-    from bank.estimators.archive import ARCHIVE_MAGIC
-    from bank.mesh import load_mesh
-    from daemon.cli.recorded import parsed_part, parsed_sides
-    from daemon.cli.writing_over import check_writes_over
-    from daemon.errors import UserError
-    from daemon.recording.copies import check_no_copies, check_paths_differ
-    from daemon.recording.reader import read_recording
-    from daemon.recording.schema import LARGEST_DIAMETER_MM
-    from daemon.recording.series import part_of, read_series, series_of
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.bank.eit.mesh import load_mesh
+    from shearloop.bank.estimation import Physics, fit
+    from shearloop.bank.estimation.alignment import alignment, telling
+    from shearloop.bank.estimation.archive import ARCHIVE_MAGIC
+    from shearloop.daemon.analysis.copies import check_no_copies, check_paths_differ
+    from shearloop.daemon.analysis.series import part_of, read_series, series_of
+    from shearloop.daemon.cli.recorded import parsed_part, parsed_sides
+    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.recording.reader import read_recording
+    from shearloop.daemon.recording.schema import LARGEST_DIAMETER_MM
 
     start, stop = parsed_part(args.part)
     late_s = args.load_late
@@ -163,7 +163,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _check_options(args: argparse.Namespace, parts: "Sequence[FrameSeries]") -> None:
     """Raise UserError for an option that does nothing for what is calibrated on."""
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if args.all_torques and any(one.kind == "raw" for one in parts):
         raise UserError("--all-torques is for slices: what is read of recordings has no such ends; leave it out")
@@ -185,7 +185,7 @@ def _of_times(
     aligned: "Aligned",
 ) -> tuple[dict[str, object], list[str]]:
     """Return what is known of when the loads of recordings were measured, which `timed` tell: as JSON, and in words."""
-    from bank.estimators.alignment import doubt, unchecked_s
+    from shearloop.bank.estimation.alignment import doubt, unchecked_s
 
     late_s = [found and round(found.late_s, 3) for found in map(aligned, timed)]
     known = ", ".join(f"{each:.2f}" for each in late_s if each is not None)
@@ -205,7 +205,7 @@ def _of_times(
     return told, sentences
 
 
-def _blind(reader: "Reader", estimator: str, sides: tuple[str, ...]) -> str:
+def _blind(reader: "IntervalRegressor", estimator: str, sides: tuple[str, ...]) -> str:
     """Return what it means that loads are not seen, and what may help."""
     low_nm, high_nm = (round(limit, 3) + 0.0 for limit in (reader.low, reader.high))
     others = ["with --estimator fused"] if estimator != "fused" else []
@@ -218,12 +218,12 @@ def _blind(reader: "Reader", estimator: str, sides: tuple[str, ...]) -> str:
     )
 
 
-def _reads_within(reader: "Reader") -> bool:
+def _reads_within(reader: "IntervalRegressor") -> bool:
     """Return whether torques beyond those calibrated on may be read as some of them."""
     return reader.low_end > reader.low or reader.high_end < reader.high
 
 
-def _ends(reader: "Reader") -> str:
+def _ends(reader: "IntervalRegressor") -> str:
     """Return what it means that torques beyond the range are read within it, and what helps."""
     limits = (reader.low, reader.high, reader.low_end, reader.high_end, reader.lowest, reader.highest)
     low_nm, high_nm, below_nm, above_nm, lowest_nm, highest_nm = (round(limit, 3) + 0.0 for limit in limits)

@@ -8,15 +8,15 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.emulated.link import add_link, checked_link
+from shearloop.daemon.cli.emulated.link import add_link, checked_link
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from bank.mesh import Mesh
-    from daemon.synthetic import Signals
-    from drivers.emulators.eit_kit import Fault
+    from shearloop.bank.eit.mesh import Mesh
+    from shearloop.daemon.synthetic import Signals
+    from shearloop.drivers.emulators.eit_kit import Fault
 
 DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
 # Where the paper's method finds its screwdriver: σ at rest and at the largest torque of the slices, in N·m.
@@ -66,10 +66,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
-    from daemon.cli.emulated.console import play
-    from daemon.errors import UserError
-    from drivers.eit_format import FRAME_PERIOD_S
-    from drivers.emulators.eit_kit import EitKitBoard, read_fault
+    from shearloop.daemon.cli.emulated.console import play
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.eit_format import FRAME_PERIOD_S
+    from shearloop.drivers.emulators.eit_kit import EitKitBoard, read_fault
 
     if not (math.isfinite(args.speed) and args.speed > 0):
         raise UserError(f"--speed {args.speed:g} is not above 0")
@@ -88,8 +88,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _fault_at(text: str) -> tuple[int, "Fault"]:
-    from daemon.errors import UserError
-    from drivers.emulators.eit_kit import read_fault
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.emulators.eit_kit import read_fault
 
     name, _, frame = text.partition("@")
     if not frame.isdecimal():
@@ -101,7 +101,7 @@ def _fault_at(text: str) -> tuple[int, "Fault"]:
 
 
 def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if args.recording is not None and args.bank is not None:
         raise UserError("give either --recording FILE to play a recording or --bank FILE to synthesise frames")
@@ -109,15 +109,15 @@ def _frames(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.f
         if args.once:
             raise UserError("--once is for a recording; synthetic frames have no end")
         return _synthetic(args, period_s)
-    from daemon.matlab.recordings import read_stream
+    from shearloop.daemon.recording.matlab_streams import read_stream
 
     lines = read_stream(args.recording, args.side).lines
     return iter(lines) if args.once else cycle(lines)
 
 
 def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[np.float64]"]:
-    from bank.bank_file import Bank
-    from daemon.synthetic import Synthesiser, TwistProgramme, solved_signals, twist_frames
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.daemon.synthetic import Synthesiser, TwistProgramme, solved_signals, twist_frames
 
     rest, largest = args.sigma
 
@@ -138,8 +138,8 @@ def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[n
 
 def _demo_mesh() -> "Mesh":
     """Return the mesh of the demo's bank; raises UserError where the project's `config/` is not beside its code."""
-    from daemon.bank_config import load_bank_plan
-    from daemon.errors import UserError
+    from shearloop.daemon.bank_config import load_bank_plan
+    from shearloop.daemon.errors import UserError
 
     if not DEMO_BANK.is_file():
         raise UserError(f"{DEMO_BANK} is not there; give --recording FILE to play, or --bank FILE to synthesise from")

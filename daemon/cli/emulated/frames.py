@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bank.bank_file import Bank
-from bank.calibration import Calibration
-from daemon.errors import UserError
-from daemon.synthetic import INJECTIONS, Synthesiser
-from drivers.emulators.rig import FrameOf
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.calibration import Calibration
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.synthetic import INJECTIONS, Synthesiser
+from shearloop.drivers.emulators.rig import FrameOf
 
 FloatArray = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drivers.emulators.robotiq.gripper import Gripper
-    from drivers.emulators.robotiq.player import Server
+    from shearloop.drivers.emulators.robotiq.gripper import Gripper
+    from shearloop.drivers.emulators.robotiq.player import Server
 
 
 def configure(parser: argparse.ArgumentParser, where: str, more: str = "") -> None:
@@ -23,10 +23,10 @@ def configure(parser: argparse.ArgumentParser, where: str, more: str = "") -> No
 
 def play_gripper(args: argparse.Namespace, make_server: Callable[["Gripper"], "Server"]) -> int:
     """Play a gripper behind the server that is made for it, until told to stop."""
-    from daemon.cli.emulated.console import play
-    from daemon.errors import UserError
-    from drivers.emulators.robotiq.gripper import Gripper
-    from drivers.emulators.robotiq.player import GripperPlayer
+    from shearloop.daemon.cli.emulated.console import play
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.emulators.robotiq.gripper import Gripper
+    from shearloop.drivers.emulators.robotiq.player import GripperPlayer
 
     if not (math.isfinite(args.speed) and args.speed > 0):
         raise UserError(f"--speed {args.speed:g} is not above 0")

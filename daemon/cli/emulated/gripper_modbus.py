@@ -3,8 +3,8 @@
 import argparse
 from functools import partial
 
-from daemon.cli.emulated import gripper as common
-from daemon.cli.emulated.link import add_link, checked_link
+from shearloop.daemon.cli.emulated import gripper as common
+from shearloop.daemon.cli.emulated.link import add_link, checked_link
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -15,7 +15,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
-    from drivers.emulators.robotiq.modbus_face import ModbusServer
+    from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
 
     link = checked_link(args.link)
     on_port = partial(print, flush=True)

@@ -3,7 +3,7 @@
 import argparse
 from functools import partial
 
-from daemon.cli.emulated import gripper as common
+from shearloop.daemon.cli.emulated import gripper as common
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -17,8 +17,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
-    from daemon.errors import UserError
-    from drivers.emulators.robotiq.urcap_face import UrcapServer
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.emulators.robotiq.urcap_face import UrcapServer
 
     if not 0 <= args.port <= 65535:
         raise UserError(f"--port {args.port} is no port; give 0 to 65535")

@@ -5,7 +5,7 @@ import math
 from functools import partial
 from itertools import count
 
-from daemon.cli.emulated.link import add_link, checked_link
+from shearloop.daemon.cli.emulated.link import add_link, checked_link
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -30,9 +30,9 @@ LEVER_ARM_M, STANDARD_GRAVITY = 0.035, 9.80665
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
-    from daemon.cli.emulated.console import play
-    from daemon.errors import UserError
-    from drivers.emulators.hx711 import PAPER_SKETCH, PERIOD_S, Hx711Board, Sketch, read_fault
+    from shearloop.daemon.cli.emulated.console import play
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.emulators.hx711 import PAPER_SKETCH, PERIOD_S, Hx711Board, Sketch, read_fault
 
     if not (math.isfinite(args.speed) and args.speed > 0):
         raise UserError(f"--speed {args.speed:g} is not above 0")

@@ -11,7 +11,7 @@ def add_link(parser: argparse.ArgumentParser) -> None:
 
 def checked_link(link: Path | None) -> Path | None:
     """Return the path for the link, its folder made; UserError when none can be made there."""
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if link is None:
         return None

@@ -10,12 +10,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from daemon.cli.emulated.link import checked_link
+from shearloop.daemon.cli.emulated.link import checked_link
 
 if TYPE_CHECKING:
-    from drivers.emulators.rig import Rig, RigSettings, RigSkin
-    from drivers.emulators.scene import Truth
-    from drivers.emulators.ur.robot import Event
+    from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
+    from shearloop.drivers.emulators.scene import Truth
+    from shearloop.drivers.emulators.ur.robot import RobotEvent
 
 JOINTS = ("lever", "tightening", "seized", "stripping")
 EPILOG = """Prints `rig ready` and where everything is, then what happens to the robot, a JSON object a line.
@@ -82,15 +82,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
-    from daemon.cli.emulated.console import play
-    from daemon.cli.emulated.frames import frame_maker
-    from daemon.errors import UserError
-    from drivers.emulators.rig import Rig
+    from shearloop.daemon.cli.emulated.console import play
+    from shearloop.daemon.cli.emulated.frames import frame_maker
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.emulators.rig import EmulatedRig
 
     settings = _settings(args)
     frames = frame_maker(args.bank, args.seed, sigma=args.sigma, calibration=args.calibration)
     with _truth_file(args.truth) as file:
-        rig = Rig(
+        rig = EmulatedRig(
             settings,
             frames,
             skin=_skin(args) if args.skin else None,
@@ -111,11 +111,11 @@ def run(args: argparse.Namespace) -> int:
 def _settings(args: argparse.Namespace) -> "RigSettings":
     from dataclasses import replace
 
-    from daemon.errors import UserError
-    from drivers.emulators.hx711 import PAPER_SKETCH
-    from drivers.emulators.rig import NOISE_NM, RigSettings, joint_of
-    from drivers.emulators.twin import TwinSettings
-    from drivers.emulators.ur.make import Make
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.emulators.hx711 import PAPER_SKETCH
+    from shearloop.drivers.emulators.rig import NOISE_NM, RigSettings, joint_of
+    from shearloop.drivers.emulators.twin import TwinSettings
+    from shearloop.drivers.emulators.ur.make import Make
 
     for name in ("speed", "arm_speed", "gel_stiffness"):
         if not (math.isfinite(getattr(args, name)) and getattr(args, name) > 0):
@@ -150,8 +150,8 @@ def _settings(args: argparse.Namespace) -> "RigSettings":
 
 def _skin(args: argparse.Namespace) -> "RigSkin":
     """Return a skin that bears half of the tool's torque: the other finger bears the other half."""
-    from daemon.cli.emulated.skin_push import PushedSkin
-    from drivers.emulators.rig import RigSkin
+    from shearloop.daemon.cli.emulated.skin_push import PushedSkin
+    from shearloop.drivers.emulators.rig import RigSkin
 
     pushed, lever_m = PushedSkin(args.seed), args.diameter_mm * 1e-3
 
@@ -161,7 +161,7 @@ def _skin(args: argparse.Namespace) -> "RigSkin":
     return RigSkin(follow, pushed.resistances_ohm)
 
 
-def _obey(rig: "Rig", line: str) -> None:
+def _obey(rig: "EmulatedRig", line: str) -> None:
     if line == "truth":
         _print("truth", **_fields(rig.scene.truth()))
     else:
@@ -171,7 +171,7 @@ def _obey(rig: "Rig", line: str) -> None:
 
 @contextmanager
 def _truth_file(path: Path | None) -> Iterator[TextIO | None]:
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if path is None:
         yield None
@@ -194,7 +194,7 @@ def _print_ready(settings: "RigSettings") -> None:
     print("rig ready", *(f"{name}={place}" for name, place in {"robot": settings.host, **places}.items()), flush=True)
 
 
-def _print_event(event: "Event") -> None:
+def _print_event(event: "RobotEvent") -> None:
     _print(
         event.name,
         detail=event.detail,

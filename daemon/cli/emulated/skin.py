@@ -4,12 +4,12 @@ import argparse
 import asyncio
 from typing import TYPE_CHECKING
 
-from daemon.cli.emulated import skin_place
+from shearloop.daemon.cli.emulated import skin_place
 
 if TYPE_CHECKING:
-    from daemon.cli.emulated.skin_push import PushedSkin
-    from drivers.emulators.skin.instruments import SkinInstruments
-    from drivers.emulators.ur.server import Controller
+    from shearloop.daemon.cli.emulated.skin_push import PushedSkin
+    from shearloop.drivers.emulators.skin.instruments import SkinInstruments
+    from shearloop.drivers.emulators.ur.server import Controller
 
 EPILOG = """Prints where source and DAQ are, again each time they are there. Commands, one a line on standard input:
   shear N, normal N              push the skin (not while a robot turns it)
@@ -40,12 +40,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
-    from daemon.cli.emulated.console import play
-    from daemon.cli.emulated.skin_push import PushedSkin
-    from daemon.errors import UserError
-    from daemon.synthetic_skin import SyntheticSkinSettings
-    from drivers.emulators.skin.instruments import SkinInstruments
-    from drivers.emulators.ur.faults import obey
+    from shearloop.daemon.cli.emulated.console import play
+    from shearloop.daemon.cli.emulated.skin_push import PushedSkin
+    from shearloop.daemon.errors import UserError
+    from shearloop.daemon.synthetic_skin import SyntheticSkinSettings
+    from shearloop.drivers.emulators.skin.instruments import SkinInstruments
+    from shearloop.drivers.emulators.ur.faults import obey
 
     _check(args)
     settings = SyntheticSkinSettings(radius_mm=args.radius_mm, normal_n=args.normal_n)
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check(args: argparse.Namespace) -> None:
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     skin_place.check_speed(args.speed)
     if not abs(args.sweep_n) <= 5.0:
@@ -91,8 +91,8 @@ def _check(args: argparse.Namespace) -> None:
 
 
 def _controller(args: argparse.Namespace, pushed: "PushedSkin") -> "Controller":
-    from drivers.emulators.ur.robot import Robot
-    from drivers.emulators.ur.server import Controller
+    from shearloop.drivers.emulators.ur.robot import Robot
+    from shearloop.drivers.emulators.ur.server import Controller
 
     robot = Robot(plant=lambda wrist_rad, _speed, _dt_s: pushed.turned(wrist_rad))
     return Controller(robot, host=args.robot, rate_hz=args.rate_hz)

@@ -3,11 +3,11 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from daemon.cli.emulated import skin_instrument, skin_place
+from shearloop.daemon.cli.emulated import skin_instrument, skin_place
 
 if TYPE_CHECKING:
-    from drivers.emulators.skin.circuit import Circuit
-    from drivers.emulators.skin.instruments import Played
+    from shearloop.drivers.emulators.skin.circuit import Circuit
+    from shearloop.drivers.emulators.skin.instruments import Played
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +23,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop; 5 mA flow all the time."""
-    from drivers.emulators.skin.instruments import play_daq
+    from shearloop.drivers.emulators.skin.instruments import play_daq
 
     where = skin_place.place(args, "")
 

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING
 
-from daemon.cli.emulated import skin_place
+from shearloop.daemon.cli.emulated import skin_place
 
 if TYPE_CHECKING:
-    from drivers.emulators.skin.circuit import Circuit
-    from drivers.emulators.skin.instruments import Played
+    from shearloop.drivers.emulators.skin.circuit import Circuit
+    from shearloop.drivers.emulators.skin.instruments import Played
 
 EPILOG = (
     "Prints the port's path or address, again each time it is there. On standard input: `shear N` and `normal N` push "
@@ -28,10 +28,10 @@ def configure(parser: argparse.ArgumentParser, link_help: str, port_help: str, f
 
 def play_instrument(args: argparse.Namespace, make: "Callable[[Circuit, argparse.Namespace], Played]") -> int:
     """Play the instrument that is made around a circuit, until told to stop."""
-    from daemon.cli.emulated.console import play
-    from daemon.cli.emulated.skin_push import PushedSkin
-    from daemon.errors import UserError
-    from drivers.emulators.skin.circuit import Circuit, befall
+    from shearloop.daemon.cli.emulated.console import play
+    from shearloop.daemon.cli.emulated.skin_push import PushedSkin
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.emulators.skin.circuit import Circuit, befall
 
     skin_place.check_speed(args.speed)
     pushed = PushedSkin(args.seed)

@@ -4,10 +4,10 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from daemon.cli.emulated.link import checked_link
+from shearloop.daemon.cli.emulated.link import checked_link
 
 if TYPE_CHECKING:
-    from drivers.emulators.skin.instruments import Place
+    from shearloop.drivers.emulators.skin.instruments import Place
 
 
 def add_place(parser: argparse.ArgumentParser, prefix: str, link_help: str, port_help: str) -> None:
@@ -19,7 +19,7 @@ def add_place(parser: argparse.ArgumentParser, prefix: str, link_help: str, port
 
 def place(args: argparse.Namespace, prefix: str) -> "Place | None":
     """Return the place that was given; None for a pseudo-terminal without a name. UserError when it cannot be one."""
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     link, port = getattr(args, f"{prefix}link"), getattr(args, f"{prefix}port")
     if port is None:
@@ -40,7 +40,7 @@ def check_speed(speed: float) -> None:
     """Raise UserError for a speed that nothing can be played at."""
     import math
 
-    from daemon.errors import UserError
+    from shearloop.daemon.errors import UserError
 
     if not (math.isfinite(speed) and speed > 0):
         raise UserError(f"--speed {speed:g} is not above 0")

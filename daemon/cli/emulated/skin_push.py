@@ -3,7 +3,7 @@
 import math
 import time
 
-from daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
+from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
 
 # How often a swept force goes there and back.
 SWEEP_PERIOD_S = 20.0

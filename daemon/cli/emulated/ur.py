@@ -6,8 +6,8 @@ import time
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from drivers.emulators.ur.robot import Event
-    from drivers.emulators.ur.server import Controller
+    from shearloop.drivers.emulators.ur.robot import RobotEvent
+    from shearloop.drivers.emulators.ur.server import Controller
 
 FAULTS = """Prints what happens, a JSON object a line. Faults, one a line on standard input:
   protective-stop         stop for safety, pause the program
@@ -41,12 +41,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
-    from daemon.cli.emulated.console import play
-    from daemon.errors import UserError
-    from drivers.emulators.ur.faults import obey
-    from drivers.emulators.ur.make import Make
-    from drivers.emulators.ur.robot import Robot
-    from drivers.emulators.ur.server import Controller
+    from shearloop.daemon.cli.emulated.console import play
+    from shearloop.daemon.errors import UserError
+    from shearloop.drivers.emulators.ur.faults import obey
+    from shearloop.drivers.emulators.ur.make import Make
+    from shearloop.drivers.emulators.ur.robot import Robot
+    from shearloop.drivers.emulators.ur.server import Controller
 
     if not 50 <= args.rate_hz <= 1000:
         raise UserError(f"--rate-hz {args.rate_hz:g} is outside 50 to 1000")
@@ -79,7 +79,7 @@ async def _play(controller: "Controller", host: str) -> None:
         await controller.run()
 
 
-def _print_event(event: "Event") -> None:
+def _print_event(event: "RobotEvent") -> None:
     _print(
         event.name,
         detail=event.detail,

@@ -8,8 +8,8 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from drivers.emulators.pty_server import PtyServer
-from drivers.emulators.robotiq.gripper import Gripper
+from shearloop.drivers.emulators.pty_server import PtyServer
+from shearloop.drivers.emulators.robotiq.gripper import Gripper
 
 DEVICE_ID = 9
 COMMAND_REGISTERS = range(0x03E8, 0x03EB)

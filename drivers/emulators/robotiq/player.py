@@ -3,8 +3,8 @@
 import asyncio
 from typing import Protocol
 
-from drivers.emulators.outage import Outage
-from drivers.emulators.robotiq.gripper import Gripper
+from shearloop.drivers.emulators.outage import Outage
+from shearloop.drivers.emulators.robotiq.gripper import Gripper
 
 STEP_S = 0.008
 COMMANDS = (

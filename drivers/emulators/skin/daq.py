@@ -5,10 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from random import Random
 
-from drivers.emulators.board import PlayedBoard
-from drivers.emulators.skin.circuit import Circuit
-from drivers.emulators.skin.scpi_face import ILLEGAL_VALUE, ScpiError, ScpiFace, number
-from drivers.emulators.skin.servers import time_of
+from shearloop.drivers.emulators.board import PlayedBoard
+from shearloop.drivers.emulators.skin.circuit import Circuit
+from shearloop.drivers.emulators.skin.scpi_face import ILLEGAL_VALUE, ScpiError, ScpiFace, number
+from shearloop.drivers.emulators.skin.servers import time_of
 
 SCANNER_IDENTITY = "Agilent Technologies,34972A,MY49007321,1.16-1.12-02-02"
 SCANNER_NO_ERROR = '+0,"No error"'
@@ -82,7 +82,7 @@ LASTING = ("silence", "stuck", "unplug")
 BOARD_COMMANDS = f"{', '.join(ONE_LINE)}, {' [SECONDS], '.join(LASTING)} [SECONDS]"
 
 
-class AdcBoard(PlayedBoard[str]):
+class EmulatedAdcBoard(PlayedBoard[str]):
     """A converter board on a pseudo-terminal: a line `v1,v2` in volts at each period, whoever listens.
 
     `on_port` hears the port's path whenever it appears; `sent` counts the sound lines.

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from drivers.emulators.skin.circuit import Circuit, Gauges, befall
-from drivers.emulators.skin.daq import PERIOD_S, AdcBoard, Scanner
-from drivers.emulators.skin.keithley import Keithley6430
-from drivers.emulators.skin.servers import Outages, ScpiSerial, ScpiSocket
+from shearloop.drivers.emulators.skin.circuit import Circuit, Gauges, befall
+from shearloop.drivers.emulators.skin.daq import PERIOD_S, EmulatedAdcBoard, Scanner
+from shearloop.drivers.emulators.skin.keithley import EmulatedKeithley6430
+from shearloop.drivers.emulators.skin.servers import Outages, ScpiSerial, ScpiSocket
 
 # What asking takes: two conversions of one period of the mains each, and the reply's way.
 ANSWER_S = 0.04
@@ -31,7 +31,7 @@ def play_source(
     circuit: Circuit, place: Place | None, on_port: Callable[[str], None], *, speed: float = 1.0, seed: int = 0
 ) -> Played:
     """Return the current source at a place; a new pseudo-terminal where none is given."""
-    feed = Keithley6430(circuit, time.monotonic, seed).feed
+    feed = EmulatedKeithley6430(circuit, time.monotonic, seed).feed
     if isinstance(place, tuple):
         return Outages(ScpiSocket(feed, *place, on_port=on_port, answer_s=ANSWER_S / speed))
     return Outages(ScpiSerial(feed, place, on_port, answer_s=ANSWER_S / speed))
@@ -44,7 +44,7 @@ def play_daq(
     if isinstance(place, tuple):
         feed = Scanner(circuit, time.monotonic, seed=seed).feed
         return Outages(ScpiSocket(feed, *place, on_port=on_port, answer_s=ANSWER_S / speed))
-    return AdcBoard(circuit, time.monotonic, period_s=PERIOD_S / speed, link=place, on_port=on_port, seed=seed)
+    return EmulatedAdcBoard(circuit, time.monotonic, period_s=PERIOD_S / speed, link=place, on_port=on_port, seed=seed)
 
 
 class SkinInstruments:

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from random import Random
 
-from drivers.emulators.skin.circuit import Circuit
-from drivers.emulators.skin.scpi_face import ILLEGAL_VALUE, ScpiError, ScpiFace, boolean, number
+from shearloop.drivers.emulators.skin.circuit import Circuit
+from shearloop.drivers.emulators.skin.scpi_face import ILLEGAL_VALUE, ScpiError, ScpiFace, boolean, number
 
 IDENTITY = "KEITHLEY INSTRUMENTS INC.,MODEL 6430,0874421,C27   Feb  4 2004 14:58:04/A02  /F/H"
 NO_ERROR = '0,"No error"'
@@ -19,7 +19,7 @@ _STATUS = 1 << 2 | 1 << 11 | 1 << 12 | 1 << 15
 _COMPLIANCE = 1 << 3
 
 
-class Keithley6430:
+class EmulatedKeithley6430:
     """The instrument behind its interface; `now_s` tells the time, `feed` takes bytes and returns the replies."""
 
     def __init__(self, circuit: Circuit, now_s: Callable[[], float], seed: int = 0) -> None:

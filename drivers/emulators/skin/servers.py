@@ -5,8 +5,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from drivers.emulators.pty_server import PtyServer
-from drivers.emulators.socket_server import SocketServer
+from shearloop.drivers.emulators.pty_server import PtyServer
+from shearloop.drivers.emulators.socket_server import SocketServer
 
 COMMANDS = (
     "silence [SECONDS], unplug [SECONDS], break-off (the next answer stops half-way, with the connection), normal"

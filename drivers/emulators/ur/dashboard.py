@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from drivers.emulators.ur.robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, PLAYING, Robot
+from shearloop.drivers.emulators.ur.robot import MODE_IDLE, MODE_POWER_OFF, MODE_RUNNING, PAUSED, PLAYING, Robot
 
 BANNER = "Connected: Universal Robots Dashboard Server"
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from drivers.emulators.ur.server import Controller
+from shearloop.drivers.emulators.ur.server import Controller
 
 
 def obey(controller: Controller, line: str) -> None:

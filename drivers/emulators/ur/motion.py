@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from drivers.emulators.ur.kinematics import (
+from shearloop.drivers.emulators.ur.kinematics import (
     Matrix,
     Vector,
     jacobian,

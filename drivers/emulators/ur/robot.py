@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.emulators.ur.kinematics import Matrix, Vector, link_frames, pose_of
-from drivers.emulators.ur.make import Make
-from drivers.emulators.ur.motion import Halt, Motion, PathError
-from drivers.emulators.ur.registers import Value, known_type
-from drivers.emulators.ur.script import ControlScript
+from shearloop.drivers.emulators.ur.kinematics import Matrix, Vector, link_frames, pose_of
+from shearloop.drivers.emulators.ur.make import Make
+from shearloop.drivers.emulators.ur.motion import Halt, Motion, PathError
+from shearloop.drivers.emulators.ur.registers import Value, known_type
+from shearloop.drivers.emulators.ur.script import ControlScript
 
 # Torque in N m on the tool, about its own axis, from the wrist's angle in rad, its speed in rad/s and the step in s of
 # the controller's time.
@@ -35,7 +35,7 @@ SAFETY_DECELERATION = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class RobotEvent:
     """Something that happened, at the robot's own time."""
 
     time_s: float
@@ -64,7 +64,7 @@ class Robot:
         self.q_rad: Vector = np.array(self.make.start_rad)
         self.qd_rad_per_s: Vector = np.zeros(6)
         self.motion: Motion | None = None
-        self.events: list[Event] = []
+        self.events: list[RobotEvent] = []
         self.robot_mode = MODE_RUNNING
         self.safety_mode = SAFETY_NORMAL
         self.runtime_state = STOPPED
@@ -280,7 +280,7 @@ class Robot:
 
     def _note(self, name: str, detail: str = "") -> None:
         q_rad = tuple(float(angle) for angle in self.q_rad)
-        self.events.append(Event(self.time_s, name, detail, self.time_s - self._commanded_s, q_rad))
+        self.events.append(RobotEvent(self.time_s, name, detail, self.time_s - self._commanded_s, q_rad))
 
 
 _VARIABLES: dict[str, Callable[[Robot], Value]] = {

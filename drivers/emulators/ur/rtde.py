@@ -4,8 +4,8 @@ import math
 import struct
 from dataclasses import dataclass, field
 
-from drivers.emulators.ur.registers import known_type, pack, unpack
-from drivers.emulators.ur.robot import Robot
+from shearloop.drivers.emulators.ur.registers import known_type, pack, unpack
+from shearloop.drivers.emulators.ur.robot import Robot
 
 VERSION, URCONTROL_VERSION, TEXT = ord("V"), ord("v"), ord("M")
 DATA, OUTPUTS, INPUTS, START, PAUSE = ord("U"), ord("O"), ord("I"), ord("S"), ord("P")

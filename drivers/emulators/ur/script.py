@@ -12,8 +12,8 @@ from typing import Protocol
 
 import numpy as np
 
-from drivers.emulators.ur.kinematics import Matrix, Vector, rotation_matrix
-from drivers.emulators.ur.motion import Halt, JointMove, LinearMove, Motion, Speed
+from shearloop.drivers.emulators.ur.kinematics import Matrix, Vector, rotation_matrix
+from shearloop.drivers.emulators.ur.motion import Halt, JointMove, LinearMove, Motion, Speed
 
 READY, DONE = 1, 2
 CONTINUOUS = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
@@ -37,7 +37,7 @@ def armed_hz(text: bytes | bytearray) -> float:
     return float(found[1]) if found is not None else 0.0
 
 
-class Arm(Protocol):
+class EmulatedArm(Protocol):
     """What the script reaches of the controller."""
 
     q_rad: Vector
@@ -75,7 +75,7 @@ class Arm(Protocol):
 class ControlScript:
     """One run of the control script, from its upload to its end."""
 
-    def __init__(self, arm: Arm) -> None:
+    def __init__(self, arm: EmulatedArm) -> None:
         """Start with every register as the script sets it in its first cycle."""
         self._arm = arm
         self._executing = False

@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from contextlib import AsyncExitStack, suppress
 
-from drivers.emulators.ur import dashboard
-from drivers.emulators.ur.robot import Event, Robot
-from drivers.emulators.ur.rtde import NotRtdeError, RtdeSession
-from drivers.emulators.ur.script import armed_hz
+from shearloop.drivers.emulators.ur import dashboard
+from shearloop.drivers.emulators.ur.robot import Robot, RobotEvent
+from shearloop.drivers.emulators.ur.rtde import NotRtdeError, RtdeSession
+from shearloop.drivers.emulators.ur.script import armed_hz
 
 RTDE_PORT, SCRIPT_PORT, DASHBOARD_PORT = 30004, 30003, 29999
 # A control script closes its outermost block in the first column.
@@ -31,7 +31,7 @@ class Controller:
         *,
         host: str = "127.0.0.1",
         rate_hz: float = 500.0,
-        on_event: Callable[[Event], None] | None = None,
+        on_event: Callable[[RobotEvent], None] | None = None,
     ) -> None:
         """Take a robot; `on_event` is told of everything that happens to it."""
         self.robot = robot

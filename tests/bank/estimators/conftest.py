@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bank.bank_file import Bank, BankDefinition, write_bank
-from bank.channels import N_CHANNELS
-from bank.estimators import Calibration, FrameSeries, fit
+from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.estimation import Calibration, FrameSeries, fit
 
 PERIOD_S = 0.54
 IDLE_S, CYCLE_S = 20.0, 30.0

@@ -4,9 +4,9 @@ from unittest import mock
 
 import numpy as np
 
-from bank import compiled
-from bank.channels import N_CHANNELS
-from bank.estimators.values import FloatArray
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.estimation.values import FloatArray
 
 # What a channel reads, or all of a side's.
 ODD = {

@@ -7,10 +7,10 @@ from functools import cache
 import numpy as np
 import pytest
 
-from bank.errors import CalibrationError
-from bank.estimators import alignment as alignments
-from bank.estimators import fit
-from bank.estimators.alignment import (
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import alignment as alignments
+from shearloop.bank.estimation import fit
+from shearloop.bank.estimation.alignment import (
     Alignment,
     alignment,
     check_alignment,
@@ -20,8 +20,8 @@ from bank.estimators.alignment import (
     torque_within,
     unchecked_s,
 )
-from bank.estimators.gripped import gripped_part
-from bank.estimators.intervals import for_few
+from shearloop.bank.estimation.grip_segmentation import gripped_part
+from shearloop.bank.estimation.intervals import for_few
 
 
 @pytest.mark.parametrize("late_s", [-2.0, -0.5, 0.0, 0.3, 1.0, 4.0])

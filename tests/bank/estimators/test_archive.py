@@ -7,12 +7,12 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank.errors import BankError, CalibrationError
-from bank.estimators import Calibration, TactileFrame, Tracker, fit
-from bank.estimators.archive import write_archive
-from bank.estimators.calibrated import Task
-from bank.estimators.cylinders import Gripped, fit_cylinders
-from bank.estimators.heads import Ridge
+from shearloop.bank.errors import BankError, CalibrationError
+from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame, fit
+from shearloop.bank.estimation.archive import write_archive
+from shearloop.bank.estimation.calibrated import OutputModel
+from shearloop.bank.estimation.cylinders import Gripped, fit_cylinders
+from shearloop.bank.estimation.regressors import Ridge
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_the_same_calibration_is_the_same_bytes(saved, tmp_path):
 
 
 def test_a_loaded_calibration_estimates_alike(fused_calibration, saved, recorded):
-    trackers = [Tracker(fused_calibration), Tracker(Calibration.load(saved))]
+    trackers = [EstimatorSession(fused_calibration), EstimatorSession(Calibration.load(saved))]
     for t, x in zip(recorded.t_s[:120], recorded.channels, strict=False):
         one, other = (tracker.estimate(TactileFrame.of(float(t), x)) for tracker in trackers)
         assert one == other
@@ -78,7 +78,7 @@ def test_diameters_that_were_calibrated_on_single_frames_are_refused(tmp_path, f
     weights = np.random.default_rng(0).normal(size=fused_calibration.scale.size)
     frames = weights + np.linspace(-1.0, 1.0, 30)[:, None] * weights
     grips = [Gripped(mm, frames + mm * weights, frames + mm * weights) for mm in (10.0, 25.0, 40.0)]
-    line, path = Task(fit_cylinders(grips), None, np.zeros(0)), tmp_path / "several.cal"
+    line, path = OutputModel(fit_cylinders(grips), None, np.zeros(0)), tmp_path / "several.cal"
     replace(fused_calibration, diameter=line).save(path)
     assert Calibration.load(path).diameter is not None
     ridge = Ridge.fit(np.concatenate([one.frames for one in grips]), np.repeat([10.0, 25.0, 40.0], 30), strength)

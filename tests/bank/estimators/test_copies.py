@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank import compiled
-from bank.channels import N_CHANNELS
-from bank.estimators import Calibration, FrameSeries, Measured, TactileFrame, Tracker, fit
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, Measured, TactileFrame, fit
 
-COPIES: dict[str, Callable[[Tracker], Tracker]] = {
+COPIES: dict[str, Callable[[EstimatorSession], EstimatorSession]] = {
     "copied": copy.deepcopy,
     "pickled": lambda tracker: pickle.loads(pickle.dumps(tracker)),  # noqa: S301 - its own
 }
@@ -78,7 +78,7 @@ def test_a_copy_goes_on_with_the_same_estimates_to_the_bit(
     calibration = calibration_of(name, m)
     series = twisting(cycles=2, seed=9).of_sides(calibration.sides)
     with mock.patch.object(compiled, "IS_COMPILED", compiled.IS_COMPILED and is_compiled):
-        tracker = Tracker(calibration, period_s=0.54)
+        tracker = EstimatorSession(calibration, period_s=0.54)
         tracker.hold(Measured(20.0, 1.0))
         if tared:
             tracker.take_idle(6)

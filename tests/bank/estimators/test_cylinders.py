@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from bank.channels import N_CHANNELS
-from bank.estimators import TactileFrame, Tracker, fit
-from bank.estimators.cylinders import Gripped, fit_cylinders, fit_line
-from bank.estimators.heads import Ridge
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.estimation import EstimatorSession, TactileFrame, fit
+from shearloop.bank.estimation.cylinders import Gripped, fit_cylinders, fit_line
+from shearloop.bank.estimation.regressors import Ridge
 
 KNOWN_MM = (10.0, 25.0, 40.0)
 N_FRAMES = 150
@@ -102,7 +102,7 @@ def test_a_diameter_is_of_this_grip_alone(twisting):
         return replace(whole, channels=channels, diameter_mm=np.full(len(whole.t_s), mm))
 
     calibration = fit("fused", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "a played rig", trust_times=True)
-    tracker, read = Tracker(calibration), []
+    tracker, read = EstimatorSession(calibration), []
     for number, mm in enumerate((12.0, 38.0)):
         for t_s, channels in zip(recorded.t_s, of(mm, 10 + number).channels, strict=True):
             estimate = tracker.estimate(TactileFrame.of(t_s + number * (recorded.t_s[-1] + 0.54), channels))
@@ -126,7 +126,7 @@ def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few(twisting)
     calibration = fit("fused", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "a played rig", trust_times=True)
     inside, widths = [], []
     for seed in range(20, 40):
-        tracker, known_half_mm = Tracker(calibration), calibration.diameter.reader.intervals.half_widths[0]
+        tracker, known_half_mm = EstimatorSession(calibration), calibration.diameter.reader.intervals.half_widths[0]
         frames = zip(recorded.t_s, of(15.0, seed).channels, strict=True)
         told = [tracker.estimate(TactileFrame.of(*one)) for one in frames]
         grip = [one for one in told if one.diameter_mm is not None]

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from bank import compiled
-from bank.channels import CHANNELS, N_CHANNELS
-from bank.estimators import Estimate, FrameSeries, TactileFrame, Tracker
-from bank.estimators.memory import Memory
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
+from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, TactileFrame
+from shearloop.bank.estimation.session_state import SessionState
 from tests.bank.estimators.conftest import IDLE_S, PERIOD_S
 
 GRIPPED = round(IDLE_S / PERIOD_S) + 2
@@ -51,7 +51,7 @@ def test_channels_that_the_session_began_without_say_nothing_when_they_come_back
 ) -> None:
     """Their idle voltages are not known: what is measured from made-up ones would be wrong, and pass for certain."""
     series, back = twisting(seed=3, cycles=2), GRIPPED + 30
-    trackers = [Tracker(fused_calibration, period_s=PERIOD_S) for _ in range(2)]
+    trackers = [EstimatorSession(fused_calibration, period_s=PERIOD_S) for _ in range(2)]
     found, expected = (
         torques([tracker.estimate(frame) for frame in without(slice(0, end), kind, series)])
         for tracker, end in zip(trackers, (back, None), strict=True)
@@ -68,9 +68,9 @@ def test_channels_that_come_back_while_idle_are_used_from_then_on(
 ) -> None:
     calibration, series = fused_calibration, twisting(seed=3, cycles=2)
     motion = calibration.motion if with_motion else None
-    memory = Memory(calibration.guards, motion, period_s=PERIOD_S)
+    memory = SessionState(calibration.guards, motion, period_s=PERIOD_S)
     moments = [memory.see(frame) for frame in without(slice(0, 12), kind, series)]
-    whole = Memory(calibration.guards, motion, period_s=PERIOD_S)
+    whole = SessionState(calibration.guards, motion, period_s=PERIOD_S)
     expected = [whole.see(frame) for frame in without(slice(0, 0), kind, series)]
     gripped = [(one, other) for one, other in zip(moments, expected, strict=True) if not other.why]
     assert len(gripped) > 60

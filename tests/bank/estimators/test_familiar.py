@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bank.estimators import FrameSeries, TactileFrame, Tracker
-from bank.estimators.familiar import DifferenceGuard
-from bank.estimators.fitting_reader import fit_reader
-from bank.estimators.heads import Ridge
-from bank.estimators.physics import Place
-from bank.estimators.reader import Reader
-from bank.estimators.twins import Twins
+from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame
+from shearloop.bank.estimation.bank_match import BankMatch
+from shearloop.bank.estimation.fitting_regressor import fit_reader
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.reciprocity import ReciprocityCheck
+from shearloop.bank.estimation.regressors import Ridge
 
 ALL = np.ones(896, dtype=np.bool_)
 
 
 def follow(calibration, frames):
-    tracker = Tracker(calibration)
+    tracker = EstimatorSession(calibration)
     return [tracker.estimate(TactileFrame.of(100.0 + i, frame)) for i, frame in enumerate(frames)]
 
 
@@ -30,7 +30,7 @@ def beyond(series: FrameSeries, below_nm: float) -> np.ndarray:
 
 def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced):
     series = sliced()
-    guard = DifferenceGuard.fit(series.channels[:, 0])
+    guard = NoveltyDetector.fit(series.channels[:, 0])
     near, far = (beyond(series, nm)[0] for nm in (0.01, 0.15))
     assert guard.judge(near, ALL).why == ()
     # Its misfit is as small as any: only how far it lies out tells of it.
@@ -50,7 +50,7 @@ def test_channels_that_vary_much_do_not_drown_the_others():
     rng = np.random.default_rng(0)
     scale = np.where(np.arange(896) < 90, 1e-2, 1e-4)
     frames = 5e-2 + scale * rng.normal(size=(30, 896))
-    guard = DifferenceGuard.fit(frames)
+    guard = NoveltyDetector.fit(frames)
     # Ten times its own spread on every quiet channel is nothing beside one spread of the loud ones, in volts.
     odd = frames[3] + np.where(np.arange(896) < 90, 0.0, 1e-3) * np.where(np.arange(896) % 2, 1, -1)
     assert guard.judge(odd, ALL).why
@@ -62,7 +62,7 @@ def saturating(value):
     return np.column_stack([np.maximum(value, 0.3), np.maximum(value, 0.3) ** 2])
 
 
-def reader_of(features, values) -> Reader:
+def reader_of(features, values) -> IntervalRegressor:
     return fit_reader(features, values, Ridge.fit, strengths=(1e-9,), difficulty=lambda _, later: np.ones(len(later)))
 
 
@@ -176,16 +176,16 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
 def test_a_slice_is_measured_against_the_calibration_once(sliced, sliced_calibration, monkeypatch):
     """What lets it pass and its interval go by the same misfits: looked for twice they were a third of the time."""
     series, looked = sliced(), []
-    for kind in (DifferenceGuard, Twins):
+    for kind in (NoveltyDetector, ReciprocityCheck):
         found = kind.misfit
         monkeypatch.setattr(kind, "misfit", lambda *args, found=found: (looked.append(type(args[0])), found(*args))[1])
     assert all(one.valid for one in follow(sliced_calibration, series.channels[20:23]))
-    assert looked == [DifferenceGuard, Twins] * 3
+    assert looked == [NoveltyDetector, ReciprocityCheck] * 3
 
 
 def test_a_judgement_holds_what_intervals_go_by(sliced):
     frames = sliced().channels[:, 0]
-    guard = DifferenceGuard.fit(frames[:30])
+    guard = NoveltyDetector.fit(frames[:30])
     for frame in frames[30:]:
         judged = guard.judge(frame, ALL)
         assert judged.why == ()
@@ -196,7 +196,7 @@ def test_a_judgement_holds_what_intervals_go_by(sliced):
 
 def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
     frames = sliced().channels[:, 0]
-    guard = DifferenceGuard.fit(frames)
+    guard = NoveltyDetector.fit(frames)
     own = guard.own_share(frames[35], ALL)
     assert own == pytest.approx(1.0, abs=0.1)
     assert guard.own_share(0.8 * frames[35], ALL) == pytest.approx(0.8 * own)
@@ -208,7 +208,7 @@ def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
 
 def test_a_judgement_says_how_much_of_the_own_response_may_be_missing(sliced):
     frames = sliced().channels[:, 0]
-    guard = DifferenceGuard.fit(frames)
+    guard = NoveltyDetector.fit(frames)
     less = 0.8 * frames[35]
     assert guard.judge(less, ALL).missing == pytest.approx(1 - guard.own_share(less, ALL) / guard.largest_own)
     assert guard.judge(less, ALL).missing > 0.15 > guard.judge(frames[35], ALL).missing
@@ -235,7 +235,7 @@ def test_what_may_be_missing_widens_to_the_side_where_it_would_be_read(sign):
 
 def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced_calibration):
     task = replace(sliced_calibration.torque, ks=np.array([3.12, 3.17]))
-    place = Place(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
+    place = BankMatch(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
     assert task.refuse_place(place) == ()
     assert task.refuse_place(None) == ()
     assert "another ridge" in task.refuse_place(replace(place, k=3.41))[0]

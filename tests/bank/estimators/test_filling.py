@@ -6,11 +6,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from bank import compiled
-from bank.bank_file import Bank
-from bank.channels import CHANNELS, N_CHANNELS
-from bank.estimators import Calibration, Estimate, FrameSeries, Physics, TactileFrame, Tracker, fit
-from bank.estimators.filling import Filling
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
+from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+from shearloop.bank.estimation.imputation import ChannelImputer
 from tests.bank.estimators import conftest
 
 # Some seconds into the first grip.
@@ -34,7 +34,7 @@ def calibration(request, recorded, bank) -> Calibration:
     return fit(request.param, [recorded], "a played rig", Physics(bank=bank))
 
 
-def without(channels: np.ndarray, start: int, series: FrameSeries, tracker: Tracker) -> list[Estimate]:
+def without(channels: np.ndarray, start: int, series: FrameSeries, tracker: EstimatorSession) -> list[Estimate]:
     """Return the estimates of a session of which (896,) channels of the first side are dead from a frame on."""
     usable = np.ones(series.channels.shape, dtype=np.bool_)
     usable[start:, 0, channels] = False
@@ -56,7 +56,7 @@ def _n_valid_of_whole(calibration: Calibration, bank: Bank, is_compiled: bool) -
     """Return how many torques of a session of which no channel dies are valid."""
     assert is_compiled == compiled.IS_COMPILED
     series = conftest.series(seed=3, cycles=3)
-    return judged(without(~ELECTRODE, len(series.t_s), series, Tracker(calibration, bank)), series)[0]
+    return judged(without(~ELECTRODE, len(series.t_s), series, EstimatorSession(calibration, bank)), series)[0]
 
 
 @pytest.mark.usefixtures("way")
@@ -66,7 +66,7 @@ def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank
     """It stayed what it was when it died: up to 62 % of the torques were false-valid."""
     series = twisting(seed=3, cycles=3)
     whole = _n_valid_of_whole(calibration, bank, compiled.IS_COMPILED)
-    n, wrong = judged(without(DEAD[dead], start, series, Tracker(calibration, bank)), series)
+    n, wrong = judged(without(DEAD[dead], start, series, EstimatorSession(calibration, bank)), series)
     assert whole > 120
     assert n > 0.95 * whole
     assert wrong < 0.12
@@ -74,7 +74,7 @@ def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank
 
 def test_what_an_estimate_was_made_from_holds_nothing_of_dead_channels(calibration, bank, twisting) -> None:
     """A heatmap of them showed where they were when they died."""
-    series, tracker, seen = twisting(seed=3, cycles=3), Tracker(calibration, bank), []
+    series, tracker, seen = twisting(seed=3, cycles=3), EstimatorSession(calibration, bank), []
     for t_s, channels in zip(series.t_s, series.channels, strict=True):
         usable = np.ones(channels.shape, dtype=np.bool_)
         usable[0, ELECTRODE] = len(seen) < DEATH
@@ -97,7 +97,7 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monk
     monkeypatch.setattr(conftest, "tip", felt_by_one_electrode)
     calibration = fit("regression", [twisting(tips=(1,))], "a played rig")
     series = twisting(seed=3, cycles=3, tips=(1,))
-    found = without(ELECTRODE, start, series, Tracker(calibration))
+    found = without(ELECTRODE, start, series, EstimatorSession(calibration))
     assert judged(found, series)[1] < 0.05
     assert not any(one.valid for one in found[DEATH:])
     refused = [one for one in found[DEATH:] if "dead or saturated" in one.why[0]]
@@ -110,15 +110,15 @@ def test_torques_that_the_dead_channels_alone_told_of_are_refused(twisting, monk
         )
     # Other channels told nothing of it, and some of those that did leave a guess: the interval holds it (else 11 %).
     for dead in (DEAD["a fifth"] & ~ELECTRODE, DEAD["an electrode that measures"]):
-        n, wrong = judged(without(dead, DEATH, series, Tracker(calibration)), series)
+        n, wrong = judged(without(dead, DEATH, series, EstimatorSession(calibration)), series)
         assert n > 120
         assert wrong < 0.08
 
 
 def test_an_older_calibration_refuses_frames_without_channels_that_it_reads(calibration, bank, twisting) -> None:
     older, series = replace(calibration, filling=None), twisting(seed=3, cycles=3)
-    found = without(ELECTRODE, DEATH, series, Tracker(older, bank))
-    assert found[:DEATH] == without(ELECTRODE, DEATH, series, Tracker(calibration, bank))[:DEATH]
+    found = without(ELECTRODE, DEATH, series, EstimatorSession(older, bank))
+    assert found[:DEATH] == without(ELECTRODE, DEATH, series, EstimatorSession(calibration, bank))[:DEATH]
     assert any(one.valid for one in found[:DEATH])
     assert not any(one.valid for one in found[DEATH:])
     assert "112 of them" in found[DEATH + 1].why[0]
@@ -130,9 +130,9 @@ def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothin
         return replace(series, channels=np.where(ELECTRODE, 0.2, series.channels))
 
     calibration, series = fit("regression", [still(recorded)], "a played rig"), still(twisting(seed=3, cycles=3))
-    expected = without(~ELECTRODE, len(series.t_s), series, Tracker(calibration))
+    expected = without(~ELECTRODE, len(series.t_s), series, EstimatorSession(calibration))
     calibration = replace(calibration, filling=None) if is_older else calibration
-    found = without(ELECTRODE, 0, series, Tracker(calibration))
+    found = without(ELECTRODE, 0, series, EstimatorSession(calibration))
     assert sum(one.valid for one in expected) > 120
     for one, other in zip(found, expected, strict=True):
         assert one.valid == other.valid
@@ -143,7 +143,7 @@ def test_channels_that_were_dead_at_calibration_refuse_nothing_and_change_nothin
 def test_what_is_filled_in_is_the_conditional_mean_of_a_gaussian() -> None:
     rng = np.random.default_rng(1)
     shapes, variances = rng.normal(size=(3, 2, 6)), rng.uniform(0.5, 2.0, (2, 6))
-    filling = Filling(rng.normal(size=(2, 6)), shapes, 1.0 / variances)
+    filling = ChannelImputer(rng.normal(size=(2, 6)), shapes, 1.0 / variances)
     usable, difference = rng.uniform(size=(2, 6)) < 0.7, rng.normal(size=(2, 6))
     found, ways = filling.filled(difference, usable)
     flat, seen = shapes.reshape(3, -1), usable.ravel()

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from bank import compiled
-from bank.channels import N_CHANNELS
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import N_CHANNELS
 
 pytestmark = pytest.mark.skipif(not compiled.IS_COMPILED, reason="nothing is compiled")
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bank.errors import CalibrationError
-from bank.estimators import fit
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import fit
 
 
 def with_a_nan(values):

@@ -5,17 +5,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bank.errors import CalibrationError
-from bank.estimators.gripped import gripped_part
-from bank.estimators.guard import LEAST_NOISE_V, Known, SideGuard, channel_noise
-from bank.estimators.guards import JUMP_NOISES, JUMP_V, Guards
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.fingertip_validator import LEAST_NOISE_V, FingertipValidator, Known, channel_noise
+from shearloop.bank.estimation.grip_segmentation import gripped_part
+from shearloop.bank.estimation.validity import JUMP_NOISES, JUMP_V, Guards
 
 ALL = np.ones((1, 896), dtype=bool)
 
 
 def guard_of(series, layer=0):
     idle, gripped, released = gripped_part(series)
-    return SideGuard.fit("right", tuple(series.channels[part, layer] for part in (idle, gripped, released)))
+    return FingertipValidator.fit("right", tuple(series.channels[part, layer] for part in (idle, gripped, released)))
 
 
 def test_grip_and_release_are_found_in_a_recording(recorded):
@@ -94,7 +94,7 @@ def test_grip_is_about_one_gripped_and_zero_idle(recorded):
 def test_a_release_is_known_by_its_step_where_none_was_calibrated(recorded):
     idle, gripped, released = gripped_part(recorded)
     frames = recorded.channels[:, 0]
-    guard = SideGuard.fit("right", (frames[idle], frames[gripped], frames[:0]))
+    guard = FingertipValidator.fit("right", (frames[idle], frames[gripped], frames[:0]))
     assert np.isfinite(guard.step_limit)
     opening, closing = int(released.start), int(gripped.start)
     assert guard.released(frames[opening + 2], frames[opening - 6], guard.idle) is True
@@ -105,9 +105,9 @@ def test_a_release_is_known_by_its_step_where_none_was_calibrated(recorded):
 def test_too_little_is_said_to_be(recorded):
     frames = recorded.channels[:, 0]
     with pytest.raises(CalibrationError, match="2 idle and 200 gripped frames are too few"):
-        SideGuard.fit("right", (frames[:2], frames[50:250], frames[:0]))
+        FingertipValidator.fit("right", (frames[:2], frames[50:250], frames[:0]))
     with pytest.raises(CalibrationError, match="cannot be told from idle"):
-        SideGuard.fit("right", (frames[:12], frames[6:34], frames[:0]))
+        FingertipValidator.fit("right", (frames[:12], frames[6:34], frames[:0]))
     n = len(recorded.torque_nm)
     for changed, told in (
         ({"torque_nm": np.zeros(n)}, "is 0 at all of these frames; record twists"),

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from scipy.stats import truncnorm
 
-from bank.errors import CalibrationError
-from bank.estimators.fitting_reader import fit_reader
-from bank.estimators.heads import (
-    Censored,
-    Curve,
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.fitting_regressor import fit_reader
+from shearloop.bank.estimation.regressors import (
+    InverseCalibration,
     Ridge,
+    TobitRidge,
     _below_zero,
     best_strength,
     later_origins,
@@ -40,7 +40,7 @@ def test_what_a_free_lever_hides_is_not_taken_for_zero():
     x = rng.normal(size=(800, 2))
     latent = x @ [0.05, 0.02] - 0.03
     y = np.maximum(latent + 0.002 * rng.normal(size=800), 0.0)
-    censored = Censored.fit(x, y, 1e-9)
+    censored = TobitRidge.fit(x, y, 1e-9)
     np.testing.assert_allclose(censored.weights, [0.05, 0.02], rtol=0.05)
     assert censored.offset - censored.weights @ censored.mean == pytest.approx(-0.03, rel=0.05)
     assert Ridge.fit(x, y, 1e-9).weights[0] < 0.03
@@ -50,7 +50,7 @@ def test_a_lever_may_be_pushed_either_way():
     rng = np.random.default_rng(3)
     x = rng.normal(size=(300, 1))
     y = -np.maximum(0.05 * x[:, 0], 0.0)
-    pushed = Censored.fit(x, y, 1e-9)
+    pushed = TobitRidge.fit(x, y, 1e-9)
     assert pushed.sign == -1.0
     assert pushed.sign * pushed.predict(np.array([[1.0]]))[0] == pytest.approx(-0.05, rel=0.1)
 
@@ -81,7 +81,7 @@ def frames_on_a_curve(values, rng, noise=0.05, drift=1.0, begins_at=0.0, shrinki
 def test_a_curve_finds_the_value_through_drift_ten_times_the_noise():
     rng = np.random.default_rng(4)
     values = rng.uniform(-1, 2, 60)
-    curve = Curve.fit(frames_on_a_curve(values, rng), values, 2, 1)
+    curve = InverseCalibration.fit(frames_on_a_curve(values, rng), values, 2, 1)
     later = rng.uniform(-1, 2, 40)
     errors = curve.predict(frames_on_a_curve(later, rng)) - later
     assert np.sqrt((errors**2).mean()) < 0.03
@@ -99,13 +99,13 @@ def test_a_curve_does_not_pull_towards_the_mean():
         return np.polyfit(later, predicted, 1)[0]
 
     assert slope(Ridge.fit(noisy, values, 0.1).predict(future)) < 0.8
-    assert 0.85 < slope(Curve.fit(noisy, values, 1, 0).predict(future)) < 1.15
+    assert 0.85 < slope(InverseCalibration.fit(noisy, values, 1, 0).predict(future)) < 1.15
 
 
 def test_a_curve_works_on_with_the_channels_that_are_left():
     rng = np.random.default_rng(6)
     values = rng.uniform(-1, 2, 60)
-    curve = Curve.fit(frames_on_a_curve(values, rng), values, 2, 1)
+    curve = InverseCalibration.fit(frames_on_a_curve(values, rng), values, 2, 1)
     frame = frames_on_a_curve([1.3], rng)[0]
     usable = rng.random(200) > 0.4
     frame[:-1][~usable] = np.nan
@@ -115,7 +115,7 @@ def test_a_curve_works_on_with_the_channels_that_are_left():
 def test_frames_together_are_read_as_each_alone():
     rng = np.random.default_rng(9)
     values = rng.uniform(-1, 2, 60)
-    curve = Curve.fit(frames_on_a_curve(values, rng, shrinking=0.08), values, 2, 1, trend=True)
+    curve = InverseCalibration.fit(frames_on_a_curve(values, rng, shrinking=0.08), values, 2, 1, trend=True)
     frames = frames_on_a_curve(rng.uniform(-1, 2, 12), rng, begins_at=60.0, shrinking=0.08)
     frames[1::3, -1] = 64.0
     frames[:4, 10:60] = np.nan
@@ -130,12 +130,12 @@ def test_a_response_that_shrinks_with_age_is_followed_beyond_what_was_fitted():
     past = frames_on_a_curve(values, rng, drift=0.0, shrinking=0.08)
     future = frames_on_a_curve(later, rng, drift=0.0, begins_at=60.0, shrinking=0.08)
     still, followed = (
-        np.sqrt(np.mean((Curve.fit(past, values, 2, 1, trend=trend).predict(future) - later) ** 2))
+        np.sqrt(np.mean((InverseCalibration.fit(past, values, 2, 1, trend=trend).predict(future) - later) ** 2))
         for trend in (False, True)
     )
     assert followed < 0.6 * still
     # Frames that are numbered from the beginning again are read as at the end of what was fitted.
-    curve, anew = Curve.fit(past, values, 2, 1, trend=True), future.copy()
+    curve, anew = InverseCalibration.fit(past, values, 2, 1, trend=True), future.copy()
     anew[:, -1] -= 60.0
     at_the_end = future.copy()
     at_the_end[:, -1] = 59.0
@@ -145,7 +145,7 @@ def test_a_response_that_shrinks_with_age_is_followed_beyond_what_was_fitted():
 def test_a_curve_needs_enough_frames():
     rng = np.random.default_rng(7)
     with pytest.raises(CalibrationError, match="4 frames at 2 distinct values do not determine"):
-        Curve.fit(rng.normal(size=(4, 9)), np.array([1.0, 1.0, 2.0, 2.0]), 2, 1)
+        InverseCalibration.fit(rng.normal(size=(4, 9)), np.array([1.0, 1.0, 2.0, 2.0]), 2, 1)
 
 
 @pytest.mark.parametrize("n", [8, 13, 19, 20, 49, 500])
@@ -170,7 +170,7 @@ def test_a_twist_the_other_way_than_the_lever_pushed_is_no_sure_zero(sign: float
     rng = np.random.default_rng(9)
     twist = np.sin(np.arange(400) / 9.0)
     frames = twist[:, None] * rng.normal(size=(1, 12)) + rng.normal(0.0, 0.05, (400, 12))
-    reader = fit_reader(frames, sign * np.maximum(twist, 0.0) * 0.1, Censored.fit, strengths=(1e-5,))
+    reader = fit_reader(frames, sign * np.maximum(twist, 0.0) * 0.1, TobitRidge.fit, strengths=(1e-5,))
     other_way = np.flatnonzero(twist < -0.1)
     read = [reader.read(frames[i]) for i in other_way.tolist()]
     truth = (sign * 0.1 * twist[other_way]).tolist()

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from bank.errors import CalibrationError
-from bank.estimators.intervals import Intervals, for_few
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.intervals import Intervals, for_few
 
 
 def test_each_stratum_covers_its_own_future():

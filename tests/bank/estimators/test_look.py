@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank import compiled
-from bank.channels import N_CHANNELS
-from bank.estimators.guard import unsaturated
-from bank.estimators.guards import JUMP_V, Guards
-from bank.estimators.memory import Memory
-from bank.estimators.values import BoolArray, FloatArray, everywhere
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.estimation.fingertip_validator import unsaturated
+from shearloop.bank.estimation.session_state import SessionState
+from shearloop.bank.estimation.validity import JUMP_V, Guards
+from shearloop.bank.estimation.values import BoolArray, FloatArray, everywhere
 from tests.bank.estimators.odd_frames import BY_NUMPY, ODD, spoilt
 
 pytestmark = pytest.mark.skipif(not compiled.IS_COMPILED, reason="nothing is compiled")
@@ -131,9 +131,9 @@ def test_a_frame_is_placed_as_by_numpy_but_for_rounding(fused_calibration, recor
     frame = spoilt(recorded.channels[random.integers(len(recorded.t_s))], kind, n, random)
     idle = np.array([guard.idle for guard in fused_calibration.guards]) * random.uniform(0.8, 1.2)
     gains = random.uniform(0.5, 2.0, (len(frame), 1))
-    memories = [Memory(fused_calibration.guards, fused_calibration.motion)]
+    memories = [SessionState(fused_calibration.guards, fused_calibration.motion)]
     with BY_NUMPY:
-        memories.append(Memory(fused_calibration.guards, fused_calibration.motion))
+        memories.append(SessionState(fused_calibration.guards, fused_calibration.motion))
     for memory in memories:
         memory._baselines, memory._gains = idle, gains
     usable = np.ones(frame.shape, dtype=np.bool_)

@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank import compiled
-from bank.channels import CHANNELS, N_CHANNELS
-from bank.estimators.guard import unsaturated
-from bank.estimators.memory import Memory
-from bank.estimators.values import BoolArray, TactileFrame, everywhere
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
+from shearloop.bank.estimation.fingertip_validator import unsaturated
+from shearloop.bank.estimation.session_state import SessionState
+from shearloop.bank.estimation.values import BoolArray, TactileFrame, everywhere
 from tests.bank.estimators.odd_frames import BY_NUMPY, ODD, spoilt
 
 pytestmark = pytest.mark.skipif(not compiled.IS_COMPILED, reason="nothing is compiled")
@@ -60,9 +60,9 @@ def test_a_frame_of_which_not_all_is_usable_is_looked_at_as_by_numpy(
     if random.integers(2):
         odd = np.where(told, channels, odd)
     frame = TactileFrame.of(1.0, odd, told)
-    memories = [Memory(fused_calibration.guards, fused_calibration.motion)]
+    memories = [SessionState(fused_calibration.guards, fused_calibration.motion)]
     with BY_NUMPY, np.errstate(all="ignore"):
-        memories.append(Memory(fused_calibration.guards, fused_calibration.motion))
+        memories.append(SessionState(fused_calibration.guards, fused_calibration.motion))
         lost = memories[1]._guards.seen(channels, told)[1]
     baselines, gains = gain * memories[0]._guards.idle, np.full((2, 1), gain)
     for memory in memories:

@@ -6,10 +6,10 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from bank import compiled
-from bank.channels import N_CHANNELS
-from bank.estimators.memory import Memory
-from bank.estimators.values import FrameSeries, TactileFrame
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.estimation.session_state import SessionState
+from shearloop.bank.estimation.values import FrameSeries, TactileFrame
 from tests.bank.estimators.odd_frames import BY_NUMPY
 
 pytestmark = pytest.mark.skipif(not compiled.IS_COMPILED, reason="nothing is compiled")
@@ -68,9 +68,9 @@ def with_fault(fault: str, series: FrameSeries) -> list[TactileFrame]:
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_session_is_the_same_as_by_numpy_but_for_rounding(fused_calibration, twisting, fault, with_motion) -> None:
     motion = replace(fused_calibration.motion, placed=True) if with_motion else None
-    memory = Memory(fused_calibration.guards, motion, period_s=0.54)
+    memory = SessionState(fused_calibration.guards, motion, period_s=0.54)
     with BY_NUMPY:
-        other = Memory(fused_calibration.guards, motion, period_s=0.54)
+        other = SessionState(fused_calibration.guards, motion, period_s=0.54)
     n_valid, first, told = 0, None, None
     with mock.patch.object(memory._guards, "seen", wraps=memory._guards.seen) as looked_long:
         for frame in with_fault(fault, twisting(seed=7)):

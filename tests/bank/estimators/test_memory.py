@@ -5,9 +5,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from bank.estimators import Tracker
-from bank.estimators.memory import Memory
-from bank.estimators.values import TactileFrame
+from shearloop.bank.estimation import EstimatorSession
+from shearloop.bank.estimation.session_state import SessionState
+from shearloop.bank.estimation.values import TactileFrame
 
 UP, DOWN = np.linspace(0, 1, 21), np.linspace(1, 0, 21)[1:]
 
@@ -23,7 +23,7 @@ def like(fused_calibration):
 
 def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(fused_calibration, like):
     """A zero that is asked for while a tool is held, which is let go and gripped again before it is complete."""
-    tracker, told = Tracker(fused_calibration), []
+    tracker, told = EstimatorSession(fused_calibration), []
     n_lags = fused_calibration.motion.n_lags
     before = [*np.zeros(12), *UP, *np.ones(n_lags)]
     for i, share in enumerate([*before, *DOWN, *UP, *np.ones(n_lags + 1)]):
@@ -38,7 +38,7 @@ def test_a_frame_from_before_a_zero_is_not_one_of_the_last_frames(fused_calibrat
 
 def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(fused_calibration, like):
     """What a grip was before a zero says nothing of the next one, which comes before an idle frame was seen again."""
-    tracker = Tracker(fused_calibration)
+    tracker = EstimatorSession(fused_calibration)
     for i, share in enumerate([*np.zeros(12), *UP, *np.ones(13)]):
         tracker.estimate(like(0.5 * i, share))
     tracker.take_idle(10)
@@ -49,7 +49,7 @@ def test_a_grip_a_third_as_strong_as_the_one_before_the_zero_is_one(fused_calibr
 
 def test_a_zero_during_which_a_tool_is_let_go_begins_anew(fused_calibration, like):
     """The mean of gripped and idle frames was taken for an idle one, and what was gripped next was read from there."""
-    memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
+    memory = SessionState(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
     told = [memory.see(like(0.5 * i, share)).why for i, share in enumerate([1, 1, 1, 1, 1, *np.zeros(9)])]
     assert [why[0] for why in told[2:5]] == [f"taking the homogeneous frame, {n} of 8" for n in (3, 4, 5)]
     assert all("jumped" in why[0] for why in told[5:7])
@@ -64,7 +64,7 @@ def test_a_zero_during_which_a_tool_is_let_go_begins_anew(fused_calibration, lik
 @pytest.mark.parametrize("step_s", [1.5, 20.0, -5.0])
 def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(fused_calibration, like, first, then, step_s):
     """After frames that were lost the next one was compared with none before, and half of the zero was of a tool."""
-    memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
+    memory = SessionState(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
     for i in range(5):
         memory.see(like(0.5 * i, first))
     told = [memory.see(like(2.0 + step_s + 0.5 * i, then)).why for i in range(9)]
@@ -74,7 +74,7 @@ def test_a_zero_in_whose_gap_a_tool_is_let_go_or_gripped_begins_anew(fused_calib
 
 
 def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(fused_calibration, like):
-    memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
+    memory = SessionState(fused_calibration.guards, fused_calibration.motion, idle_frames=8)
     for i in range(8):
         memory.see(like(0.5 * i + 20.0 * (i > 4), 0.0))
     assert not memory.taking_idle
@@ -82,7 +82,7 @@ def test_a_zero_with_a_gap_in_which_nothing_happens_goes_on(fused_calibration, l
 
 def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(fused_calibration, like):
     """With fewer than five idle frames only an outright grip was one, and others were taken for idle."""
-    memory = Memory(fused_calibration.guards, fused_calibration.motion, idle_frames=2)
+    memory = SessionState(fused_calibration.guards, fused_calibration.motion, idle_frames=2)
     seen = [memory.see(like(0.5 * i, share)) for i, share in enumerate([0, 0, *np.full(18, 0.3)])]
     assert not seen[-1].why
     steps = np.array([guard.gripped - guard.idle for guard in fused_calibration.guards])
@@ -93,7 +93,7 @@ def test_a_zero_of_two_frames_is_a_baseline_for_a_weak_grip(fused_calibration, l
 @pytest.mark.parametrize("spoilt", [1, 3, 4])
 def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(fused_calibration, like, spoilt, kind):
     """One garbled frame in a hundred left a quarter of the estimates void: each was taken for another fingertip."""
-    tracker, rng = Tracker(fused_calibration), np.random.default_rng(4)
+    tracker, rng = EstimatorSession(fused_calibration), np.random.default_rng(4)
     shares = [*np.zeros(12), *UP, *np.ones(14)]
     for i, share in enumerate(shares):
         estimate = tracker.estimate(like(0.5 * i, share))
@@ -112,7 +112,7 @@ def test_up_to_three_spoilt_frames_are_left_out_and_more_end_the_memory(fused_ca
 @pytest.mark.parametrize("lost", [2, 3, 4])
 def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(fused_calibration, like, lost):
     """A frame is put halfway where one is missing: with more of them lost, all before would be of another time."""
-    tracker = Tracker(fused_calibration, period_s=0.27)
+    tracker = EstimatorSession(fused_calibration, period_s=0.27)
     shares = [*np.zeros(12), *UP, *np.ones(14)]
     for i, share in enumerate(shares):
         estimate = tracker.estimate(like(0.27 * i, share))
@@ -123,7 +123,7 @@ def test_of_a_quick_board_two_lost_frames_are_too_many_as_of_a_slow_one(fused_ca
 
 
 def test_a_board_that_turns_out_slower_than_its_first_frames_is_followed(fused_calibration, like):
-    tracker = Tracker(fused_calibration)
+    tracker = EstimatorSession(fused_calibration)
     times = [*0.1 * np.arange(12), *(2.0 + 0.5 * np.arange(60))]
     shares = [*np.zeros(20), *UP, *np.ones(31)]
     told = [tracker.estimate(like(t_s, share)).why for t_s, share in zip(times, shares, strict=True)]
@@ -155,7 +155,7 @@ def test_what_is_valid_is_of_one_grip_and_hardly_made_up(fused_calibration):
     @example(session=[*[("gap", False)] * 4, ("good", False), ("late", False), ("gap", False), *[("good", True)] * 6,
                       *[("good", False)] * 14], period_s=np.inf)  # fmt: skip
     def holds(session, period_s):
-        memory, rng = Memory(guards, motion, period_s), np.random.default_rng(0)
+        memory, rng = SessionState(guards, motion, period_s), np.random.default_rng(0)
         t_s, held, before, other, account, steps_s = 0.0, False, None, None, [], []
         for kind, changes in [*begun, *session]:
             step_s = STEPS_S.get(kind, 0.5)

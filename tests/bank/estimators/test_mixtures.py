@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bank.estimators import Calibration, FrameSeries, TactileFrame, Tracker, fit
-from bank.estimators.familiar import DifferenceGuard
-from bank.estimators.fitting_reader import fit_reader
-from bank.estimators.heads import Ridge
-from bank.estimators.mixtures import Mixtures, Passing
+from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, TactileFrame, fit
+from shearloop.bank.estimation.contamination import ContaminationTest, Passing
+from shearloop.bank.estimation.fitting_regressor import fit_reader
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.regressors import Ridge
 
 
 def shrinking(seed: int) -> FrameSeries:
@@ -35,7 +35,7 @@ def mixed_with_a_foreign_frame(series: FrameSeries, share: float) -> FrameSeries
 
 def judged(calibration: Calibration, series: FrameSeries) -> tuple[float, float, float]:
     """Return the share of valid and of false-valid estimates, and the median width of the intervals in N·m."""
-    tracker = Tracker(calibration)
+    tracker = EstimatorSession(calibration)
     pairs = zip(series.t_s, series.channels, strict=True)
     estimates = [tracker.estimate(TactileFrame.of(float(t), channels)) for t, channels in pairs]
     valid = [
@@ -96,9 +96,9 @@ def test_a_streams_intervals_know_nothing_of_mixtures(fused_calibration):
 def test_mixtures_are_those_that_the_guard_of_the_earlier_slices_lets_pass():
     differences = shrinking(0).channels[:, 0]
     past, future = np.arange(30), np.arange(30, 50)
-    guard = DifferenceGuard.fit(differences[past])
+    guard = NoveltyDetector.fit(differences[past])
     usable = np.ones(896, dtype=bool)
-    mixtures = Mixtures(differences, np.append)
+    mixtures = ContaminationTest(differences, np.append)
     passing = mixtures.passing(past, future)
     assert 0 < len(passing.rows) < 20 * 15 * 3
     for row, features, nearness in zip(passing.rows, passing.features, passing.nearness, strict=True):

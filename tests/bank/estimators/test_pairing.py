@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bank.estimators.pairing import LARGEST_APART_PERIODS, Pairing
+from shearloop.bank.estimation.pairing import LARGEST_APART_PERIODS, Pairing
 
 PERIOD_NS = 540_000_000
 

@@ -3,11 +3,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from bank.channels import CHANNELS
-from bank.errors import CalibrationError
-from bank.estimators import FrameSeries, Physics, TactileFrame, Tracker, fit
-from bank.estimators.physics import NOT_TURNED, NearestCell, Registration, image_matrix, register, settle_half_turn
-from bank.forward import ForwardModel
+from shearloop.bank.eit.channels import CHANNELS
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import EstimatorSession, FrameSeries, Physics, TactileFrame, fit
+from shearloop.bank.estimation.bank_match import (
+    NOT_TURNED,
+    NearestCell,
+    Registration,
+    image_matrix,
+    register,
+    settle_half_turn,
+)
 
 
 @pytest.mark.parametrize("reflected", [False, True])
@@ -68,7 +75,7 @@ def test_torque_by_the_place_in_the_bank(bank, name):
     t = np.arange(32.0)
     whole = FrameSeries("difference", ("right",), t, frames[:, None], t, torque, np.full(32, np.nan))
     calibration = fit(name, [whole.between(0, 24)], "earlier", Physics(bank=bank))
-    tracker = Tracker(calibration, bank)
+    tracker = EstimatorSession(calibration, bank)
     for i in range(24, 32):
         estimate = tracker.estimate(TactileFrame.of(t[i], frames[i][None]))
         assert estimate.torque_nm == pytest.approx(torque[i], abs=0.015)
@@ -76,7 +83,7 @@ def test_torque_by_the_place_in_the_bank(bank, name):
         assert estimate.score is not None
         assert estimate.score > 0.95
     with pytest.raises(CalibrationError, match="needs its bank"):
-        Tracker(calibration)
+        EstimatorSession(calibration)
 
 
 def test_another_bank_is_refused(bank):
@@ -86,7 +93,7 @@ def test_another_bank_is_refused(bank):
     series = FrameSeries("difference", ("right",), t, frames, t, rng.uniform(0, 1, 20), np.full(20, np.nan))
     calibration = fit("bank", [series], "x", Physics(bank=bank))
     with pytest.raises(CalibrationError, match="name the bank it was made with"):
-        Tracker(calibration, dataclasses.replace(bank, identity="0" * 64))
+        EstimatorSession(calibration, dataclasses.replace(bank, identity="0" * 64))
 
 
 def test_an_image_shows_where_and_which_way(fingertip):

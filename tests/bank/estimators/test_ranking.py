@@ -1,7 +1,7 @@
 import numpy as np
 
-from bank.estimators.heads import ranked_channels
-from bank.estimators.ranking import accuracy_over_channels
+from shearloop.bank.estimation.ranking import accuracy_over_channels
+from shearloop.bank.estimation.regressors import ranked_channels
 
 
 def test_the_channels_that_carry_the_value_come_first_and_suffice():

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bank.errors import CalibrationError
-from bank.estimators import FrameSeries, TactileFrame, Tracker, fit
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame, fit
 
 
 def follow(calibration, series, usable=None):
-    tracker = Tracker(calibration)
+    tracker = EstimatorSession(calibration)
     return [
         tracker.estimate(TactileFrame.of(float(t), x, usable)) for t, x in zip(series.t_s, series.channels, strict=True)
     ]

@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bank.channels import CHANNELS
-from bank.estimators import FrameSeries, TactileFrame, Tracker, fit
-from bank.estimators.familiar import DifferenceGuard
-from bank.estimators.guard import unsaturated
+from shearloop.bank.eit.channels import CHANNELS
+from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame, fit
+from shearloop.bank.estimation.fingertip_validator import unsaturated
+from shearloop.bank.estimation.novelty import NoveltyDetector
 
 STEP_V = 0.00215
 
 
 def estimates(calibration, series: FrameSeries):
-    tracker = Tracker(calibration)
+    tracker = EstimatorSession(calibration)
     return [
         tracker.estimate(TactileFrame.of(float(t), frame)) for t, frame in zip(series.t_s, series.channels, strict=True)
     ]
@@ -91,7 +91,7 @@ def test_a_drift_does_not_lead_a_regression_astray(twisting):
 
 def test_the_less_a_difference_is_explained_the_wider_the_interval(sliced):
     series = sliced()
-    guard = DifferenceGuard.fit(series.channels[:, 0])
+    guard = NoveltyDetector.fit(series.channels[:, 0])
     usable = np.ones(896, dtype=np.bool_)
     noise = np.random.default_rng(1).normal(0.0, 1.0, 896)
     frame = series.channels[10, 0]

@@ -5,8 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bank.errors import CalibrationError
-from bank.estimators import Estimate, FrameSeries, Measured, TactileFrame, Tracker, fit, fitting, fitting_raw
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import (
+    Estimate,
+    EstimatorSession,
+    FrameSeries,
+    Measured,
+    TactileFrame,
+    fit,
+    fitting,
+    fitting_raw,
+)
 
 
 def changed(series, **content):
@@ -14,7 +23,7 @@ def changed(series, **content):
 
 
 def follow(calibration, series, usable=None) -> list[Estimate]:
-    tracker = calibration if isinstance(calibration, Tracker) else Tracker(calibration)
+    tracker = calibration if isinstance(calibration, EstimatorSession) else EstimatorSession(calibration)
     return [
         tracker.estimate(TactileFrame.of(float(t), x, usable)) for t, x in zip(series.t_s, series.channels, strict=True)
     ]
@@ -74,7 +83,7 @@ def test_another_session_takes_its_own_baseline(fused_calibration, twisting, gri
 def test_three_idle_frames_are_a_baseline_for_an_outright_grip(fused_calibration, twisting, told):
     other = twisting(seed=22)
     first = int(np.flatnonzero(other.t_s > 20)[0]) - 3
-    tracker = Tracker(fused_calibration)
+    tracker = EstimatorSession(fused_calibration)
     if told:
         tracker.take_idle(3)
     valid = [
@@ -167,7 +176,7 @@ def test_frames_that_come_again_later_are_no_motion(fused_calibration, twisting)
     other = twisting(seed=13)
     order = [*range(150), 148, 149, *range(150, 220)]
     again = [TactileFrame.of(float(other.t_s[i]), other.channels[i]) for i in order]
-    tracker = Tracker(fused_calibration)
+    tracker = EstimatorSession(fused_calibration)
     estimates = [tracker.estimate(one) for one in again]
     assert estimates[149].valid
     assert not any(one.valid for one in estimates[150:162])
@@ -207,7 +216,7 @@ def test_squeezing_alone_is_no_torque(fused_calibration, twisting):
 
 def test_a_frame_of_other_sides_is_refused(fused_calibration):
     with pytest.raises(CalibrationError, match=r"of 2 sides \(right, left\)"):
-        Tracker(fused_calibration).estimate(TactileFrame.of(0.0, np.zeros((1, 896))))
+        EstimatorSession(fused_calibration).estimate(TactileFrame.of(0.0, np.zeros((1, 896))))
 
 
 def test_a_session_that_begins_with_a_spoilt_frame_gets_over_it(fused_calibration, twisting):
@@ -242,7 +251,7 @@ def test_tools_that_turn_differently_give_no_torque_where_their_diameters_are_on
 def test_another_tool_is_refused_for_as_long_as_it_is_held(fused_calibration, twisting):
     twisted = twisting(seed=5)
     calibration = replace(fused_calibration, tool_mm=20.0)
-    tracker, plain = Tracker(calibration), Tracker(calibration)
+    tracker, plain = EstimatorSession(calibration), EstimatorSession(calibration)
     held = {
         60: Measured(22.9, 0.1),
         70: Measured(23.2, 0.1),
@@ -265,7 +274,7 @@ def test_another_tool_is_refused_for_as_long_as_it_is_held(fused_calibration, tw
     assert set(refused) <= {*range(70, 80), *range(90, 100)}
     assert len(refused) > 15
     assert all(same), "what it was told of tools changes nothing that it remembers"
-    unknown = Tracker(fused_calibration)
+    unknown = EstimatorSession(fused_calibration)
     unknown.hold(Measured(14.0, 0.1))
     frames = [TactileFrame.of(float(t_s), x) for t_s, x in zip(twisted.t_s, twisted.channels, strict=True)]
     assert any(unknown.estimate(frame).valid for frame in frames)
@@ -299,7 +308,7 @@ def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(fused_c
     kept = ~np.isin(np.arange(len(whole.t_s)) % every, list(left_out))
     part = changed(whole, t_s=whole.t_s[kept], channels=whole.channels[kept], diameter_mm=whole.diameter_mm[kept])
     period_s = float(whole.t_s[1] - whole.t_s[0])
-    estimates = follow(Tracker(fused_calibration, period_s=period_s), part)
+    estimates = follow(EstimatorSession(fused_calibration, period_s=period_s), part)
     assert not any(one.valid for one in estimates)
     assert any("are missing" in why for one in estimates for why in one.why)
 
@@ -307,7 +316,7 @@ def test_of_a_board_that_leaves_out_half_of_its_frames_no_torque_is_read(fused_c
 def test_a_board_that_is_faster_than_configured_is_followed_all_the_same(fused_calibration, twisting):
     whole = twisting(seed=5)
     fast = changed(whole, t_s=whole.t_s / 5, torque_t_s=whole.torque_t_s / 5)
-    configured = follow(Tracker(fused_calibration, period_s=0.54), fast)
+    configured = follow(EstimatorSession(fused_calibration, period_s=0.54), fast)
     assert [one.torque_nm for one in configured] == [one.torque_nm for one in follow(fused_calibration, whole)]
 
 

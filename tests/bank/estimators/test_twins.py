@@ -7,10 +7,10 @@ import pytest
 import yaml
 from scipy.stats import chi2
 
-from bank.batch_forward import BatchForwardModel
-from bank.estimators import Calibration, TactileFrame, Tracker, fit
-from bank.estimators.familiar import DifferenceGuard
-from bank.estimators.twins import _FIRST, _SECOND, Twins
+from shearloop.bank.eit.batch_forward import BatchForwardModel
+from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame, fit
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.reciprocity import _FIRST, _SECOND, ReciprocityCheck
 from tests.bank.conftest import small_fingertip
 
 ALL = np.ones(896, dtype=np.bool_)
@@ -33,7 +33,7 @@ def test_opposite_injections_read_the_same_magnitudes() -> None:
 def test_the_misfit_of_noise_is_that_of_noise() -> None:
     """By the chi-squared distribution: twice the noise is four times the median square, which has a closed form."""
     frames = slices(400, 2)
-    twins = Twins.fit(frames[:200])
+    twins = ReciprocityCheck.fit(frames[:200])
     expected = float(chi2.median(1)) * np.median(frames[:200].var(axis=0)) / 2 / np.median(twins.spread**2)
     quiet = np.median([twins.misfit(one, ALL) for one in frames[200:]])
     assert quiet == pytest.approx(expected * 1e-6 / np.median(frames[:200].var(axis=0)), rel=0.15)
@@ -43,7 +43,7 @@ def test_the_misfit_of_noise_is_that_of_noise() -> None:
 
 def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_not() -> None:
     frames = slices(60, 3)
-    guard, later = DifferenceGuard.fit(frames[:40]), frames[50]
+    guard, later = NoveltyDetector.fit(frames[:40]), frames[50]
     drifted = later + np.where(np.arange(896) % 28 < 2, 4e-3, 0.0)
     foreign = 0.85 * later + 0.15 * later[np.random.default_rng(4).permutation(896)]
     assert guard.twins is not None
@@ -59,7 +59,7 @@ def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_n
 
 def test_what_one_of_the_two_does_not_say_is_left_out() -> None:
     frames = slices(50, 5)
-    twins = Twins.fit(frames[:40])
+    twins = ReciprocityCheck.fit(frames[:40])
     usable = ALL.copy()
     usable[_SECOND[:100]] = False
     wrong = np.where(usable, frames[45], 1e3)
@@ -82,4 +82,4 @@ def test_a_calibration_from_before_is_read_and_does_without(sliced, tmp_path) ->
     assert found.torque.guard is not None
     assert found.torque.guard.twins is None
     whole = sliced()
-    assert Tracker(found).estimate(TactileFrame.of(0.0, whole.channels[3])).valid
+    assert EstimatorSession(found).estimate(TactileFrame.of(0.0, whole.channels[3])).valid

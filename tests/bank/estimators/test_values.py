@@ -3,9 +3,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bank.errors import CalibrationError
-from bank.estimators import FrameSeries, Measured, TactileFrame, fused
-from bank.estimators.values import distinct
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import FrameSeries, Measured, TactileFrame, fused
+from shearloop.bank.estimation.values import distinct
 
 measurements = st.builds(Measured, st.floats(-1e3, 1e3, allow_nan=False), st.floats(1e-3, 1e3, allow_nan=False))
 

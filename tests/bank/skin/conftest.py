@@ -1,7 +1,7 @@
 import pytest
 
-from bank.skin.annulus import MESH_112, CondensedSkin, condense
-from bank.skin.section import PAPER_SECTION
+from shearloop.bank.skin.annulus import MESH_112, CondensedSkin, condense
+from shearloop.bank.skin.section import PAPER_SECTION
 
 
 @pytest.fixture(scope="session")

@@ -3,9 +3,9 @@ import pytest
 import skfem
 from numpy.typing import NDArray
 
-from bank.errors import GeometryError
-from bank.skin.annulus import MESH_112, CondensedSkin, MeshSize, annulus_mesh, plane_strain_stiffness
-from bank.skin.section import PAPER_SECTION as SECTION
+from shearloop.bank.errors import GeometryError
+from shearloop.bank.skin.annulus import MESH_112, CondensedSkin, MeshSize, annulus_mesh, plane_strain_stiffness
+from shearloop.bank.skin.section import PAPER_SECTION as SECTION
 
 ELEMENT = skfem.ElementVector(skfem.ElementQuad2())
 # A ring under pressure: any A, B satisfy equilibrium (Lamé).

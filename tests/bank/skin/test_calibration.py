@@ -7,12 +7,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from bank.errors import CalibrationError
-from bank.skin.calibration import CalibrationTable, SkinCalibration
-from bank.skin.calibration_file import load_calibration, read_table, save_calibration
-from bank.skin.calibration_fit import fit_calibration
-from bank.skin.membrane import UNSTRETCHED, Direction, Membrane, paper_membrane
-from bank.skin.synthetic import loading, loop
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration
+from shearloop.bank.skin.calibration_file import load_calibration, read_table, save_calibration
+from shearloop.bank.skin.calibration_fit import fit_calibration
+from shearloop.bank.skin.membrane import UNSTRETCHED, Direction, Membrane, paper_membrane
+from shearloop.bank.skin.synthetic import loading, loop
 
 MEMBRANE = paper_membrane()
 R1, R2 = 24.6, 25.3

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bank.skin import closed_form
-from bank.skin.annulus import CondensedSkin, MeshSize, condense
-from bank.skin.contact import (
+from shearloop.bank.skin import closed_form
+from shearloop.bank.skin.annulus import CondensedSkin, MeshSize, condense
+from shearloop.bank.skin.contact import (
     ContactError,
     ContactState,
     follow,
@@ -18,12 +18,12 @@ from bank.skin.contact import (
     solve_contact,
     unloaded,
 )
-from bank.skin.gauge import gauge_factor, response_of_strains
-from bank.skin.membrane import UNSTRETCHED, section_membrane
-from bank.skin.section import PAPER_SECTION as SECTION
-from bank.skin.section import Section
-from bank.skin.statistics import fit_line, origin_slope
-from bank.skin.synthetic import loading, loop
+from shearloop.bank.skin.gauge import gauge_factor, response_of_strains
+from shearloop.bank.skin.membrane import UNSTRETCHED, section_membrane
+from shearloop.bank.skin.section import PAPER_SECTION as SECTION
+from shearloop.bank.skin.section import Section
+from shearloop.bank.skin.statistics import fit_line, origin_slope
+from shearloop.bank.skin.synthetic import loading, loop
 
 Floats = NDArray[np.float64]
 NORMAL_FORCES = (0.5, 1.0, 1.5, 2.0)

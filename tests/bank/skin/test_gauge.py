@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from bank.errors import CalibrationError, GeometryError
-from bank.skin import gauge
-from bank.skin.section import Section
+from shearloop.bank.errors import CalibrationError, GeometryError
+from shearloop.bank.skin import gauge
+from shearloop.bank.skin.section import Section
 
 
 def test_the_paper_s_gauge_has_25_ohm_and_stays_within_5_kelvin() -> None:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bank.errors import CalibrationError
-from bank.skin.membrane import (
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin.membrane import (
     UNSTRETCHED,
     Direction,
     Membrane,
@@ -16,8 +16,8 @@ from bank.skin.membrane import (
     paper_membrane,
     section_membrane,
 )
-from bank.skin.statistics import origin_slope
-from bank.skin.synthetic import loading, responses
+from shearloop.bank.skin.statistics import origin_slope
+from shearloop.bank.skin.synthetic import loading, responses
 
 MEMBRANE = paper_membrane()
 CAPSTAN = math.exp(-MEMBRANE.friction * MEMBRANE.gauge_angle_rad)

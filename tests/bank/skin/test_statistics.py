@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from bank.errors import CalibrationError
-from bank.skin import statistics
-from bank.skin.membrane import paper_membrane
-from bank.skin.synthetic import Figures, loading, loop, recover, responses
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.skin import statistics
+from shearloop.bank.skin.membrane import paper_membrane
+from shearloop.bank.skin.synthetic import Figures, loading, loop, recover, responses
 
 RNG_SEED = 20
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import COMMANDS, main
+from shearloop.daemon.cli import COMMANDS, main
 
 # What needs none, and why.
 WITHOUT = {

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from bank.skin.calibration_file import load_calibration
-from bank.skin.characterisation import Row
-from bank.skin.membrane import paper_membrane
-from bank.skin.synthetic import loop, responses
-from daemon.cli import main
-from daemon.cli.skin import _table
+from shearloop.bank.skin.calibration_file import load_calibration
+from shearloop.bank.skin.characterisation import Row
+from shearloop.bank.skin.membrane import paper_membrane
+from shearloop.bank.skin.synthetic import loop, responses
+from shearloop.daemon.cli import main
+from shearloop.daemon.cli.skin import _table
 
 
 @pytest.fixture(scope="session")

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from daemon.cli import main
-from daemon.cli.writing_over import check_writes_over
-from daemon.errors import UserError
+from shearloop.daemon.cli import main
+from shearloop.daemon.cli.writing_over import check_writes_over
+from shearloop.daemon.errors import UserError
 
 MCAP = b"\x89MCAP0\r\n and what cannot be recorded again"
 

@@ -2,8 +2,8 @@ from typing import Any
 
 import pytest
 
-from daemon.control.controller import TwistController
-from daemon.control.settings import ControllerSettings
+from shearloop.daemon.control.controller import TwistController
+from shearloop.daemon.control.settings import ControllerSettings
 
 DEFAULTS: dict[str, Any] = {
     "stiffness_nm_per_rad": 0.25,

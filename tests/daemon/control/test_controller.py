@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.control.controller import Reason, Refusal, TwistController
-from daemon.control.settings import ControllerSettings
-from daemon.errors import UserError
+from shearloop.daemon.control.controller import ControllerReason, ControllerRefusal, TwistController
+from shearloop.daemon.control.settings import ControllerSettings
+from shearloop.daemon.errors import UserError
 
 from .conftest import DEFAULTS, Bench
 
@@ -77,18 +77,18 @@ def test_refused_measurements_change_nothing(batch: list[tuple[float | None, int
 def test_every_refusal_is_counted_by_kind(bench: Bench) -> None:
     bench.advance(1.0)
     fresh = TwistController(bench.settings)
-    assert fresh.measure(0.1, 0, 1) is Refusal.NOT_STARTED
-    assert bench.measure(None) is Refusal.NOT_A_NUMBER
-    assert bench.measure(math.nan) is Refusal.NOT_A_NUMBER
-    assert bench.measure(0.0, -0.1) is Refusal.FROM_THE_FUTURE
-    assert bench.measure(0.0, 0.1) is Refusal.NO_ANGLE  # its window has not ended
+    assert fresh.measure(0.1, 0, 1) is ControllerRefusal.NOT_STARTED
+    assert bench.measure(None) is ControllerRefusal.NOT_A_NUMBER
+    assert bench.measure(math.nan) is ControllerRefusal.NOT_A_NUMBER
+    assert bench.measure(0.0, -0.1) is ControllerRefusal.FROM_THE_FUTURE
+    assert bench.measure(0.0, 0.1) is ControllerRefusal.NO_ANGLE  # its window has not ended
     assert bench.measure(0.0, 0.3) is None
-    assert bench.measure(0.0, 0.3) is Refusal.OUT_OF_ORDER
-    assert bench.measure(0.0, 0.5) is Refusal.OUT_OF_ORDER
+    assert bench.measure(0.0, 0.3) is ControllerRefusal.OUT_OF_ORDER
+    assert bench.measure(0.0, 0.5) is ControllerRefusal.OUT_OF_ORDER
     bench.advance(3.0)
-    assert bench.measure(0.0, 2.5) is Refusal.LATE
+    assert bench.measure(0.0, 2.5) is ControllerRefusal.LATE
     assert sum(bench.controller.refused.values()) == 7
-    assert bench.controller.refused[Refusal.OUT_OF_ORDER] == 2
+    assert bench.controller.refused[ControllerRefusal.OUT_OF_ORDER] == 2
 
 
 def test_one_wild_value_moves_the_wrist_by_no_more_than_its_bounded_share() -> None:
@@ -111,7 +111,7 @@ def test_hold_is_zero_speed_at_once_and_resume_does_not_lunge() -> None:
     bench.controller.hold()
     command = bench.controller.command(bench.t_ns + 8_000_000, bench.angle)
     assert command.speed_rad_per_s == 0.0
-    assert command.reasons == (Reason.HELD,)
+    assert command.reasons == (ControllerReason.HELD,)
     assert command.holds
     bench.speed = 0.0
     bench.measured_for(2.0)
@@ -130,7 +130,7 @@ def test_a_stale_torque_holds_and_a_fresh_one_lets_go() -> None:
     assert bench.speed > 0.0
     bench.advance(0.05)
     command = bench.controller.command(bench.t_ns + 1, bench.angle)
-    assert (command.speed_rad_per_s, command.reasons) == (0.0, (Reason.STALE,))
+    assert (command.speed_rad_per_s, command.reasons) == (0.0, (ControllerReason.STALE,))
     bench.speed = 0.0
     bench.measured_for(0.5)
     bench.advance(0.1)
@@ -139,11 +139,11 @@ def test_a_stale_torque_holds_and_a_fresh_one_lets_go() -> None:
 
 def test_without_angle_measurement_set_point_or_start_the_wrist_stays() -> None:
     bench = Bench()
-    assert TwistController(bench.settings).command(0, 0.0).reasons == (Reason.NOT_STARTED,)
+    assert TwistController(bench.settings).command(0, 0.0).reasons == (ControllerReason.NOT_STARTED,)
     assert set(bench.controller.command(bench.t_ns + 1, math.nan).reasons) == {
-        Reason.NO_ANGLE,
-        Reason.NO_SET_POINT,
-        Reason.NOT_MEASURED,
+        ControllerReason.NO_ANGLE,
+        ControllerReason.NO_SET_POINT,
+        ControllerReason.NOT_MEASURED,
     }
 
 
@@ -157,12 +157,12 @@ def test_a_slipping_grip_is_bounded_and_then_held(slip_nm: float) -> None:
         bench.advance(0.5)
         bench.measure(min(0.25 * (bench.angle - 0.3), slip_nm))
     command = bench.controller.command(bench.t_ns + 1, bench.angle)
-    assert Reason.NOT_FOLLOWING in command.reasons
+    assert ControllerReason.NOT_FOLLOWING in command.reasons
     assert command.speed_rad_per_s == 0.0
     # The way to the set point, and what the offset limit allows beyond it, and one measurement's share.
     assert bench.angle - 0.3 <= (0.16 + 0.06 + 0.036 * 0.3) / 0.25
     bench.controller.resume()
-    assert Reason.NOT_FOLLOWING not in bench.controller.command(bench.t_ns + 2, bench.angle).reasons
+    assert ControllerReason.NOT_FOLLOWING not in bench.controller.command(bench.t_ns + 2, bench.angle).reasons
 
 
 # --- limits
@@ -222,7 +222,7 @@ def test_the_wrist_comes_to_rest_at_the_limit_of_its_travel() -> None:
     bench.measured_for(8.0)
     assert bench.angle - 0.3 == pytest.approx(0.2, abs=0.002)
     assert bench.angle - 0.3 <= 0.2
-    assert Reason.TRAVEL in bench.controller.command(bench.t_ns + 8_000_000, bench.angle).reasons
+    assert ControllerReason.TRAVEL in bench.controller.command(bench.t_ns + 8_000_000, bench.angle).reasons
 
 
 # --- wind-up

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from daemon.control.creep import Creep, Stretch, fit_creep
-from daemon.errors import UserError
-from drivers.emulators.twin import Twin, TwinSettings
+from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
+from shearloop.daemon.errors import UserError
+from shearloop.drivers.emulators.twin import Twin, TwinSettings
 
 PERIOD_S = 0.5412
 

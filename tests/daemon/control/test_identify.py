@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.control.excite import ExciteSettings, IdentifyStep
-from daemon.control.identify import IdentifyError, NotYetKnownError, Record, identify
-from daemon.errors import UserError
+from shearloop.daemon.control.excitation import ExciteSettings, StiffnessExcitation
+from shearloop.daemon.control.identify import IdentifyError, NotYetKnownError, Record, identify
+from shearloop.daemon.errors import UserError
 
 WINDOW_S = 0.5412
 
@@ -124,7 +124,7 @@ def test_a_torque_that_is_no_springs_is_refused() -> None:
 # --- the step with its wrist programme
 
 
-def step_on(stiffness: float, noise_nm: float, **changes: Any) -> tuple[IdentifyStep, list[float], list[float]]:
+def step_on(stiffness: float, noise_nm: float, **changes: Any) -> tuple[StiffnessExcitation, list[float], list[float]]:
     """Run the step on a wrist that does what it is told at once; return it with all angles and speeds."""
     values: dict[str, Any] = {
         "amplitude_rad": 0.4,
@@ -133,7 +133,7 @@ def step_on(stiffness: float, noise_nm: float, **changes: Any) -> tuple[Identify
         "torque_limit_nm": 0.15,
         "stiffness_share": 0.05,
     }
-    step = IdentifyStep(ExciteSettings(**(values | changes)))
+    step = StiffnessExcitation(ExciteSettings(**(values | changes)))
     rng, angle, angles, speeds, since = np.random.default_rng(3), 1.0, [], [], []
     for number in range(40_000):
         now_ns = 10**9 + number * 8_000_000
@@ -185,7 +185,9 @@ def test_the_step_gives_up_when_it_cannot_know_better() -> None:
 
 
 def test_nonsense_does_not_reach_the_record() -> None:
-    step = IdentifyStep(ExciteSettings(amplitude_rad=0.4, sample_period_s=0.5, window_s=0.5, torque_limit_nm=0.1))
+    step = StiffnessExcitation(
+        ExciteSettings(amplitude_rad=0.4, sample_period_s=0.5, window_s=0.5, torque_limit_nm=0.1)
+    )
     step.measure(0.1, 0, 1)
     assert step.command(0, math.nan) == 0.0
     step.command(0, 1.0)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.control.margins import (
+from shearloop.daemon.control.margins import (
     LoopModel,
     characteristic_polynomial,
     gain_limit,

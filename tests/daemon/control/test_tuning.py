@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.control.identify import Identified
-from daemon.control.settings import ControllerSettings
-from daemon.control.tuning import (
+from shearloop.daemon.control.identify import ToolModel
+from shearloop.daemon.control.settings import ControllerSettings
+from shearloop.daemon.control.tuning import (
     MOST_GAIN,
     RequiredMargins,
     gain_for_noise,
@@ -20,7 +20,7 @@ from daemon.control.tuning import (
 
 from .conftest import DEFAULTS
 
-FOUND = Identified(
+FOUND = ToolModel(
     stiffness_nm_per_rad=0.25,
     stiffness_std=0.01,
     lag_s=0.0,

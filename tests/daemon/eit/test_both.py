@@ -9,14 +9,14 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from daemon.clock import Clock
-from daemon.eit.both import BOTH, BothTask
-from daemon.eit.estimation import Estimation
-from daemon.eit.estimator import Reading
-from daemon.eit.fingertip import FingertipTask
-from daemon.messages import Message
-from daemon.wire.publisher import Publisher
-from drivers.eit_kit import EitKit, Frame
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import Message
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensing.both import BOTH, CombinedFingertipTask
+from shearloop.daemon.sensing.estimation import EstimatorTask
+from shearloop.daemon.sensing.estimator import Reading
+from shearloop.daemon.sensing.fingertip import FingertipTask
+from shearloop.drivers.eit_kit import EitKit, Frame
 
 PERIOD_S = 0.54
 NONE = np.zeros(896, dtype=np.bool_)
@@ -49,7 +49,7 @@ class Board:
 
     period_s = PERIOD_S
 
-    def __init__(self, both: BothTask) -> None:
+    def __init__(self, both: CombinedFingertipTask) -> None:
         self._both = both
 
     async def frames(self) -> AsyncGenerator[Frame]:
@@ -81,16 +81,18 @@ class Reader:
         return Reading(why=("nothing",))
 
 
-def both_of(told: Told, reader: Reader) -> BothTask:
-    return BothTask(estimation(BOTH, told, reader), ("right", "left"), PERIOD_S)
+def both_of(told: Told, reader: Reader) -> CombinedFingertipTask:
+    return CombinedFingertipTask(estimation(BOTH, told, reader), ("right", "left"), PERIOD_S)
 
 
-def estimation(name: str, told: Told, reader: Reader) -> Estimation:
-    return Estimation(name, cast(Any, reader), cast(Publisher, told), Clock(), lambda: PERIOD_S, lambda _: None)
+def estimation(name: str, told: Told, reader: Reader) -> EstimatorTask:
+    return EstimatorTask(name, cast(Any, reader), cast(Publisher, told), Clock(), lambda: PERIOD_S, lambda _: None)
 
 
 @contextlib.asynccontextmanager
-async def running(told: Told, both: BothTask) -> AsyncGenerator[tuple[asyncio.Task[None], asyncio.Task[None]]]:
+async def running(
+    told: Told, both: CombinedFingertipTask
+) -> AsyncGenerator[tuple[asyncio.Task[None], asyncio.Task[None]]]:
     """Run both's task and the right fingertip's two; gives the one that reads the board, and both's."""
     right = FingertipTask(
         cast(EitKit, Board(both)), estimation("right", told, Reader()), cast(Publisher, told), both.room

@@ -5,13 +5,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from daemon.clock import Clock
-from daemon.eit.estimation import Estimation
-from daemon.eit.estimator import Reading
-from daemon.messages import Message
-from daemon.wire.publisher import Publisher
-from drivers.eit_line import Frame
-from drivers.raw_input import InputKind, RawInput, Tap, no_tap
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import Message
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensing.estimation import EstimatorTask
+from shearloop.daemon.sensing.estimator import Reading
+from shearloop.drivers.eit_line import Frame
+from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
 
 MS = 1_000_000
 PERIOD_NS = 540 * MS
@@ -62,14 +62,16 @@ class Unheard:
         pass
 
 
-def estimating(estimator: Tared, clock: Clock, tap: Tap = no_tap) -> Estimation:
+def estimating(estimator: Tared, clock: Clock, tap: Tap = no_tap) -> EstimatorTask:
     publisher = cast(Publisher, Unheard())
-    return Estimation("right", cast(Any, estimator), publisher, clock, lambda: PERIOD_NS / 1e9, lambda _: None, tap=tap)
+    return EstimatorTask(
+        "right", cast(Any, estimator), publisher, clock, lambda: PERIOD_NS / 1e9, lambda _: None, tap=tap
+    )
 
 
 @pytest.mark.parametrize("since_ms", [1, 100, 540, 621])
 def test_the_frame_that_is_under_way_when_a_zero_is_asked_for_is_not_of_it(since_ms: int) -> None:
-    clock, estimator, told = Held(), Tared(), list[RawInput]()
+    clock, estimator, told = Held(), Tared(), list[RawEvent]()
     estimation = estimating(estimator, clock, told.append)
     asked_ns = clock.t_ns
     estimation.tare()

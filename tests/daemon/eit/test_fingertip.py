@@ -8,15 +8,15 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from daemon.clock import Clock
-from daemon.config import Fingertip
-from daemon.eit.estimation import Estimation
-from daemon.eit.estimator import Reading
-from daemon.eit.fingertip import FingertipTask
-from daemon.messages import Message
-from daemon.wire.publisher import Publisher
-from drivers.eit_format import FRAME_PERIOD_S
-from drivers.eit_kit import EitKit, Frame
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import FingertipConfig
+from shearloop.daemon.messaging.messages import Message
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensing.estimation import EstimatorTask
+from shearloop.daemon.sensing.estimator import Reading
+from shearloop.daemon.sensing.fingertip import FingertipTask
+from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import EitKit, Frame
 
 
 class Told:
@@ -76,7 +76,7 @@ class Reader:
 
 def task_of(told: Told, reader: Reader) -> FingertipTask:
     publisher = cast(Publisher, told)
-    estimation = Estimation("right", cast(Any, reader), publisher, Clock(), lambda: Board.period_s, lambda _: None)
+    estimation = EstimatorTask("right", cast(Any, reader), publisher, Clock(), lambda: Board.period_s, lambda _: None)
     return FingertipTask(cast(EitKit, Board()), estimation, publisher)
 
 
@@ -117,4 +117,4 @@ async def test_what_an_estimator_dies_of_ends_its_own_task_and_not_the_one_that_
 
 
 def test_a_board_is_expected_at_its_own_pace_before_that_is_measured() -> None:
-    assert Fingertip.model_fields["frame_period_s"].default == FRAME_PERIOD_S
+    assert FingertipConfig.model_fields["frame_period_s"].default == FRAME_PERIOD_S

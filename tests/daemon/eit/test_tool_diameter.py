@@ -2,9 +2,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bank.estimators import Measured
-from bank.polynomial import Interval
-from daemon.eit.tool_diameter import STALE_AFTER_NS, FingertipDiameters, as_text, from_text
+from shearloop.bank.eit.polynomial import Interval
+from shearloop.bank.estimation import Measured
+from shearloop.daemon.sensing.tool_diameter import STALE_AFTER_NS, FingertipDiameters, as_text, from_text
 
 
 def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> None:

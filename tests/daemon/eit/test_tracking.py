@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bank.bank_file import Bank
-from bank.estimators import Calibration, FrameSeries, fit
-from bank.fast_matching import FastZeroLagMatcher
-from daemon.cli.check import _torque
-from daemon.config import Both, Fingertip
-from daemon.doctor.files import both_finding, calibration_finding
-from daemon.eit.opening import open_both, open_estimator
-from daemon.eit.tracking import Scoring, TrackedEstimator
-from daemon.errors import UserError
-from drivers.eit_kit import Frame
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.fast_matching import FastZeroLagMatcher
+from shearloop.bank.estimation import Calibration, FrameSeries, fit
+from shearloop.daemon.cli.check import _torque
+from shearloop.daemon.config import CombinedConfig, FingertipConfig
+from shearloop.daemon.doctor.files import both_finding, calibration_finding
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.sensing.opening import open_both, open_estimator
+from shearloop.daemon.sensing.tracking import Scoring, TrackedEstimator
+from shearloop.drivers.eit_kit import Frame
 from tests.bank.estimators.conftest import IDLE_S, PERIOD_S, series
 
 NO_CHANNEL = np.zeros(896, bool)
@@ -144,14 +144,14 @@ def test_only_what_takes_a_millisecond_is_not_left_to_a_thread(name, quick, cali
     assert (found is not None) == quick
 
 
-def fingertip(**changes: object) -> Fingertip:
-    return Fingertip.model_validate({"device": {"path": "eit"}, **changes})
+def fingertip(**changes: object) -> FingertipConfig:
+    return FingertipConfig.model_validate({"device": {"path": "eit"}, **changes})
 
 
 def test_the_calibration_says_which_estimator_it_is(files: dict[str, Path]) -> None:
     opened = open_estimator(fingertip(calibration=files["right"]), "right")
     assert isinstance(opened, TrackedEstimator)
-    both = open_both(Both(calibration=files["both"]), {"right": fingertip(), "left": fingertip()})
+    both = open_both(CombinedConfig(calibration=files["both"]), {"right": fingertip(), "left": fingertip()})
     assert both.sides == ("right", "left")
     assert both.grids is None
 
@@ -162,11 +162,13 @@ def test_doctor_and_check_show_what_was_taken_on_somebodys_word(
     path, tips = tmp_path / "both.cal", {"right": fingertip(), "left": fingertip()}
     alone = fingertip(calibration=files["right"])
     replace(calibration, vouched=("load times",)).save(path)
-    vouched = both_finding(Both(calibration=path), tips)
+    vouched = both_finding(CombinedConfig(calibration=path), tips)
     assert vouched.state == "good"
     assert vouched.found.endswith(", on somebody's word for when its loads were measured (--load-late)")
-    assert "with torque, on somebody's word for" in _torque(open_both(Both(calibration=path), tips), calibrated=True)
-    for finding in (both_finding(Both(calibration=files["both"]), tips), calibration_finding("right", alone)):
+    assert "with torque, on somebody's word for" in _torque(
+        open_both(CombinedConfig(calibration=path), tips), calibrated=True
+    )
+    for finding in (both_finding(CombinedConfig(calibration=files["both"]), tips), calibration_finding("right", alone)):
         assert finding.state == "good"
         assert "word" not in finding.found
 
@@ -181,7 +183,7 @@ def test_doctor_and_check_show_what_was_taken_on_somebodys_word(
         (lambda _: open_estimator(fingertip(estimator="fused", calibration="no.cal"), "right"), "no.cal does not"),
         (lambda _: open_estimator(fingertip(estimator="fused", calibration=__file__), "right"), "is another kind;"),
         (lambda _: open_estimator(fingertip(), "right"), "needs its bank; add `bank:`"),
-        (lambda f: open_both(Both(calibration=f["both"]), {"right": fingertip()}), "of both, and name"),
+        (lambda f: open_both(CombinedConfig(calibration=f["both"]), {"right": fingertip()}), "of both, and name"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_a_sentence(

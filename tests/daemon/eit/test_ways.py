@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bank import compiled
-from bank.channels import CHANNELS, N_CHANNELS
-from bank.estimators import Calibration, FrameSeries, fit
-from daemon.eit.estimator import Reading
-from daemon.eit.tracking import TrackedEstimator
-from drivers.eit_kit import Frame
+from shearloop.bank.eit import compiled
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
+from shearloop.bank.estimation import Calibration, FrameSeries, fit
+from shearloop.daemon.sensing.estimator import Reading
+from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.drivers.eit_kit import Frame
 from tests.bank.estimators.conftest import PERIOD_S, series
 
 pytestmark = pytest.mark.skipif(not compiled.IS_COMPILED, reason="nothing is compiled")

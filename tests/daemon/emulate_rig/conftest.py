@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.bank_file import BankDefinition, write_bank
+from shearloop.bank.eit.bank_file import BankDefinition, write_bank
 from tests.daemon.emulate_rig.rig import HOMOGENEOUS, PACE, PATTERN, RigProcess
 
 

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bank.channels import CHANNELS, ZERO_SLOTS
-from drivers.eit_kit import EitKit, Frame
-from drivers.hx711 import LoadCalibration, LoadSample
-from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import GripperCommand, GripperState
-from drivers.robotiq.socket_client import SocketClient
-from drivers.robotiq.width import WidthCalibration
-from drivers.serial_port import LinkEvent
-from drivers.ur.client import LinkEvent as RobotLink
-from drivers.ur.client import UrRobot
-from drivers.ur.messages import Enable, RobotState, Stop, WristSpeed
-from drivers.ur.settings import read_settings
+from shearloop.bank.eit.channels import CHANNELS, ZERO_SLOTS
+from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.hx711 import LoadCalibration, LoadSample
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.messages import GripperCommand, GripperState
+from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.width import WidthCalibration
+from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.ur.client import UrLinkEvent as RobotLink
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import Enable, RobotState, Stop, WristSpeed
+from shearloop.drivers.ur.settings import read_settings
 from tests.emulator_process import EmulatorProcess, Event
 
 # Gel, fingers and boards; the arm moves as fast as its loop bears.

@@ -6,13 +6,13 @@ from contextlib import AsyncExitStack
 
 import pytest
 
-from drivers.errors import DeviceLostError, DriverError
-from drivers.load_cell import LoadCell
-from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import ObjectStatus
-from drivers.serial_port import LinkEvent
-from drivers.ur.client import LinkEvent as RobotLink
-from drivers.ur.messages import Unlock
+from shearloop.drivers.errors import DeviceLostError, DriverError
+from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.messages import ObjectStatus
+from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.ur.client import UrLinkEvent as RobotLink
+from shearloop.drivers.ur.messages import Unlock
 from tests.daemon.emulate_rig.rig import (
     COUNTS,
     DEADLINE_S,

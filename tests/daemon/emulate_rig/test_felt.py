@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.calibration import Calibration
-from drivers.hx711 import LoadCalibration
-from drivers.load_cell import LoadCell
-from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import ObjectStatus
-from drivers.robotiq.modbus_client import ModbusClient
-from drivers.robotiq.width import WidthCalibration
+from shearloop.bank.eit.calibration import Calibration
+from shearloop.drivers.hx711 import LoadCalibration
+from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.messages import ObjectStatus
+from shearloop.drivers.robotiq.modbus_client import ModbusClient
+from shearloop.drivers.robotiq.width import WidthCalibration
 from tests.daemon.emulate_rig.rig import (
     CM_PER_NM,
     COUNTS,
@@ -82,7 +82,7 @@ async def test_a_twist_is_felt_by_load_cell_wrench_and_both_fingertips_and_is_go
 async def test_the_modbus_gripper_the_papers_sketch_a_calibration_and_the_truth_in_a_file(
     bank: Path, tmp_path: Path
 ) -> None:
-    from bank.bank_file import Bank
+    from shearloop.bank.eit.bank_file import Bank
 
     sigma = np.linspace(1.0, 2.0, 20)
     calibration = tmp_path / "calibration.yaml"

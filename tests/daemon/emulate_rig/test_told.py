@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.channels import channels_of_line
-from daemon.cli import main
+from shearloop.bank.eit.channels import channels_of_line
+from shearloop.daemon.cli import main
 
 
 @pytest.mark.parametrize(
@@ -49,8 +49,8 @@ def test_mistakes_are_told(
     ],
 )
 def test_what_is_no_command_is_said_to_be_none(line: str, sentence: str, tmp_path: Path) -> None:
-    from drivers.emulators.rig import Rig, RigSettings
+    from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings
 
-    rig = Rig(RigSettings(run_dir=tmp_path), lambda _grip, _shear, _diameter: channels_of_line(np.zeros(1024)))
+    rig = EmulatedRig(RigSettings(run_dir=tmp_path), lambda _grip, _shear, _diameter: channels_of_line(np.zeros(1024)))
     with pytest.raises(ValueError, match=sentence):
         rig.command(line)

@@ -6,10 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from daemon.config_file import load_yaml_model
-from daemon.experiment.machine import Experiment, Phase
-from daemon.experiment.steps import ExperimentFile
-from daemon.experiment.wishes import ActionState, GoTo, Still, Track, Turn, View, Wish
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.step_commands import (
+    ActionState,
+    ConstantVelocity,
+    Hold,
+    MoveToAngle,
+    StepCommand,
+    StepContext,
+    TrackTorque,
+)
+from shearloop.daemon.control.step_runner import Experiment, ExperimentPhase
 
 TICK_NS = 8_000_000
 STIFFNESS_NM_PER_RAD = 0.2
@@ -25,28 +33,28 @@ class Bench:
     def __init__(self, machine: Experiment, tick_ns: int = TICK_NS) -> None:
         self.machine, self.t_ns, self.wrist_rad, self.tick_ns = machine, 0, 0.0, tick_ns
         self.begun: list[str] = []
-        self.wish = Wish()
-        self.seen: list[Wish] = []
+        self.wish = StepCommand()
+        self.seen: list[StepCommand] = []
 
-    def view(self) -> View:
+    def view(self) -> StepContext:
         done = ActionState.DONE if self.wish.action else ActionState.IDLE
-        return View(self.wrist_rad, STIFFNESS_NM_PER_RAD * self.wrist_rad, action=done)
+        return StepContext(self.wrist_rad, STIFFNESS_NM_PER_RAD * self.wrist_rad, action=done)
 
-    def tick(self, *, held: bool = False) -> Wish:
+    def tick(self, *, held: bool = False) -> StepCommand:
         self.t_ns += self.tick_ns
         wish = self.machine.update(self.view(), self.t_ns, held=held)
         if wish.action is not None and wish.number != self.wish.number:
             self.begun.append(type(wish.action).__name__)
         step_s = self.tick_ns / 1e9
         match wish.wrist:
-            case GoTo(angle, speed):
+            case MoveToAngle(angle, speed):
                 reach = speed * step_s
                 self.wrist_rad += max(-reach, min(reach, angle - self.wrist_rad))
-            case Turn(speed):
+            case ConstantVelocity(speed):
                 self.wrist_rad += speed * step_s
-            case Track(torque, _):
+            case TrackTorque(torque, _):
                 self.wrist_rad += 0.05 * (torque / STIFFNESS_NM_PER_RAD - self.wrist_rad)
-            case Still():
+            case Hold():
                 pass
         self.wish = wish
         self.seen.append(wish)
@@ -71,7 +79,7 @@ def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
         )
     )
     bench.run()
-    assert bench.machine.phase is Phase.DONE
+    assert bench.machine.phase is ExperimentPhase.DONE
     assert bench.begun == ["MoveTo", "GripTo", "TakeZero", "GripTo", "MoveTo"]
     assert bench.machine.progress().share == 1.0
     holds = [wish for wish in bench.seen if wish.doing.startswith("holding 0.200 rad")]
@@ -81,9 +89,9 @@ def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
 
 def test_absolute_angles_are_the_wrists_own() -> None:
     machine = experiment({"do": "twist", "angles_rad": [1.5], "absolute": True})
-    machine.update(View(0.0, 0.0, gripped_at_rad=1.4), TICK_NS)
-    wish = machine.update(View(0.0, 0.0, gripped_at_rad=1.4), 2 * TICK_NS)
-    assert isinstance(wish.wrist, GoTo)
+    machine.update(StepContext(0.0, 0.0, gripped_at_rad=1.4), TICK_NS)
+    wish = machine.update(StepContext(0.0, 0.0, gripped_at_rad=1.4), 2 * TICK_NS)
+    assert isinstance(wish.wrist, MoveToAngle)
     assert wish.wrist.angle_rad == pytest.approx(0.1)
 
 
@@ -91,17 +99,17 @@ def test_tighten_ends_at_the_torque_or_at_the_angle_whichever_comes_first() -> N
     for angle_rad, reached_rad in ((3.0, 0.5), (0.25, 0.25)):
         bench = Bench(experiment({"do": "tighten", "until_torque_nm": 0.1, "until_angle_rad": angle_rad}))
         bench.run()
-        assert bench.machine.phase is Phase.DONE
+        assert bench.machine.phase is ExperimentPhase.DONE
         assert bench.wrist_rad == pytest.approx(-reached_rad, abs=0.002), "clockwise is negative"
 
 
 def test_a_failed_action_stops_the_experiment_with_its_reason() -> None:
     machine = experiment({"do": "grip"}, {"do": "release"})
-    machine.update(View(0.0, None, action=ActionState.RUNNING), TICK_NS)
+    machine.update(StepContext(0.0, None, action=ActionState.RUNNING), TICK_NS)
     wish = machine.update(
-        View(0.0, None, action=ActionState.FAILED, failure="nothing was between the fingers"), TICK_NS
+        StepContext(0.0, None, action=ActionState.FAILED, failure="nothing was between the fingers"), TICK_NS
     )
-    assert (machine.phase, wish) == (Phase.STOPPED, Wish())
+    assert (machine.phase, wish) == (ExperimentPhase.STOPPED, StepCommand())
     assert machine.why == "step 1 (grip) failed: nothing was between the fingers"
 
 
@@ -112,19 +120,19 @@ def test_while_paused_or_held_the_wrist_stands_and_no_time_passes() -> None:
     left_s, angle_rad = bench.machine.progress().remaining_s, bench.wrist_rad
     bench.machine.pause()
     for _ in range(1000):
-        assert bench.tick().wrist == Still()
+        assert bench.tick().wrist == Hold()
     bench.machine.resume()
     for _ in range(1000):
-        assert bench.tick(held=True).wrist == Still()
+        assert bench.tick(held=True).wrist == Hold()
     assert bench.machine.progress().remaining_s == left_s
     assert bench.wrist_rad == angle_rad
     bench.run()
-    assert bench.machine.phase is Phase.DONE
+    assert bench.machine.phase is ExperimentPhase.DONE
 
 
 def test_a_step_that_takes_too_long_is_said_to_be_overdue() -> None:
     machine = experiment({"do": "grip", "timeout_s": 2.0})
-    view = View(0.0, None, action=ActionState.RUNNING)
+    view = StepContext(0.0, None, action=ActionState.RUNNING)
     machine.update(view, 2_000_000_000)
     assert not machine.progress().overdue
     machine.update(view, 2_100_000_000)
@@ -181,12 +189,12 @@ def test_any_experiment_ends_whatever_interrupts_it_and_never_moves_after_its_en
         elif what == "resume":
             bench.machine.resume()
         wish = bench.tick(held=what == "hold")
-        assert what != "hold" or wish.wrist == Still()
+        assert what != "hold" or wish.wrist == Hold()
         assert 0.0 <= bench.machine.progress().share <= 1.0
     bench.machine.resume()
     bench.run()
-    assert bench.machine.phase is Phase.DONE
-    assert bench.tick() == Wish()
+    assert bench.machine.phase is ExperimentPhase.DONE
+    assert bench.tick() == StepCommand()
 
 
 @pytest.mark.parametrize("path", sorted(Path("config/experiments").glob("*.yaml")), ids=lambda path: path.stem)
@@ -194,4 +202,4 @@ def test_the_experiments_that_are_shipped_are_in_order_and_end(path: Path) -> No
     file = load_yaml_model(path, ExperimentFile)
     bench = Bench(Experiment(file, 0), tick_ns=100_000_000)
     bench.run()
-    assert bench.machine.phase is Phase.DONE
+    assert bench.machine.phase is ExperimentPhase.DONE

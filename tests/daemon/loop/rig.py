@@ -7,32 +7,32 @@ from typing import Any
 
 import numpy as np
 
-from daemon.experiment.machine import Phase
-from daemon.experiment.steps import ExperimentFile
-from daemon.experiment.wishes import Action, GripTo
-from daemon.loop.brain import Brain, Orders
-from daemon.loop.senses import Arm, Hand, Source, Torque
-from daemon.loop.tune import TuneSettings, tuned
-from daemon.loop.watch import WatchSettings
-from daemon.loop.wrist import Wrist, WristSettings
-from drivers.emulators.twin import Twin, TwinSettings
+from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.fault_detection import MonitorSettings
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample, TorqueSource
+from shearloop.daemon.control.step_commands import Action, GripTo
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.control.tune import TuneSettings, tuned
+from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.drivers.emulators.twin import Twin, TwinSettings
 
 TICK_S = 0.008
-EIT = Source(name="right", period_s=0.5412, window_s=0.5412)
-LOAD = Source(name="load_cell", period_s=1 / 10.9)
+EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
+LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)
 GRIP = {"do": "grip", "width_mm": 10.0, "force_n": 60.0}
 TUNE = TuneSettings()
 
 
-def brain(watch: WatchSettings | None = None) -> Brain:
-    wrists = {source.name: Wrist(source, WristSettings(), partial(tuned, TUNE)) for source in (EIT, LOAD)}
-    return Brain(wrists, watch or WatchSettings(), {"right": EIT, "load_cell": LOAD}, ("gripper", "right"))
+def brain(watch: MonitorSettings | None = None) -> ControlLoop:
+    wrists = {source.name: WristController(source, WristSettings(), partial(tuned, TUNE)) for source in (EIT, LOAD)}
+    return ControlLoop(wrists, watch or MonitorSettings(), {"right": EIT, "load_cell": LOAD}, ("gripper", "right"))
 
 
 class Rig:
     """The twin with sensors and devices around it, stepped in the loop's own ticks: no I/O, no waiting."""
 
-    def __init__(self, subject: Brain, seed: int = 0, noise_nm: float = 0.012) -> None:
+    def __init__(self, subject: ControlLoop, seed: int = 0, noise_nm: float = 0.012) -> None:
         self.brain = subject
         self.twin = Twin(TwinSettings(gel_stiffness_nm_per_rad=0.3))
         self.random = np.random.default_rng(seed)
@@ -46,11 +46,11 @@ class Rig:
         self.silent: set[str] = set()
         # What the load cell says too much, and whether it says nothing of use.
         self.offset_nm, self.void = 0.0, False
-        self.arm = Arm(0.3, 0)
-        self.hand = Hand(0, 140.0, holding=False, moving=False)
+        self.arm = ArmStatus(0.3, 0)
+        self.hand = GripperStatus(0, 140.0, holding=False, moving=False)
         self.pending: list[tuple[int, Action]] = []
         self.begun: list[Action] = []
-        self.orders = Orders()
+        self.orders = ControlOutput()
         self.true_nm: list[float] = []
 
     @property
@@ -86,10 +86,10 @@ class Rig:
         if self.tick % 68 == 0 and "right" not in self.silent:
             middle = now - round(EIT.window_s * 0.5e9)
             value = float(np.mean(self.window) + self.random.normal(0.0, self.noise_nm))
-            self.brain.hear(Torque("right", value, "", middle, now))
+            self.brain.hear(TorqueSample("right", value, "", middle, now))
         if self.tick % 11 == 0 and "load_cell" not in self.silent:
             value = torque_nm + self.offset_nm + float(self.random.normal(0.0, 0.0005))
-            self.brain.hear(Torque("load_cell", None if self.void else value, "", now - 1_000_000, now))
+            self.brain.hear(TorqueSample("load_cell", None if self.void else value, "", now - 1_000_000, now))
 
     def _finish(self, action: Action) -> None:
         if isinstance(action, GripTo):
@@ -115,6 +115,6 @@ def started(rig: Rig, *steps: dict[str, Any], **keys: Any) -> Rig:
     return rig
 
 
-def phase(rig: Rig) -> Phase:
+def phase(rig: Rig) -> ExperimentPhase:
     assert rig.brain.experiment is not None
     return rig.brain.experiment.phase

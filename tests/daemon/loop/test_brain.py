@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from daemon.experiment.machine import Phase
-from daemon.experiment.wishes import GripTo, MoveTo, TakeZero
+from shearloop.daemon.control.step_commands import GripTo, MoveTo, Tare
+from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.loop.rig import GRIP, TICK_S, Rig, brain, phase, started
 
 
@@ -22,8 +22,8 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive: str) -> Non
     )
     rig.run(200)
     assert rig.brain.experiment is not None
-    assert phase(rig) is Phase.DONE, rig.brain.experiment.why
-    assert [type(action) for action in rig.begun] == [MoveTo, GripTo, TakeZero, GripTo]
+    assert phase(rig) is ExperimentPhase.DONE, rig.brain.experiment.why
+    assert [type(action) for action in rig.begun] == [MoveTo, GripTo, Tare, GripTo]
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
     assert held.mean() == pytest.approx(0.1, abs=0.008)
     assert held.std() < 0.006
@@ -32,7 +32,7 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive: str) -> Non
 def test_a_set_point_without_identification_is_refused_with_the_cure() -> None:
     rig = started(Rig(brain()), GRIP, {"do": "hold_torque", "torque_nm": 0.1})
     rig.run(20)
-    assert phase(rig) is Phase.STOPPED
+    assert phase(rig) is ExperimentPhase.STOPPED
     assert rig.brain.experiment is not None
     assert "put an `identify` step before" in rig.brain.experiment.why
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from daemon.experiment.machine import Phase
-from daemon.safety import Response
+from shearloop.daemon.control.safety import Response
+from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.loop.rig import GRIP, TICK_S, Rig, brain, phase, started
 
 FAULTS = st.sampled_from(["right", "load_cell", "arm", "hand", "protective", "pause", "resume", "stop", "kick", "ack"])
@@ -22,7 +22,7 @@ def test_no_fault_at_any_time_makes_the_wrist_faster_than_its_limit_or_move_afte
         for _ in range(ticks):
             rig.step()
             assert abs(rig.speed) <= 0.5
-            if rig.brain.standing.verdict.response >= Response.HOLD or phase(rig) is not Phase.RUNNING:
+            if rig.brain.standing.verdict.response >= Response.HOLD or phase(rig) is not ExperimentPhase.RUNNING:
                 assert rig.speed == 0.0
         match fault:
             case "protective":
@@ -63,7 +63,7 @@ def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
         rig.brain.senses.late_s = 0.15 if "late" in wrong else 0.0
         for _ in range(ticks):
             rig.step()
-            if phase(rig) is not Phase.RUNNING:
+            if phase(rig) is not ExperimentPhase.RUNNING:
                 assert rig.speed == 0.0
                 continue
             held = rig.brain.standing.verdict.response is Response.HOLD

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from daemon.experiment.machine import Phase
-from daemon.experiment.steps import ExperimentFile
-from daemon.safety import Event
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.safety import FaultCode
+from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.loop.rig import GRIP, Rig, brain, phase, started
 
 TWIST = {"do": "twist", "angles_rad": [0.2]}
@@ -18,8 +18,8 @@ def test_a_tool_that_is_taken_away_is_noticed() -> None:
     rig.run(5)
     rig.force_n = 0.0
     rig.step()
-    assert Event.GRIP_LOST in {trouble.event for trouble in rig.brain.standing.verdict.troubles}
-    assert phase(rig) is Phase.STOPPED
+    assert FaultCode.GRIP_LOST in {trouble.event for trouble in rig.brain.standing.verdict.troubles}
+    assert phase(rig) is ExperimentPhase.STOPPED
 
 
 @pytest.mark.parametrize("step", [{**GRIP, "expect_object": False}, {"do": "release", "width_mm": 20}])
@@ -28,11 +28,11 @@ def test_a_tool_that_is_met_though_nobody_expected_it_is_watched_as_well(step: d
     rig.meets = True
     started(rig, step, {"do": "twist", "angles_rad": [0.2], "hold_s": 60})
     rig.run(5)
-    assert phase(rig) is Phase.RUNNING
+    assert phase(rig) is ExperimentPhase.RUNNING
     rig.force_n = 0.0
     rig.step()
-    assert Event.GRIP_LOST in {trouble.event for trouble in rig.brain.standing.verdict.troubles}
-    assert phase(rig) is Phase.STOPPED
+    assert FaultCode.GRIP_LOST in {trouble.event for trouble in rig.brain.standing.verdict.troubles}
+    assert phase(rig) is ExperimentPhase.STOPPED
 
 
 @pytest.mark.parametrize(

@@ -5,9 +5,9 @@ from typing import Any
 
 import pytest
 
-from daemon.experiment.machine import Phase
-from daemon.experiment.steps import ExperimentFile
-from daemon.safety import Event, Response
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.safety import FaultCode, Response
+from shearloop.daemon.control.step_runner import ExperimentPhase
 from tests.daemon.loop.rig import EIT, GRIP, TICK_S, Rig, brain, phase, started
 
 
@@ -20,7 +20,7 @@ def test_a_silent_board_holds_the_wrist_and_then_stops_it() -> None:
     assert (rig.speed, rig.brain.standing.phase) == (0.0, "held")
     assert "Look at the sensor's cable" in rig.brain.standing.verdict.reasons[0]
     rig.run(6)
-    assert phase(rig) is Phase.STOPPED
+    assert phase(rig) is ExperimentPhase.STOPPED
     assert rig.orders.stop
     assert not rig.orders.release, "the grip is kept"
 
@@ -33,7 +33,7 @@ def test_a_board_that_speaks_again_in_time_lets_the_twist_go_on() -> None:
     assert rig.brain.standing.phase == "held"
     rig.silent.clear()
     rig.run(30)
-    assert phase(rig) is Phase.DONE
+    assert phase(rig) is ExperimentPhase.DONE
 
 
 def test_the_torque_limit_stops_and_releases_once() -> None:
@@ -43,7 +43,7 @@ def test_the_torque_limit_stops_and_releases_once() -> None:
         rig.step()
         releases += rig.orders.release
     assert releases == 1
-    assert phase(rig) is Phase.STOPPED
+    assert phase(rig) is ExperimentPhase.STOPPED
     assert rig.force_n == 0.0
     assert max(rig.true_nm) < 0.1 + 0.3 * 0.2 * 0.2, "no farther than one reading of the load cell"
 
@@ -53,7 +53,7 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged() -> Non
     rig.run(2)
     rig.arm = replace(rig.arm, protective_stop=True)
     rig.step()
-    assert phase(rig) is Phase.STOPPED
+    assert phase(rig) is ExperimentPhase.STOPPED
     rig.arm = replace(rig.arm, protective_stop=False)
     rig.run(1)
     file = ExperimentFile.model_validate({"name": "again", "steps": [{"do": "wait", "wait_s": 1}]})
@@ -67,12 +67,12 @@ def test_a_protective_stop_ends_the_experiment_until_it_is_acknowledged() -> Non
 @pytest.mark.parametrize(
     ("sense", "event"),
     [
-        ({"protective_stop": True}, Event.PROTECTIVE_STOP),
-        ({"emergency_stop": True}, Event.EMERGENCY_STOP),
-        ({"blocked": "the robot's process was started again"}, Event.ROBOT_BLOCKED),
+        ({"protective_stop": True}, FaultCode.PROTECTIVE_STOP),
+        ({"emergency_stop": True}, FaultCode.EMERGENCY_STOP),
+        ({"blocked": "the robot's process was started again"}, FaultCode.ROBOT_BLOCKED),
     ],
 )
-def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense: dict[str, Any], event: Event) -> None:
+def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense: dict[str, Any], event: FaultCode) -> None:
     rig = started(Rig(brain()), GRIP, {"do": "twist", "angles_rad": [0.3]})
     rig.run(2)
     rig.arm = replace(rig.arm, **sense)
@@ -99,7 +99,7 @@ def test_a_task_that_died_stops_the_wrist_and_says_of_what() -> None:
     rig.run(5)
     rig.brain.senses.died = {"right.estimator": "ValueError: no number"}
     rig.step()
-    assert phase(rig) is Phase.STOPPED
+    assert phase(rig) is ExperimentPhase.STOPPED
     assert "right.estimator: ValueError: no number" in rig.brain.standing.verdict.reasons[0]
 
 
@@ -115,7 +115,7 @@ def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothi
     held = 0
     for _ in range(300):
         rig.step()
-        assert phase(rig) is Phase.RUNNING
+        assert phase(rig) is ExperimentPhase.RUNNING
         if rig.brain.standing.verdict.response is Response.HOLD:
             held += 1
             assert rig.speed == 0.0

@@ -7,15 +7,15 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from daemon.experiment.machine import Phase
-from daemon.experiment.steps import ExperimentFile
-from daemon.experiment.wishes import Action, GripTo, MoveTo
-from daemon.loop.senses import Arm, Hand, Torque
-from daemon.loop_actions import along_tool
-from daemon.safety import Response
-from drivers.emulators.twin import Twin, TwinSettings
-from drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
-from drivers.ur.pilot import Pilot
+from shearloop.daemon.control.actions import along_tool
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
+from shearloop.daemon.control.safety import Response
+from shearloop.daemon.control.step_commands import Action, GripTo, MoveTo
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.ur.command_handler import CommandHandler
+from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
 from tests.daemon.loop.rig import EIT, brain
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm
 from tests.drivers.ur.test_limits import LIMITS
@@ -96,7 +96,7 @@ class WholeRig:
     def __init__(self) -> None:
         self.brain, self.arm, self.twin = brain(), CheckedArm(), Twin(TwinSettings())
         self.now_ns, self.number, self.force_n = 10**12, 0, 0.0
-        self.pilot = Pilot(SETTINGS, self.arm, self.now_ns)
+        self.pilot = CommandHandler(SETTINGS, self.arm, self.now_ns)
         self.silent, self.absurd, self.fault = False, False, ""
         self.sent, self.stopped, self.late = 0.0, True, 0
         self.action: tuple[int, Action] | None = None
@@ -166,17 +166,17 @@ class WholeRig:
 
     def _sense(self, torque_nm: float) -> None:
         state = self.pilot.state(self.arm.reading, self.number)
-        self.brain.senses.arm = Arm(
+        self.brain.senses.arm = ArmStatus(
             state.wrist_rad, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked
         )
         holding = self.force_n > 0
-        self.brain.senses.hand = Hand(self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)
+        self.brain.senses.hand = GripperStatus(self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)
         said = 1e30 if self.absurd else torque_nm
         if not self.silent and self.number % 11 == 0:
-            self.brain.hear(Torque("load_cell", said, "", self.now_ns - CYCLE_NS, self.now_ns))
+            self.brain.hear(TorqueSample("load_cell", said, "", self.now_ns - CYCLE_NS, self.now_ns))
         if not self.silent and self.number % 68 == 0:
             middle = self.now_ns - round(EIT.window_s * 0.5e9)
-            self.brain.hear(Torque("right", math.nan if self.absurd else torque_nm, "", middle, self.now_ns))
+            self.brain.hear(TorqueSample("right", math.nan if self.absurd else torque_nm, "", middle, self.now_ns))
 
     def _begin(self, action: Action) -> None:
         self.action = (self.number + 30, action)
@@ -223,7 +223,7 @@ def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits
         rig.befall(fault)
     experiment = rig.brain.experiment
     assert experiment is not None
-    if experiment.phase is Phase.STOPPED:
+    if experiment.phase is ExperimentPhase.STOPPED:
         for _ in range(60):
             rig.cycle()
         assert abs(rig.arm.reading.qd_rad_per_s[5]) < 1e-9, "stopped, and yet it turns"

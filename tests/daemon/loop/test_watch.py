@@ -3,36 +3,43 @@ from itertools import pairwise
 
 import pytest
 
-from daemon.control.tuning import COMMAND_PERIOD_S
-from daemon.experiment.steps import Limits
-from daemon.loop.senses import Arm, Hand, Senses, Source, Torque
-from daemon.loop.watch import ARM_STALE_S, LONGEST_TICK_S, Watched, WatchSettings, compared_for_s, troubles
-from daemon.loop_task import PUBLISH_EVERY, wrench_source
-from daemon.safety import TABLE, Event, Response
-from drivers.ur.pace import Pace
-from drivers.ur.sample_age import SampleAge
+from shearloop.daemon.control.experiment_schema import ExperimentLimits
+from shearloop.daemon.control.fault_detection import (
+    ARM_STALE_S,
+    LONGEST_TICK_S,
+    MonitorInputs,
+    MonitorSettings,
+    compared_for_s,
+    troubles,
+)
+from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopInputs, TorqueSample, TorqueSource
+from shearloop.daemon.control.runner import PUBLISH_EVERY, wrench_source
+from shearloop.daemon.control.safety import TABLE, FaultCode, Response
+from shearloop.daemon.control.tuning import COMMAND_PERIOD_S
+from shearloop.drivers.ur.pace import Pace
+from shearloop.drivers.ur.sample_age import SampleAge
 from tests.drivers.ur.flight import SETTINGS
 
-EIT = Source(name="right", period_s=0.5412, window_s=0.5412)
-LOAD = Source(name="load_cell", period_s=1 / 10.9)
-WRENCH = Source(name="wrench", period_s=0.04, of_the_arm=True)
+EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
+LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)
+WRENCH = TorqueSource(name="wrench", period_s=0.04, of_the_arm=True)
 NOW_NS = 100_000_000_000
 
 
 def torque(
-    source: Source, torque_nm: float | None, *, came_s: float = 0.0, way_s: float = 0.0, why: str = ""
-) -> Torque:
+    source: TorqueSource, torque_nm: float | None, *, came_s: float = 0.0, way_s: float = 0.0, why: str = ""
+) -> TorqueSample:
     """Return a torque that came so long ago, and took so long to come once its acquisition had ended."""
     t_ns = NOW_NS - round(came_s * 1e9)
     acquired_s = 0.5 * max(source.window_s, source.period_s)
-    return Torque(source.name, torque_nm, why, t_ns - round((acquired_s + way_s) * 1e9), t_ns)
+    return TorqueSample(source.name, torque_nm, why, t_ns - round((acquired_s + way_s) * 1e9), t_ns)
 
 
-def watched(driving: Source, supervising: tuple[Source, ...]) -> Watched:
-    return Watched(
+def watched(driving: TorqueSource, supervising: tuple[TorqueSource, ...]) -> MonitorInputs:
+    return MonitorInputs(
         driving=driving,
         supervising=supervising,
-        limits=Limits(),
+        limits=ExperimentLimits(),
         torque_needed=True,
         gripped=True,
         twisted_rad=0.0,
@@ -40,12 +47,12 @@ def watched(driving: Source, supervising: tuple[Source, ...]) -> Watched:
 
 
 def found(
-    *torques: Torque, driving: Source = EIT, supervising: tuple[Source, ...] = (LOAD, WRENCH)
-) -> dict[Event, str]:
-    senses = Senses(arm=Arm(0.0, NOW_NS))
+    *torques: TorqueSample, driving: TorqueSource = EIT, supervising: tuple[TorqueSource, ...] = (LOAD, WRENCH)
+) -> dict[FaultCode, str]:
+    senses = LoopInputs(arm=ArmStatus(0.0, NOW_NS))
     for each in torques:
         senses.hear(each)
-    events = troubles(senses, watched(driving, supervising), WatchSettings(), NOW_NS)
+    events = troubles(senses, watched(driving, supervising), MonitorSettings(), NOW_NS)
     return {each.event: each.sentence for each in events}
 
 
@@ -56,22 +63,22 @@ def test_nothing_is_wrong_while_all_torques_are_new_valid_and_alike() -> None:
 def test_a_supervising_sensor_whose_torque_is_void_holds_the_wrist_and_says_why() -> None:
     saturated = torque(LOAD, None, why="the reading is at the end of its range")
     events = found(torque(EIT, 0.1), saturated)
-    assert set(events) == {Event.ESTIMATE_INVALID}
-    assert "load_cell says: the reading is at the end of its range" in events[Event.ESTIMATE_INVALID]
+    assert set(events) == {FaultCode.ESTIMATE_INVALID}
+    assert "load_cell says: the reading is at the end of its range" in events[FaultCode.ESTIMATE_INVALID]
 
 
 def test_a_driving_sensor_whose_torque_is_void_is_named_too() -> None:
     events = found(torque(EIT, None, why="no signal"), torque(LOAD, 0.1))
-    assert "right says: no signal" in events[Event.ESTIMATE_INVALID]
+    assert "right says: no signal" in events[FaultCode.ESTIMATE_INVALID]
 
 
 def test_what_measures_no_torque_is_watched_for_silence_alone() -> None:
-    left = Source(name="left", period_s=0.5412, measures_torque=False)
+    left = TorqueSource(name="left", period_s=0.5412, measures_torque=False)
     heard = torque(EIT, 0.1), torque(LOAD, 0.1)
     supervising = (LOAD, left)
     assert found(*heard, torque(left, None, why="no calibration"), supervising=supervising) == {}
     silent = found(*heard, torque(left, None, came_s=2.0), supervising=supervising)
-    assert "the last torque of left came 2.0 s ago" in silent[Event.ESTIMATE_STALE]
+    assert "the last torque of left came 2.0 s ago" in silent[FaultCode.ESTIMATE_STALE]
 
 
 def test_the_wrench_is_watched_with_the_state_that_it_comes_with() -> None:
@@ -79,18 +86,18 @@ def test_the_wrench_is_watched_with_the_state_that_it_comes_with() -> None:
 
 
 @pytest.mark.parametrize("source", [EIT, LOAD])
-def test_a_torque_that_comes_in_time_but_is_of_long_ago_is_stale(source: Source) -> None:
+def test_a_torque_that_comes_in_time_but_is_of_long_ago_is_stale(source: TorqueSource) -> None:
     """As from an estimator that has fallen behind: eight frames wait for it, and one comes in each period."""
     fresh = {one.name: torque(one, 0.1) for one in (EIT, LOAD)}
     late = torque(source, 0.1, way_s=8 * source.period_s)
     events = found(*{**fresh, source.name: late}.values())
-    assert events.keys() == {Event.ESTIMATE_STALE}
-    assert f"the last torque of {source.name} was measured" in events[Event.ESTIMATE_STALE]
-    assert f"it took {8.5 * source.period_s:.1f} s to come" in events[Event.ESTIMATE_STALE]
+    assert events.keys() == {FaultCode.ESTIMATE_STALE}
+    assert f"the last torque of {source.name} was measured" in events[FaultCode.ESTIMATE_STALE]
+    assert f"it took {8.5 * source.period_s:.1f} s to come" in events[FaultCode.ESTIMATE_STALE]
 
 
 @pytest.mark.parametrize("source", [EIT, LOAD, replace(EIT, window_s=5 * EIT.period_s)])
-def test_a_frame_that_is_missed_and_a_mean_of_several_are_borne(source: Source) -> None:
+def test_a_frame_that_is_missed_and_a_mean_of_several_are_borne(source: TorqueSource) -> None:
     """Half an acquisition, a tenth of a period on the way, and two periods since: one frame was missed."""
     patient = torque(source, 0.1, came_s=2.0 * source.period_s, way_s=0.1 * source.period_s)
     assert found(patient, driving=source, supervising=()) == {}
@@ -100,58 +107,60 @@ def test_a_torque_that_counts_as_new_is_held_against_its_limit() -> None:
     """Beyond 2.5 of its short periods, and younger than `freshness_s`."""
     quick = replace(LOAD, period_s=0.005)
     beyond = torque(quick, 0.9, came_s=0.05)
-    assert found(beyond, driving=quick, supervising=()).keys() == {Event.TORQUE_LIMIT}
+    assert found(beyond, driving=quick, supervising=()).keys() == {FaultCode.TORQUE_LIMIT}
 
 
 @pytest.mark.parametrize("rate_hz", [10.9, 80.0, 1000.0])
 def test_torques_are_compared_for_as_long_as_the_slower_one_counts_as_new(rate_hz: float) -> None:
     """Else a disagreement would come and go with every frame, and a hold would never become a stop."""
     quick = replace(LOAD, period_s=1.0 / rate_hz)
-    senses = Senses(kept_s=compared_for_s((EIT, quick), WatchSettings()), arm=Arm(0.0, NOW_NS))
+    senses = LoopInputs(kept_s=compared_for_s((EIT, quick), MonitorSettings()), arm=ArmStatus(0.0, NOW_NS))
     frame = torque(EIT, 0.1, came_s=2.4 * EIT.period_s)
     senses.hear(frame)
     for number in range(round(60 * rate_hz), 0, -1):
         senses.hear(torque(quick, 0.3, came_s=(number - 1) / rate_hz))
-    (trouble,) = troubles(senses, watched(EIT, (quick,)), WatchSettings(), NOW_NS)
-    assert trouble.event is Event.TORQUES_DISAGREE
+    (trouble,) = troubles(senses, watched(EIT, (quick,)), MonitorSettings(), NOW_NS)
+    assert trouble.event is FaultCode.TORQUES_DISAGREE
     assert len(senses.recent[LOAD.name].torque_nm) <= 10 * rate_hz, "and the rest is forgotten"
 
 
 LOST = {"robot": "No UR controller at 10.0.0.1. Check that it is on.", "gripper": "There is no gripper socket."}
 
 
-def devices(lost: dict[str, str], *, arm: Arm | None = None, hand: Hand | None = None) -> list[tuple[Event, str]]:
+def devices(
+    lost: dict[str, str], *, arm: ArmStatus | None = None, hand: GripperStatus | None = None
+) -> list[tuple[FaultCode, str]]:
     """Return what is said of the devices while nothing moves."""
-    senses = Senses(arm=arm, hand=hand, lost=lost)
+    senses = LoopInputs(arm=arm, hand=hand, lost=lost)
     idle = replace(watched(EIT, ()), torque_needed=False, gripped=False, required=("robot", "gripper"))
-    return [(each.event, each.detail) for each in troubles(senses, idle, WatchSettings(), NOW_NS)]
+    return [(each.event, each.detail) for each in troubles(senses, idle, MonitorSettings(), NOW_NS)]
 
 
 def test_devices_that_were_never_there_are_awaited_in_one_sentence() -> None:
-    assert devices({}) == [(Event.DEVICE_AWAITED, "robot; gripper")]
+    assert devices({}) == [(FaultCode.DEVICE_AWAITED, "robot; gripper")]
     both = "robot, No UR controller at 10.0.0.1. Check that it is on; gripper, There is no gripper socket"
-    assert devices(LOST) == [(Event.DEVICE_AWAITED, both)]
+    assert devices(LOST) == [(FaultCode.DEVICE_AWAITED, both)]
 
 
 def test_a_device_that_was_there_is_gone_beside_one_that_was_never_there() -> None:
-    arm, hand = Arm(0.0, NOW_NS), Hand(NOW_NS, 30.0, holding=False, moving=False)
+    arm, hand = ArmStatus(0.0, NOW_NS), GripperStatus(NOW_NS, 30.0, holding=False, moving=False)
     assert devices(LOST, arm=arm, hand=hand) == [
-        (Event.ROBOT_LOST, LOST["robot"]),
-        (Event.DEVICE_LOST, f"gripper: {LOST['gripper']}"),
+        (FaultCode.ROBOT_LOST, LOST["robot"]),
+        (FaultCode.DEVICE_LOST, f"gripper: {LOST['gripper']}"),
     ]
     assert devices({"gripper": LOST["gripper"]}, arm=arm) == [
-        (Event.DEVICE_AWAITED, "gripper, There is no gripper socket")
+        (FaultCode.DEVICE_AWAITED, "gripper, There is no gripper socket")
     ]
-    assert [event for event, _ in devices(LOST, hand=hand)] == [Event.DEVICE_AWAITED, Event.DEVICE_LOST]
+    assert [event for event, _ in devices(LOST, hand=hand)] == [FaultCode.DEVICE_AWAITED, FaultCode.DEVICE_LOST]
 
 
 def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again() -> None:
     """Its process, killed, was "gone" and to be plugged in; what comes back is blocked until it is unlocked."""
     died = "The robot's process died of SIGKILL while controlling. The process is started again with motion disabled."
-    blocked = Arm(0.0, NOW_NS, blocked="Motion has not been enabled since the robot's process was started.")
-    for senses in (Senses(arm=Arm(0.0, NOW_NS), lost={"robot": died}), Senses(arm=blocked)):
+    blocked = ArmStatus(0.0, NOW_NS, blocked="Motion has not been enabled since the robot's process was started.")
+    for senses in (LoopInputs(arm=ArmStatus(0.0, NOW_NS), lost={"robot": died}), LoopInputs(arm=blocked)):
         (trouble,) = troubles(
-            senses, replace(watched(EIT, ()), torque_needed=False, required=("robot",)), WatchSettings(), NOW_NS
+            senses, replace(watched(EIT, ()), torque_needed=False, required=("robot",)), MonitorSettings(), NOW_NS
         )
         assert trouble.rule.response is Response.STOP_AND_KEEP_GRIP
         assert trouble.sentence.startswith("the robot")
@@ -160,22 +169,22 @@ def test_a_robot_that_is_gone_or_does_not_move_is_not_plugged_in_again() -> None
 
 
 def test_a_sensor_that_was_never_there_is_not_gone() -> None:
-    senses = Senses(arm=Arm(0.0, NOW_NS), lost={"right": "There is no port."})
-    (trouble,) = troubles(senses, watched(EIT, ()), WatchSettings(), NOW_NS)
+    senses = LoopInputs(arm=ArmStatus(0.0, NOW_NS), lost={"right": "There is no port."})
+    (trouble,) = troubles(senses, watched(EIT, ()), MonitorSettings(), NOW_NS)
     assert trouble.detail == "right has not been there yet: There is no port."
     senses.hear(torque(EIT, 0.1))
-    (trouble,) = troubles(senses, watched(EIT, ()), WatchSettings(), NOW_NS)
+    (trouble,) = troubles(senses, watched(EIT, ()), MonitorSettings(), NOW_NS)
     assert trouble.detail == "right is gone: There is no port."
     senses.lost["right"] = ""
-    (trouble,) = troubles(senses, watched(EIT, ()), WatchSettings(), NOW_NS)
+    (trouble,) = troubles(senses, watched(EIT, ()), MonitorSettings(), NOW_NS)
     assert trouble.detail == "right is gone: ", "though it does not say why"
 
 
 def test_a_loop_that_was_away_for_long_was_not_too_slow() -> None:
-    senses = Senses(arm=Arm(0.0, NOW_NS))
-    for late_s, event in ((0.2, Event.LOOP_LATE), (3.0, Event.DAEMON_PAUSED)):
+    senses = LoopInputs(arm=ArmStatus(0.0, NOW_NS))
+    for late_s, event in ((0.2, FaultCode.LOOP_LATE), (3.0, FaultCode.DAEMON_PAUSED)):
         senses.late_s = late_s
-        (trouble,) = troubles(senses, replace(watched(EIT, ()), torque_needed=False), WatchSettings(), NOW_NS)
+        (trouble,) = troubles(senses, replace(watched(EIT, ()), torque_needed=False), MonitorSettings(), NOW_NS)
         assert trouble.event is event
     assert "the daemon itself was not running: it stood still for 3.0 s" in trouble.sentence
     assert "overload" in trouble.rule.cure, "what follows from it is not told, and may be all that would say so"
@@ -189,7 +198,7 @@ def test_states_that_come_late_for_good_are_stale_for_long_enough_to_stop_the_wr
         late_s = 0.2 if number >= 100 else 0.001
         stale_s += 0.008 * (age.age_ns(made_s, round((made_s + late_s) * 1e9)) > ARM_STALE_S * 1e9)
     assert stale_s == pytest.approx(9.7, abs=0.1)
-    assert stale_s > (TABLE[Event.STATE_STALE].hold_at_most_s or 0.0) + 1.0
+    assert stale_s > (TABLE[FaultCode.STATE_STALE].hold_at_most_s or 0.0) + 1.0
 
 
 @pytest.mark.parametrize("rate_hz", [100.0, 125.0, 500.0])
@@ -213,22 +222,22 @@ def test_loop_is_not_late_as_long_as_states_are_told_as_agreed(rate_hz: float) -
 def test_no_sample_goes_uncompared_where_the_robot_tells_but_some_of_its_cycles(rate_hz: float, slow_hz: float) -> None:
     """A slower sensor that disagrees does so at each of its samples: else the wrist would turn on until the next."""
     pace = Pace(replace(SETTINGS, rate_hz=rate_hz), 0.0)
-    wrench, slow = wrench_source(rate_hz), Source(name="load_cell", period_s=1 / slow_hz)
-    senses, published, sample = Senses(), -1, 0.5
+    wrench, slow = wrench_source(rate_hz), TorqueSource(name="load_cell", period_s=1 / slow_hz)
+    senses, published, sample = LoopInputs(), -1, 0.5
     compared = []
     for _ in range(round(20.0 * rate_hz)):
         t_ns = NOW_NS + round(pace.cycle / rate_hz * 1e9)
-        senses.arm = Arm(0.0, t_ns)
+        senses.arm = ArmStatus(0.0, t_ns)
         if pace.tells(rests=False, news=False):
             if pace.cycle // PUBLISH_EVERY != published:
                 published = pace.cycle // PUBLISH_EVERY
-                senses.hear(Torque("wrench", 0.1, "", t_ns, t_ns))
+                senses.hear(TorqueSample("wrench", 0.1, "", t_ns, t_ns))
             measured_ns = NOW_NS + round((sample - 0.5) / slow_hz * 1e9)
             if t_ns >= NOW_NS + round(sample / slow_hz * 1e9):
-                senses.hear(Torque("load_cell", 0.3, "", measured_ns, t_ns))
+                senses.hear(TorqueSample("load_cell", 0.3, "", measured_ns, t_ns))
                 sample += 1.0
-                events = troubles(senses, watched(slow, (wrench,)), WatchSettings(), t_ns)
-                compared.append(Event.TORQUES_DISAGREE in {each.event for each in events})
+                events = troubles(senses, watched(slow, (wrench,)), MonitorSettings(), t_ns)
+                compared.append(FaultCode.TORQUES_DISAGREE in {each.event for each in events})
         pace.plan((pace.cycle + 1) / rate_hz, rests=False)
         pace.begin()
     assert len(compared) > 150

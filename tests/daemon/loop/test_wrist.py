@@ -6,10 +6,10 @@ from itertools import pairwise
 
 import pytest
 
-from daemon.experiment.wishes import GoTo
-from daemon.loop.senses import Source
-from daemon.loop.tune import TuneSettings, tuned
-from daemon.loop.wrist import AS_GOOD_RAD, AS_GOOD_SHARE, Wrist, WristSettings
+from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.control.step_commands import MoveToAngle
+from shearloop.daemon.control.tune import TuneSettings, tuned
+from shearloop.daemon.control.wrist_controller import AS_GOOD_RAD, AS_GOOD_SHARE, WristController, WristSettings
 
 CYCLE_NS = 8_000_000
 SETTINGS = WristSettings()
@@ -17,8 +17,8 @@ SETTINGS = WristSettings()
 AT_ONCE = WristSettings(actuation_s=0.0)
 
 
-def wrist(settings: WristSettings = AT_ONCE) -> Wrist:
-    return Wrist(Source(name="load_cell", period_s=0.1), settings, partial(tuned, TuneSettings()))
+def wrist(settings: WristSettings = AT_ONCE) -> WristController:
+    return WristController(TorqueSource(name="load_cell", period_s=0.1), settings, partial(tuned, TuneSettings()))
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
@@ -27,19 +27,19 @@ def test_a_speed_as_good_as_the_one_that_was_sent_is_that_one(sign: float) -> No
     one.sent(sent)
     for apart_rad, is_kept in ((0.9 * AS_GOOD_RAD, True), (1.1 * AS_GOOD_RAD, False)):
         wanted = sent + sign * apart_rad * SETTINGS.angle_bandwidth_per_s
-        turn = one.turn(GoTo(wanted / SETTINGS.angle_bandwidth_per_s, 0.2), 10**9, 0.0, 0.0)
+        turn = one.turn(MoveToAngle(wanted / SETTINGS.angle_bandwidth_per_s, 0.2), 10**9, 0.0, 0.0)
         assert turn.speed_rad_per_s == pytest.approx(sent if is_kept else wanted, abs=1e-12)
 
 
 def test_a_wrist_that_stands_sets_out_for_however_little() -> None:
-    turn = wrist().turn(GoTo(0.1 * AS_GOOD_RAD, 0.2), 10**9, 0.0, 0.0)
+    turn = wrist().turn(MoveToAngle(0.1 * AS_GOOD_RAD, 0.2), 10**9, 0.0, 0.0)
     assert turn.speed_rad_per_s == pytest.approx(0.1 * AS_GOOD_RAD * SETTINGS.angle_bandwidth_per_s)
 
 
 def test_a_held_angle_is_kept_and_seldom_needs_another_speed() -> None:
     one, angle_rad, speeds, errors_rad = wrist(), 0.0, [], []
     for cycle in range(1000):
-        speed = one.turn(GoTo(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
+        speed = one.turn(MoveToAngle(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
         one.sent(speed)
         angle_rad += speed * CYCLE_NS / 1e9
         speeds.append(speed)
@@ -60,7 +60,7 @@ def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(
     cycles = round(300 + 12.0 / bandwidth_per_s / (CYCLE_NS / 1e9))
     for goal_rad in (way_rad, -way_rad):
         for _ in range(2 * cycles):
-            speed = one.turn(GoTo(goal_rad, allowed_rad_per_s), t_ns, angle_rad, 0.0).speed_rad_per_s
+            speed = one.turn(MoveToAngle(goal_rad, allowed_rad_per_s), t_ns, angle_rad, 0.0).speed_rad_per_s
             assert abs(speed) <= (1.0 + AS_GOOD_SHARE) * allowed_rad_per_s
             one.sent(speed)
             angle_rad += speed * CYCLE_NS / 1e9

@@ -6,16 +6,16 @@ from typing import cast
 
 import pytest
 
-from daemon.config import LoopConfig
-from daemon.experiment.wishes import GoTo
-from daemon.loop.brain import Brain
-from daemon.loop.senses import Source
-from daemon.loop.wrist import Wrist, WristSettings
-from daemon.wrist_commands import WristCommands
-from drivers.ur.client import UrRobot
-from drivers.ur.messages import Command, Reply
-from drivers.ur.news import News
-from drivers.ur.pace import Pace
+from shearloop.daemon.config import LoopConfig
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.control.step_commands import MoveToAngle
+from shearloop.daemon.control.velocity_sender import VelocityCommandSender
+from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import Command, CommandReply
+from shearloop.drivers.ur.news import News
+from shearloop.drivers.ur.pace import Pace
 from tests.drivers.ur.flight import SETTINGS, flying
 
 FASTEST_PER_S = next(
@@ -27,10 +27,12 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
     """Return how far from the angle the wrist is in each cycle."""
     flight, news, pace = flying(), News(), Pace(SETTINGS, 0.0)
     settings = WristSettings(angle_bandwidth_per_s=bandwidth_per_s)
-    wrist = Wrist(Source(name="load_cell", period_s=0.1), settings, lambda *_: pytest.fail("no loop is closed"))
+    wrist = WristController(
+        TorqueSource(name="load_cell", period_s=0.1), settings, lambda *_: pytest.fail("no loop is closed")
+    )
     replies: list[Callable[[], None]] = []
 
-    def tell(command: Command, answered: Callable[[Reply], None]) -> None:
+    def tell(command: Command, answered: Callable[[CommandReply], None]) -> None:
         reply = flight.ask(command)
         assert reply.accepted
         # It comes with the next state that is told.
@@ -38,7 +40,7 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, tell=tell)
     brain = SimpleNamespace(sent=wrist.sent, note_refusal=pytest.fail)
-    commands = WristCommands(cast(UrRobot, robot), cast(Brain, brain), 4.0, pytest.fail)
+    commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain), 4.0, pytest.fail)
     origin_rad, errors = flight.state.wrist_rad, []
     for pace.cycle in range(cycles):
         flight.fly(1)
@@ -49,7 +51,7 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
             robot.state = state
             while replies:
                 replies.pop()()
-            turn = wrist.turn(GoTo(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
+            turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
             commands.turn(turn.speed_rad_per_s, flight.now_ns)
     return errors
 

@@ -9,8 +9,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.io import savemat
 
-from daemon.errors import UserError
-from daemon.matlab.recordings import (
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.matlab_streams import (
     read_diameter_slices,
     read_line,
     read_load_stream,

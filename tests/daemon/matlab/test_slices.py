@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bank.channels import channels_of_line
-from daemon.errors import UserError
-from daemon.matlab.recordings import read_diameter_slices, read_line, read_torque_slices
-from daemon.matlab.slices import SliceRecorder
+from shearloop.bank.eit.channels import channels_of_line
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.matlab_slices import SliceRecorder
+from shearloop.daemon.recording.matlab_streams import read_diameter_slices, read_line, read_torque_slices
 
 S = 1_000_000_000
 PERIOD_S = 0.5
@@ -244,7 +244,7 @@ def unwritable(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
         def full(_descriptor: int) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        monkeypatch.setattr("bank.stored.os.fsync", full)
+        monkeypatch.setattr("shearloop.bank.eit.stored.os.fsync", full)
     return tmp_path
 
 
@@ -268,7 +268,7 @@ def test_no_message_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.Monke
         threads.add(threading.current_thread())
         assert let_go.wait(60)
 
-    monkeypatch.setattr("daemon.matlab.slices.savemat", slow)
+    monkeypatch.setattr("shearloop.daemon.recording.matlab_slices.savemat", slow)
     sweep = Sweep(tmp_path)
     sweep.hold(1, 0.1)
     sweep.hold(2, 0.1)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from bank.channels import line_of_channels
+from shearloop.bank.eit.channels import line_of_channels
 
 PERIOD_S = 0.5408
 # 2024-12-03 16:09 as MATLAB counts days.

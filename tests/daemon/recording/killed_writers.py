@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from daemon.clock import Clock
-from daemon.messages import EitFrame, wire_map
-from daemon.recording.identity import Identity, basic_identity
-from daemon.recording.recorder import Recorder
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import EitFrame, wire_map
+from shearloop.daemon.recording.identity import Identity, basic_identity
+from shearloop.daemon.recording.recorder import Recorder
 
 # Five boards of frames: a kill in the middle of a write is likely.
 PERIOD_S = 0.1

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.io import loadmat
 
-from bank.channels import line_of_channels
-from daemon.cli import main
-from daemon.recording.reader import read_recording
-from daemon.recording.writer import RecordingWriter
+from shearloop.bank.eit.channels import line_of_channels
+from shearloop.daemon.cli import main
+from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.writer import RecordingWriter
 
 LINES = line_of_channels(np.round(np.random.default_rng(0).uniform(0, 1, (4, 896)), 4))
 
@@ -60,7 +60,7 @@ def test_a_torn_recording_is_refused_with_its_cure_and_repaired(
 def test_a_damaged_chunk_is_left_out_and_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daemon.recording.writer._FLUSH_EVERY", 1)
+    monkeypatch.setattr("shearloop.daemon.recording.writer._FLUSH_EVERY", 1)
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, "a bench") as writer:
         for i in range(100):

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from bank.estimators import Estimate, FrameSeries, fit
-from bank.estimators.alignment import Alignment
-from daemon.cli import main
-from daemon.cli.calibrated.recording import _of_times
-from daemon.recording.evaluation import Reason, Track, judge, reasons
+from shearloop.bank.estimation import Estimate, FrameSeries, fit
+from shearloop.bank.estimation.alignment import Alignment
+from shearloop.daemon.analysis.evaluation import EstimateTrack, Reason, judge, reasons
+from shearloop.daemon.cli import main
+from shearloop.daemon.cli.calibrated.recording import _of_times
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
 KEYS |= {"latency_ms_p50", "latency_ms_p99"}
@@ -54,7 +54,7 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tm
         reader = replace(found.torque.reader, misses_loads=misses_loads)
         return replace(found, torque=replace(found.torque, reader=reader))
 
-    monkeypatch.setattr("bank.estimators.fit", blind)
+    monkeypatch.setattr("shearloop.bank.estimation.fit", blind)
     calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--estimator", "regression"]
     calibrate += ["--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
@@ -70,7 +70,9 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tm
 @pytest.mark.usefixtures("few_mixtures")
 def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, capsys, monkeypatch):
     fitted = []
-    monkeypatch.setattr("bank.estimators.fit", lambda *a, **options: fitted.append(fit(*a, **options)) or fitted[-1])
+    monkeypatch.setattr(
+        "shearloop.bank.estimation.fit", lambda *a, **options: fitted.append(fit(*a, **options)) or fitted[-1]
+    )
     calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
     reader = fitted[-1].torque.reader
@@ -116,7 +118,7 @@ def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alon
     ]
     nothing = np.full(8, np.nan)
     series = FrameSeries("raw", ("right",), np.arange(8.0), np.zeros((8, 1, 896)), nothing[:0], nothing[:0], nothing)
-    track = Track(series, tuple(Estimate(valid=False, why=(why,)) for why in said), np.zeros(8))
+    track = EstimateTrack(series, tuple(Estimate(valid=False, why=(why,)) for why in said), np.zeros(8))
     assert reasons([track]) == [
         Reason(3, said[2], differ=True),
         Reason(2, said[5], differ=True),
@@ -131,7 +133,7 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
         Reason(12, "gripped too lately: 12 more frames are needed", differ=True),
         Reason(1, "no grip", differ=False),
     ]
-    monkeypatch.setattr("daemon.recording.evaluation.reasons", lambda _: told)
+    monkeypatch.setattr("shearloop.daemon.analysis.evaluation.reasons", lambda _: told)
     assert main(["evaluate", str(calibration), slices]) == 0
     said = capsys.readouterr().out
     assert "12 frames not valid, e.g.: gripped too lately: 12 more frames are needed" in said
@@ -225,7 +227,7 @@ def test_figures_are_what_their_names_say():
     ] + [Estimate(False, ("no grip",))]
     t = np.arange(4.0)
     series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, truth, np.full(4, np.nan))
-    figures = judge([Track(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
+    figures = judge([EstimateTrack(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
     error = np.array([0.02, 0.0, 0.07])
     assert figures["rmse_nm"] == pytest.approx(np.sqrt((error**2).mean()))
     assert figures["bias_nm"] == pytest.approx(error.mean())
@@ -245,12 +247,15 @@ def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
     refused = [Estimate(False, ("no grip",))]
     told = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, np.full(4, 0.1), np.full(4, np.nan))
     of_cylinders = replace(told, torque_t_s=t[:0], torque_nm=t[:0], diameter_mm=np.full(4, 20.0))
-    tracks = [Track(told, (*torques, *refused), np.ones(4)), Track(of_cylinders, tuple(cylinders), np.ones(4))]
+    tracks = [
+        EstimateTrack(told, (*torques, *refused), np.ones(4)),
+        EstimateTrack(of_cylinders, tuple(cylinders), np.ones(4)),
+    ]
     figures = judge(tracks)
     assert figures["coverage_95"] == 1.0
     assert figures["interval_nm"] == pytest.approx(0.04)
     assert figures["diameter_interval_mm"] == pytest.approx(11.5)
-    nothing = judge([Track(replace(told, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))])
+    nothing = judge([EstimateTrack(replace(told, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))])
     assert nothing["interval_nm"] is nothing["diameter_interval_mm"] is None
 
 

@@ -5,12 +5,12 @@ from typing import Any
 
 import pytest
 
-from daemon.clock import Clock
-from daemon.messages import EitEstimate, wire_map
-from daemon.recording.content import message_json
-from daemon.recording.recorded_run import Happened
-from daemon.recording.replay import Comparison
-from daemon.recording.schema import completed
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import EitEstimate, wire_map
+from shearloop.daemon.recording.content import message_json
+from shearloop.daemon.recording.recorded_run import RecordedEvent
+from shearloop.daemon.recording.replay import Comparison
+from shearloop.daemon.recording.schema import completed
 from tests.daemon.sample_messages import sample
 
 TOPIC = EitEstimate.topic
@@ -21,10 +21,10 @@ def estimate(**changes: Any) -> dict[str, Any]:
     return content | {"source": "right", "t_mono_ns": 5} | changes
 
 
-def recorded(content: dict[str, Any]) -> Happened:
+def recorded(content: dict[str, Any]) -> RecordedEvent:
     """Return a message as it comes back from a recording, which leaves out what has no value."""
     plain = json.loads(message_json(TOPIC, content, 0))
-    return Happened(TOPIC, content["t_mono_ns"], completed(TOPIC, plain), content["source"])
+    return RecordedEvent(TOPIC, content["t_mono_ns"], completed(TOPIC, plain), content["source"])
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ from typing import Any, NoReturn
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from daemon.recording.content import as_json, input_json, input_of
-from drivers.raw_input import InputKind, RawInput
+from shearloop.daemon.recording.content import as_json, input_json, input_of
+from shearloop.drivers.raw_event import InputKind, RawEvent
 
 # Half of a surrogate pair too: Python has that for each byte of a file's name that is no UTF-8.
 texts = st.text(st.characters())
@@ -48,5 +48,5 @@ def test_mapping_that_is_no_dict_is_written_as_one() -> None:
 
 
 def test_raw_input_reads_the_same_byte_for_byte() -> None:
-    told = RawInput(InputKind.DATA, 123456789012345678, bytes(range(256)))
+    told = RawEvent(InputKind.DATA, 123456789012345678, bytes(range(256)))
     assert input_of(json.loads(input_json(told))) == told

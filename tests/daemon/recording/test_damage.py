@@ -11,19 +11,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from daemon.cli import main
-from daemon.clock import Clock
-from daemon.config import load_daemon_config
-from daemon.errors import UserError
-from daemon.recording.export import export, topics_of
-from daemon.recording.identity import Attached, Identity, basic_identity
-from daemon.recording.importing import import_mat
-from daemon.recording.reader import read_recording
-from daemon.recording.recorded_run import RecordedRun
-from daemon.recording.recorder import Recorder
-from daemon.recording.salvage import repair
-from daemon.recording.summary import summarise
-from drivers.raw_input import InputKind, RawInput
+from shearloop.daemon.cli import main
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.export import export, topics_of
+from shearloop.daemon.recording.identity import Attached, Identity, basic_identity
+from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.recorded_run import RecordedRun
+from shearloop.daemon.recording.recorder import Recorder
+from shearloop.daemon.recording.repair import repair
+from shearloop.daemon.recording.summary import summarise
+from shearloop.drivers.raw_event import InputKind, RawEvent
 from tests.daemon.recording.test_recorder import frame, torque
 from tests.daemon.recording.test_replay import replayed
 
@@ -38,7 +38,7 @@ def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     recorder = Recorder(folder, Identity(basic_identity("a test"), (attached,)), clock)
     tap = recorder.tap("right")
     for number in range(4):
-        tap(RawInput(InputKind.DATA, clock.now_ns(), b"0.1, 0.2\r\n"))
+        tap(RawEvent(InputKind.DATA, clock.now_ns(), b"0.1, 0.2\r\n"))
         recorder.record("eit.frame", frame(clock, number))
         recorder.record("load.torque", torque(clock, number))
         if number == 1:

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from daemon.clock import Clock
-from daemon.errors import UserError
-from daemon.recording import recorder as recorder_module
-from daemon.recording.mcap_file import McapFile
-from daemon.recording.recorder import Recorder
-from daemon.recording.salvage import repair
-from daemon.recording.summary import summarise
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording import recorder as recorder_module
+from shearloop.daemon.recording.mcap_file import McapFile
+from shearloop.daemon.recording.recorder import Recorder
+from shearloop.daemon.recording.repair import repair
+from shearloop.daemon.recording.summary import summarise
 from tests.daemon.conftest import deadline
 from tests.daemon.recording.test_recorder import IDENTITY, frame, topics, torque
 

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from bank.channels import N_LINE_VALUES
-from daemon.errors import UserError
-from daemon.recording.importing import import_mat
-from daemon.recording.reader import read_recording
-from daemon.recording.series import part_of, read_series, series_of
-from daemon.recording.writer import RecordingWriter
+from shearloop.bank.eit.channels import N_LINE_VALUES
+from shearloop.daemon.analysis.series import part_of, read_series, series_of
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.writer import RecordingWriter
 
 PERIOD_S = 0.5408
 

@@ -13,19 +13,19 @@ import pytest
 import zmq.asyncio
 from mcap.reader import make_reader
 
-from bank.channels import LINE_SLOTS, line_of_channels
-from daemon.app import Daemon
-from daemon.clock import Clock
-from daemon.config import load_daemon_config
-from daemon.errors import UserError
-from daemon.messages import EitFrame, LoadTorque, wire_map
-from daemon.recording import recorder as recorder_module
-from daemon.recording.identity import Attached, Identity, basic_identity
-from daemon.recording.reader import read_recording
-from daemon.recording.recorder import Recorder
-from daemon.recording.salvage import repair
-from daemon.recording.summary import summarise
-from drivers.raw_input import InputKind, RawInput
+from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, wire_map
+from shearloop.daemon.recording import recorder as recorder_module
+from shearloop.daemon.recording.identity import Attached, Identity, basic_identity
+from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.recorder import Recorder
+from shearloop.daemon.recording.repair import repair
+from shearloop.daemon.recording.summary import summarise
+from shearloop.drivers.raw_event import InputKind, RawEvent
 from tests.daemon.conftest import deadline
 
 IDENTITY = Identity(basic_identity("a test"), (Attached("configuration.json", "application/json", b"{}"),))
@@ -75,8 +75,8 @@ def topics(path: Path) -> dict[str, list[dict]]:
 def test_everything_is_recorded_with_its_schema_and_its_time(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path / "new" / "folder", IDENTITY, clock)
-    recorder.tap("right")(RawInput(InputKind.OPENED, 5))
-    recorder.tap("right")(RawInput(InputKind.DATA, 7, bytes(range(256))))
+    recorder.tap("right")(RawEvent(InputKind.OPENED, 5))
+    recorder.tap("right")(RawEvent(InputKind.DATA, 7, bytes(range(256))))
     one = frame(clock, 0)
     recorder.record("eit.frame", one)
     recorder.record("load.torque", torque(clock, 0, float("nan")))

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from bank.channels import line_of_channels
-from daemon.config import RecordingConfig, load_daemon_config
-from daemon.errors import UserError
-from daemon.recording import identity
-from daemon.recording.reader import read_recording
-from daemon.recording.series import read_series
-from daemon.recording.writer import RecordingWriter
+from shearloop.bank.eit.channels import line_of_channels
+from shearloop.daemon.analysis.series import read_series
+from shearloop.daemon.config import RecordingConfig, load_daemon_config
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording import identity
+from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.writer import RecordingWriter
 
 
 def written(path, n=4):

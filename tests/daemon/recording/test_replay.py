@@ -13,15 +13,15 @@ import pytest
 import yaml
 import zmq.asyncio
 
-from daemon.app import Daemon
-from daemon.cli import main
-from daemon.config import DaemonConfig, load_daemon_config
-from daemon.recording.chain import Chain
-from daemon.recording.importing import import_mat
-from daemon.recording.recorded_run import RecordedRun
-from daemon.recording.replay import Comparison, Replay, ReplayClock
-from daemon.wire.publisher import Publisher
-from daemon.wire.request import request
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli import main
+from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.request import request
+from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.recorded_run import RecordedRun
+from shearloop.daemon.recording.replay import Comparison, Replay, ReplayClock
+from shearloop.daemon.recording.replay_pipeline import ReplayPipeline
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.test_run import recording
 
@@ -41,7 +41,7 @@ async def replayed(
         publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), address, clock)
         opened.callback(publisher.close)
         publisher.listen(lambda topic, content: seen.append((topic, content)))
-        replay = Replay(run, Chain(config, run.asides(), publisher), publisher, clock)
+        replay = Replay(run, ReplayPipeline(config, run.asides(), publisher), publisher, clock)
         await replay.play(speed)
     return seen, replay.comparison
 
@@ -186,7 +186,7 @@ def test_mistakes_end_in_one_sentence(
 
 
 def test_what_is_not_a_number_goes_on_the_wire_as_it_went() -> None:
-    from daemon.recording.replay import wire_map_of
+    from shearloop.daemon.recording.replay import wire_map_of
 
     on_wire = wire_map_of({"seq": 3, "joints_rad": [1.5, None, 2.5], "why": ""})
     assert on_wire["joints_rad_shape"] == [3]

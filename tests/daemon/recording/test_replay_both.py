@@ -14,13 +14,13 @@ import pytest
 import zmq.asyncio
 from scipy.io import savemat
 
-from bank.channels import channels_of_line, line_of_channels
-from bank.estimators import FrameSeries, Measured, fit
-from daemon.app import Daemon
-from daemon.config import load_daemon_config
-from daemon.eit.both import LARGEST_BACKLOG, BothTask
-from daemon.eit.estimation import Taken
-from drivers.eit_format import ADC_STEP_V
+from shearloop.bank.eit.channels import channels_of_line, line_of_channels
+from shearloop.bank.estimation import FrameSeries, Measured, fit
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.sensing.both import LARGEST_BACKLOG, CombinedFingertipTask
+from shearloop.daemon.sensing.estimation import Taken
+from shearloop.drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import measured, replayed
 
@@ -78,7 +78,7 @@ async def test_pairs_follow_from_the_order_of_arrival_and_boards_wait_while_too_
         if len(estimated) == number:
             all_estimated.set()
 
-    both = BothTask(SimpleNamespace(finish=finish, count=0), ("right", "left"), 1.0)
+    both = CombinedFingertipTask(SimpleNamespace(finish=finish, count=0), ("right", "left"), 1.0)
     estimating = asyncio.create_task(both.estimate())
     while both._room.is_set():
         both.take("right", SimpleNamespace(t_mid_ns=number * 10**9))

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 import zmq.asyncio
 
-from bank.estimators import Measured
-from daemon.app import Daemon
-from daemon.config import load_daemon_config
-from daemon.eit.estimator import Estimator
-from daemon.recording.recorded_run import RecordedRun
+from shearloop.bank.estimation import Measured
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.recording.recorded_run import RecordedRun
+from shearloop.daemon.sensing.estimator import Estimator
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import replayed
 from tests.daemon.test_run import recording

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from daemon.messages import EitFrame, Message, wire_map
-from daemon.recording.content import input_json, message_json
-from daemon.recording.schema import INPUT, completed, schemas
-from daemon.topics import TOPICS
-from drivers.raw_input import InputKind, RawInput
+from shearloop.daemon.messaging.messages import EitFrame, Message, wire_map
+from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.recording.content import input_json, message_json
+from shearloop.daemon.recording.schema import INPUT, completed, schemas
+from shearloop.drivers.raw_event import InputKind, RawEvent
 from tests.daemon.sample_messages import sample
 
 PLAIN = {"boolean", "string", "number", "integer"}
@@ -78,7 +78,7 @@ def test_every_message_is_what_its_schema_says_with_and_without_values(topic: st
 
 
 def test_raw_inputs_are_what_their_schema_says() -> None:
-    written = json.loads(input_json(RawInput(InputKind.DATA, 7, bytes(range(256)))))
+    written = json.loads(input_json(RawEvent(InputKind.DATA, 7, bytes(range(256)))))
     Draft202012Validator(schemas()[INPUT]).validate(written)
 
 

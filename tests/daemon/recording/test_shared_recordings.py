@@ -15,18 +15,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.errors import CalibrationError
-from bank.estimators import Calibration, FrameSeries, Name, fit
-from bank.estimators import alignment as alignments
-from bank.estimators.alignment import alignment, doubt, is_filtered
-from bank.estimators.familiar import DifferenceGuard
-from bank.estimators.physics import Registration
-from bench.charts.stability import balanced
-from daemon.cli import main
-from daemon.recording.evaluation import follow, judge
-from daemon.recording.importing import import_mat
-from daemon.recording.reader import read_recording
-from daemon.recording.series import part_of, read_series, series_of
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import Calibration, FrameSeries, Name, fit
+from shearloop.bank.estimation import alignment as alignments
+from shearloop.bank.estimation.alignment import alignment, doubt, is_filtered
+from shearloop.bank.estimation.bank_match import Registration
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.daemon.analysis.charts.stability import balanced
+from shearloop.daemon.analysis.evaluation import follow, judge
+from shearloop.daemon.analysis.series import part_of, read_series, series_of
+from shearloop.daemon.cli import main
+from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.reader import read_recording
 
 # Five of the ten twists come before this share of the recording.
 HALF = 0.457
@@ -360,7 +360,7 @@ def test_no_good_recording_is_doubted(shared, twists_file, tmp_path):
 @pytest.mark.parametrize("n", [19, 24, 29, 34, 39, 44])
 def test_no_later_slice_is_strange_and_a_third_of_a_foreign_one_is(slices, n):
     frames, usable = slices.channels[:, 0], np.ones(896, dtype=np.bool_)
-    guard = DifferenceGuard.fit(frames[:n])
+    guard = NoveltyDetector.fit(frames[:n])
     later = frames[n:]
     foreign = later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
     assert not any(guard.judge(one, usable).why for one in later)

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from daemon.cli import main
-from daemon.recording.export import topics_of
+from shearloop.daemon.cli import main
+from shearloop.daemon.recording.export import topics_of
 from tests.daemon.recording.test_replay import measured, replayed
 from tests.daemon.skin.test_skin_run import played
 

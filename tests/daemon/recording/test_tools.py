@@ -5,19 +5,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bank.estimators import Measured
-from daemon.cli import main
-from daemon.clock import Clock
-from daemon.eit.tool_diameter import as_text
-from daemon.errors import UserError
-from daemon.experiment.steps import ExperimentFile, Wait
-from daemon.messages import EitFrame, wire_map
-from daemon.recording.identity import Identity, basic_identity, notes_of
-from daemon.recording.reader import read_recording
-from daemon.recording.recorder import Recorder
-from daemon.recording.series import read_series, series_of
-from daemon.recording.summary import summarise
-from drivers.raw_input import InputKind, RawInput
+from shearloop.bank.estimation import Measured
+from shearloop.daemon.analysis.series import read_series, series_of
+from shearloop.daemon.cli import main
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.experiment_schema import ExperimentFile, WaitStep
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.messages import EitFrame, wire_map
+from shearloop.daemon.recording.identity import Identity, basic_identity, notes_of
+from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.recorder import Recorder
+from shearloop.daemon.recording.summary import summarise
+from shearloop.daemon.sensing.tool_diameter import as_text
+from shearloop.drivers.raw_event import InputKind, RawEvent
 
 PERIOD_NS = 540_000_000
 TEN, TWENTY = Measured(10.2, 1.2), Measured(20.1, 1.2)
@@ -35,14 +35,14 @@ class Held(Clock):
 def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float | None = None) -> Path:
     """Record 40 frames as a daemon does; from the frame with each number on the gripper holds another tool, or none."""
     clock, told = Held(), dict(held)
-    file = ExperimentFile(name="twist", tool_mm=named_mm, steps=(Wait(do="wait", wait_s=1.0),))
+    file = ExperimentFile(name="twist", tool_mm=named_mm, steps=(WaitStep(do="wait", wait_s=1.0),))
     recorder = Recorder(folder, Identity(basic_identity("a test")), clock)
     recorder.experiment(file.name, notes=notes_of(file))
     for number in range(40):
         clock.t_ns += PERIOD_NS
-        recorder.tap("right")(RawInput(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
+        recorder.tap("right")(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
         if number in told:
-            recorder.tap("right")(RawInput(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, as_text(number, told[number])))
+            recorder.tap("right")(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, as_text(number, told[number])))
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
         message = EitFrame(
             source="right",

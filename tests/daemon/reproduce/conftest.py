@@ -8,12 +8,12 @@ import pytest
 from numpy.typing import NDArray
 from scipy.io import savemat
 
-from bank.bank_file import BankDefinition
-from bank.build import RowSolver
-from bank.mesh import Mesh
-from daemon.bank_config import load_geometry
-from daemon.reproduce import banks
-from daemon.reproduce.banks import Grid
+from shearloop.bank.eit.bank_file import BankDefinition
+from shearloop.bank.eit.build import RowSolver
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.daemon.analysis.reproduce import banks
+from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.bank_config import load_geometry
 
 K, SIGMA = np.linspace(2.6, 3.6, 7), np.linspace(1.0, 2.0, 8)
 

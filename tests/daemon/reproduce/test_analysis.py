@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bank.bank_file import BankDefinition
-from bank.build import RowSolver
-from bank.channels import smoothed_along_channels
-from bank.grouping import group_means
-from bank.matching import ReferenceMatcher, best_match
-from bank.mesh import Mesh, load_mesh
-from daemon.matlab.recordings import DiameterSlices, TorqueSlices, read_torque_slices
-from daemon.reproduce.analysis import (
+from shearloop.bank.eit.bank_file import BankDefinition
+from shearloop.bank.eit.build import RowSolver
+from shearloop.bank.eit.channels import smoothed_along_channels
+from shearloop.bank.eit.grouping import group_means
+from shearloop.bank.eit.matching import ReferenceMatcher, best_match
+from shearloop.bank.eit.mesh import Mesh, load_mesh
+from shearloop.daemon.analysis.reproduce.analysis import (
     TorqueResult,
     analyse_diameter,
     analyse_torque,
@@ -19,7 +18,8 @@ from daemon.reproduce.analysis import (
     match_slices,
     score_models,
 )
-from daemon.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
+from shearloop.daemon.analysis.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
+from shearloop.daemon.recording.matlab_streams import DiameterSlices, TorqueSlices, read_torque_slices
 
 
 @pytest.fixture(scope="module")

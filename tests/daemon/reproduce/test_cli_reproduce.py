@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from scipy.io import savemat
 
-from bank.bank_file import Bank
-from bank.calibration import Calibration
-from daemon.cli import main
-from daemon.reproduce import banks
-from daemon.reproduce.report import PAPER_MODEL_SCORES
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.calibration import Calibration
+from shearloop.daemon.analysis.reproduce import banks
+from shearloop.daemon.analysis.reproduce.report import PAPER_MODEL_SCORES
+from shearloop.daemon.cli import main
 
 pytestmark = pytest.mark.usefixtures("small_grids")
 
@@ -61,7 +61,9 @@ def test_numbers_figures_and_calibrations_are_made(
     before = focused.stat().st_mtime_ns
     (wide,) = (out / "banks").glob("wide-*.bank")
     wide.write_bytes(wide.read_bytes()[:-100])
-    monkeypatch.setattr("daemon.reproduce.figures.draw_all", lambda *_: [])  # they take most of the time
+    monkeypatch.setattr(
+        "shearloop.daemon.analysis.reproduce.figures.draw_all", lambda *_: []
+    )  # they take most of the time
     assert main(command) == 0
     said = capsys.readouterr()
     assert focused.stat().st_mtime_ns == before

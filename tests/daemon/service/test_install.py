@@ -6,8 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from daemon.cli import main
-from daemon.service.installation import EXAMPLE, PLACES, REAL_TIME, find_program, install_steps, service_file
+from shearloop.daemon.cli import main
+from shearloop.daemon.service.installation import (
+    EXAMPLE,
+    PLACES,
+    REAL_TIME,
+    find_program,
+    install_steps,
+    service_file,
+)
 
 PROGRAM = "/usr/bin/true"
 
@@ -119,8 +126,8 @@ def test_a_program_that_the_service_cannot_see_is_refused(
     assert "there is no program" in mistake(capsys, "install", "--dry-run")
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin/shearloop").touch()
-    monkeypatch.setattr("daemon.service.installation._HIDDEN", (str(tmp_path),))
+    monkeypatch.setattr("shearloop.daemon.service.installation._HIDDEN", (str(tmp_path),))
     said = mistake(capsys, "install", "--dry-run")
     assert f"lies in {tmp_path}, which the service is not allowed to see" in said
-    monkeypatch.setattr("daemon.service.installation._HIDDEN", ("/nowhere",))
+    monkeypatch.setattr("shearloop.daemon.service.installation._HIDDEN", ("/nowhere",))
     assert find_program() == tmp_path / "bin/shearloop"

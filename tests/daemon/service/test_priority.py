@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from daemon.service import priority
+from shearloop.daemon.service import priority
 
 
 def test_the_session_gets_its_place_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

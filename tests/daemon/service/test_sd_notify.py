@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon import health
-from daemon.clock import Clock
-from daemon.errors import UserError
-from daemon.sd_notify import notify
-from daemon.service.locked_memory import lock_memory
-from daemon.supervisor import Supervisor, TaskRecord
-from daemon.wire.publisher import Publisher
+from shearloop.daemon import health
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sd_notify import notify
+from shearloop.daemon.service.locked_memory import lock_memory
+from shearloop.daemon.supervisor import Supervisor, TaskRecord
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 

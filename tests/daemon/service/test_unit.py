@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from daemon.config import load_daemon_config
-from daemon.service.installation import PLACES, UNIT, hidden_folder, service_file, unit_for
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.service.installation import PLACES, UNIT, hidden_folder, service_file, unit_for
 
 ROOT = Path(__file__).resolve().parents[3]
 # Any program will do for systemd to look at; that the service may see ours is find_program's business.
@@ -89,7 +89,7 @@ def test_a_wheel_carries_every_file_of_the_service_and_of_the_page(tmp_path: Pat
         assets = sorted((ROOT / "daemon" / "view" / "assets").iterdir())
         assert {"index.html", "app.js", "uPlot.LICENSE.txt"} <= {path.name for path in assets}
         for path in assets:
-            assert archive.read(f"daemon/view/assets/{path.name}") == path.read_bytes()
+            assert archive.read(f"daemon/web/assets/{path.name}") == path.read_bytes()
 
 
 # ---- udev ---------------------------------------------------------------------------------------------------------

@@ -36,7 +36,7 @@ umount -l /run/before
 cat >/opt/shearloop/bin/shearloop <<RUN
 #!/bin/sh
 export PYTHONPATH=/opt/code:/opt/site LD_LIBRARY_PATH=/opt/python/lib
-exec /opt/python/bin/python3 -m daemon "\$@"
+exec /opt/python/bin/python3 -m shearloop "\$@"
 RUN
 chmod +x /opt/shearloop/bin/shearloop
 /opt/shearloop/bin/shearloop install --program /opt/shearloop/bin/shearloop "$@"

@@ -7,13 +7,13 @@ from random import Random
 
 import pytest
 
-from bank.skin.calibration import SkinCalibration
-from bank.skin.calibration_file import load_calibration
-from bank.skin.calibration_fit import fit_calibration
-from bank.skin.membrane import Direction
-from daemon.skin.estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
-from daemon.synthetic_skin import REST_OHM, SyntheticSkin, SyntheticSkinSettings, calibration_table
-from drivers.shear_skin.judge import Fault, SkinSample
+from shearloop.bank.skin.calibration import SkinCalibration
+from shearloop.bank.skin.calibration_file import load_calibration
+from shearloop.bank.skin.calibration_fit import fit_calibration
+from shearloop.bank.skin.membrane import Direction
+from shearloop.daemon.sensing.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
+from shearloop.daemon.synthetic_skin import REST_OHM, SyntheticSkin, SyntheticSkinSettings, calibration_table
+from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
 
 NOISE = 1e-4
 PERIOD_NS = 100_000_000
@@ -104,9 +104,11 @@ def test_normal_force_alone_is_no_shear(calibration: SkinCalibration) -> None:
     assert readings[-1].interval.in_deadband
 
 
-@pytest.mark.parametrize("fault", [Fault.OPEN_1, Fault.SHORT_2, Fault.REVERSED_1, Fault.COMPLIANCE, Fault.SOURCE_LOST])
+@pytest.mark.parametrize(
+    "fault", [SkinFault.OPEN_1, SkinFault.SHORT_2, SkinFault.REVERSED_1, SkinFault.COMPLIANCE, SkinFault.SOURCE_LOST]
+)
 def test_what_the_driver_refuses_is_no_force_and_the_next_good_sample_is_one(
-    calibration: SkinCalibration, fault: Fault
+    calibration: SkinCalibration, fault: SkinFault
 ) -> None:
     bench = Bench(calibration).zeroed()
     bench.push(0.8)

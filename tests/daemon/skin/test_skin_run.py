@@ -11,12 +11,12 @@ import yaml
 import zmq
 import zmq.asyncio
 
-from daemon.app import Daemon
-from daemon.cli import main
-from daemon.config import load_daemon_config
-from daemon.synthetic_skin import SyntheticSkin
-from daemon.wire.request import request
-from drivers.emulators.skin.instruments import SkinInstruments
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli import main
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.messaging.request import request
+from shearloop.daemon.synthetic_skin import SyntheticSkin
+from shearloop.drivers.emulators.skin.instruments import SkinInstruments
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.test_run import collector, running
 
@@ -190,7 +190,7 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path)
 
 
 async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daemon.skin.task.ZERO_DEADLINE_S", 0.3)
+    monkeypatch.setattr("shearloop.daemon.sensing.skin_task.ZERO_DEADLINE_S", 0.3)
     async with played(tmp_path) as bench:
         await bench.valid()
         bench.instruments.command("open 2")
@@ -282,7 +282,7 @@ def test_a_mistake_in_the_skin_s_section_is_one_sentence_and_status_2(
 
 
 def test_a_calibration_that_is_none_is_told_before_anything_is_opened(tmp_path: Path) -> None:
-    from bank.errors import CalibrationError
+    from shearloop.bank.errors import CalibrationError
 
     path = written(tmp_path, {"skin": section(ADC, calibration="none.yaml")})
     with zmq.asyncio.Context() as context, pytest.raises(CalibrationError, match=r"none\.yaml: the calibration cannot"):

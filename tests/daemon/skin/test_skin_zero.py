@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.skin.zero import MOST_CHANGE, RefusedZero, Zero, ZeroTaker
+from shearloop.daemon.sensing.skin_zero import MOST_CHANGE, RefusedZero, Zero, ZeroTaker
 
 REST, SLOPE = (24.6, 25.3), 0.088
 NOISE = 1e-4

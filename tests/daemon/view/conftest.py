@@ -90,7 +90,7 @@ class Viewer:
     def start(self) -> None:
         self._process = subprocess.Popen(
             [
-                *(sys.executable, "-m", "daemon", "view", "--json", "--port", str(self._port)),
+                *(sys.executable, "-m", "shearloop", "view", "--json", "--port", str(self._port)),
                 *("--connect", self._daemon.publish, "--commands", self._daemon.commands),
                 *("--token-file", str(self._folder / "token")),
             ],

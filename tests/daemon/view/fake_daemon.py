@@ -18,8 +18,9 @@ import numpy as np
 import zmq
 import zmq.asyncio
 
-from daemon.clock import Clock
-from daemon.messages import (
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
+from shearloop.daemon.messaging.messages import (
     EitEstimate,
     EitHeatmap,
     GripperStateMessage,
@@ -30,8 +31,7 @@ from daemon.messages import (
     RobotStateMessage,
     SkinShear,
 )
-from daemon.wire.command_server import CommandRefusedError, CommandServer
-from daemon.wire.publisher import Publisher
+from shearloop.daemon.messaging.publisher import Publisher
 
 # Estimates and heatmaps come twice a second, all else ten times.
 PUMP_S, SLOW_TURNS = 0.1, 5

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from daemon.errors import UserError
-from daemon.view.access import host_allowed, origin_allowed, token_given
-from daemon.view.token_file import default_path, kept_token
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.web.access import host_allowed, origin_allowed, token_given
+from shearloop.daemon.web.token_file import default_path, kept_token
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:7760", "localhost:9000", "LOCALHOST:1", "[::1]:7760"])

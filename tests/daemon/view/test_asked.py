@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from daemon.errors import UserError
-from daemon.view import asked
-from daemon.view.asked import Requests
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.web import asked
+from shearloop.daemon.web.asked import Requests
 
 
 async def test_a_reply_and_a_failure_come_back(monkeypatch: pytest.MonkeyPatch) -> None:

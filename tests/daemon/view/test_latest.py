@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bank.models import conductivity as conductivity_of_mesh
-from daemon.messages import decode, encode
-from daemon.view.conductivity import HEIGHTS, profile
-from daemon.view.latest import MOST_STREAMS, Latest, plain
+from shearloop.bank.eit.models import conductivity as conductivity_of_mesh
+from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.web.conductivity import HEIGHTS, profile
+from shearloop.daemon.web.latest import MOST_STREAMS, Latest, plain
 from tests.bank.conftest import small_fingertip
 
 

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from daemon.view.conductivity import profile
+from shearloop.daemon.web.conductivity import profile
 from tests.daemon.view.conftest import Browsed
 from tests.daemon.view.fake_daemon import MESSAGES, REASONS
 

@@ -17,18 +17,18 @@ import pytest
 import zmq.asyncio
 from aiohttp import web
 
-from daemon.clock import Clock
-from daemon.errors import UserError
-from daemon.messages import EitHeatmap, LoadTorque
-from daemon.view import bridge as bridge_module
-from daemon.view import server as server_module
-from daemon.view.bridge import Bridge, Place
-from daemon.view.latest import Latest
-from daemon.view.serve import serve
-from daemon.view.server import HEADERS, NEEDS_TOKEN, make_app
-from daemon.wire.addresses import PUBLISH_ADDRESS
-from daemon.wire.command_server import CommandRefusedError, CommandServer
-from daemon.wire.publisher import Publisher
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
+from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.web import bridge as bridge_module
+from shearloop.daemon.web import server as server_module
+from shearloop.daemon.web.bridge import Bridge, Place
+from shearloop.daemon.web.latest import Latest
+from shearloop.daemon.web.serve import serve
+from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, make_app
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 TOKEN = "the token of this test, long enough for anybody"  # noqa: S105 - opens nothing but this test's page
@@ -146,7 +146,7 @@ async def test_every_answer_tells_the_browser_to_load_nothing_from_elsewhere(tmp
 
 
 def test_the_page_names_nothing_outside_of_itself() -> None:
-    assets = resources.files("daemon.view") / "assets"
+    assets = resources.files("shearloop.daemon.web") / "assets"
     for item in assets.iterdir():
         if item.name.endswith((".html", ".css", ".js")):
             text = item.read_text()
@@ -261,7 +261,7 @@ async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tm
     def ready(_: int) -> None:
         raise AssertionError
 
-    from daemon.cli.view import _fingertip
+    from shearloop.daemon.cli.view import _fingertip
 
     tip = _fingertip(None)
     assert (tip.width_cm, tip.height_cm) == (4.4, 3.6)

@@ -13,9 +13,9 @@ import aiohttp
 import pytest
 import zmq.asyncio
 
-from daemon.app import Daemon
-from daemon.cli import main
-from daemon.config import load_daemon_config
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli import main
+from shearloop.daemon.config import load_daemon_config
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 

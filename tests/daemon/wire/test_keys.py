@@ -10,14 +10,14 @@ import pytest
 import zmq
 import zmq.asyncio
 
-from daemon.app import Daemon
-from daemon.cli import main
-from daemon.config import load_daemon_config
-from daemon.errors import UserError
-from daemon.messages import decode, encode
-from daemon.wire.addresses import has_a_port, needs_keys, open_stop_address, stays_on_this_machine
-from daemon.wire.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
-from daemon.wire.publisher import bind
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli import main
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.addresses import has_a_port, needs_keys, open_stop_address, stays_on_this_machine
+from shearloop.daemon.messaging.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
+from shearloop.daemon.messaging.messages import decode, encode
+from shearloop.daemon.messaging.publisher import bind
 
 Write = Callable[..., Path]
 NETWORK = "tcp://0.0.0.0:*"

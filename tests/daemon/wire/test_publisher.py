@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 import zmq
 
-from daemon.clock import Clock
-from daemon.messages import LoadTorque, decode, encode
-from daemon.wire.publisher import Publisher
-from daemon.wire.subscriber import messages
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.messages import LoadTorque, decode, encode
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.subscriber import messages
 from tests.daemon.conftest import DEADLINE_S
 
 
@@ -136,7 +136,7 @@ async def test_more_subscriptions_than_are_taken_in_at_a_time_are_taken_in_by_an
 def test_who_listens_where_nobody_speaks_is_told_so_once_and_hears_who_comes_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("daemon.wire.subscriber.QUIET_S", 0.02)
+    monkeypatch.setattr("shearloop.daemon.messaging.subscriber.QUIET_S", 0.02)
     address, told = f"ipc://{tmp_path}/publish", []
     content = {"timestamp": 1.0, "t_mono_ns": 2, "source": "daemon"}
     with zmq.Context() as context, context.socket(zmq.XPUB) as late:

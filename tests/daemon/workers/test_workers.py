@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.cli import main
-from daemon.errors import UserError
-from daemon.workers import LOCAL, InTurn, Processes, workers
+from shearloop.daemon.cli import main
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.workers import LOCAL, Processes, SerialExecutor, workers
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 from tests.daemon.workers.conftest import ROOT, STARTED_S
 
@@ -47,7 +47,7 @@ def dies_once(folder: str, item: int) -> int:
 
 def test_the_numbers_are_the_same_wherever_they_are_computed(scheduler: str) -> None:
     items, shared = list(range(12)), {"factor": 0.37}
-    alone = dict(InTurn().map(square, shared, items))
+    alone = dict(SerialExecutor().map(square, shared, items))
     assert dict(Processes(2).map(square, shared, items)) == alone
     with workers(scheduler) as cluster:
         assert dict(cluster.map(square, shared, items)) == alone
@@ -61,13 +61,13 @@ def test_a_cluster_of_this_machines_own_has_a_worker_for_each_processor(monkeypa
         asked.append(jobs)
         yield None
 
-    monkeypatch.setattr("daemon.workers._local_client", local)
+    monkeypatch.setattr("shearloop.daemon.workers._local_client", local)
     for jobs in (None, 1, 5):
         with workers(LOCAL, jobs):
             pass
     assert asked == [len(os.sched_getaffinity(0)), 1, 5]
     with workers(None) as alone:
-        assert isinstance(alone, InTurn)
+        assert isinstance(alone, SerialExecutor)
 
 
 def test_what_a_task_raises_is_raised_here(scheduler: str) -> None:
@@ -115,7 +115,7 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_what_listens_and_is_no_scheduler_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("daemon.workers.CONNECT_S", 0.5)
+    monkeypatch.setattr("shearloop.daemon.workers.CONNECT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
         with pytest.raises(UserError, match=f"no Dask scheduler answers at {address} within 0.5 s"), workers(address):
@@ -148,10 +148,10 @@ def test_a_scheduler_without_workers_and_one_that_ends_are_one_sentence_each(
     import distributed
 
     process, address = lonely
-    monkeypatch.setattr("daemon.workers.FIRST_WORKER_S", 0.5)
+    monkeypatch.setattr("shearloop.daemon.workers.FIRST_WORKER_S", 0.5)
     with pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"), workers(address):
         pass
-    monkeypatch.setattr("daemon.workers._wait_for_a_worker", lambda *_: None)
+    monkeypatch.setattr("shearloop.daemon.workers._wait_for_a_worker", lambda *_: None)
     # As soon as the tasks are waited for.
     begun = distributed.as_completed
     monkeypatch.setattr(distributed, "as_completed", lambda tasks: (process.kill(), begun(tasks))[1])

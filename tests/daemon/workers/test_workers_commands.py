@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from daemon.cli import main
-from daemon.workers import Cluster, InTurn, workers
+from shearloop.daemon.cli import main
+from shearloop.daemon.workers import Cluster, SerialExecutor, workers
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 from tests.daemon.workers.conftest import STARTED_S
 
@@ -106,11 +106,11 @@ def test_a_bank_that_a_worker_is_killed_under_has_the_same_bytes(
 def test_a_chart_has_the_same_numbers_from_a_cluster_that_a_worker_is_killed_of(
     scheduler: str, killed: list[int], tmp_path: Path
 ) -> None:
-    from bank.estimators import Name, Physics
-    from bench.charts.faults import FAULTS
-    from bench.charts.sources import Split, bank_of, own_fingertip, synthetic_slices
-    from bench.charts.stability import sweeps
-    from daemon.reproduce.banks import Grid
+    from shearloop.bank.estimation import Name, Physics
+    from shearloop.daemon.analysis.charts.faults import FAULTS
+    from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, synthetic_slices
+    from shearloop.daemon.analysis.charts.stability import sweeps
+    from shearloop.daemon.analysis.reproduce.banks import Grid
 
     bank = bank_of(None, own_fingertip(0.4).mesh(), tmp_path, Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8)))
     slices = synthetic_slices(tmp_path)
@@ -121,5 +121,5 @@ def test_a_chart_has_the_same_numbers_from_a_cluster_that_a_worker_is_killed_of(
     with workers(scheduler) as cluster:
         there = sweeps(split, names, Physics(bank, None), bank, cluster)
     assert killed
-    assert there == sweeps(split, names[:1], Physics(bank, None), bank, InTurn()) * 2
+    assert there == sweeps(split, names[:1], Physics(bank, None), bank, SerialExecutor()) * 2
     assert len(there) == 2 * len(FAULTS)

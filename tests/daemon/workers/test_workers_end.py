@@ -14,9 +14,9 @@ from unittest.mock import AsyncMock
 
 import pytest
 
-import daemon.workers
-from daemon.cli.interruption import interrupts_heard
-from daemon.workers import Processes, workers
+from shearloop.daemon import workers as daemon_workers
+from shearloop.daemon.cli.interruption import interrupts_heard
+from shearloop.daemon.workers import Processes, workers
 from tests.daemon.workers.conftest import STARTED_S
 
 # From a signal and what it interrupts to the process in which a task was.
@@ -131,7 +131,7 @@ def test_a_local_cluster_ends_when_it_is_interrupted_and_again_while_it_ends(
     number: signal.Signals, interrupted_once_it_works: Interrupted, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Closing that was interrupted was waited for at exit, for 10 s, and left a worker in the middle of a task."""
-    end_workers = daemon.workers._end_workers
+    end_workers = daemon_workers._end_workers
     ended: list[Any] = []
 
     async def again(local: Any) -> None:
@@ -143,7 +143,7 @@ def test_a_local_cluster_ends_when_it_is_interrupted_and_again_while_it_ends(
         with workers("local", 1) as cluster:
             next(cluster.map(waits, (str(tmp_path / "told"), ""), [0]))
 
-    monkeypatch.setattr("daemon.workers._end_workers", again)
+    monkeypatch.setattr("daemon_workers._end_workers", again)
     worker = interrupted_once_it_works(number, work)
     assert ended[0].status.name == "closed"
     with pytest.raises(ProcessLookupError):
@@ -154,7 +154,7 @@ def test_what_fails_because_everything_is_ended_is_told_as_that() -> None:
     """As workers that were to begin, where a whole group of processes is sent SIGTERM: it was a traceback."""
 
     def fails(number: signal.Signals | None) -> None:
-        with interrupts_heard(), daemon.workers._interrupted_later():
+        with interrupts_heard(), daemon_workers._interrupted_later():
             if number is not None:
                 signal.raise_signal(number)
             raise RuntimeError
@@ -168,16 +168,16 @@ def test_what_fails_because_everything_is_ended_is_told_as_that() -> None:
 async def test_workers_are_given_little_time_to_end_each_though_another_fails() -> None:
     """One in the middle of a task had 4 s."""
     nannies = [SimpleNamespace(close=AsyncMock(side_effect=TimeoutError)) for _ in range(2)]
-    await daemon.workers._end_workers(cast(Any, SimpleNamespace(workers=dict(enumerate(nannies)))))
+    await daemon_workers._end_workers(cast(Any, SimpleNamespace(workers=dict(enumerate(nannies)))))
     for nanny in nannies:
-        nanny.close.assert_awaited_once_with(timeout=daemon.workers.WORKERS_END_S)
+        nanny.close.assert_awaited_once_with(timeout=daemon_workers.WORKERS_END_S)
 
 
 def test_of_signals_that_were_held_back_the_one_that_is_not_ignored_ends_the_command() -> None:
     """A script's background ignores Ctrl-C: that one came first, and SIGTERM after it was lost."""
 
     def hears_both() -> None:
-        with interrupts_heard(), daemon.workers._interrupted_later():
+        with interrupts_heard(), daemon_workers._interrupted_later():
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGTERM)
 

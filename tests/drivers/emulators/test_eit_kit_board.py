@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bank.channels import ZERO_SLOTS
-from drivers.eit_format import Refusal, read_line
-from drivers.emulators.eit_kit import EitKitBoard, Fault, FaultKind, format_line, read_fault
-from drivers.serial_port import SerialPort
+from shearloop.bank.eit.channels import ZERO_SLOTS
+from shearloop.drivers.eit_format import FrameError, read_line
+from shearloop.drivers.emulators.eit_kit import EitKitBoard, Fault, FaultKind, format_line, read_fault
+from shearloop.drivers.serial_port import SerialPort
 
 
 async def two_lines(port: SerialPort) -> bytes:
@@ -33,7 +33,7 @@ def test_a_line_is_what_the_board_sends_byte_for_byte() -> None:
 def test_what_it_sends_is_what_the_driver_reads(seed: int) -> None:
     values = np.where(ZERO_SLOTS, 0, np.random.default_rng(seed).integers(1, 22_000, 1024) / 10_000)
     read = read_line(format_line(values).removesuffix(b"\n"), ZERO_SLOTS)
-    assert not isinstance(read, Refusal)
+    assert not isinstance(read, FrameError)
     np.testing.assert_array_equal(read, values)
 
 

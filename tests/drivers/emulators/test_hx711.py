@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.emulators.hx711 import PAPER_SKETCH, Fault, FaultKind, Hx711Board, Sketch, read_fault
-from drivers.hx711 import LoadCalibration, LoadSample
-from drivers.load_cell import LoadCell
-from drivers.serial_port import LinkEvent, ReconnectPolicy
+from shearloop.drivers.emulators.hx711 import PAPER_SKETCH, Fault, FaultKind, Hx711Board, Sketch, read_fault
+from shearloop.drivers.hx711 import LoadCalibration, LoadSample
+from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy
 
 SKETCH = Sketch()
 CALIBRATION = LoadCalibration(tare_counts=SKETCH.tare_counts, scale_n_per_count=1 / (0.035 * SKETCH.counts_per_nm))

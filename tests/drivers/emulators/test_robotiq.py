@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
-from drivers.emulators.robotiq.modbus_face import ModbusFace, crc16
-from drivers.emulators.robotiq.urcap_face import UrcapFace
+from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
+from shearloop.drivers.emulators.robotiq.modbus_face import ModbusFace, crc16
+from shearloop.drivers.emulators.robotiq.urcap_face import UrcapFace
 
 READ_STATUS = bytes.fromhex("09 03 07D0 0003")
 

@@ -2,9 +2,9 @@
 
 import pytest
 
-from drivers.emulators.ur.faults import obey
-from drivers.emulators.ur.robot import Robot
-from drivers.emulators.ur.server import Controller
+from shearloop.drivers.emulators.ur.faults import obey
+from shearloop.drivers.emulators.ur.robot import Robot
+from shearloop.drivers.emulators.ur.server import Controller
 
 
 def test_faults_are_carried_out_and_ended() -> None:

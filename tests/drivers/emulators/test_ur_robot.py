@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.emulators.ur.make import Make
-from drivers.emulators.ur.robot import MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, Robot
-from drivers.emulators.ur.script import (
+from shearloop.drivers.emulators.ur.make import Make
+from shearloop.drivers.emulators.ur.robot import MODE_POWER_OFF, MODE_RUNNING, PAUSED, STOPPED, Robot
+from shearloop.drivers.emulators.ur.script import (
     IS_STEADY,
     MOVE_J,
     MOVE_L,

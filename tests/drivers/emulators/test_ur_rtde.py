@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.emulators.ur import server
-from drivers.emulators.ur.make import Make
-from drivers.emulators.ur.registers import pack, unpack
-from drivers.emulators.ur.robot import Robot
-from drivers.emulators.ur.rtde import NotRtdeError, RtdeSession, package
+from shearloop.drivers.emulators.ur import server
+from shearloop.drivers.emulators.ur.make import Make
+from shearloop.drivers.emulators.ur.registers import pack, unpack
+from shearloop.drivers.emulators.ur.robot import Robot
+from shearloop.drivers.emulators.ur.rtde import NotRtdeError, RtdeSession, package
 
 GREETING = package(ord("V"), b"\x00\x02") + package(ord("v"), b"")
 COMMAND = b"input_int_register_0,input_double_register_0,"

@@ -12,17 +12,15 @@ from pathlib import Path
 
 import pytest
 
-from drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
-from drivers.emulators.robotiq.modbus_face import ModbusServer
-from drivers.emulators.robotiq.urcap_face import UrcapServer
-from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import (
-    GripperClient,
-)
-from drivers.robotiq.modbus_client import ModbusClient
-from drivers.robotiq.socket_client import SocketClient
-from drivers.robotiq.width import WidthCalibration
-from drivers.serial_port import LinkEvent, ReconnectPolicy
+from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
+from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
+from shearloop.drivers.emulators.robotiq.urcap_face import UrcapServer
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.messages import GripperClient
+from shearloop.drivers.robotiq.modbus_client import ModbusClient
+from shearloop.drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.width import WidthCalibration
+from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy
 
 STEP_S = 0.01
 # Between two looks of the driver at its clock.

@@ -5,14 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.robotiq.faults import GripperFaultError, GripperRefusedError
-from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import (
-    ActivationStatus,
-    GripperCommand,
-    ObjectStatus,
-)
-from drivers.robotiq.socket_client import SocketClient
+from shearloop.drivers.robotiq.faults import GripperFaultError, GripperRefusedError
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand, ObjectStatus
+from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.drivers.robotiq.gripper_rig import CALIBRATION, WAYS, a_rig
 
 

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from drivers.robotiq.gripper import RobotiqGripper
-from drivers.robotiq.messages import (
+from shearloop.drivers.robotiq.gripper import RobotiqGripper
+from shearloop.drivers.robotiq.messages import (
     ActivationStatus,
-    GoTo,
     GripperCommand,
+    GripperMove,
     GripperState,
     ObjectStatus,
     Readout,
@@ -46,7 +46,7 @@ class Counted:
 
     async def write(self, request: Request) -> None:
         self.asked.append("write")
-        if isinstance(request, GoTo):
+        if isinstance(request, GripperMove):
             self.readout = replace(self.readout, pre=request.position, obj=ObjectStatus.MOVING)
 
 

@@ -7,24 +7,32 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.calibration_file import CalibrationError
-from drivers.errors import DeviceLostError, ProtocolError
-from drivers.robotiq import registers
-from drivers.robotiq.faults import fault_of
-from drivers.robotiq.messages import Activate, ActivationStatus, GoTo, Halt, ObjectStatus, Readout, Reset
-from drivers.robotiq.urcap import READ_ORDER, ReplyParser, readout_of, set_lines, value_of
-from drivers.robotiq.width import WidthCalibration
+from shearloop.drivers.calibration_file import CalibrationError
+from shearloop.drivers.errors import DeviceLostError, ProtocolError
+from shearloop.drivers.robotiq import registers
+from shearloop.drivers.robotiq.faults import fault_of
+from shearloop.drivers.robotiq.messages import (
+    Activate,
+    ActivationStatus,
+    GripperHalt,
+    GripperMove,
+    ObjectStatus,
+    Readout,
+    Reset,
+)
+from shearloop.drivers.robotiq.urcap import READ_ORDER, ReplyParser, readout_of, set_lines, value_of
+from shearloop.drivers.robotiq.width import WidthCalibration
 
 byte = st.integers(0, 255)
 
 
 def test_requests_are_the_manuals_registers() -> None:
     # Instruction manual, "Modbus RTU": reset 0000 0000 0000, close at full speed and force 0900 00FF FFFF.
-    last = GoTo(0, 0, 0)
+    last = GripperMove(0, 0, 0)
     assert registers.command_registers(Reset(), last) == [0, 0, 0]
     assert registers.command_registers(Activate(), last) == [0x0100, 0, 0]
-    assert registers.command_registers(GoTo(255, 255, 255), last) == [0x0900, 0x00FF, 0xFFFF]
-    assert registers.command_registers(Halt(), GoTo(255, 255, 128)) == [0x0100, 0x00FF, 0xFF80]
+    assert registers.command_registers(GripperMove(255, 255, 255), last) == [0x0900, 0x00FF, 0xFFFF]
+    assert registers.command_registers(GripperHalt(), GripperMove(255, 255, 128)) == [0x0100, 0x00FF, 0xFF80]
 
 
 def test_replies_are_read_as_the_manual_explains_them() -> None:
@@ -48,10 +56,10 @@ def test_every_status_is_either_read_whole_or_refused(content: bytes) -> None:
 
 
 def test_socket_lines_are_those_that_the_urcap_takes() -> None:
-    assert set_lines(GoTo(100, 255, 50)) == [b"SET POS 100 SPE 255 FOR 50 GTO 1\n"]
+    assert set_lines(GripperMove(100, 255, 50)) == [b"SET POS 100 SPE 255 FOR 50 GTO 1\n"]
     assert set_lines(Reset()) == [b"SET ACT 0\n", b"SET ATR 0\n"]
     assert set_lines(Activate()) == [b"SET ACT 1\n"]
-    assert set_lines(Halt()) == [b"SET GTO 0\n"]
+    assert set_lines(GripperHalt()) == [b"SET GTO 0\n"]
 
 
 @given(st.lists(st.one_of(st.just("ack"), st.tuples(st.sampled_from(READ_ORDER), byte)), max_size=8), st.data())
@@ -177,7 +185,7 @@ def test_gauges_that_make_no_line_are_refused(gauges: list[tuple[float, float]],
 
 
 def test_what_pymodbus_has_to_say_does_not_come_between_our_lines() -> None:
-    said = "import drivers.robotiq.modbus_client; from pymodbus.logging import Log; Log.error('received pdu')"
+    said = "import shearloop.drivers.robotiq.modbus_client; from pymodbus.logging import Log; Log.error('received pdu')"
     # Where pytest listens to every logger, nobody would print it anyway.
     done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
     assert (done.stdout, done.stderr) == ("", "")

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.robotiq.faults import GripperFaultError
-from drivers.robotiq.messages import Activate, ActivationStatus, GoTo, ObjectStatus, Readout, Reset
-from drivers.robotiq.sequences import (
+from shearloop.drivers.robotiq.faults import GripperFaultError
+from shearloop.drivers.robotiq.messages import Activate, ActivationStatus, GripperMove, ObjectStatus, Readout, Reset
+from shearloop.drivers.robotiq.sequences import (
     ACTIVATION_DEADLINE_NS,
     MOTION_DEADLINE_NS,
     PAUSE_NS,
@@ -22,7 +22,7 @@ S = 10**9
 RESET = Readout(False, False, ActivationStatus.RESET, ObjectStatus.MOVING, 0, 0, 3, 0)
 ACTIVATING = replace(RESET, act=True, sta=ActivationStatus.ACTIVATING, flt=5)
 ACTIVE = Readout(True, True, ActivationStatus.ACTIVE, ObjectStatus.AT_TARGET, 0, 50, 50, 0)
-GO = GoTo(100, 255, 0)
+GO = GripperMove(100, 255, 0)
 
 
 def after_activate() -> ActivationSequence:

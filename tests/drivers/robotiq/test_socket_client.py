@@ -7,10 +7,10 @@ from typing import cast
 
 import pytest
 
-from drivers.errors import DeviceLostError, ProtocolError
-from drivers.robotiq.messages import GoTo, Reset
-from drivers.robotiq.socket_client import SocketClient, _Connection
-from drivers.robotiq.urcap import READ_ORDER, STANDING_ORDER
+from shearloop.drivers.errors import DeviceLostError, ProtocolError
+from shearloop.drivers.robotiq.messages import GripperMove, Reset
+from shearloop.drivers.robotiq.socket_client import SocketClient, _Connection
+from shearloop.drivers.robotiq.urcap import READ_ORDER, STANDING_ORDER
 
 VALUES = {"ACT": 1, "STA": 3, "GTO": 1, "PRE": 100, "OBJ": 3, "POS": 100, "FLT": 0, "COU": 7}
 
@@ -66,7 +66,7 @@ async def test_what_is_asked_is_answered_in_order() -> None:
     async with connected(peer) as client:
         assert (await client.read()).pos == 100
         await client.write(Reset())
-        await client.write(GoTo(10, 20, 30))
+        await client.write(GripperMove(10, 20, 30))
         assert (await client.read()).current == 7
     asked = [f"GET {variable}" for variable in READ_ORDER]
     assert peer.lines == [*asked, "SET ACT 0", "SET ATR 0", "SET POS 10 SPE 20 FOR 30 GTO 1", *asked]
@@ -121,7 +121,7 @@ async def test_bytes_that_nobody_asked_for_are_no_answer_to_what_is_asked_next()
     peer = Peer(usual)
     async with connected(peer) as client:
         peer.unasked = b"ack"
-        await client.write(GoTo(1, 2, 3))
+        await client.write(GripperMove(1, 2, 3))
         with pytest.raises(ProtocolError, match="without being asked"):
             await client.read()
 

@@ -6,16 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.shear_skin.daq import Voltages
-from drivers.shear_skin.judge import Fault, Judge, SkinSample
-from drivers.shear_skin.source import SourceReading
+from shearloop.drivers.shear_skin.daq import Voltages
+from shearloop.drivers.shear_skin.judge import SampleValidator, SkinFault, SkinSample
+from shearloop.drivers.shear_skin.source import SourceReading
 
 CURRENT_A, SOURCE_S, DAQ_S = 5e-3, 0.5, 0.1
 GOOD = SourceReading(0, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
 
 
-def judge() -> Judge:
-    return Judge(CURRENT_A, SOURCE_S, DAQ_S)
+def judge() -> SampleValidator:
+    return SampleValidator(CURRENT_A, SOURCE_S, DAQ_S)
 
 
 def voltages(v1_v: float, v2_v: float, number: int = 0, *, over_1: bool = False, over_2: bool = False) -> Voltages:
@@ -40,23 +40,23 @@ STUCK_OPEN = SourceReading(0, output_on=True, voltage_v=1.0, current_a=1e-9, com
 @pytest.mark.parametrize(
     ("v1_v", "v2_v", "source", "faults"),
     [
-        (0.123, 0.126, None, [Fault.SOURCE_LOST]),
-        (0.0, 0.0, SourceReading(0, output_on=False), [Fault.SOURCE_OFF]),
-        (1.0, 0.0, STUCK_OPEN, [Fault.COMPLIANCE, Fault.OPEN_1]),
-        (0.0, 1.0, STUCK_OPEN, [Fault.COMPLIANCE, Fault.OPEN_2]),
-        (0.0, 0.0, STUCK_OPEN, [Fault.COMPLIANCE]),
+        (0.123, 0.126, None, [SkinFault.SOURCE_LOST]),
+        (0.0, 0.0, SourceReading(0, output_on=False), [SkinFault.SOURCE_OFF]),
+        (1.0, 0.0, STUCK_OPEN, [SkinFault.COMPLIANCE, SkinFault.OPEN_1]),
+        (0.0, 1.0, STUCK_OPEN, [SkinFault.COMPLIANCE, SkinFault.OPEN_2]),
+        (0.0, 0.0, STUCK_OPEN, [SkinFault.COMPLIANCE]),
         # Half a second before the source says so, the voltages do.
-        (1.0, 0.0, GOOD, [Fault.OPEN_1]),
-        (0.126, 0.0001, GOOD, [Fault.SHORT_2]),
-        (-0.123, 0.126, GOOD, [Fault.REVERSED_1]),
-        (0.123, -0.126, GOOD, [Fault.REVERSED_2]),
-        (0.123, 0.3, GOOD, [Fault.IMPLAUSIBLE_2]),
-        (0.123, 0.180, GOOD, [Fault.SUM]),
-        (0.123, 0.126, SourceReading(0, True, 0.252, 4.8e-3), [Fault.CURRENT]),
+        (1.0, 0.0, GOOD, [SkinFault.OPEN_1]),
+        (0.126, 0.0001, GOOD, [SkinFault.SHORT_2]),
+        (-0.123, 0.126, GOOD, [SkinFault.REVERSED_1]),
+        (0.123, -0.126, GOOD, [SkinFault.REVERSED_2]),
+        (0.123, 0.3, GOOD, [SkinFault.IMPLAUSIBLE_2]),
+        (0.123, 0.180, GOOD, [SkinFault.SUM]),
+        (0.123, 0.126, SourceReading(0, True, 0.252, 4.8e-3), [SkinFault.CURRENT]),
     ],
 )
 def test_each_fault_has_its_name_and_leaves_no_resistance(
-    v1_v: float, v2_v: float, source: SourceReading | None, faults: list[Fault]
+    v1_v: float, v2_v: float, source: SourceReading | None, faults: list[SkinFault]
 ) -> None:
     sample = said(v1_v, v2_v, source)
     assert list(sample.faults) == faults
@@ -66,14 +66,14 @@ def test_each_fault_has_its_name_and_leaves_no_resistance(
 
 
 def test_beyond_the_range_is_open_only_where_nothing_is_across_the_other_gauge() -> None:
-    assert list(said(9.9e37, 0.126, over_1=True).faults) == [Fault.OVERRANGE_1]
-    assert list(said(0.512, 0.0, STUCK_OPEN, over_1=True).faults) == [Fault.COMPLIANCE, Fault.OPEN_1]
+    assert list(said(9.9e37, 0.126, over_1=True).faults) == [SkinFault.OVERRANGE_1]
+    assert list(said(0.512, 0.0, STUCK_OPEN, over_1=True).faults) == [SkinFault.COMPLIANCE, SkinFault.OPEN_1]
 
 
 def test_a_source_that_falls_silent_is_lost_after_two_seconds() -> None:
     one = judge()
     assert one.sample(voltages(0.123, 0.126, 20), GOOD).trusted
-    assert list(one.sample(voltages(0.124, 0.126, 21), GOOD).faults) == [Fault.SOURCE_LOST]
+    assert list(one.sample(voltages(0.124, 0.126, 21), GOOD).faults) == [SkinFault.SOURCE_LOST]
     assert one.faults == {"source_lost": 1}
 
 
@@ -97,13 +97,13 @@ def test_a_jump_is_a_disturbance_until_it_stays() -> None:
 def test_voltages_from_before_the_current_flowed_are_not_called_a_short() -> None:
     one = judge()
     on = SourceReading(2 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
-    assert one.sample(voltages(0.0, 0.0, 1), on).faults == (Fault.SOURCE_LOST,)
+    assert one.sample(voltages(0.0, 0.0, 1), on).faults == (SkinFault.SOURCE_LOST,)
     assert one.sample(voltages(0.123, 0.126, 2), on).trusted
     off = SourceReading(3 * 10**8, output_on=False)
-    assert one.sample(voltages(0.0, 0.0, 3), off).faults == (Fault.SOURCE_OFF,)
+    assert one.sample(voltages(0.0, 0.0, 3), off).faults == (SkinFault.SOURCE_OFF,)
     on = SourceReading(5 * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A)
-    assert one.sample(voltages(0.0, 0.0, 4), on).faults == (Fault.SOURCE_OFF,)
-    assert one.sample(voltages(0.0, 0.0, 6), on).faults == (Fault.SHORT_1, Fault.SHORT_2)
+    assert one.sample(voltages(0.0, 0.0, 4), on).faults == (SkinFault.SOURCE_OFF,)
+    assert one.sample(voltages(0.0, 0.0, 6), on).faults == (SkinFault.SHORT_1, SkinFault.SHORT_2)
 
 
 def test_a_converter_that_stands_still_is_told_by_gauge() -> None:
@@ -111,7 +111,7 @@ def test_a_converter_that_stands_still_is_told_by_gauge() -> None:
     sources = [SourceReading(n * 10**8, output_on=True, voltage_v=0.252, current_a=CURRENT_A) for n in range(60)]
     samples = [one.sample(voltages(0.123, 0.126 + 1e-6 * (n % 2), n), source) for n, source in enumerate(sources)]
     assert samples[40].trusted
-    assert list(samples[59].faults) == [Fault.STUCK_1]
+    assert list(samples[59].faults) == [SkinFault.STUCK_1]
 
 
 ANY = st.floats(-2, 2) | st.just(9.9e37)

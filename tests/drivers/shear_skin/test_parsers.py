@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
-from drivers.shear_skin.adc_board import BAUD_RATE, PairParser
-from drivers.shear_skin.scanner import read_scan
-from drivers.shear_skin.scpi import LONGEST_REPLY, Reply, ReplyLines, numbers
-from drivers.shear_skin.source import read_elements
+from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.shear_skin.adc_board import BAUD_RATE, PairParser
+from shearloop.drivers.shear_skin.scanner import read_scan
+from shearloop.drivers.shear_skin.scpi import LONGEST_REPLY, Reply, ReplyLines, numbers
+from shearloop.drivers.shear_skin.source import read_elements
 
 PERIOD_NS = 100_000_000
 VOLTS = st.floats(-0.6, 0.6).map(lambda volts: round(volts, 6))

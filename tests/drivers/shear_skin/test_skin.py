@@ -10,18 +10,18 @@ from pathlib import Path
 
 import pytest
 
-from drivers.emulators.skin import daq as played_daq
-from drivers.emulators.skin.circuit import Circuit, befall
-from drivers.emulators.skin.keithley import Keithley6430 as PlayedSource
-from drivers.emulators.skin.servers import Outages, ScpiSerial, ScpiSocket
-from drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
-from drivers.shear_skin.adc_board import AdcBoard
-from drivers.shear_skin.daq import Daq
-from drivers.shear_skin.judge import Fault, SkinSample
-from drivers.shear_skin.scanner import ScpiScanner
-from drivers.shear_skin.skin import ShearSkin
-from drivers.shear_skin.source import BAUD_RATE, OUTPUT, READ, Keithley6430
-from drivers.tcp_port import TcpLink
+from shearloop.drivers.emulators.skin import daq as played_daq
+from shearloop.drivers.emulators.skin.circuit import Circuit, befall
+from shearloop.drivers.emulators.skin.keithley import EmulatedKeithley6430 as PlayedSource
+from shearloop.drivers.emulators.skin.servers import Outages, ScpiSerial, ScpiSocket
+from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
+from shearloop.drivers.shear_skin.adc_board import AdcBoard
+from shearloop.drivers.shear_skin.daq import Daq
+from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
+from shearloop.drivers.shear_skin.scanner import ScpiScanner
+from shearloop.drivers.shear_skin.skin import ShearSkin
+from shearloop.drivers.shear_skin.source import BAUD_RATE, OUTPUT, READ, Keithley6430
+from shearloop.drivers.tcp_port import TcpLink
 
 R1, R2 = 24.6, 25.3
 RATE_HZ = 500.0
@@ -56,7 +56,7 @@ class Bench:
                 self.changed.clear()
                 await self.changed.wait()
 
-    async def next_says(self, *faults: Fault) -> None:
+    async def next_says(self, *faults: SkinFault) -> None:
         """Wait for a sample with exactly these faults that was taken from here on."""
         begin = len(self.samples)
         try:
@@ -87,7 +87,7 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         played_daq.Scanner(circuit, time.monotonic).feed, on_port=lambda _: ready.release(), answer_s=0.0
     )
     scanner_outages = Outages(scanner)
-    board = played_daq.AdcBoard(
+    board = played_daq.EmulatedAdcBoard(
         circuit, time.monotonic, period_s=1 / RATE_HZ, link=folder / "adc", on_port=lambda _: ready.release()
     )
     players.append(board.run if adc else scanner_outages.run)
@@ -145,7 +145,7 @@ async def test_resistances_come_through_over_every_way_in(tmp_path: Path, serial
         for name, true_ohm in (("r1_ohm", R1), ("r2_ohm", R2)):
             values = [getattr(sample, name) for sample in good]
             assert sum(values) / len(values) == pytest.approx(true_ohm, rel=2e-4)
-        assert all(sample.faults == (Fault.SOURCE_LOST,) for sample in bench.samples if not sample.trusted)
+        assert all(sample.faults == (SkinFault.SOURCE_LOST,) for sample in bench.samples if not sample.trusted)
         assert [sample.seq for sample in bench.samples] == list(range(len(bench.samples)))
         times = [sample.t_mid_ns for sample in bench.samples]
         assert all(a < b for a, b in pairwise(times))
@@ -165,20 +165,20 @@ async def test_a_source_that_cannot_be_switched_off_is_told(tmp_path: Path, seri
     async with a_bench(tmp_path, serial_source=serial_source, adc=True, deadline_s=0.1) as bench:
         await bench.next_says()
         bench.source.command(outage)
-        await bench.next_says(Fault.SOURCE_LOST)
+        await bench.next_says(SkinFault.SOURCE_LOST)
     assert bench.source_errors["not switched off"] == 1
     assert any("has not confirmed that its output is off" in event.sentence for event in bench.events)
 
 
 FAULTS = [
-    ("open 1", {Fault.COMPLIANCE, Fault.OPEN_1}),
-    ("open 2", {Fault.COMPLIANCE, Fault.OPEN_2}),
-    ("short 1", {Fault.SHORT_1}),
-    ("short 2", {Fault.SHORT_2}),
-    ("reversed 1", {Fault.REVERSED_1}),
-    ("reversed 2", {Fault.REVERSED_2}),
-    ("leads 400", {Fault.COMPLIANCE}),
-    ("leads 40", {Fault.SUM}),
+    ("open 1", {SkinFault.COMPLIANCE, SkinFault.OPEN_1}),
+    ("open 2", {SkinFault.COMPLIANCE, SkinFault.OPEN_2}),
+    ("short 1", {SkinFault.SHORT_1}),
+    ("short 2", {SkinFault.SHORT_2}),
+    ("reversed 1", {SkinFault.REVERSED_1}),
+    ("reversed 2", {SkinFault.REVERSED_2}),
+    ("leads 400", {SkinFault.COMPLIANCE}),
+    ("leads 40", {SkinFault.SUM}),
 ]
 
 
@@ -207,7 +207,7 @@ async def test_a_source_that_is_silent_or_gone_is_named_and_set_up_again_without
             bench.source.command(outage)
             # A late reading of the source looks like a lost one for a while; the outage itself is what is awaited.
             await bench.until(lambda n=losses: bench.losses > n)
-            await bench.next_says(Fault.SOURCE_LOST)
+            await bench.next_says(SkinFault.SOURCE_LOST)
             assert bench.circuit.output_on, "the current flows on while the cable is out"
             bench.source.command("normal")
             await bench.next_says()
@@ -220,7 +220,7 @@ async def test_a_source_that_is_switched_off_by_hand_stays_off_and_says_so(tmp_p
     async with a_bench(tmp_path, serial_source=False, adc=False) as bench:
         await bench.next_says()
         bench.circuit.output_on = False
-        await bench.next_says(Fault.SOURCE_OFF)
+        await bench.next_says(SkinFault.SOURCE_OFF)
         assert not bench.circuit.output_on
         bench.circuit.output_on = True
         await bench.next_says()
@@ -240,7 +240,7 @@ async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too
             return reply
 
         bench.played.face.feed = switched_off_after_it_said_that_it_is_on  # type: ignore[method-assign]
-        await bench.next_says(Fault.SOURCE_OFF)
+        await bench.next_says(SkinFault.SOURCE_OFF)
         assert not bench.circuit.output_on
         assert bench.skin.source_facts()["openings"] == openings
 
@@ -251,7 +251,7 @@ async def test_a_source_that_says_nonsense_is_not_believed(tmp_path: Path) -> No
         sound = bench.played.face.feed
         bench.played.face.feed = lambda data: sound(data) and b"%%%\n"  # type: ignore[method-assign]  # a bad cable
         await bench.until(lambda: bench.source_errors.get("not understood", 0) >= 3)
-        await bench.next_says(Fault.SOURCE_LOST)
+        await bench.next_says(SkinFault.SOURCE_LOST)
         bench.played.face.feed = sound  # type: ignore[method-assign]
         await bench.next_says()
 
@@ -315,7 +315,7 @@ async def test_a_scanner_that_breaks_off_in_the_middle_of_an_answer_is_named_cou
 
 def errors_of_start(bench: Bench) -> Mapping[str, int]:
     """Samples from before the source's first reading, and whatever is read while it is late."""
-    lost = sum(Fault.SOURCE_LOST in sample.faults for sample in bench.samples)
+    lost = sum(SkinFault.SOURCE_LOST in sample.faults for sample in bench.samples)
     return {"source_lost": lost} if lost else {}
 
 
@@ -330,7 +330,7 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
         assert isinstance(facts["errors"], dict)
         assert facts["errors"]["not two decimals"] == 2
         bench.reader("stuck")
-        await bench.next_says(Fault.STUCK_1, Fault.STUCK_2)
+        await bench.next_says(SkinFault.STUCK_1, SkinFault.STUCK_2)
 
 
 async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:

@@ -6,10 +6,18 @@ from collections.abc import Callable
 
 import pytest
 
-from drivers.errors import DriverError
-from drivers.ur.messages import Command, Enable, MoveLinear, Reading, Reply, RobotState, WristSpeed
-from drivers.ur.pilot import Pilot
-from drivers.ur.settings import UrSettings
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.command_handler import CommandHandler
+from shearloop.drivers.ur.messages import (
+    Command,
+    CommandReply,
+    Enable,
+    MoveLinear,
+    RobotState,
+    RtdeSample,
+    WristSpeed,
+)
+from shearloop.drivers.ur.settings import UrSettings
 from tests.drivers.ur.test_limits import AT_REST, LIMITS
 
 SETTINGS = UrSettings(host="10.0.0.1", limits=LIMITS)
@@ -54,7 +62,7 @@ class FakeArm:
     def be(self, **changes: object) -> None:
         self.reading = dataclasses.replace(self.reading, **changes)  # type: ignore[arg-type]
 
-    def read(self) -> Reading:
+    def read(self) -> RtdeSample:
         return self.reading
 
     def end_program(self) -> None:
@@ -155,21 +163,21 @@ class Flight:
         self.arm = FakeArm()
         self.now_ns = 10**12
         self.number = self.cycle = 0
-        self.decided: dict[int, Reply] = {}
+        self.decided: dict[int, CommandReply] = {}
         self._settings = settings
         self.begin_anew(takes_over=takes_over)
 
     def begin_anew(self, *, takes_over: bool) -> None:
         """Put another pilot in the place of the one before."""
         self.cycle = 0
-        self.pilot = Pilot(self._settings, self.arm, self.now_ns, takes_over=takes_over)
+        self.pilot = CommandHandler(self._settings, self.arm, self.now_ns, takes_over=takes_over)
 
     def be_alone(self) -> None:
         """Let a cycle pass without a pilot; what is done then is the program's own."""
         self.arm.cycle()
         self.now_ns += CYCLE_NS
 
-    def ask(self, command: Command) -> Reply:
+    def ask(self, command: Command) -> CommandReply:
         """Send a command and return its reply, letting cycles pass until it comes."""
         self.number += 1
         reply = self.pilot.request(self.number, command, self.arm.reading, self.now_ns)

@@ -5,9 +5,9 @@ from typing import NoReturn
 
 import pytest
 
-from drivers.ur import child
-from drivers.ur.messages import Configure, Message, Reading, RobotState
-from drivers.ur.wire import Decoder, encode
+from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur.messages import Configure, Message, RobotState, RtdeSample
+from shearloop.drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 
@@ -46,7 +46,7 @@ class Daemon:
 class CyclingArm(FakeArm):
     """An arm that goes through a cycle whenever it is read."""
 
-    def read(self) -> Reading:
+    def read(self) -> RtdeSample:
         self.cycle()
         return super().read()
 
@@ -83,7 +83,7 @@ class TimedArm(CyclingArm):
         super().__init__()
         self.read_s: list[float] = []
 
-    def read(self) -> Reading:
+    def read(self) -> RtdeSample:
         super().read()
         self.read_s.append(child.time.monotonic() - 1000.0)
         self.be(t_mono_ns=child.time.monotonic_ns())

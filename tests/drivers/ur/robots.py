@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-from drivers.ur.client import LinkEvent, UrRobot
-from drivers.ur.messages import Enable, RobotState
-from drivers.ur.settings import UrSettings, read_settings
+from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
+from shearloop.drivers.ur.messages import Enable, RobotState
+from shearloop.drivers.ur.settings import UrSettings, read_settings
 
 ROOT = Path(__file__).parents[3]
 
@@ -17,14 +17,14 @@ class Link:
     """A robot's link events, to be waited for."""
 
     def __init__(self) -> None:
-        self.events: list[LinkEvent] = []
+        self.events: list[UrLinkEvent] = []
         self._changed = asyncio.Event()
 
-    def __call__(self, event: LinkEvent) -> None:
+    def __call__(self, event: UrLinkEvent) -> None:
         self.events.append(event)
         self._changed.set()
 
-    async def down(self, number: int = 1, within_s: float = 15.0) -> LinkEvent:
+    async def down(self, number: int = 1, within_s: float = 15.0) -> UrLinkEvent:
         """Return the loss of this number."""
         async with asyncio.timeout(within_s):
             while len(losses := [event for event in self.events if event.status == "down"]) < number:

@@ -11,8 +11,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from drivers.ur.messages import MoveLinear, WristSpeed
-from drivers.ur.receiver import Received
+from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
+from shearloop.drivers.ur.receiver import Received
 from tests.drivers.ur.flight import SETTINGS
 
 SIX = (0.0,) * 6
@@ -37,7 +37,7 @@ class Client:
 
 @pytest.fixture
 def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
-    """The module `drivers.ur.arm` over such clients."""
+    """The module `shearloop.drivers.ur.arm` over such clients."""
     for name, kinds in (
         ("rtde_control", ["RTDEControlInterface"]),
         ("dashboard_client", ["DashboardClient"]),
@@ -47,10 +47,10 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
         for kind in kinds:
             setattr(module, kind, Client)
         monkeypatch.setitem(sys.modules, name, module)
-    arm = importlib.import_module("drivers.ur.arm")
+    arm = importlib.import_module("shearloop.drivers.ur.arm")
     monkeypatch.setattr(arm, "Receiver", Client)
     yield arm
-    del sys.modules["drivers.ur.arm"]
+    del sys.modules["shearloop.drivers.ur.arm"]
 
 
 def test_sample_that_has_waited_in_the_socket_is_read_as_old(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

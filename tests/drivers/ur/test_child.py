@@ -4,8 +4,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from drivers.ur import child
-from drivers.ur.messages import Disconnect, Enable, Message, Reading, Reply, Unlock, WristSpeed
+from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Message, RtdeSample, Unlock, WristSpeed
 from tests.drivers.ur.process import CyclingArm, Daemon, fly
 
 ROOT = Path(__file__).parents[3]
@@ -24,7 +24,7 @@ def test_unlocking_that_a_disconnection_ends_is_answered(daemon: Daemon) -> None
     daemon.say(Unlock(), Disconnect())
     fly(daemon, arm)
     assert arm.calls == []
-    replies = {number: message for number, message in daemon.hear() if isinstance(message, Reply)}
+    replies = {number: message for number, message in daemon.hear() if isinstance(message, CommandReply)}
     assert "disconnects" in replies[1].refused
     assert replies[2].accepted
 
@@ -34,7 +34,7 @@ def test_nothing_that_comes_after_a_disconnection_is_carried_out(daemon: Daemon)
     daemon.say(Disconnect(), Enable(), WristSpeed(0.5, 4.0), Unlock())
     fly(daemon, arm)
     assert arm.calls == []
-    replies = [message for _, message in daemon.hear() if isinstance(message, Reply)]
+    replies = [message for _, message in daemon.hear() if isinstance(message, CommandReply)]
     assert [reply.accepted for reply in replies] == [True, False, False, False]
 
 
@@ -53,7 +53,7 @@ class Uploading(CyclingArm):
             self._left = self._reads
         return True
 
-    def read(self) -> Reading:
+    def read(self) -> RtdeSample:
         if self._left is not None:
             self._left -= 1
             if self._left == 0:
@@ -118,8 +118,8 @@ def test_program_of_somebody_else_is_not_stopped_by_a_process_that_leaves(daemon
 
 CRASHING = """
 import threading
-from drivers.ur import child
-from drivers.ur.messages import Configure
+from shearloop.drivers.ur import child
+from shearloop.drivers.ur.messages import Configure
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 class Arm(FakeArm):

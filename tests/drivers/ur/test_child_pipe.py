@@ -2,9 +2,9 @@
 
 import pytest
 
-from drivers.ur import child
-from drivers.ur.messages import Reply, Stop, WristSpeed
-from drivers.ur.pace import Pace
+from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur.messages import CommandReply, Stop, WristSpeed
+from shearloop.drivers.ur.pace import Pace
 from tests.drivers.ur.flight import SETTINGS, Flight, flying
 from tests.drivers.ur.process import Daemon
 
@@ -27,28 +27,28 @@ def test_refused_wrist_speed_is_answered_at_once_one_that_is_taken_with_the_next
         daemon.hear()
     daemon.say(WristSpeed(0.1, -4.0))
     child._obey(daemon.pipe, flight.pilot, pace, flight.state)
-    assert [message.accepted for _, message in daemon.hear() if isinstance(message, Reply)] == [True, False]
+    assert [message.accepted for _, message in daemon.hear() if isinstance(message, CommandReply)] == [True, False]
 
 
 def test_reply_to_a_wrist_speed_comes_with_the_next_state_in_one_piece(daemon: Daemon) -> None:
     pipe, state = daemon.pipe, Flight().state
-    pipe.hold(Reply(sent=WristSpeed(0.1, 4.0)), 1)
+    pipe.hold(CommandReply(sent=WristSpeed(0.1, 4.0)), 1)
     with pytest.raises(BlockingIOError):
         daemon.hear()
     pipe.send_latest(state)
-    assert daemon.hear() == [(1, Reply(sent=WristSpeed(0.1, 4.0))), (0, state)]
+    assert daemon.hear() == [(1, CommandReply(sent=WristSpeed(0.1, 4.0))), (0, state)]
 
 
 def test_what_was_held_back_comes_before_what_is_sent_at_once(daemon: Daemon) -> None:
-    daemon.pipe.hold(Reply(sent=WristSpeed(0.1, 4.0)), 1)
-    daemon.pipe.send(Reply(sent=Stop(4.0)), 2)
+    daemon.pipe.hold(CommandReply(sent=WristSpeed(0.1, 4.0)), 1)
+    daemon.pipe.send(CommandReply(sent=Stop(4.0)), 2)
     assert [number for number, _ in daemon.hear()] == [1, 2]
 
 
 def test_what_is_held_back_from_a_daemon_that_reads_nothing_has_a_bound(daemon: Daemon) -> None:
     pipe, state = daemon.pipe, Flight().state
     for _ in range(10_000):
-        pipe.hold(Reply(), 1)
+        pipe.hold(CommandReply(), 1)
         pipe.send_latest(state)
         if not pipe.open:
             return

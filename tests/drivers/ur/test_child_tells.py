@@ -4,20 +4,20 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.ur import child
-from drivers.ur.messages import (
+from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur.command_handler import CommandHandler
+from shearloop.drivers.ur.messages import (
+    CommandReply,
     Disconnect,
     Ease,
     Enable,
     Heartbeat,
-    Reading,
-    Reply,
     RobotState,
+    RtdeSample,
     Stop,
     Unlock,
     WristSpeed,
 )
-from drivers.ur.pilot import Pilot
 from tests.drivers.ur.process import Daemon, Eased, TimedArm
 
 
@@ -100,7 +100,7 @@ def test_a_stop_that_the_readings_tell_later_than_the_commands_is_told_as_what_i
             self.takes = child.time.monotonic() < 1000.0 + stopped_s
             return super().wrist(command)
 
-        def read(self) -> Reading:
+        def read(self) -> RtdeSample:
             if child.time.monotonic() > 1000.003 + stopped_s and self.reading.safety_mode == 1:
                 self.protective_stop()
             return super().read()
@@ -142,7 +142,7 @@ def test_what_happens_is_told_in_the_cycle_that_sees_it(
     """Of a wrist so slow that not each is told."""
 
     class Stopping(TimedArm):
-        def read(self) -> Reading:
+        def read(self) -> RtdeSample:
             if child.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
                 self.protective_stop()
             return super().read()
@@ -159,7 +159,7 @@ def test_what_happened_while_the_daemon_did_not_read_is_told_as_soon_as_it_does(
     send, lost = daemon.pipe.send_latest, list[int]()
 
     class Reduced(TimedArm):
-        def read(self) -> Reading:
+        def read(self) -> RtdeSample:
             super().read()
             if self.reading.t_mono_ns > 1000.24e9 - 1e3:
                 self.be(safety_mode=2)
@@ -184,14 +184,14 @@ def test_robot_that_is_made_ready_no_more_is_told_at_once_however_soon(
     """Announced as being made ready, and given up in the same cycle: all is as before the announcement."""
     arm = TimedArm()
     arm.be(robot_mode=3)
-    given_up = Pilot.tick
+    given_up = CommandHandler.tick
 
-    def tick(pilot: Pilot, reading: Reading, now_ns: int) -> tuple[int, Reply] | None:
+    def tick(pilot: CommandHandler, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
         if now_ns > 1000.1e9 and pilot._recovery is not None:
             pilot._recovery.give_up("Nobody waits for it.")
         return given_up(pilot, reading, now_ns)
 
-    monkeypatch.setattr("drivers.ur.pilot.Pilot.tick", tick)
+    monkeypatch.setattr("shearloop.drivers.ur.command_handler.Pilot.tick", tick)
     eased = Eased(daemon, monkeypatch, (0.201, Unlock()), (0.4, Disconnect()), arm=arm)
     ready = [state for state in eased.states if 1000.195 < state.t_mono_ns / 1e9 < 1000.3]
     announced = next(number for number, state in enumerate(ready) if state.recovering)

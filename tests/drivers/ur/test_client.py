@@ -9,15 +9,8 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.ur.client import UrRobot
-from drivers.ur.messages import (
-    Enable,
-    MoveLinear,
-    Stop,
-    Unlock,
-    WristSpeed,
-    ZeroForceTorque,
-)
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed, ZeroForceTorque
 from tests.drivers.ur.robots import ROOT, Link, enable, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
@@ -319,8 +312,8 @@ async def test_leaving_stops_the_arm_and_ends_the_program(
 
 DAEMON = """
 import asyncio, sys
-from drivers.ur.client import UrRobot
-from drivers.ur.messages import Enable, WristSpeed
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import Enable, WristSpeed
 from tests.drivers.ur.robots import settings_for, until
 
 async def main():

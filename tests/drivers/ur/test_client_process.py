@@ -12,11 +12,11 @@ from unittest.mock import Mock
 
 import pytest
 
-from drivers.errors import DriverError
-from drivers.ur.client import UrRobot
-from drivers.ur.conversation import LAST_WORDS_BYTES, Conversation, LostError, output
-from drivers.ur.messages import Failed, Reply, Stop
-from drivers.ur.wire import encode
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.messages import CommandReply, Failed, Stop
+from shearloop.drivers.ur.wire import encode
+from shearloop.drivers.ur.worker_connection import LAST_WORDS_BYTES, LostError, WorkerConnection, output
 from tests.drivers.ur.flight import SETTINGS, Flight, flying
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
@@ -73,8 +73,8 @@ async def test_long_line_of_a_process_is_heard_and_told_in_short(play: Callable[
 
 BRIEFLY = """
 import os, sys
-from drivers.ur.messages import Configure
-from drivers.ur.wire import Decoder, encode
+from shearloop.drivers.ur.messages import Configure
+from shearloop.drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.flight import Flight
 
 decoder = Decoder()
@@ -90,9 +90,9 @@ os.write(1, encode(flight.state))
 
 LEAVES_IN_GOOD_ORDER = """
 import os, sys
-from drivers.ur.messages import Disconnect
-from drivers.ur.pilot import Pilot
-from drivers.ur.wire import Decoder, encode
+from shearloop.drivers.ur.messages import Disconnect
+from shearloop.drivers.ur.command_handler import Pilot
+from shearloop.drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 os.write(1, encode(Pilot(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
@@ -112,9 +112,9 @@ async def test_process_is_ended_in_good_order_though_who_waits_for_a_reply_dies_
     play(f"cd '{ROOT}' && exec '{sys.executable}' -c '{LEAVES_IN_GOOD_ORDER}' '{told}'")
     unheard: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: unheard.append(context))
-    replies: list[Reply] = []
+    replies: list[CommandReply] = []
 
-    def dies(_reply: Reply) -> None:
+    def dies(_reply: CommandReply) -> None:
         raise ZeroDivisionError("nothing to divide")
 
     async with asyncio.timeout(60):
@@ -200,8 +200,8 @@ async def test_of_states_that_are_read_at_once_all_but_the_last_are_overtaken() 
     flight.fly(1)
     with output() as (stdout, its_stdout):
         process = Mock(spec=asyncio.subprocess.Process, stdin=Mock(), stderr=Mock())
-        conversation = Conversation(robot, process, stdout)
-        os.write(its_stdout.number, 3 * encode(flight.state) + encode(Reply(), 1))
+        conversation = WorkerConnection(robot, process, stdout)
+        os.write(its_stdout.number, 3 * encode(flight.state) + encode(CommandReply(), 1))
         conversation._hear()
         os.write(its_stdout.number, encode(flight.state))
         conversation._hear()
@@ -213,7 +213,7 @@ async def test_loss_that_is_told_when_nobody_listens_any_more_is_no_complaint_of
     asyncio.get_running_loop().set_exception_handler(lambda _loop, said: complaints.append(said))
     with output() as (stdout, its_stdout):
         process = Mock(spec=asyncio.subprocess.Process, stdin=Mock(), stderr=Mock())
-        conversation = Conversation(UrRobot(SETTINGS), process, stdout)
+        conversation = WorkerConnection(UrRobot(SETTINGS), process, stdout)
         os.write(its_stdout.number, encode(Failed("lost", "The connection is lost.")))
         conversation._hear()
         del conversation
@@ -226,15 +226,15 @@ async def test_process_that_ends_by_itself_as_the_daemon_stops_is_waited_for(
 ) -> None:
     play("exit 1")
     begun, may_end = asyncio.Event(), asyncio.Event()
-    real, ended = Conversation.end, []
+    real, ended = WorkerConnection.end, []
 
-    async def end(conversation: Conversation) -> None:
+    async def end(conversation: WorkerConnection) -> None:
         begun.set()
         await may_end.wait()
         await real(conversation)
         ended.append(conversation)
 
-    monkeypatch.setattr(Conversation, "end", end)
+    monkeypatch.setattr(WorkerConnection, "end", end)
     run = asyncio.create_task(UrRobot(settings_for("127.0.0.254")).run())
     await begun.wait()
     run.cancel()
@@ -249,24 +249,24 @@ async def test_a_process_that_is_lost_while_the_daemon_ends_is_not_started_again
 ) -> None:
     """Task groups tell of the loss alone, and the daemon waited for ever for a robot that it had told to end."""
     play("exec cat")
-    listened: list[Conversation] = []
+    listened: list[WorkerConnection] = []
     kept_alive = asyncio.Event()
 
-    async def listen(conversation: Conversation) -> None:
+    async def listen(conversation: WorkerConnection) -> None:
         assert not listened, "it was started again"
         listened.append(conversation)
         await kept_alive.wait()
         raise LostError("crashed", "The robot's process died.")
 
-    async def keep_alive(_: Conversation) -> None:
+    async def keep_alive(_: WorkerConnection) -> None:
         kept_alive.set()
         try:
             await asyncio.Event().wait()
         finally:
             run.cancel()
 
-    monkeypatch.setattr(Conversation, "listen", listen)
-    monkeypatch.setattr(Conversation, "keep_alive", keep_alive)
+    monkeypatch.setattr(WorkerConnection, "listen", listen)
+    monkeypatch.setattr(WorkerConnection, "keep_alive", keep_alive)
     run = asyncio.create_task(UrRobot(settings_for("127.0.0.254")).run())
     with pytest.raises(asyncio.CancelledError):
         await run

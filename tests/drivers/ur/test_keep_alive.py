@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from drivers.ur import conversation
-from drivers.ur.conversation import HEARTBEAT, Conversation
+from shearloop.drivers.ur import worker_connection as conversation
+from shearloop.drivers.ur.worker_connection import HEARTBEAT, WorkerConnection
 from tests.drivers.ur.flight import SETTINGS
 
 LONGEST_S = SETTINGS.silence_timeout_s / 4
@@ -47,7 +47,7 @@ async def signs_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends
     """Return when signs of life were given."""
     played: Any = Played(commands_until_s, ends_s)
     monkeypatch.setattr(conversation, "time", SimpleNamespace(monotonic=lambda: played.now_s))
-    talk = Conversation(played, SimpleNamespace(stdin=played, stderr=object()), 0)  # type: ignore[arg-type]
+    talk = WorkerConnection(played, SimpleNamespace(stdin=played, stderr=object()), 0)  # type: ignore[arg-type]
     with monkeypatch.context() as patched:
         patched.setattr(asyncio, "sleep", played.sleep)
         with pytest.raises(asyncio.CancelledError):

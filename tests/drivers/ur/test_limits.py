@@ -8,13 +8,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from drivers.ur.limits import beyond, clip_linear, clip_stop, clip_wrist, line_violation, violation, within
-from drivers.ur.messages import MoveLinear, Reading, Stop, WristSpeed
-from drivers.ur.motion import tool_axis_torque
-from drivers.ur.settings import Bound, JointRange, Limits, Workspace
+from shearloop.drivers.ur.limits import beyond, clip_linear, clip_stop, clip_wrist, line_violation, violation, within
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
+from shearloop.drivers.ur.motion import tool_axis_torque
+from shearloop.drivers.ur.settings import Bound, JointRange, UrLimits, Workspace
 
 CYCLE_S, REACTION_S = 0.008, 0.04
-LIMITS = Limits(
+LIMITS = UrLimits(
     joints=JointRange((-6.0, -6.0, -3.0, -6.0, -6.0, -2.0), (6.0, 6.0, 3.0, 6.0, 6.0, 2.0), 0.1),
     workspace=Workspace((-0.8, -0.8, 0.0), (0.8, 0.8, 0.9), 0.02),
     wrist_speed_rad_per_s=Bound(0.8, 1.0),
@@ -24,7 +24,7 @@ LIMITS = Limits(
     force_n=Bound(40.0, 60.0),
     torque_nm=Bound(4.0, 6.0),
 )
-AT_REST = Reading(
+AT_REST = RtdeSample(
     t_mono_ns=0,
     timestamp_s=0.0,
     age_ns=0,
@@ -41,7 +41,7 @@ AT_REST = Reading(
 )
 
 
-def reading(wrist_rad: float = 0.0, speed: float = 0.0, force_n: float = 0.0, torque_nm: float = 0.0) -> Reading:
+def reading(wrist_rad: float = 0.0, speed: float = 0.0, force_n: float = 0.0, torque_nm: float = 0.0) -> RtdeSample:
     return dataclasses.replace(
         AT_REST,
         q_rad=(*AT_REST.q_rad[:5], wrist_rad),
@@ -57,7 +57,7 @@ readings = st.builds(reading, st.floats(-2.5, 2.5), st.floats(-1.5, 1.5), st.flo
 
 
 @given(commands, readings)
-def test_wrist_command_is_within_the_limits_and_tells_what_was_clipped(asked: WristSpeed, now: Reading) -> None:
+def test_wrist_command_is_within_the_limits_and_tells_what_was_clipped(asked: WristSpeed, now: RtdeSample) -> None:
     sent, reasons = clip_wrist(asked, now, LIMITS, REACTION_S)
     assert abs(sent.rad_per_s) <= min(LIMITS.wrist_speed_rad_per_s.inner, abs(asked.rad_per_s))
     assert sent.rad_per_s * asked.rad_per_s >= 0

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
-from drivers.ur.messages import (
+from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.ur.messages import (
+    CommandReply,
     Configure,
     Disconnect,
     Ease,
@@ -20,16 +21,15 @@ from drivers.ur.messages import (
     Heartbeat,
     Message,
     MoveLinear,
-    Phase,
-    Reply,
+    RobotPhase,
     RobotState,
     Stop,
     Unlock,
     WristSpeed,
     ZeroForceTorque,
 )
-from drivers.ur.settings import UrSettings
-from drivers.ur.wire import Decoder, encode
+from shearloop.drivers.ur.settings import UrSettings
+from shearloop.drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.test_limits import LIMITS
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -53,7 +53,7 @@ states = st.builds(
 messages = st.one_of(
     wrist, line, stop, st.just(Enable()), st.just(Unlock()), st.just(ZeroForceTorque()), st.just(Disconnect()),
     st.just(Heartbeat()), st.builds(Ease, st.integers(1, 100)),
-    st.builds(Reply, st.text(), sent, reasons), st.builds(Phase, st.text()),
+    st.builds(CommandReply, st.text(), sent, reasons), st.builds(RobotPhase, st.text()),
     st.builds(Failed, st.sampled_from(["lost", "silent"]), st.text()), states,
     st.just(Configure(UrSettings(host="10.0.0.1", limits=LIMITS))),
 )  # fmt: skip
@@ -120,7 +120,7 @@ def test_wrist_speed_with_anything_missing_wrong_or_more_is_refused(body: bytes)
     ],
 )
 def test_reply_with_anything_missing_wrong_or_more_is_refused(change: Callable[[bytes], bytes], wrong: str) -> None:
-    reply = Reply("", WristSpeed(0.5, 4.0), ("force",))
+    reply = CommandReply("", WristSpeed(0.5, 4.0), ("force",))
     with pytest.raises(ProtocolError, match=f"Reply: .*{wrong}"):
         Decoder().feed(_with_body(reply, change(encode(reply)[9:])))
 

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.ur.messages import RobotState
-from drivers.ur.news import ANGLE_NEWS_RAD, News
+from shearloop.drivers.ur.messages import RobotState
+from shearloop.drivers.ur.news import ANGLE_NEWS_RAD, News
 from tests.drivers.ur.flight import Flight
 
 STATE = Flight().state

@@ -4,8 +4,8 @@ import dataclasses
 
 import pytest
 
-from drivers.ur.messages import Ease, Enable, Heartbeat, Message, Stop
-from drivers.ur.pace import Pace
+from shearloop.drivers.ur.messages import Ease, Enable, Heartbeat, Message, Stop
+from shearloop.drivers.ur.pace import Pace
 from tests.drivers.ur.flight import SETTINGS
 
 PERIOD_S = 1.0 / SETTINGS.rate_hz

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from drivers.emulators.ur.server import SCRIPT_PORT
-from drivers.ur.client import UrRobot
+from shearloop.drivers.emulators.ur.server import SCRIPT_PORT
+from shearloop.drivers.ur.client import UrRobot
 from tests.drivers.ur.robots import Link, enable, running, settings_for, until
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 

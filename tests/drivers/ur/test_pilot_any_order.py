@@ -4,7 +4,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from drivers.ur.messages import Enable, Stop, Unlock, WristSpeed
+from shearloop.drivers.ur.messages import Enable, Stop, Unlock, WristSpeed
 from tests.drivers.ur.flight import Flight
 from tests.drivers.ur.test_limits import LIMITS
 

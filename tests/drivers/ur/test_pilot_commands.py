@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from drivers.ur.messages import Command, Enable, MoveLinear, Reading, Stop, WristSpeed, ZeroForceTorque
+from shearloop.drivers.ur.messages import Command, Enable, MoveLinear, RtdeSample, Stop, WristSpeed, ZeroForceTorque
 from tests.drivers.ur.flight import POSE, Flight, flying, turning
 
 
@@ -63,5 +63,5 @@ def test_no_zero_hides_a_force_beyond_its_limit() -> None:
 
 def test_reading_is_part_of_the_state() -> None:
     flight = flying()
-    for field in dataclasses.fields(Reading):
+    for field in dataclasses.fields(RtdeSample):
         assert getattr(flight.state, field.name) == getattr(flight.arm.reading, field.name)

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.ur.messages import Disconnect, MoveLinear, Reply, Stop, WristSpeed
+from shearloop.drivers.ur.messages import CommandReply, Disconnect, MoveLinear, Stop, WristSpeed
 from tests.drivers.ur.flight import POSE, SETTINGS, WATCHDOG_NS, Flight, flying, turning
 from tests.drivers.ur.test_limits import LIMITS
 
@@ -62,7 +62,7 @@ def test_speed_that_is_given_anew_between_cycles_is_told_the_robot_as_often(late
         flight.fly(1)
         if cycle % 2:
             now_ns += late_ns
-            assert flight.pilot.request(cycle, given, flight.arm.reading, now_ns) == Reply(sent=given)
+            assert flight.pilot.request(cycle, given, flight.arm.reading, now_ns) == CommandReply(sent=given)
     assert max(later - earlier for earlier, later in pairwise(told_ns)) <= WATCHDOG_NS / 4
 
 

@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import pytest
 
-from drivers.ur.messages import Disconnect, Enable, Unlock
-from drivers.ur.paused import AGAIN_S
+from shearloop.drivers.ur.messages import Disconnect, Enable, Unlock
+from shearloop.drivers.ur.paused import AGAIN_S
 from tests.drivers.ur.flight import CYCLE_NS, Flight, flying, turning
 
 ASKED = "stop_program"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from drivers.ur.messages import Disconnect, Enable, MoveLinear, Stop, Unlock, WristSpeed
+from shearloop.drivers.ur.messages import Disconnect, Enable, MoveLinear, Stop, Unlock, WristSpeed
 from tests.drivers.ur.flight import POSE, SETTINGS, Flight, flying, turning
 
 

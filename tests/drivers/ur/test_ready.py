@@ -4,9 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from drivers.ur import ready as ready_module
-from drivers.ur.ready import Ready
-from drivers.ur.receiver import Received
+from shearloop.drivers.ur import ready as ready_module
+from shearloop.drivers.ur.ready import Ready
+from shearloop.drivers.ur.receiver import Received
 
 SIX = (0.0,) * 6
 READY, DONE = 1, 2

@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.errors import ProtocolError
-from drivers.ur import receiver as receiver_module
-from drivers.ur.probe import ProbeError
-from drivers.ur.receiver import Received, Receiver, SampleParser
+from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.ur import receiver as receiver_module
+from shearloop.drivers.ur.probe import ProbeError
+from shearloop.drivers.ur.receiver import Received, Receiver, SampleParser
 
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32"
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from drivers.ur.sample_age import RISES, SampleAge
+from shearloop.drivers.ur.sample_age import RISES, SampleAge
 
 PERIOD_NS = 8_000_000
 STARTED_NS = 7 * 10**12

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from drivers.ur.script import in_a_file, watched
+from shearloop.drivers.ur.script import in_a_file, watched
 from tests.drivers.ur.robots import ROOT
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
 # Uploads the script, and is gone before the watchdog is armed by a command.
 DIES_TOO_SOON = """
 import os, sys
-from drivers.ur.arm import Arm
+from shearloop.drivers.ur.arm import Arm
 from tests.drivers.ur.robots import settings_for
 arm = Arm(settings_for(sys.argv[1]), "5.17.3.0")
 while not arm.clear_command():

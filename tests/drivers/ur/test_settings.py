@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from drivers.errors import DriverError
-from drivers.ur.settings import read_settings
+from shearloop.drivers.errors import DriverError
+from shearloop.drivers.ur.settings import read_settings
 
 DELIVERED = Path(__file__).parents[3] / "config" / "ur.yaml"
 

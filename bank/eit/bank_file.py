@@ -1,0 +1,323 @@
+"""The bank file: the signals of a basis model over a grid of k and σ, mapped read-only and shared by processes.
+
+Layout, all numbers little-endian:
+
+    0     8 bytes   magic
+    8     u64       format version
+    16    32 bytes  sha256 of the header
+    48    header    JSON, padded with blanks to the end of the first page: the definition, and a table of the arrays
+                    (type, shape, offset in the file, sha256)
+    4096  arrays    the small ones at multiples of 64, and last the signals at a multiple of the page size:
+                    float32 (k × σ × 896), C order
+
+The header and the small arrays are checked each time a bank is opened, the signals when asked for.
+"""
+
+import errno
+import hashlib
+import json
+import math
+import os
+import struct
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS, STIMULATION_CURRENT
+from shearloop.bank.eit.models import MODELS, PLAIN, Variation, model_named
+from shearloop.bank.eit.stored import replaced
+from shearloop.bank.errors import BankFileError, ModelError
+
+FORMAT_VERSION = 1
+# A signal with a smaller norm than this (in the units of the homogeneous voltages, whose norm is about 20) has no
+# shape to compare with: its normalised correlation is 0/0.
+MIN_SIGNAL_NORM = 1e-3
+
+BANK_MAGIC = b"\x8eSHLBANK"
+_PREAMBLE = struct.Struct("<8sQ32s")
+_ALIGNMENT = 64
+_PAGE = 4096
+_TYPES = {
+    "k_grid": "<f8",
+    "sigma_grid": "<f8",
+    "homogeneous": "<f8",
+    "min_conductivity": "<f8",
+    "valid": "|b1",
+    "signals": "<f4",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BankDefinition:
+    """What a bank is of: the geometry's digest, the basis model, and the grids of k (K,) and σ (S,) in its units.
+
+    `variation` is what all of its cells have in common beside k and σ; without one it has no part in the identity.
+    Raises ModelError for an unknown model, and for a grid that is empty, does not ascend or holds a σ ≤ 0.
+    """
+
+    geometry_hash: str
+    model: str
+    k_grid: NDArray[np.float64]
+    sigma_grid: NDArray[np.float64]
+    variation: Variation = PLAIN
+
+    def __post_init__(self) -> None:
+        """Take read-only copies of the grids and check all."""
+        model = model_named(self.model)
+        for name in ("k_grid", "sigma_grid"):
+            grid = np.array(getattr(self, name), dtype=np.float64)
+            if grid.ndim != 1 or grid.size == 0 or not np.isfinite(grid).all() or (np.diff(grid) <= 0).any():
+                raise ModelError(f"the {name.replace('_', ' ')} must be finite numbers that ascend")
+            grid.setflags(write=False)
+            object.__setattr__(self, name, grid)
+        if self.sigma_grid[0] <= 0 and model.sigma_unit != "not used":
+            raise ModelError(f"sigma must be above 0 for the model {self.model}, not {self.sigma_grid[0]:g}")
+
+    @property
+    def identity(self) -> str:
+        """The hash of everything that defines a bank, the same on all machines."""
+        defining = {
+            "format": FORMAT_VERSION,
+            "channel_table": CHANNEL_TABLE_HASH,
+            "stimulation_current": STIMULATION_CURRENT,
+            "geometry": self.geometry_hash,
+            "model": self.model,
+            # Twelve digits: the last of a grid's sixteen may differ between machines.
+            "k": [f"{k:.11e}" for k in self.k_grid.tolist()],
+            "sigma": [f"{sigma:.11e}" for sigma in self.sigma_grid.tolist()],
+        } | _told(self.variation)
+        return hashlib.sha256(json.dumps(defining, sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bank:
+    """A bank of difference signals v(k, σ) − v_homogeneous; its arrays are read-only.
+
+    signals (K, S, 896) float32, zeros in cells that are not valid; homogeneous (896,); k_grid (K,) and sigma_grid (S,)
+    in k_unit and sigma_unit; min_conductivity (K, S), the smallest of each cell's conductivities; valid (K, S), where
+    that is positive and the signal's norm at least MIN_SIGNAL_NORM.
+    """
+
+    path: Path
+    definition: BankDefinition
+    identity: str
+    homogeneous: NDArray[np.float64]
+    min_conductivity: NDArray[np.float64]
+    valid: NDArray[np.bool_]
+    signals: NDArray[np.float32]
+    signals_sha256: str
+
+    @property
+    def model(self) -> str:
+        """The basis model's name."""
+        return self.definition.model
+
+    @property
+    def geometry_hash(self) -> str:
+        """The digest of the mesh that the bank was solved on."""
+        return self.definition.geometry_hash
+
+    @property
+    def k_grid(self) -> NDArray[np.float64]:
+        """The (K,) values of k, ascending."""
+        return self.definition.k_grid
+
+    @property
+    def sigma_grid(self) -> NDArray[np.float64]:
+        """The (S,) values of σ, ascending."""
+        return self.definition.sigma_grid
+
+    @property
+    def k_unit(self) -> str:
+        """The unit of k."""
+        return MODELS[self.model].k_unit
+
+    @property
+    def sigma_unit(self) -> str:
+        """The unit of σ."""
+        return MODELS[self.model].sigma_unit
+
+    @classmethod
+    def open(cls, path: str | Path, verify: bool = False) -> "Bank":
+        """Map a bank file read-only; `verify` also reads all signals and compares their checksum.
+
+        Raises BankFileError for a file that is missing, not a bank, truncated, damaged, or made under another format
+        or channel table.
+        """
+        path = Path(path)
+        # One descriptor for all of it: a bank that is renamed over this one meanwhile does not mix with it.
+        try:
+            with path.open("rb") as file:
+                header = _read_header(path, file)
+                try:
+                    arrays = {name: _read_array(path, file, name, header["arrays"][name]) for name in _TYPES}
+                    checksums = {name: str(header["arrays"][name]["sha256"]) for name in _TYPES}
+                    identity = str(header["identity"])
+                    definition = BankDefinition(
+                        header["geometry"],
+                        header["model"],
+                        arrays["k_grid"],
+                        arrays["sigma_grid"],
+                        Variation(**header.get("variation", {})),
+                    )
+                except (KeyError, TypeError, ValueError, ModelError) as error:
+                    raise _unusable(path, f"its header does not describe a bank ({error!r})") from error
+        except OSError as error:
+            raise BankFileError(f"{path}: the bank cannot be read: {error.strerror}; {_cure(path)}") from error
+        for name, array in arrays.items():
+            if (verify or name != "signals") and _sha256(array) != checksums[name]:
+                raise _unusable(path, f"the file is damaged: the checksum of {name} is not {checksums[name][:12]}…")
+        if definition.identity != identity:
+            raise _unusable(path, f"its grids, model and geometry do not give its identity {identity[:12]}…")
+        _check_shapes(path, arrays)
+        return cls(
+            path=path,
+            definition=definition,
+            identity=identity,
+            homogeneous=arrays["homogeneous"],
+            min_conductivity=arrays["min_conductivity"],
+            valid=arrays["valid"],
+            signals=arrays["signals"],
+            signals_sha256=checksums["signals"],
+        )
+
+
+def write_bank(
+    path: Path,
+    definition: BankDefinition,
+    homogeneous: NDArray[np.float64],
+    min_conductivity: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+    signals: NDArray[np.float32],
+) -> None:
+    """Write a bank file over what was there.
+
+    Raises BankFileError where it cannot be written; a file that was there before is then untouched.
+    """
+    arrays: dict[str, NDArray[Any]] = {
+        "k_grid": definition.k_grid,
+        "sigma_grid": definition.sigma_grid,
+        "homogeneous": homogeneous,
+        "min_conductivity": min_conductivity,
+        "valid": valid,
+        "signals": signals,
+    }
+    stored = {name: np.ascontiguousarray(arrays[name], dtype=kind) for name, kind in _TYPES.items()}
+    header, offsets = _layout(definition, stored)
+    preamble = _PREAMBLE.pack(BANK_MAGIC, FORMAT_VERSION, hashlib.sha256(header).digest())
+    try:
+        with replaced(path) as file:
+            file.write(preamble + header)
+            for key, array in stored.items():
+                file.write(b"\0" * (offsets[key] - file.tell()))
+                file.write(array.data)
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+def unwritable(path: Path, error: OSError) -> BankFileError:
+    """Return what to say of a bank, or its journal, that the disk refuses: where it is full, the solved rows stay."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return BankFileError(
+            f"{path}: the bank cannot be written: {error.strerror}, and the rows solved so far are kept; make room and "
+            "give the same command again"
+        )
+    return BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out")
+
+
+def _told(variation: Variation) -> dict[str, Any]:
+    return {} if variation == PLAIN else {"variation": asdict(variation)}
+
+
+def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, int]]:
+    offsets, end = {}, _PAGE
+    for name, array in stored.items():
+        offsets[name] = _up(end, _PAGE if name == "signals" else _ALIGNMENT)
+        end = offsets[name] + array.nbytes
+    header = {
+        "identity": definition.identity,
+        "channel_table": CHANNEL_TABLE_HASH,
+        "geometry": definition.geometry_hash,
+        "model": definition.model,
+        "k_unit": MODELS[definition.model].k_unit,
+        "sigma_unit": MODELS[definition.model].sigma_unit,
+        "arrays": {
+            name: {"type": _TYPES[name], "shape": array.shape, "offset": offsets[name], "sha256": _sha256(array)}
+            for name, array in stored.items()
+        },
+    } | _told(definition.variation)
+    # About 1.4 kB whatever the bank: the grids are arrays, and nothing in it is of the user's length.
+    return json.dumps(header).encode().ljust(_PAGE - _PREAMBLE.size), offsets
+
+
+def _read_header(path: Path, file: BinaryIO) -> dict[str, Any]:
+    page = file.read(_PAGE)
+    if not page.startswith(BANK_MAGIC):
+        # Whatever it is, it is not to be written over.
+        raise BankFileError(
+            f"{path}: this is not a bank: expected a file that starts with shearloop's mark of one; name a bank, or "
+            "make one with `shearloop bank build --config FILE --out NAME.bank`"
+        )
+    if len(page) < _PAGE:
+        raise _unusable(path, f"the file is truncated: expected a header of {_PAGE} bytes, found {len(page)}")
+    _, version, checksum = _PREAMBLE.unpack_from(page)
+    if version != FORMAT_VERSION:
+        raise _unusable(path, f"the bank has format version {version}, expected {FORMAT_VERSION}")
+    text = page[_PREAMBLE.size :]
+    if hashlib.sha256(text).digest() != checksum:
+        raise _unusable(path, "the file is damaged: its header does not have the checksum expected")
+    header = json.loads(text)
+    if not isinstance(header, dict):
+        raise _unusable(path, "its header does not describe a bank")
+    if header.get("channel_table") != CHANNEL_TABLE_HASH:
+        raise _unusable(
+            path,
+            f"the bank was made under the channel table {str(header.get('channel_table'))[:12]}…, "
+            f"expected {CHANNEL_TABLE_HASH[:12]}…",
+        )
+    return header
+
+
+def _read_array(path: Path, file: BinaryIO, name: str, entry: dict[str, Any]) -> NDArray[Any]:
+    """Return one array of the file: the signals mapped, the small ones read."""
+    kind, shape, offset = np.dtype(_TYPES[name]), tuple(entry["shape"]), entry["offset"]
+    expected, size = offset + kind.itemsize * math.prod(shape), os.fstat(file.fileno()).st_size
+    if size < expected or (name == "signals" and size != expected):
+        raise _unusable(path, f"the file is truncated or has grown: expected {expected} bytes, found {size}")
+    if name == "signals":
+        return np.memmap(file, dtype=kind, mode="r", offset=offset, shape=shape)
+    file.seek(offset)
+    array: NDArray[Any] = np.frombuffer(file.read(expected - offset), dtype=kind).reshape(shape)
+    return array
+
+
+def _check_shapes(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
+    cells = (len(arrays["k_grid"]), len(arrays["sigma_grid"]))
+    expected = {
+        "homogeneous": (N_CHANNELS,),
+        "min_conductivity": cells,
+        "valid": cells,
+        "signals": (*cells, N_CHANNELS),
+    }
+    for name, shape in expected.items():
+        if arrays[name].shape != shape:
+            raise _unusable(path, f"{name} has shape {arrays[name].shape}, expected {shape}")
+
+
+def _sha256(array: NDArray[Any]) -> str:
+    return hashlib.sha256(array.data).hexdigest()
+
+
+def _up(position: int, multiple: int) -> int:
+    return -(-position // multiple) * multiple
+
+
+def _cure(path: Path) -> str:
+    return f"make it anew with `shearloop bank build --config FILE --out {path}`"
+
+
+def _unusable(path: Path, why: str) -> BankFileError:
+    return BankFileError(f"{path}: {why}; {_cure(path)}")

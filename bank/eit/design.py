@@ -1,0 +1,341 @@
+"""How much model a scene needs: the coarsest of everything whose added error stays below a third of the noise.
+
+All errors are relative L2 errors of a difference frame, in units of the measured noise of one frame: a step adds
+little while it is below a third, since errors add as squares (√(1 + 1/9) = 1.05). Torque is read from how frames change
+with it, so for channels and injections it is the torque's standard deviation by generalised least squares that may
+grow by that much.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.eit.batch_forward import BatchForwardModel
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from shearloop.bank.eit.fingertip import Fingertip
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.model_scores import Setting, searched_settings
+from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.bank.errors import CalibrationError
+
+Floats = NDArray[np.float64]
+
+# The share of the noise that each choice may add.
+ALLOWED = 1.0 / 3.0
+CHANNEL_S = 0.6e-3
+# Above 0.5 cm the electrodes decide: nothing becomes coarser.
+MESH_SIZES_CM = (0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.05)
+COUNTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 150)
+RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+CHANNEL_COUNTS = (8, 16, 32, 64, 112, 168, 224, 280, 336, 392, 448, 504, 560, 616, 672, 728, 784, 840, 896)
+_WITHOUT_SIGMA = tuple(name for name, model in MODELS.items() if model.sigma_unit == "not used")
+# Parameters of each model beside the amplitude: the step has no width.
+PARAMETERS = {name: 1 if name in _WITHOUT_SIGMA else 2 for name in MODELS}
+_FOLDS = 8
+# Linear elements: errors fall in proportion to the mesh size, and two fine meshes tell where they go.
+_FINE_CM = (0.05, 0.035)
+# Places along k and along sigma that a rank is judged by: from fewer of them, few directions seem to carry all (of nine
+# a rank whose error is a third of the noise on other places seemed to add a tenth).
+_RANKED = 17
+_N_DRIFT = 2
+_LEAST_FRAMES = 8
+# What is less than this share of a frame is rounding: a board's converter alone makes thousands of times as much.
+_LEAST_NOISE = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """What was measured: (n, 896) differences in volts, the noise of one frame in volts, torque (n,) or None."""
+
+    differences: Floats
+    noise_v: float
+    torque_nm: Floats | None
+
+    def __post_init__(self) -> None:
+        """Refuse too little, and what no board makes."""
+        if len(self.differences) < _LEAST_FRAMES:
+            raise CalibrationError(
+                f"{len(self.differences)} gripped frames are too few to judge a model by; record {_LEAST_FRAMES}"
+            )
+        # Sizes that overflow as a square, or vanish, are no number here.
+        with np.errstate(all="ignore"):
+            noise = self.noise_v / np.sqrt((self.differences**2).mean())
+        if not _LEAST_NOISE <= noise < np.inf:
+            raise CalibrationError(
+                "the gripped frames have no noise to design for: they are all alike, multiples of a few, or none a "
+                "board sends; record frames as they come"
+            )
+
+    @property
+    def relative_noise(self) -> float:
+        """The noise as a share of the differences, both as RMS."""
+        return self.noise_v / float(np.sqrt((self.differences**2).mean()))
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One setting: the error it adds in units of the noise, and what it costs, in words."""
+
+    setting: float
+    added: float
+    cost: str
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Settings from coarse to fine, and the coarsest that is good enough; the finest where none is."""
+
+    name: str
+    unit: str
+    steps: tuple[Step, ...]
+
+    @property
+    def chosen(self) -> Step:
+        """The coarsest step that adds at most a third of the noise, as all finer ones do: none by luck alone."""
+        good = itertools.takewhile(lambda step: step.added <= ALLOWED, reversed(self.steps))
+        return min(good, key=self.steps.index, default=self.steps[-1])
+
+    @property
+    def next_step(self) -> Step | None:
+        """The step after the chosen one, None where that is the finest."""
+        after = self.steps.index(self.chosen) + 1
+        return self.steps[after] if after < len(self.steps) else None
+
+    @property
+    def enough(self) -> bool:
+        """Whether the chosen step is good enough."""
+        return self.chosen.added <= ALLOWED
+
+
+_ONE_SIGMA = Choice("cells along sigma", "cells", (Step(1, 0.0, "the model does not depend on sigma"),))
+
+
+@dataclass(frozen=True, slots=True)
+class Supported:
+    """A model against the data: error of held-out channels relative to the frame, its standard error, BIC per frame.
+
+    The error is that of predictions for injections that k, σ and amplitude were not fitted to; `penalised` adds to it
+    what its parameters would explain of pure noise.
+    """
+
+    model: str
+    parameters: int
+    error: float
+    standard_error: float
+    penalised: float
+    bic: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Design:
+    """The choices for a scene; k and sigma (low, high), in the model's units, are where the frames lie, with a margin.
+
+    A model that does not depend on sigma has a range of one value, and one cell along it.
+    """
+
+    relative_noise: float
+    models: tuple[Supported, ...]
+    model: str
+    k_range: tuple[float, float]
+    sigma_range: tuple[float, float]
+    mesh: Choice
+    k_count: Choice
+    sigma_count: Choice
+    rank: Choice
+    channels: Choice
+    injections: Choice
+
+
+def designed(scene: Scene, fingertip: Fingertip) -> Design:
+    """Return the choices for a scene on this fingertip. Raises BankError for a geometry that cannot be solved on."""
+    forward = BatchForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh())
+    height_cm = forward.mesh.height_cm
+    signals = {name: _signals(forward, name, searched_settings(name, height_cm)) for name in MODELS}
+    models = tuple(_supported(scene, name, signals[name][1]) for name in MODELS)
+    model = min(models, key=lambda one: one.penalised).model
+    settings, own = signals[model]
+    k_range, sigma_range = _ranges(scene, settings, own)
+    # Of the searched settings, which are positive everywhere, the nearest to the middle of the ranges.
+    middle = min(settings, key=lambda one: abs(one.k - sum(k_range) / 2) + abs(one.sigma - sum(sigma_range) / 2))
+    if one_sigma := model in _WITHOUT_SIGMA:
+        sigma_range = (middle.sigma, middle.sigma)
+    noise = scene.relative_noise
+    return Design(
+        noise, models, model, k_range, sigma_range,
+        _mesh_choice(fingertip, model, middle, noise),
+        _count_choice(forward, model, k_range, lambda k: Setting(k, middle.sigma), noise, "k"),
+        _ONE_SIGMA if one_sigma else _count_choice(
+            forward, model, sigma_range, lambda s: Setting(middle.k, s), noise, "sigma"
+        ),
+        _rank_choice(forward, model, k_range, sigma_range, noise),
+        *_board_choices(scene),
+    )  # fmt: skip
+
+
+def _signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> tuple[list[Setting], Floats]:
+    """Return those settings that are positive everywhere, and their (m, 896) magnitudes."""
+    cells = [conductivity(forward.mesh, model, *setting) for setting in settings]
+    kept = [i for i, cell in enumerate(cells) if cell.min() > 0]
+    voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *(cells[i] for i in kept)]))
+    return [settings[i] for i in kept], np.abs(voltages[1:] - voltages[0])
+
+
+def _fit(frames: Floats, signals: Floats) -> tuple[Floats, Floats]:
+    """Return (n, m) amplitudes of the best multiples of (m, d) signals for (n, d) frames, and the squares left."""
+    energy = (signals**2).sum(axis=1)
+    amplitude = frames @ signals.T / energy
+    return amplitude, (frames**2).sum(axis=1)[:, None] - amplitude**2 * energy
+
+
+def _supported(scene: Scene, model: str, signals: Floats) -> Supported:
+    """Judge a model on injections that its parameters were not fitted to."""
+    frames, injection = np.abs(scene.differences), CHANNELS[:, 0]
+    left = np.zeros(len(frames))
+    for fold in range(_FOLDS):
+        out = injection % _FOLDS == fold
+        amplitude, squares = _fit(frames[:, ~out], signals[:, ~out])
+        best = squares.argmin(axis=1)
+        predicted = amplitude[np.arange(len(frames)), best][:, None] * signals[best][:, out]
+        left += ((frames[:, out] - predicted) ** 2).sum(axis=1)
+    share = left / (frames**2).sum(axis=1)
+    whole = _fit(frames, signals)[1].min(axis=1)
+    p = PARAMETERS[model] + 1
+    bic = N_CHANNELS * np.log(whole / N_CHANNELS) + p * np.log(N_CHANNELS)
+    error = float(np.sqrt(share.mean()))
+    return Supported(
+        model, p, error, float(share.std() / np.sqrt(len(share)) / (2 * error)),
+        float(np.sqrt(share.mean() * (1 + p * np.log(N_CHANNELS) / N_CHANNELS))), float(bic.mean()),
+    )  # fmt: skip
+
+
+def _ranges(
+    scene: Scene, settings: Sequence[Setting], signals: Floats
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return where the frames lie, with the distance to the next searched setting as margin."""
+    best = _fit(np.abs(scene.differences), signals)[1].argmin(axis=1)
+    found = []
+    for values, every in (
+        (np.array([settings[i][axis] for i in best]), np.unique([s[axis] for s in settings])) for axis in (0, 1)
+    ):
+        low, high = np.quantile(values, [0.02, 0.98])
+        below, above = every[every < low], every[every > high]
+        found.append((float(below[-1] if len(below) else 0.8 * low), float(above[0] if len(above) else 1.2 * high)))
+    return found[0], found[1]
+
+
+def _off(one: Floats, other: Floats) -> float:
+    """Return how far two magnitudes are apart in shape, relative L2: the amplitude is free."""
+    amplitude = float(one @ other / (other @ other))
+    return float(np.linalg.norm(one - amplitude * other) / np.linalg.norm(one))
+
+
+def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float) -> Choice:
+    def solved(size: float) -> tuple[Floats, int]:
+        forward = ForwardModel(mesh := replace(fingertip, mesh_size_cm=size).mesh())
+        signal = forward.voltages(conductivity(mesh, model, *place)) - forward.homogeneous()
+        return np.abs(signal), len(mesh.triangles)
+
+    coarse, fine = (solved(size)[0] for size in _FINE_CM)
+    truth = fine + (fine - coarse) / (_FINE_CM[0] / _FINE_CM[1] - 1.0)
+    steps = []
+    for size in MESH_SIZES_CM:
+        signal, triangles = solved(size)
+        steps.append(Step(size, _off(truth, signal) / noise, f"{triangles} triangles"))
+    return Choice("mesh size", "cm", tuple(steps))
+
+
+def _count_choice(
+    forward: BatchForwardModel,
+    model: str,
+    ends: tuple[float, float],
+    at: Callable[[float], Setting],
+    noise: float,
+    name: str,
+) -> Choice:
+    """Choose how many cells lie between the ends: the error is that of a frame half-way between two cells."""
+    steps, unit = [], MODELS[model].k_unit if name == "k" else MODELS[model].sigma_unit
+    for count in COUNTS:
+        spacing = (ends[1] - ends[0]) / (count - 1)
+        # Half a cell to either side of places all over the range; the worst of them counts.
+        places = np.linspace(ends[0] + spacing, ends[1] - spacing, 4)
+        pairs = (_signals(forward, model, [at(v), at(v + spacing / 2)])[1] for v in places.tolist())
+        # Where a conductivity would not be positive there is no cell.
+        found = [_off(*pair) for pair in pairs if len(pair) == 2]
+        if not found:
+            raise CalibrationError(
+                f"the {model} model is positive nowhere along {name} from {ends[0]:.3g} to {ends[1]:.3g}: these frames "
+                "lie at the rim of what it can describe; record a grip that is less strong"
+            )
+        added = max(found)
+        steps.append(Step(count, added / noise, f"{spacing:.3g} {unit} apart"))
+    return Choice(f"cells along {name}", "cells", tuple(steps))
+
+
+def _rank_choice(
+    forward: BatchForwardModel, model: str, k: tuple[float, float], sigma: tuple[float, float], noise: float
+) -> Choice:
+    ks, sigmas = (np.unique(np.linspace(*ends, _RANKED)).tolist() for ends in (k, sigma))
+    grid = [Setting(a, b) for a in ks for b in sigmas]
+    signals = _signals(forward, model, grid)[1]
+    signals /= np.linalg.norm(signals, axis=1, keepdims=True)
+    squares = np.linalg.svd(signals, compute_uv=False) ** 2
+    steps = [
+        Step(rank, float(np.sqrt(squares[rank:].sum() / squares.sum())) / noise, f"{4 * rank} bytes a cell, of 3584")
+        for rank in RANKS
+    ]
+    return Choice("rank of the bank", "numbers a cell", tuple(steps))
+
+
+def _board_choices(scene: Scene) -> tuple[Choice, Choice]:
+    """Choose channels and injections by the torque's standard deviation, from the frames' own change with torque.
+
+    The frames' slope over torque, their drift about it and their noise are those of the recording; without a known
+    torque the main direction in which the frames vary stands for it.
+    """
+    frames = np.abs(scene.differences)
+    centred = frames - frames.mean(axis=0)
+    if scene.torque_nm is not None and np.ptp(scene.torque_nm) > 0:
+        torque = scene.torque_nm - scene.torque_nm.mean()
+        slope = centred.T @ torque / float(torque @ torque)
+        residual = centred - np.outer(torque, slope)
+    else:
+        u, s, vt = np.linalg.svd(centred, full_matrices=False)
+        slope, residual = s[0] * vt[0], centred - np.outer(u[:, 0] * s[0], vt[0])
+    _, s, vt = np.linalg.svd(residual, full_matrices=False)
+    drift = vt[:_N_DRIFT].T * (s[:_N_DRIFT] / np.sqrt(max(len(frames) - 2, 1)))
+
+    def spread(channels: NDArray[np.int64]) -> float:
+        """Return the standard deviation of a torque read from these channels."""
+        b, v = slope[channels] / scene.noise_v, drift[channels] / scene.noise_v
+        inner = np.linalg.inv(np.eye(_N_DRIFT) + v.T @ v)
+        information = float(b @ b - (b @ v) @ inner @ (v.T @ b))
+        return float(1.0 / np.sqrt(max(information, 1e-300)))
+
+    everything = np.arange(N_CHANNELS)
+    least = spread(everything)
+
+    def added(channels: NDArray[np.int64]) -> float:
+        return float(np.sqrt(max((spread(channels) / least) ** 2 - 1.0, 0.0)))
+
+    # By how much each counts in that reading, where drift is taken out: not by how far the torque moves it alone.
+    inner = np.linalg.inv(np.eye(_N_DRIFT) * scene.noise_v**2 + drift.T @ drift)
+    order = np.argsort(-np.abs(slope - drift @ (inner @ (drift.T @ slope))), kind="stable")
+    channels = [Step(n, added(order[:n]), _rate(n)) for n in CHANNEL_COUNTS]
+    injection = CHANNELS[:, 0]
+    taken: list[int] = []
+    steps = []
+    while len(taken) < N_ELECTRODES:
+        rest = [one for one in range(N_ELECTRODES) if one not in taken]
+        taken.append(min(rest, key=lambda one: spread(np.flatnonzero(np.isin(injection, [*taken, one])))))
+        chosen = np.flatnonzero(np.isin(injection, taken))
+        steps.append(
+            Step(len(taken), added(chosen), f"{_rate(len(chosen))}; injections {', '.join(map(str, sorted(taken)))}")
+        )
+    return Choice("channels", "of 896", tuple(channels)), Choice("injections", "of 32", tuple(steps))
+
+
+def _rate(channels: int) -> str:
+    return f"{1.0 / (channels * CHANNEL_S):.2f} frames/s at {1e3 * CHANNEL_S:g} ms a channel"

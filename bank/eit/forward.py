@@ -1,0 +1,201 @@
+"""The forward model: from conductivity to voltages, by linear finite elements and the complete electrode model.
+
+Cheng, Isaacson, Newell and Gisser 1989; Somersalo, Cheney and Isaacson 1992. With u the potential inside, U_e that of
+electrode e with contact impedance z_e, and I_e the current into it, for all test functions (v, V):
+
+    ∫ s ∇u·∇v dx + Σ_e 1/z_e ∫_e (u − U_e)(v − V_e) ds = Σ_e I_e V_e
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+from numpy.typing import NDArray
+from scipy.sparse.linalg import splu
+from skfem import Basis, BilinearForm, ElementTriP1, FacetBasis, LinearForm, MeshTri
+from skfem.helpers import dot, grad
+
+from shearloop.bank.eit.channels import CHANNELS, N_ELECTRODES, STIMULATION_CURRENT
+from shearloop.bank.eit.mesh import Mesh, require_fingertip
+from shearloop.bank.errors import ConductivityError
+
+# The node whose potential is zero; only differences of potentials leave this module.
+_GROUND = 0
+
+
+class CompleteElectrodeModel:
+    """The electrode potentials of a mesh with any number of electrodes, for any conductivity of its triangles.
+
+    What does not depend on conductivity is assembled once. Not a value but a solver: it keeps no state between calls.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        """Assemble what does not depend on conductivity."""
+        self.mesh = mesh
+        stiffness, contact = assemble(mesh)
+        n, n_triangles = len(mesh.nodes) + mesh.n_electrodes, len(mesh.triangles)
+        place = elimination_order(mesh, stiffness)
+        rows = place[np.concatenate([stiffness.rows, contact.rows])]
+        columns = place[np.concatenate([stiffness.columns, contact.columns])]
+        values = np.concatenate([stiffness.values, contact.values])
+        # The conductivity that each term is multiplied with: its triangle's, or the constant 1 at the contacts.
+        factor = np.full(len(values), n_triangles)
+        factor[: len(stiffness.values)] = np.tile(np.arange(n_triangles), 9)
+        kept = (rows >= 0) & (columns >= 0)
+        keys, entry = np.unique(columns[kept] * n + rows[kept], return_inverse=True)
+        # Entry p of the grounded matrix, in compressed columns, is Σ_t shares[p, t] · (s, 1)_t.
+        self._shares = sp.csr_array(
+            (values[kept], (entry, factor[kept])), shape=(len(keys), n_triangles + 1), dtype=np.float64
+        )
+        column, row = np.divmod(keys, n)
+        self._indices = row.astype(np.int32)
+        self._indptr = np.searchsorted(column, np.arange(n)).astype(np.int32)
+        self._shape = (n - 1, n - 1)
+
+    def electrode_potentials(
+        self, conductivity: NDArray[np.float64], currents: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the (L, R) potentials of the electrodes for (T,) conductivities and (L, R) currents into them.
+
+        Currents must add up to zero over the electrodes. Raises ConductivityError where conductivity is not positive
+        (the matrix would be indefinite, and its solution finite and meaningless).
+        """
+        require_positive(conductivity, len(self.mesh.triangles))
+        matrix = sp.csc_array(
+            (self._shares @ np.append(conductivity, 1.0), self._indices, self._indptr), shape=self._shape
+        )
+        # Symmetric positive definite: no pivoting, so the order stays as it is and the electrodes come last. Narrow
+        # panels suit the few entries of a plane mesh.
+        factors = splu(
+            matrix,
+            permc_spec="NATURAL",
+            diag_pivot_thresh=0.0,
+            relax=1,
+            panel_size=1,
+            options={"SymmetricMode": True, "Equil": False},
+        )
+        # Currents enter at the electrodes only. When all nodes are eliminated, what is left is the electrodes' own
+        # system (the Schur complement), and the nodes' potentials need not be found.
+        last = slice(-self.mesh.n_electrodes, None)
+        schur = factors.L[last, last] @ factors.U[last, last]
+        return np.asarray(np.linalg.solve(schur.toarray(), currents), dtype=np.float64)
+
+
+class ForwardModel:
+    """The 896 voltages of a fingertip. Raises GeometryError for a mesh that has not 32 electrodes.
+
+    currents (32, 16) go into the electrodes in the first half of the patterns.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        """Check the mesh and assemble."""
+        require_fingertip(mesh)
+        self.mesh = mesh
+        self._solver = CompleteElectrodeModel(mesh)
+        # Opposite injection: the second half of the patterns is the first with the sign changed.
+        half = N_ELECTRODES // 2
+        self.currents = STIMULATION_CURRENT * np.vstack([-np.eye(half), np.eye(half)])
+        sink, _, self._positive, self._negative = CHANNELS.T
+        self._pattern = sink % half
+        self._sign = np.where(sink < half, 1.0, -1.0)
+
+    def voltages(self, conductivity: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the (896,) voltages, in channel order, of (T,) conductivities of the mesh's triangles.
+
+        Raises ConductivityError, before anything is solved, where conductivity is not positive.
+        """
+        return self.channels_of(self._solver.electrode_potentials(conductivity, self.currents))
+
+    def channels_of(self, potentials: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the (…, 896) voltages of the (…, 32, 16) potentials that `currents` raise."""
+        differences: NDArray[np.float64] = (
+            potentials[..., self._positive, self._pattern] - potentials[..., self._negative, self._pattern]
+        )
+        return self._sign * differences
+
+    def homogeneous(self) -> NDArray[np.float64]:
+        """Return the (896,) voltages of conductivity 1 everywhere."""
+        return self.voltages(np.ones(len(self.mesh.triangles)))
+
+
+def require_positive(conductivity: NDArray[np.float64], n_triangles: int) -> None:
+    """Raise ConductivityError unless there is one finite, positive conductivity for every triangle."""
+    if conductivity.shape != (n_triangles,):
+        raise ConductivityError(f"there are {n_triangles} triangles, but conductivities of shape {conductivity.shape}")
+    if not np.isfinite(conductivity).all():
+        raise ConductivityError("the conductivity is not finite everywhere")
+    if conductivity.min() <= 0:
+        raise ConductivityError(
+            f"the conductivity is not positive everywhere: its smallest value is {conductivity.min():.6g}, "
+            f"and {int((conductivity <= 0).sum())} of {n_triangles} triangles are at or below 0"
+        )
+
+
+@BilinearForm
+def _stiffness(u, v, _):  # type: ignore[no-untyped-def]  # skfem carries no types
+    return dot(grad(u), grad(v))
+
+
+@BilinearForm
+def _mass(u, v, w):  # type: ignore[no-untyped-def]  # as above
+    return u * v / w.z
+
+
+@LinearForm
+def _load(v, w):  # type: ignore[no-untyped-def]  # as above
+    return v / w.z
+
+
+def assemble(mesh: Mesh) -> tuple["Terms", "Terms"]:
+    """Return the terms ∫∇u·∇v of every triangle, and those of the contacts, with the electrodes after the nodes."""
+    domain = MeshTri(mesh.nodes.T.copy(), mesh.triangles.T.copy())
+    inside = _stiffness.coo_data(Basis(domain, ElementTriP1(), intorder=0))
+    stiffness = Terms(inside.indices[0], inside.indices[1], inside.data)
+
+    edges = FacetBasis(domain, ElementTriP1(), facets=_facets_of(domain, mesh.electrode_edges), intorder=2)
+    impedance = mesh.contact_impedance[mesh.electrode_of_edge]
+    z = np.repeat(impedance[:, None], edges.dx.shape[1], axis=1)
+    mass, load = _mass.coo_data(edges, z=z), _load.coo_data(edges, z=z)
+    node = load.indices[0]
+    electrode = len(mesh.nodes) + np.tile(mesh.electrode_of_edge, 3)
+    contact = Terms(
+        np.concatenate([mass.indices[0], node, electrode, electrode]),
+        np.concatenate([mass.indices[1], electrode, node, electrode]),
+        # An edge's functions add up to 1, so its loads add up to its length over z.
+        np.concatenate([mass.data, -load.data, -load.data, load.data]),
+    )
+    # The third node of the triangle behind an edge has a function that vanishes on the edge.
+    return stiffness, contact.where(np.abs(contact.values) > 1e-12 * np.abs(contact.values).max())
+
+
+def elimination_order(mesh: Mesh, stiffness: "Terms") -> NDArray[np.int64]:
+    """Return each unknown's place: −1 for the grounded node, then nodes in an order of little fill, then electrodes."""
+    n = len(mesh.nodes)
+    laplacian = sp.csc_array((stiffness.values, (stiffness.rows, stiffness.columns)), shape=(n, n))
+    free = np.delete(np.arange(n), _GROUND)
+    grounded = sp.csc_array(laplacian[free][:, free])
+    ordering = splu(grounded, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    place = np.full(n + mesh.n_electrodes, -1, dtype=np.int64)
+    place[free] = ordering.perm_c
+    place[n:] = n - 1 + np.arange(mesh.n_electrodes)
+    return place
+
+
+def _facets_of(domain: MeshTri, edges: NDArray[np.int64]) -> NDArray[np.int64]:
+    wanted = np.sort(edges, axis=1) @ [domain.nvertices, 1]
+    numbers = np.sort(domain.facets, axis=0).T.astype(np.int64) @ [domain.nvertices, 1]
+    order = np.argsort(numbers)
+    found: NDArray[np.int64] = order[np.searchsorted(numbers, wanted, sorter=order)]
+    return found
+
+
+class Terms(NamedTuple):
+    """What is added up in a matrix: (P,) row and column numbers and values."""
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    values: NDArray[np.float64]
+
+    def where(self, keep: NDArray[np.bool_]) -> "Terms":
+        """Return some of the terms."""
+        return Terms(self.rows[keep], self.columns[keep], self.values[keep])

@@ -1,0 +1,272 @@
+"""Matching a measured difference against a bank: the paper's heatmap, and the place of its maximum.
+
+Trehan et al. 2025, section 2: the heatmap holds, for every k and σ, the largest normalised cross-correlation between
+|frame − homogeneous frame| and |simulated signal|, over all lags along the channels; its global maximum gives the
+characteristic k and σ. What is written here is the method itself, in float64 and without shortcuts: anything faster is
+tested against it.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import fft
+from scipy.special import chdtri
+
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.compiled_search import energy as compiled_energy
+from shearloop.bank.errors import MatchingError
+
+FloatArray = NDArray[np.float64]
+
+# Scores that differ by less are the same to rounding: of those the first cell in (k, σ) order is taken.
+TIE = 1e-12
+# Cells this near to the maximum, in k or in σ, belong to its peak and are no runner-up.
+RUNNER_UP_RADIUS = 5
+# Frames of pure noise that pass for a signal: one in a million, at 1.85 frames a second about one in six days.
+FALSE_ALARM = 1e-6
+_LEAST_ENERGY = float(chdtri(N_CHANNELS, FALSE_ALARM))
+# Cells whose spectra are in memory at once: 1024 × 897 complex numbers and as many correlations are 30 MB.
+CHUNK_CELLS = 1024
+# All 2 · 896 − 1 lags of the linear cross-correlation, none of them wrapped around.
+_N_LAGS = 2 * N_CHANNELS - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """A heatmap's maximum, and the best score outside its neighbourhood, None where the bank ends before that.
+
+    cell is (row of k, column of σ); a runner_up as good as score says that the frame fits two places of the bank.
+    """
+
+    k: float
+    sigma: float
+    cell: tuple[int, int]
+    score: float
+    runner_up: float | None
+    runner_up_cell: tuple[int, int] | None
+
+
+@dataclass(frozen=True, slots=True)
+class NoSignal:
+    """The difference is what noise alone makes: its shape means nothing, and it must not be matched."""
+
+    why: str
+
+
+class Matcher(ABC):
+    """Scores differences against all valid cells of a bank; keeps no state between calls."""
+
+    def __init__(
+        self, signals: NDArray[np.float32], valid: NDArray[np.bool_], k_grid: FloatArray, sigma_grid: FloatArray
+    ) -> None:
+        """Take (K, S, 896) difference signals, (K, S) validity, and the (K,) and (S,) grids.
+
+        The signals are not copied; those of cells that are not valid are never read. Raises MatchingError when the
+        shapes do not fit, no cell is valid, or a valid cell has no signal.
+        """
+        shape = (len(k_grid), len(sigma_grid))
+        if signals.shape != (*shape, N_CHANNELS) or valid.shape != shape:
+            raise MatchingError(
+                f"a bank of {shape[0]} k × {shape[1]} σ needs signals of shape {(*shape, N_CHANNELS)} and a validity "
+                f"of shape {shape}, not {signals.shape} and {valid.shape}"
+            )
+        if not valid.any():
+            raise MatchingError("no cell of the bank is valid: choose k and σ where the conductivity stays positive")
+        self.k_grid = k_grid
+        self.sigma_grid = sigma_grid
+        self.valid = valid
+        # Not as a memory map, whose indexing is slow.
+        self._signals = np.asarray(signals).reshape(-1, N_CHANNELS)
+        self._cells = np.flatnonzero(valid)
+
+    def __reduce__(self) -> tuple[type[Self], tuple[NDArray[Any], ...]]:
+        """Copy or send it as what it is made of: what is compiled for it cannot be copied, and is made anew."""
+        signals = self._signals.reshape(*self.valid.shape, N_CHANNELS)
+        return type(self), (signals, self.valid, self.k_grid, self.sigma_grid)
+
+    @classmethod
+    def from_bank(cls, bank: Bank) -> Self:
+        """Return the matcher of an opened bank."""
+        return cls(bank.signals, bank.valid, bank.k_grid, bank.sigma_grid)
+
+    def heatmap(self, difference: ArrayLike) -> FloatArray:
+        """Return the (K, S) scores of one (896,) difference, from 0 to 1, NaN in cells that are not valid.
+
+        Raises MatchingError as `heatmaps` does.
+        """
+        found: FloatArray = self.heatmaps(np.asarray(difference)[None])[0]
+        return found
+
+    def heatmaps(self, differences: ArrayLike) -> FloatArray:
+        """Return the (n, K, S) scores of (n, 896) differences, whose sign and scale do not matter.
+
+        Beside the result about 30 MB are in use, however large the bank. Raises MatchingError for a wrong shape, a
+        value that is not finite, and a difference that is zero everywhere (0/0: ask `signal_above_noise` beforehand).
+        """
+        frames = unit_magnitudes(differences)
+        maps = np.full((len(frames), self.valid.size), np.nan)
+        for cells in self._chunks():
+            maps[:, cells] = self._scores(frames, self._unit_signals(cells))
+        # Rounding may carry a perfect fit past 1 by one bit.
+        return np.clip(maps, 0.0, 1.0, out=maps).reshape(-1, *self.valid.shape)
+
+    def mean_heatmap(self, differences: ArrayLike) -> FloatArray:
+        """Return the (K, S) mean of the heatmaps of (n, 896) differences: several frames of one contact, accumulated.
+
+        Raises MatchingError as `heatmaps` does.
+        """
+        mean: FloatArray = self.heatmaps(differences).mean(axis=0)
+        return mean
+
+    def match(self, difference: ArrayLike) -> Match:
+        """Return the maximum of one (896,) difference's heatmap and its runner-up; see `best_match`.
+
+        Raises MatchingError as `heatmaps` does.
+        """
+        return best_match(self.heatmap(difference), self.k_grid, self.sigma_grid)
+
+    def _chunks(self, size: int = CHUNK_CELLS) -> Iterator[NDArray[np.int64]]:
+        """Yield the numbers of all valid cells, as many at a time as are in memory at once."""
+        for start in range(0, len(self._cells), size):
+            yield self._cells[start : start + size]
+
+    def _unit_signals(self, cells: NDArray[np.int64]) -> FloatArray:
+        magnitudes = self._magnitudes(cells)
+        norms = np.linalg.norm(magnitudes, axis=1, keepdims=True)
+        # Below the least normal number float32 has lost the digits.
+        if not (np.isfinite(norms) & (norms > np.finfo(np.float32).tiny)).all():
+            raise MatchingError("a cell that the bank calls valid has no finite signal; build the bank anew")
+        return np.asarray(magnitudes / norms)
+
+    def _magnitudes(self, cells: NDArray[np.int64]) -> FloatArray:
+        return np.abs(self._signals.take(cells, axis=0), dtype=np.float64)
+
+    @abstractmethod
+    def _scores(self, frames: FloatArray, signals: FloatArray) -> FloatArray:
+        """Return the (n, m) scores of (n, 896) frames and (m, 896) signals, both magnitudes of norm 1."""
+
+
+class ReferenceMatcher(Matcher):
+    """The paper's score: the largest over all 1791 lags of the cross-correlation of two magnitudes of norm 1."""
+
+    def _scores(self, frames: FloatArray, signals: FloatArray) -> FloatArray:
+        # Correlation is a product of spectra; padded to all lags, nothing wraps around. The padding may add a lag
+        # without overlap: zero there, and never above the others, since all values are magnitudes.
+        n = fft.next_fast_len(_N_LAGS, real=True)
+        spectra = fft.rfft(signals, n)
+        scores = np.empty((len(frames), len(signals)))
+        for row, spectrum in enumerate(fft.rfft(frames, n)):
+            scores[row] = fft.irfft(spectrum * np.conj(spectra), n).max(axis=1)
+        return scores
+
+
+class ZeroLagMatcher(Matcher):
+    """The cosine of the angle between the two magnitudes: the cross-correlation at lag 0 alone.
+
+    Bank and board number the channels alike, so that a lag other than 0 compares voltages of different electrodes.
+    """
+
+    def _scores(self, frames: FloatArray, signals: FloatArray) -> FloatArray:
+        return np.asarray(frames @ signals.T)
+
+
+def unit_magnitudes(differences: ArrayLike) -> FloatArray:
+    """Return the magnitudes of (n, 896) differences, each row of norm 1.
+
+    Raises MatchingError for a wrong shape, a value that is not finite, and a row of zeros.
+    """
+    values = np.asarray(differences, dtype=np.float64)
+    if values.ndim != 2 or values.shape[1] != N_CHANNELS:
+        raise MatchingError(f"a difference has {N_CHANNELS} channels; the array has shape {values.shape}")
+    magnitudes = np.abs(values)
+    # Scaled by the largest first, so that the squares of no finite input overflow or vanish.
+    largest = magnitudes.max(axis=1, keepdims=True, initial=0.0)
+    if not np.isfinite(largest).all():
+        raise MatchingError(f"{int((~np.isfinite(values)).sum())} channels of the difference are not finite")
+    if not (largest > 0).all():
+        raise MatchingError("the difference is zero in all channels: there is nothing to match")
+    magnitudes /= largest
+    return np.asarray(magnitudes / np.linalg.norm(magnitudes, axis=1, keepdims=True))
+
+
+def unit_magnitude(difference: ArrayLike) -> FloatArray:
+    """Return the magnitudes of one (896,) difference, of norm 1, without the price of many; errors as of many."""
+    magnitudes = np.abs(np.asarray(difference, dtype=np.float64))
+    if magnitudes.shape == (N_CHANNELS,):
+        largest = float(magnitudes.max())
+        if 0 < largest < np.inf:
+            magnitudes /= largest
+            magnitudes /= math.sqrt(float(magnitudes @ magnitudes))
+            return magnitudes
+    (found,) = unit_magnitudes(np.asarray(difference)[None])
+    return np.asarray(found)
+
+
+def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal | None:
+    """Return why an (896,) difference is no signal, or None where it stands out of the noise.
+
+    noise_std is the standard deviation of the difference from noise alone, (896,) or one number for all channels.
+    Of independent Gaussian noise, Σ (difference/noise_std)² is distributed as χ² with 896 degrees of freedom; a signal
+    is what exceeds its quantile at 1 − FALSE_ALARM. Raises MatchingError for input that is not finite, and for a noise
+    that is not above zero: a frame is never free of noise, if only that of the converter's rounding.
+    """
+    values, noise = np.asarray(difference, dtype=np.float64), np.asarray(noise_std, dtype=np.float64)
+    if values.shape != (N_CHANNELS,) or noise.shape not in ((), (N_CHANNELS,)):
+        raise MatchingError(
+            f"a difference has {N_CHANNELS} channels; the arrays have shapes {values.shape}, {noise.shape}"
+        )
+    energy = compiled_energy(values, noise) if noise.shape == values.shape else None
+    if energy is None:
+        if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
+            raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
+        with np.errstate(over="ignore"):  # far above the noise is all that matters
+            energy = float(np.sum((values / noise) ** 2))
+    least = _LEAST_ENERGY
+    if energy > least:
+        return None
+    return NoSignal(
+        f"no signal above the noise: the difference is {np.sqrt(energy / N_CHANNELS):.2f} times the noise, "
+        f"and a signal needs {np.sqrt(least / N_CHANNELS):.2f} times"
+    )
+
+
+def best_match(
+    heatmap: FloatArray, k_grid: FloatArray, sigma_grid: FloatArray, radius: int = RUNNER_UP_RADIUS
+) -> Match:
+    """Return the maximum of a (K, S) heatmap and its runner-up.
+
+    Of scores that tie (within TIE) the lowest flat index wins. The runner-up is the best cell more than `radius` cells
+    away in k or in σ. Cells with NaN are never returned; raises MatchingError when there is no other cell.
+    """
+    if heatmap.shape != (len(k_grid), len(sigma_grid)):
+        raise MatchingError(f"the heatmap has shape {heatmap.shape}, the grids {len(k_grid)} k × {len(sigma_grid)} σ")
+    best = _first_maximum(heatmap)
+    if best is None:
+        raise MatchingError("no cell of the heatmap is valid")
+    row, column = best
+    beyond = heatmap.copy()
+    beyond[max(row - radius, 0) : row + radius + 1, max(column - radius, 0) : column + radius + 1] = np.nan
+    runner_up = _first_maximum(beyond)
+    return Match(
+        k=float(k_grid[row]),
+        sigma=float(sigma_grid[column]),
+        cell=best,
+        score=float(heatmap[best]),
+        runner_up=None if runner_up is None else float(heatmap[runner_up]),
+        runner_up_cell=runner_up,
+    )
+
+
+def _first_maximum(heatmap: FloatArray) -> tuple[int, int] | None:
+    scores = np.where(np.isnan(heatmap), -np.inf, heatmap)
+    largest = scores.max()
+    if largest == -np.inf:
+        return None
+    row, column = np.unravel_index(int(np.argmax(scores >= largest - TIE)), scores.shape)
+    return int(row), int(column)

@@ -1,0 +1,177 @@
+"""The five basis models of a sheared fingertip: conductivity 1 + f(y; k, σ), y along the fingertip's height.
+
+Trehan et al. 2025, equations (1) to (5). A `Variation` beside k and σ scales f, adds to it, or turns the axis.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.errors import ModelError
+
+if TYPE_CHECKING:
+    from shearloop.bank.eit.mesh import Mesh
+
+Values = NDArray[np.float64]
+
+_SUBDIVISIONS = 5
+# Triangles whose points are computed in one go.
+_AT_ONCE = 1300
+# An axis turned as far as this lies across: no height is along it.
+QUARTER_DEG = 90.0
+
+
+@dataclass(frozen=True, slots=True)
+class BasisModel:
+    """One basis function f(y, k, σ, c), where c is half the fingertip's height, and the units of its parameters."""
+
+    name: str
+    title: str
+    k_unit: str
+    sigma_unit: str
+    function: Callable[[Values, float, float, float], Values]
+
+
+@dataclass(frozen=True, slots=True)
+class Variation:
+    """What else a conductivity may depend on: 1 + offset + amplitude · f(y′; k, σ).
+
+    y′ is the height along an axis that is turned by tilt_deg about the fingertip's centre, towards x. Raises ModelError
+    for what is not finite, and for a tilt of a quarter turn or more.
+    """
+
+    amplitude: float = 1.0
+    offset: float = 0.0
+    tilt_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what describes no conductivity."""
+        if not np.isfinite([self.amplitude, self.offset, self.tilt_deg]).all() or abs(self.tilt_deg) >= QUARTER_DEG:
+            raise ModelError(
+                f"amplitude, offset and tilt must be finite, and the tilt less than ±{QUARTER_DEG:g}°, not "
+                f"{self.amplitude:g}, {self.offset:g} and {self.tilt_deg:g}°"
+            )
+
+
+PLAIN = Variation()
+
+
+def _step(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - all five have one signature
+    return np.where(y > k, 0.5, -0.5)
+
+
+def _linear(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - as above
+    return (y - k) / sigma
+
+
+def _cut_linear(y: Values, k: float, sigma: float, c: float) -> Values:
+    return np.where((c - k / 2 <= y) & (y <= c + k / 2), (y - c) / sigma, 0.0)
+
+
+def _gaussian_derivative(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - as above
+    # In place: memory that is new at each step takes longer than the arithmetic.
+    d = y - k
+    f = d * d
+    f *= -0.5 / np.square(sigma)
+    np.exp(f, out=f)
+    f *= d
+    f *= -1 / np.square(sigma)
+    return f
+
+
+def _modulated_gaussian(y: Values, k: float, sigma: float, c: float) -> Values:
+    return np.exp(-((y - c) ** 2) / (2 * sigma**2)) * np.cos(k * (y - c))
+
+
+MODELS = {
+    model.name: model
+    for model in (
+        BasisModel("step", "Step", "cm", "not used", _step),
+        BasisModel("linear", "Linear", "cm", "cm", _linear),
+        BasisModel("cut_linear", "Cut linear", "cm", "cm", _cut_linear),
+        BasisModel("gaussian_derivative", "Gaussian derivative", "cm", "cm", _gaussian_derivative),
+        BasisModel("modulated_gaussian", "Modulated Gaussian", "rad/cm", "cm", _modulated_gaussian),
+    )
+}
+
+
+def model_named(name: str) -> BasisModel:
+    """Return a basis model; raises ModelError, with the names that exist, for one that does not."""
+    try:
+        return MODELS[name]
+    except KeyError:
+        raise ModelError(f"there is no basis model {name!r}; choose one of {', '.join(MODELS)}") from None
+
+
+def averaging_points() -> NDArray[np.float64]:
+    """Return the (15, 3) barycentric coordinates that f is averaged over in a triangle.
+
+    Each edge is cut into five and lines parallel to the edges are drawn through the cuts: 25 equal triangles. The
+    points are the centroids of the 15 that stand as the whole one does: ((3i + 1)/15, (3j + 1)/15, (3l + 1)/15) with
+    i + j + l = 4.
+    """
+    n = _SUBDIVISIONS
+    steps = [(i, j, n - 1 - i - j) for i in range(n) for j in range(n - i)]
+    return (3.0 * np.array(steps) + 1.0) / (3 * n)
+
+
+def conductivity(mesh: "Mesh", model: str, k: float, sigma: float, variation: Variation = PLAIN) -> NDArray[np.float64]:
+    """Return the (T,) conductivity of a mesh's triangles: 1 + the mean of f over the triangle's averaging points.
+
+    It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
+    """
+    heights = _heights(mesh, variation)[mesh.triangles] @ averaging_points().T
+    values: NDArray[np.float64] = _mean(_pieces(heights), _centre(mesh), model, k, sigma, variation)
+    return values
+
+
+class Conductivities:
+    """What `conductivity` returns, to the bit, for many parameters on one mesh: triangles alike are averaged once."""
+
+    def __init__(self, mesh: "Mesh", variation: Variation = PLAIN) -> None:
+        """Find the triangles whose corners have the same heights."""
+        heights = _heights(mesh, variation)
+        corners = heights[mesh.triangles]
+        _, first, self._alike = np.unique(corners, axis=0, return_index=True, return_inverse=True)
+        self._heights = _pieces((corners @ averaging_points().T)[first])
+        self._centre = _centre(mesh)
+        self._variation = variation
+
+    def of(self, model: str, k: float, sigma: float) -> NDArray[np.float64]:
+        """Return the (T,) conductivity; errors as of `conductivity`."""
+        values: NDArray[np.float64] = _mean(self._heights, self._centre, model, k, sigma, self._variation)[self._alike]
+        return values
+
+
+def _heights(mesh: "Mesh", variation: Variation) -> Values:
+    """Return the (N,) heights of the nodes along the axis, in cm."""
+    x, y = mesh.nodes.T
+    if variation.tilt_deg == 0:
+        return np.asarray(y)
+    turn = np.deg2rad(variation.tilt_deg)
+    middle = (x.min() + x.max()) / 2
+    return np.asarray(_centre(mesh) + (y - _centre(mesh)) * np.cos(turn) + (x - middle) * np.sin(turn))
+
+
+def _centre(mesh: "Mesh") -> float:
+    return float((mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2)
+
+
+def _pieces(heights: Values) -> list[Values]:
+    """Cut (T, 15) heights into (15, ≤ _AT_ONCE) of some triangles each: small enough for the processor's caches."""
+    return [np.ascontiguousarray(piece.T) for piece in np.array_split(heights, -(-len(heights) // _AT_ONCE))]
+
+
+def _mean(pieces: list[Values], centre: float, model: str, k: float, sigma: float, variation: Variation) -> Values:
+    basis = model_named(model)
+    if not (np.isfinite(k) and np.isfinite(sigma)):
+        raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
+    if sigma <= 0 and basis.sigma_unit != "not used":
+        raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
+    shape = np.concatenate([basis.function(heights, k, sigma, centre).sum(axis=0) for heights in pieces])
+    shape /= len(pieces[0])
+    values: Values = 1.0 + variation.offset + variation.amplitude * shape
+    return values

@@ -1,0 +1,21 @@
+"""Estimators: `fit` makes a calibration from recordings, a `EstimatorSession` turns frames into estimates with it."""
+
+from shearloop.bank.estimation.calibrated import NAMES, Calibration, Name
+from shearloop.bank.estimation.fitting import fit
+from shearloop.bank.estimation.fitting_choices import Physics
+from shearloop.bank.estimation.session import EstimatorSession
+from shearloop.bank.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, fused
+
+__all__ = [
+    "NAMES",
+    "Calibration",
+    "Estimate",
+    "FrameSeries",
+    "Measured",
+    "Name",
+    "Physics",
+    "TactileFrame",
+    "EstimatorSession",
+    "fit",
+    "fused",
+]

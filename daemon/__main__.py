@@ -1,7 +1,0 @@
-"""`python -m daemon` is `shearloop`."""
-
-import sys
-
-from daemon.cli import main
-
-sys.exit(main())

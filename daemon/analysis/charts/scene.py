@@ -1,0 +1,132 @@
+"""`shearloop chart scene`: how much model a scene needs, by the recording's own noise."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from shearloop.bank.eit.design import ALLOWED, Choice, Design, Scene, designed
+from shearloop.bank.eit.fingertip import Fingertip
+from shearloop.daemon.analysis.charts.picture import SHADES, figure, save
+from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
+from shearloop.daemon.scene import choices_of, doubts, scene_of
+from shearloop.daemon.workers import Workers, in_order
+
+_MESH_SIZE_CM = 0.07
+_LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
+
+
+def chart(parts: Sequence[Split], out: Path, pool: Workers) -> list[Path]:
+    """Design for the whole of each recording, draw and write; each recording is a task of its own.
+
+    Why a design may not be worth building is told on stderr, as `bank design` tells it.
+    """
+    scenes = [scene_of(split.whole) for split in parts]
+    found = in_order(pool.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
+    written = []
+    for split, design in zip(parts, found, strict=True):
+        title = split.title.split(",", maxsplit=1)[0]
+        for sentence in doubts(design):
+            print(f"shearloop chart: {title}: {sentence}", file=sys.stderr)
+        written += write(title, design, out)
+    return written
+
+
+def designed_on(fingertip: Fingertip, scene: Scene) -> Design:
+    """Return `designed` with its arguments as a task has them."""
+    return designed(scene, fingertip)
+
+
+def write(title: str, design: Design, out: Path) -> list[Path]:
+    """Draw a design and write it."""
+    made = figure(15, 13)
+    grid = made.add_gridspec(3, 3, height_ratios=[1, 1, 0.95])
+    choices = choices_of(design)
+    for place, choice in zip(((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2)), choices, strict=True):
+        _draw_choice(made.add_subplot(grid[place]), choice)
+    _draw_models(made.add_subplot(grid[2, 0]), design)
+    _draw_table(made.add_subplot(grid[2, 1:]), choices)
+    made.suptitle(
+        f"How much model {title} needs: its noise is {design.relative_noise:.1%} of a difference frame; "
+        "ring: the coarsest that adds less than a third of it",
+        fontsize=13,
+    )  # fmt: skip
+    content = asdict(design) | {
+        "allowed": ALLOWED, "chosen": {one.name: asdict(one.chosen) | {"enough": one.enough} for one in choices},
+    }  # fmt: skip
+    slug = "-".join(title.replace(".", " ").replace("_", " ").split()).lower()
+    return save(made, content, out, f"scene-{slug}")
+
+
+def _draw_choice(axes: Axes, choice: Choice) -> None:
+    settings, added = ([getattr(step, name) for step in choice.steps] for name in ("setting", "added"))
+    # What is exact adds nothing, which a logarithmic axis cannot show.
+    shown = np.maximum(added, _LEAST_SHOWN)
+    axes.plot(settings, shown, "-o", color=SHADES[1], markersize=5)
+    scale = "linear" if len(settings) > _MOST_TICKS else "log"
+    axes.set(xscale=scale, yscale="log", xlabel=f"{choice.name}, {choice.unit}", ylabel="added error / noise")
+    axes.axhline(ALLOWED, color="black", linestyle="--", linewidth=1)
+    axes.annotate(
+        "a third of the noise", (0.02, ALLOWED), xycoords=("axes fraction", "data"), xytext=(0, -10),
+        textcoords="offset points", fontsize=8, ha="left",
+    )  # fmt: skip
+    chosen = choice.chosen
+    ring = max(chosen.added, _LEAST_SHOWN)
+    axes.plot(chosen.setting, ring, "o", markersize=15, markerfacecolor="none", color="black")
+    if settings[0] > settings[-1]:
+        axes.invert_xaxis()
+    ticks = settings[:: max(1, len(settings) // _MOST_TICKS)] if scale == "log" else _spaced(settings)
+    axes.set_xticks(ticks, [f"{value:g}" for value in ticks], fontsize=8, rotation=60 if scale == "log" else 0)
+    axes.minorticks_off()
+    axes.set_ylim(0.5 * min(shown), 3.0 * max(*shown, ALLOWED))
+    axes.grid(alpha=0.25)
+    cost = chosen.cost.split(";", maxsplit=1)[0]
+    axes.set_title(f"{chosen.setting:g} {choice.unit}: {cost}", fontsize=9.5)
+
+
+def _spaced(settings: Sequence[float]) -> list[float]:
+    """Return settings, from the last one back, that stand far enough apart on a linear axis to be read."""
+    apart = (max(settings) - min(settings)) / (1.3 * _MOST_TICKS)
+    kept = [settings[-1]]
+    for one in reversed(settings):
+        if kept[-1] - one >= apart:
+            kept.append(one)
+    return kept
+
+
+def _draw_models(axes: Axes, design: Design) -> None:
+    ranked = sorted(design.models, key=lambda one: one.penalised)
+    for i, one in enumerate(ranked):
+        axes.barh(i, one.penalised, xerr=one.standard_error, color="#d9d9d9", edgecolor="black", capsize=3,
+                  hatch="//" if one.model == design.model else None)  # fmt: skip
+        axes.plot(one.error, i, "|", color="black", markersize=16, markeredgewidth=2)
+    axes.axvline(design.relative_noise, color="black", linestyle=":", linewidth=1.2)
+    axes.set_yticks(range(len(ranked)), [f"{one.model}\n({one.parameters} parameters)" for one in ranked], fontsize=8.5)
+    axes.invert_yaxis()
+    axes.set(
+        xlabel="unexplained on injections left out, share of a frame\n(bar: penalised; tick: not; dotted: the noise)",
+        title="which model the data supports (hatched)",
+    )  # fmt: skip
+
+
+def _draw_table(axes: Axes, choices: Sequence[Choice]) -> None:
+    rows = []
+    for one in choices:
+        step, after = one.chosen, one.next_step
+        buys = "–" if after is None else f"{np.sqrt(1 + step.added**2) - np.sqrt(1 + after.added**2):.1%} less error"
+        rows.append([
+            one.name, f"{step.setting:g}", f"{step.added:.2f}", "–" if after is None else f"{after.setting:g}", buys,
+            "–" if after is None else after.cost.split(";", maxsplit=1)[0],
+        ])  # fmt: skip
+    axes.set_axis_off()
+    table = axes.table(
+        rows, colLabels=["", "chosen", "adds (noise = 1)", "next step", "which buys", "and costs"],
+        loc="center", cellLoc="left", colWidths=[0.17, 0.09, 0.14, 0.1, 0.16, 0.36],
+    )  # fmt: skip
+    table.auto_set_font_size(False)
+    table.set_fontsize(9)
+    table.scale(1, 1.9)
+    axes.set_title("What each further step would buy")

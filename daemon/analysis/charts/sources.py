@@ -1,0 +1,141 @@
+"""What charts are measured on: recordings of the user, split in time, or synthetic ones where none is given."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
+from shearloop.bank.eit.fingertip import Fingertip
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.estimation import FrameSeries
+from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP, Grid, cached_bank
+from shearloop.daemon.analysis.series import part_of, read_series
+from shearloop.daemon.bank_config import FingertipGeometryConfig, load_geometry
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.synthetic import Synthesiser, TwistProgramme
+from shearloop.drivers.eit_format import FRAME_PERIOD_S
+
+Floats = NDArray[np.float64]
+
+# Frames before the judged part of a stream that fill the memory of an estimator that has one.
+WARM_UP_FRAMES = 15
+# The bank of a chart where none is named: config/banks/demo.yaml's.
+GRID = Grid(np.linspace(2.9, 4.1, 50), np.linspace(0.9, 2.3, 50))
+MESH_SIZE_CM = 0.2
+# Synthetic frames come from a finer mesh than the bank they are matched with, from cells between that bank's.
+_PLAYED_GRID = Grid(np.linspace(3.07, 3.47, 5), np.linspace(1.03, 1.99, 17))
+PLAYED_MESH_SIZE_CM = 0.14
+_LARGEST_NM = 0.14
+_AVERAGED_FRAMES = 9
+_REST_S = 8.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Split:
+    """What is fitted and what is judged: earlier and later frames of one recording."""
+
+    title: str
+    past: FrameSeries
+    future: FrameSeries
+    whole: FrameSeries
+
+
+def own_fingertip(mesh_size_cm: float) -> Fingertip:
+    """Return the paper's fingertip as its measures describe it, with another mesh size."""
+    config = load_yaml_model(OWN_FINGERTIP, FingertipGeometryConfig)
+    return config.model_copy(update={"mesh_size_cm": mesh_size_cm}).fingertip()
+
+
+def mesh_of(path: Path | None) -> Mesh:
+    """Return the mesh of a file, or the own fingertip's."""
+    return load_geometry(path) if path is not None else own_fingertip(MESH_SIZE_CM).mesh()
+
+
+def bank_of(path: Path | None, mesh: Mesh, scratch: Path, grid: Grid = GRID) -> Bank:
+    """Return the bank of a file, or a small one of this mesh, which is kept in the scratch folder."""
+    return Bank.open(path) if path is not None else cached_bank("chart", grid, mesh, scratch, 1, lambda *_: None)
+
+
+def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
+    """Return each recording's earlier and later part; `share` of it is the earlier one. Synthetic without paths."""
+    named = [(path.name or str(path), series) for path in paths for series in read_series(path)]
+    if not named:
+        named = [("synthetic slices", synthetic_slices(scratch)), ("synthetic stream", synthetic_stream(scratch))]
+    return [
+        Split(f"{name}, {KINDS[series.kind]}, first {share:.0%}", *_parted(series, share), series)
+        for name, series in named
+        if series.torque_t_s.size and not np.isfinite(series.diameter_mm).any()
+    ]
+
+
+KINDS = {"raw": "stream", "difference": "slices"}
+
+
+def _parted(series: FrameSeries, share: float) -> tuple[FrameSeries, FrameSeries]:
+    start = round(share * len(series.t_s)) - (WARM_UP_FRAMES if series.kind == "raw" else 0)
+    return part_of(series, 0, share), series.between(max(start, 0), len(series.t_s))
+
+
+def sigma_of(torque_nm: float) -> float:
+    """Return the σ in cm that a torque makes in synthetic frames: it falls as the torque rises, as measured."""
+    return 1.9 - 0.7 * torque_nm / _LARGEST_NM
+
+
+def torque_of(sigma: float) -> float:
+    """Return the torque in N·m that belongs to a σ in cm in synthetic frames, also beyond those that occur."""
+    return _LARGEST_NM * (1.9 - sigma) / 0.7
+
+
+def played_bank(scratch: Path) -> Bank:
+    """Return the bank that synthetic frames are made from."""
+    mesh = own_fingertip(PLAYED_MESH_SIZE_CM).mesh()
+    return cached_bank("played", _PLAYED_GRID, mesh, scratch, 1, lambda *_: None)
+
+
+def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> Floats:
+    """Return the mean of nine frames, (896,) in volts, as the paper's slices are smoothed over time."""
+    lines = [synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
+    return np.asarray(np.mean([channels_of_line(line) for line in lines], axis=0))
+
+
+def homogeneous_of(synthesiser: Synthesiser) -> Floats:
+    """Return the homogeneous frame that synthetic slices of this seed are differences to, if asked for first."""
+    return mean_frame(synthesiser, 3.2, 1.5, 0.0)
+
+
+def synthetic_slices(scratch: Path, seed: int = 0) -> FrameSeries:
+    """Return 49 differences as the paper's slices are: five repeats of ten torques, means of nine frames."""
+    synthesiser, rng = Synthesiser(played_bank(scratch), seed=seed), np.random.default_rng((seed, 1))
+
+    homogeneous = homogeneous_of(synthesiser)
+    levels = np.tile(np.linspace(0.01, _LARGEST_NM, 10), 5)[1:]
+    torque = np.clip(levels + rng.normal(0.0, 0.003, len(levels)), 0.0, _LARGEST_NM)
+    # Every repeat the tool sits a little elsewhere in the grip, a little more firmly.
+    repeat = np.arange(1, 50) // 10
+    frames = [
+        np.abs(mean_frame(synthesiser, 3.2 + 0.03 * r, sigma_of(nm), 1.0 + 0.03 * r) - homogeneous)
+        for r, nm in zip(repeat, torque, strict=True)
+    ]
+    t_s = np.arange(49.0)
+    return FrameSeries("difference", ("right",), t_s, np.array(frames)[:, None], t_s, torque, np.full(49, np.nan))
+
+
+def synthetic_stream(scratch: Path, seed: int = 0, cycles: int = 8) -> FrameSeries:
+    """Return the frames of two fingertips that hold a tool through eight twists, idle before."""
+    programme = TwistProgramme(torque_nm=0.12, grip_s=1.0, cycles=cycles)
+    gripped_s = programme.idle_s + programme.grip_s
+    end_s = gripped_s + _REST_S + cycles * 2 * (programme.turn_s + programme.hold_s)
+    t_s = np.arange(0.5 * FRAME_PERIOD_S, end_s, FRAME_PERIOD_S)
+    # A rest after the grip, before the first twist.
+    moments = [programme.at(t if t < gripped_s else max(t - _REST_S, gripped_s)) for t in t_s.tolist()]
+    channels = np.empty((len(t_s), 2, N_CHANNELS))
+    for side, k in enumerate((3.2, 3.35)):
+        synthesiser = Synthesiser(played_bank(scratch), seed=seed + 100 * side)
+        for i, (grip, torque_nm) in enumerate(moments):
+            channels[i, side] = channels_of_line(synthesiser.line(k, sigma_of(torque_nm), grip))
+    torque = np.array([torque_nm for _, torque_nm in moments])
+    return FrameSeries("raw", ("right", "left"), t_s, channels, t_s, torque, np.full(len(t_s), np.nan))

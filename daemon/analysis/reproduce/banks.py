@@ -1,0 +1,125 @@
+"""The mesh and the two banks that a reproduction uses: chosen, built, and kept for the next time."""
+
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.eit.bank_file import Bank, BankDefinition
+from shearloop.bank.eit.build import build_bank
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.errors import BankFileError
+from shearloop.daemon.bank_config import load_bank_plan, load_geometry
+from shearloop.daemon.errors import UserError
+
+MODEL = "gaussian_derivative"
+# Beside a folder of recordings, where the paper's own mesh is looked for.
+PAPER_MESH = Path("reference") / "fingertip_mesh.npz"
+# Beside the packages: the fingertip by its measures.
+OWN_FINGERTIP = Path(__file__).resolve().parents[2] / "config" / "fingertips" / "paper.yaml"
+
+RowProgress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """The cells of a bank: k (K,) and sigma (S,) in cm."""
+
+    k: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+
+
+# Over all of the fingertip, as the paper's figure 6, and finer over the part where screwdrivers are found.
+GRIDS = {
+    "focused": Grid(np.linspace(3.1, 3.4, 100), np.linspace(1.2, 1.9, 100)),
+    "wide": Grid(np.linspace(0.01, 4.4, 100), np.linspace(0.01, 4.4, 100)),
+}
+
+
+# The paper's focused grid is where nearly all of its own slices match best; a tool of another thickness is elsewhere.
+FEWEST_INSIDE = 0.9
+# Of the best matches: outliers set no border. Around them so many of the wide bank's steps are added.
+_ENDS, _STEPS_AROUND = (0.02, 0.98), 2
+
+
+def focused_grid(k: NDArray[np.float64], sigma: NDArray[np.float64]) -> Grid:
+    """Return the cells to look at more closely, from the best matches k (n,), sigma (n,) on the wide bank, in cm.
+
+    The paper's own, where they hold the matches; else as many around the matches, and over no less.
+    """
+    paper, wide = GRIDS["focused"], GRIDS["wide"]
+    inside = _within(k, paper.k) & _within(sigma, paper.sigma)
+    if inside.mean() >= FEWEST_INSIDE:
+        return paper
+    return Grid(_around(k, paper.k, wide.k), _around(sigma, paper.sigma, wide.sigma))
+
+
+def _within(found: NDArray[np.float64], grid: NDArray[np.float64]) -> NDArray[np.bool_]:
+    inside: NDArray[np.bool_] = (found >= grid[0]) & (found <= grid[-1])
+    return inside
+
+
+def _around(found: NDArray[np.float64], paper: NDArray[np.float64], wide: NDArray[np.float64]) -> NDArray[np.float64]:
+    low, high = np.quantile(found, _ENDS)
+    half = max(high - low + 2 * _STEPS_AROUND * (wide[1] - wide[0]), paper[-1] - paper[0]) / 2
+    middle = (low + high) / 2
+    return np.linspace(max(middle - half, wide[0]), min(middle + half, wide[-1]), len(paper))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ChosenMesh:
+    """A mesh, and where it is from, for the report."""
+
+    mesh: Mesh
+    origin: str
+
+
+def choose_mesh(recordings: Path, mesh: Path | None, bank_config: Path | None) -> ChosenMesh:
+    """Return the mesh of a file or a bank's configuration; without either the paper's beside the recordings, or ours.
+
+    Raises UserError and GeometryError for files that cannot be used.
+    """
+    if mesh is not None:
+        return ChosenMesh(load_geometry(mesh), str(mesh))
+    if bank_config is not None:
+        return ChosenMesh(load_bank_plan(bank_config).mesh, f"the geometry of {bank_config}")
+    beside = recordings.resolve().parent / PAPER_MESH
+    if beside.is_file():
+        return ChosenMesh(load_geometry(beside), f"{beside} (the paper's)")
+    if OWN_FINGERTIP.is_file():
+        return ChosenMesh(load_geometry(OWN_FINGERTIP), f"our own grid for {OWN_FINGERTIP}")
+    raise UserError(f"there is neither {beside} nor {OWN_FINGERTIP}; name a mesh with --mesh")
+
+
+def cached_bank(name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int, on_row: RowProgress) -> Bank:
+    """Return the bank of this grid and mesh from a folder, building it there if it is not there in good order.
+
+    `on_row(name, done, total)` is called while it is built. Raises BankFileError where it cannot be written.
+    """
+    identity = BankDefinition(mesh.digest, MODEL, grid.k, grid.sigma).identity
+    path = folder / f"{name}-{identity[:12]}.bank"
+    if path.exists():
+        try:
+            bank = Bank.open(path, verify=True)
+            if bank.identity == identity:
+                return bank
+        except BankFileError as error:
+            print(f"{error} (building it anew)", file=sys.stderr)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: the folder for banks cannot be made: {error.strerror}") from error
+    build_bank(
+        mesh,
+        MODEL,
+        grid.k,
+        grid.sigma,
+        path,
+        jobs=jobs,
+        on_row=lambda done, total: on_row(name, done, total),
+        on_notice=lambda sentence: print(sentence, file=sys.stderr),
+    )
+    return Bank.open(path)

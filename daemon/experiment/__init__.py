@@ -1,1 +1,0 @@
-"""Experiments: what is written in YAML, and the state machine that carries it out."""

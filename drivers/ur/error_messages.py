@@ -1,0 +1,121 @@
+"""What the person at the bench is told: why motion is not possible, and what to do about it."""
+
+from shearloop.drivers.ur.messages import (
+    ROBOT_MODE_RUNNING,
+    SAFETY_EMERGENCY_STOPS,
+    SAFETY_NORMAL,
+    SAFETY_PROTECTIVE_STOP,
+    SAFETY_REDUCED,
+    RtdeSample,
+)
+
+NOT_INSTALLED = (
+    "The robot needs the package ur-rtde, which is not installed here. It has wheels for CPython up to 3.12 on x86-64 "
+    "Linux and none for 3.13 or later: run shearloop with Python 3.11 or 3.12, then `pip install 'ur-rtde>=1.6'`."
+)
+NOT_ENABLED = "Motion has not been enabled since the robot's process was started: enable it when the arm may move."
+BEING_MADE_READY = "The robot is being made ready (safety, power, control program): ask again in a second."
+LEAVING = "The daemon disconnects from the robot: start it again to go on."
+NOT_OURS = (
+    "A program runs on the robot that someone else started or resumed: unlock to start the control program instead."
+)
+NOT_STOPPING = (
+    "The arm did not come to rest in time after it was told to stop: keep clear of it, look at the teach pendant."
+)
+PAUSED = (
+    "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach pendant, "
+    "or unlock, which stops it and starts the control program."
+)
+ASTRAY = "The arm moved although nothing was asked of it: look whether somebody or something else moves it."
+
+_SAFETY = {
+    4: "The robot is in recovery mode: move it back within its safety limits at the teach pendant.",
+    5: "A safeguard stop holds the robot: close the safeguard, then unlock.",
+    8: "The robot's safety system reports a violation: restart it at the teach pendant.",
+    9: "The robot's safety system reports a fault: restart the controller.",
+}
+
+
+def unreachable(host: str, why: str) -> str:
+    """Return the sentence for a controller that does not accept connections."""
+    return (
+        f"No UR controller at {host}: {why}. Check that it is switched on and that this computer is in its network "
+        "(Settings → System → Network at the teach pendant)."
+    )
+
+
+def silent(host: str, seconds: float, doing: str) -> str:
+    """Return the sentence for a controller that keeps connections open and says nothing."""
+    return (
+        f"The UR controller at {host} said nothing for {seconds:.1f} s while {doing}: it is starting, hangs, or "
+        "something else listens on its ports. Look at the teach pendant."
+    )
+
+
+def version_refused(host: str, version: str) -> str:
+    """Return the sentence for a controller without RTDE protocol 2."""
+    return (
+        f"The UR controller at {host} ({version}) refuses protocol 2 of RTDE: it needs PolyScope 3.10 or 5.4, or newer."
+    )
+
+
+def registers_in_use(host: str) -> str:
+    """Return the sentence for input registers that someone else writes."""
+    return (
+        f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
+        "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus."
+    )
+
+
+def local_control(host: str) -> str:
+    """Return the sentence for a robot that takes no commands from the network."""
+    return f"The robot at {host} is in local control: switch it to remote control, top right on the teach pendant."
+
+
+def refused_by_client(host: str, text: str) -> str:
+    """Return the sentence for what ur-rtde says in its own words."""
+    return f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”."
+
+
+def not_taken(what: str) -> str:
+    """Return the sentence for a command that the control program did not take."""
+    return f"The robot did not take the {what}: its control program does not answer."
+
+
+def left_to_watchdog(why: str) -> str:
+    """Return the sentence for a control program that is sent nothing any more, for the reason in a sentence."""
+    return f"{why} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
+
+
+def still_paused(why: str) -> str:
+    """Return the sentence for a program of ours that is paused and could not be stopped."""
+    why = why.strip().removesuffix(".")
+    return f"The program that is paused could not be stopped ({why}): stop it at the teach pendant, do not resume it."
+
+
+def unfit(reading: RtdeSample, host: str, state_timeout_s: float) -> str:
+    """Return why the controller cannot take motion commands, or the empty string."""
+    if not reading.connected:
+        return f"The connection to the robot at {host} is lost."
+    if reading.age_ns > state_timeout_s * 1e9:
+        return (
+            f"The controller at {host} has sent nothing newer than a state that is {reading.age_ns / 1e9:.2f} s old: "
+            "look at its cable, what else uses the network, and with a simulator whether its clock is slower than "
+            "real time."
+        )
+    if reading.safety_mode == SAFETY_PROTECTIVE_STOP:
+        return "Protective stop: look for its cause, clear the workspace, then unlock (not in the first 5 s)."
+    if reading.safety_mode in SAFETY_EMERGENCY_STOPS:
+        return "Emergency stop: make the cell safe, release the button, then unlock."
+    if reading.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
+        return _SAFETY.get(reading.safety_mode, f"The robot's safety system is in mode {reading.safety_mode}.")
+    if reading.robot_mode != ROBOT_MODE_RUNNING:
+        return f"The arm is not powered and released (robot mode {reading.robot_mode}): unlock to power it."
+    if reading.program_paused:
+        return PAUSED
+    if not reading.program_running:
+        return (
+            "The control program on the robot does not run: it was stopped at the pendant, or by the watchdog when "
+            "commands came late. Unlock to start it again."
+        )
+    return ""

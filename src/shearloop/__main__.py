@@ -1,0 +1,7 @@
+"""`python -m daemon` is `shearloop`."""
+
+import sys
+
+from shearloop.daemon.cli import main
+
+sys.exit(main())

@@ -2,8 +2,6 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# What is compiled when it is installed, where there is a C compiler; everything works without, up to a millisecond later.
-COMPILED := setup.py $(wildcard bank/*.[ch] drivers/*.[ch])
 # Many small solves: one BLAS thread each, on every machine.
 export OPENBLAS_NUM_THREADS := 1
 # Some containers forbid Python to keep what it compiled; every process of the tests would then compile all of them anew.
@@ -15,21 +13,18 @@ unexport PYTHONDONTWRITEBYTECODE
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
-$(VENV)/.installed: pyproject.toml $(COMPILED)
+$(VENV)/.installed: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[plot,view]'
 	touch $@
 
-$(VENV)/.installed-dev: pyproject.toml $(COMPILED) $(VENV)/.installed
+$(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@
 
-# From Debian: a C compiler, and for the tests of the service and of the live view's page alone, which skip without them.
+# From Debian: for the tests of the service and of the live view's page alone, which skip without them.
 system-packages:
 	missing=; \
-	command -v cc >/dev/null || missing="$$missing gcc libc6-dev"; \
-	$(PYTHON) -c 'import pathlib, sys, sysconfig; sys.exit(not pathlib.Path(sysconfig.get_path("include"), "Python.h").exists())' \
-	|| missing="$$missing python3-dev"; \
 	command -v systemd-analyze >/dev/null || missing="$$missing systemd"; \
 	command -v chromium >/dev/null || missing="$$missing chromium fonts-dejavu-core"; \
 	[ -z "$$missing" ] || { apt-get update -qq -o Acquire::Retries=2 -o Acquire::http::Timeout=30 && apt-get install -y -qq --no-install-recommends $$missing; }
@@ -51,7 +46,7 @@ run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
 # theirs to the others. What drives a robot runs by itself afterwards, the longest test beside all others: a robot stops
 # when its computer is busy. Others may keep it busy all the same, so such a test has a second and a third try, which
 # the summary names. (Status 5: nothing of this kind was asked for.)
-PYTEST := $(BIN)/python -m pytest
+PYTEST := $(BIN)/pytest
 test: install-dev
 	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
 	$(PYTEST) -n 2 --dist loadfile --no-loadscope-reorder -m real_time --reruns 2 --reruns-delay 2 -rR $(PYTEST_ARGS) || [ $$? -eq 5 ]

@@ -1,4 +1,5 @@
-"""How exact a diameter is over the number of cylinders calibrated on: `python -m benchmarks.cylinders --bank run/demo.bank`.
+"""How exact a diameter is over the number of cylinders calibrated on: `python -m benchmarks.cylinders --bank
+run/demo.bank`.
 
 The emulated rig is calibrated on three to seven cylinders, each gripped once, and judged on other recordings of tools
 that were not among them. With `--recordings` each of the paper's four cylinders is read by a line through the other

@@ -1,6 +1,7 @@
 """The daemon's own loop around the emulated skin in virtual time, over gains, delays and normal forces.
 
-What is measured with it and why is told in `benchmarks/skin_loop.py`; the chart is in `daemon/analysis/charts/limit_cycle.py`.
+What is measured with it and why is told in `benchmarks/skin_loop.py`; the chart is in
+`daemon/analysis/charts/limit_cycle.py`.
 """
 
 import math

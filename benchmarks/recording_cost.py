@@ -1,4 +1,5 @@
-"""What recording a whole rig costs: `python -m benchmarks.recording_cost --hours N`, N of them recorded as fast as it goes.
+"""What recording a whole rig costs: `python -m benchmarks.recording_cost --hours N`, N of them recorded as fast as
+it goes.
 
 Two boards, load cell, gripper and robot at their rated pace, with random numbers in everything, which compress worse
 than any real ones. The time is the recorder's own and that of making the messages for it.

@@ -1,4 +1,5 @@
-"""Records the emulated rig and calibrates its fingertips: `python -m benchmarks.rig_twists --bank run/demo.bank --out run`.
+"""Records the emulated rig and calibrates its fingertips: `python -m benchmarks.rig_twists --bank run/demo.bank
+--out run`.
 
 A real rig is calibrated on recordings: idle, a grip, twists with the load cell read beside, idle again, for a few
 cylinders. This plays the same on the emulated rig's own physics and frames, in the scene's time instead of the clock's
@@ -29,7 +30,8 @@ from shearloop.drivers.emulators.rig import NOISE_NM, SIDES, FrameOf
 from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper
 from shearloop.drivers.emulators.scene import Scene
 
-# Three are enough to read others between them by; of five the interval is half as wide (python -m benchmarks.cylinders).
+# Three are enough to read others between them by; of five the interval is half as wide (python -m
+# benchmarks.cylinders).
 DIAMETERS_MM = (10.0, 17.5, 25.0, 32.5, 40.0)
 # Of the twin: an injection of a frame takes about as long.
 STEP_S = 0.02

@@ -1,6 +1,7 @@
 """The calibration of the emulated shear skin, made as a real one's is: loadings, a table, a fit.
 
-`python -m benchmarks.skin_calibration` plays loops to ± 1.2 N and ± 5 N under three normal forces with the paper's noise,
+`python -m benchmarks.skin_calibration` plays loops to ± 1.2 N and ± 5 N under three normal forces with the paper's
+noise,
 writes the table that a bench would record, and fits `config/calibrations/skin_demo.yaml` to it.
 """
 

@@ -1,6 +1,7 @@
 """The loop that holds a shear force through hysteresis and deadband: how wide is what is left of an oscillation?
 
-`python -m benchmarks.skin_loop --out DIR` lets the daemon's own loop (brain, identification, controller, estimator) drive
+`python -m benchmarks.skin_loop --out DIR` lets the daemon's own loop (brain, identification, controller, estimator)
+drive
 the emulated skin in virtual time: 1 N is loaded, unloaded to 0.6 N and loaded again, each held for 20 s. What it
 tells: the width of the true force (peak to peak) over the last 12 s of each hold, against 2 μFₙ, the width of the
 friction's own band; and how far from the set point it is held. Over gains and over delays, with normal forces, with

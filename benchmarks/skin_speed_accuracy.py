@@ -1,6 +1,7 @@
 """Shear skin, speed against accuracy: closed form, membrane and three meshes against the converged 2-D solution.
 
-`python -m benchmarks.skin_speed_accuracy --out DIR` follows one loading to 1 N and one whole hysteresis loop between ±1 N
+`python -m benchmarks.skin_speed_accuracy --out DIR` follows one loading to 1 N and one whole hysteresis loop between
+±1 N
 under 1 N of normal force, writes `skin_speed_accuracy.json` and draws the chart. Errors are the largest difference
 of response, relative to the largest response. Times are the best of several runs per load step; the 2-D models pay
 their mesh once beforehand, which is given apart. The reference itself is converged to a few parts in 10⁵ (its response

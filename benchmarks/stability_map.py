@@ -4,7 +4,8 @@
 
 Four loops at the EIT's rate, without noise: the held speed and the late correction, which have no compensator, and
 the twist controller with the right stiffness and with a tool twice as stiff as it believes. The simulated boundary
-is bisected with the real controller on the simulated plant; the computed one comes from `shearloop.daemon.control.margins`
+is bisected with the real controller on the simulated plant; the computed one comes from
+`shearloop.daemon.control.margins`
 (delay) and from the monodromy matrix of one cycle of dropped frames. Writes stability_map.json and .png.
 """
 

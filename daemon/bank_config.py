@@ -152,7 +152,8 @@ class FingertipGeometryConfig(ConfigModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BankPlan:
-    """All that `shearloop.bank.eit.build.build_bank` needs to know: k_grid (K,) and sigma_grid (S,) in the model's units."""
+    """All that `shearloop.bank.eit.build.build_bank` needs to know: k_grid (K,) and sigma_grid (S,) in the model's
+    units."""
 
     mesh: Mesh
     model: str

@@ -5,13 +5,10 @@ The compiled code is `_cells.c`; numpy does the same without, and the tests comp
 
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from zlib import crc32
 
-try:
-    from shearloop.drivers import _cells as cells
-except ImportError:
-    # No compiler, or none that could build it; docs/speed.md tells what that costs.
-    cells = None  # type: ignore[assignment]
+cells: Any = None
 
 
 def is_stale(module: ModuleType) -> bool:
@@ -24,6 +21,6 @@ def is_stale(module: ModuleType) -> bool:
 
 
 if cells is not None and is_stale(cells):
-    cells = None  # type: ignore[assignment]
+    cells = None
 
 __all__ = ["cells", "is_stale"]

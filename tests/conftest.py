@@ -5,13 +5,24 @@ import gc
 import inspect
 import io
 import os
+import sys
 import threading
+import types
 from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
 import pytest
 import structlog
+
+# Test helpers are imported as `tests.…` and measurements as `benchmarks.…`, without the repository's root on the path:
+# there `bank`, `daemon` and `drivers` could be imported beside `shearloop.bank`, `shearloop.daemon` and the rest.
+_ROOT = Path(__file__).resolve().parents[1]
+for _name in ("tests", "benchmarks"):
+    if _name not in sys.modules:
+        _package = types.ModuleType(_name)
+        _package.__path__ = [str(_ROOT / _name)]
+        sys.modules[_name] = _package
 
 # Before numpy is imported, as the command line and the Makefile do: threads that wait for a busy machine's other
 # processor make a calibration twenty times as slow.

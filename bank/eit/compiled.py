@@ -7,15 +7,13 @@ the time from a frame to its estimate.
 
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 from zlib import crc32
 
 from scipy.linalg import cython_blas
 
-try:
-    from shearloop.bank import _frames, _search
-except ImportError:
-    # No compiler, or none that could build it; docs/speed.md tells what that costs.
-    _frames = _search = None  # type: ignore[assignment]
+_frames: Any = None
+_search: Any = None
 frames = _frames
 search = _search
 

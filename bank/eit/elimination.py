@@ -1,6 +1,7 @@
 """Eliminating the inner unknowns of many symmetric positive matrices of one pattern, all at the same steps.
 
-The pattern decides where entries arise and which meet, so that is planned once (`shearloop.bank.eit.fronts`); what is left for each
+The pattern decides where entries arise and which meet, so that is planned once (`shearloop.bank.eit.fronts`); what
+is left for each
 matrix is arithmetic on small dense matrices, and several matrices stand side by side in memory, so that every step of
 it is one of whole vector registers (`shearloop.bank.eit.tiles`).
 """

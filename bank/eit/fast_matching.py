@@ -1,7 +1,9 @@
 """The same match as from the whole heatmap, but from a few of its cells: what cannot be the maximum is never scored.
 
-A compressed bank (`shearloop.bank.eit.compression`) bounds the scores of groups of cells, then of cells; whatever is bounded below a
-score that some cell reaches is dropped (`shearloop.bank.eit.bounds`), and what is left is scored in float64. How well the bank
+A compressed bank (`shearloop.bank.eit.compression`) bounds the scores of groups of cells, then of cells; whatever is
+bounded below a
+score that some cell reaches is dropped (`shearloop.bank.eit.bounds`), and what is left is scored in float64. How
+well the bank
 compresses decides how long it takes, never what comes out.
 """
 

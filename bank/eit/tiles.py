@@ -1,4 +1,5 @@
-"""The arithmetic of `shearloop.bank.eit.elimination`, compiled: several matrices side by side, on small tiles of their entries.
+"""The arithmetic of `shearloop.bank.eit.elimination`, compiled: several matrices side by side, on small tiles of
+their entries.
 
 All that numba compiles is in this file, for what it keeps on the disk is made anew when this file changes.
 """

@@ -10,12 +10,12 @@ __all__ = [
     "NAMES",
     "Calibration",
     "Estimate",
+    "EstimatorSession",
     "FrameSeries",
     "Measured",
     "Name",
     "Physics",
     "TactileFrame",
-    "EstimatorSession",
     "fit",
     "fused",
 ]

@@ -70,8 +70,8 @@ def read_archive(path: str | Path, identities: Mapping[str, str], kind: type[T])
         restored: T = _restored(kind, header["content"], "", arrays)
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise CalibrationError(
-            f"{path}: the file does not describe a calibration of this version ({error}); use the version that wrote it, "
-            "or calibrate again"
+            f"{path}: the file does not describe a calibration of this version ({error}); use the version that "
+            "wrote it, or calibrate again"
         ) from error
     return restored
 

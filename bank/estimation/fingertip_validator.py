@@ -1,6 +1,7 @@
 """Whether a frame is one that a calibration can speak of: the right fingertip, gripping, undisturbed.
 
-`FingertipValidator` for raw frames knows a fingertip by its pattern of voltages: the same one keeps it from day to day but for
+`FingertipValidator` for raw frames knows a fingertip by its pattern of voltages: the same one keeps it from day to
+day but for
 a common gain and a few per cent, another does not (median deviation 0.03–0.07 against 0.15–0.19 between recordings of
 two fingertips on two days). A grip is told by a linear discriminant that looks away from what twisting and the gel's
 slow recovery change.

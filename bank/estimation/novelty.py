@@ -99,7 +99,8 @@ class NoveltyDetector:
         return cls(
             whole.mean, whole.spread, whole.directions, whole.variances, least,
             float(np.median(misfits, axis=0)[0]), _MISFIT_MARGIN * float(misfit),
-            max(_MISFIT_MARGIN * float(outlying), _LEAST_OUTLYING), _REACH_MARGIN * reach, ReciprocityCheck.fit(differences),
+            max(_MISFIT_MARGIN * float(outlying), _LEAST_OUTLYING), _REACH_MARGIN * reach,
+            ReciprocityCheck.fit(differences),
             float(np.quantile(own, LEVEL)),
         )  # fmt: skip
 

@@ -2,7 +2,8 @@
 
 `Ridge` for features that hold the value linearly. `TobitRidge` for a load cell that a lever pushes from one side only:
 where it reads nothing the twist may be anything below, so those frames bound the value instead of fixing it (Tobin
-1958). `InverseCalibration` the other way round, frames as a smooth curve over the value with correlated drift beside it (classical
+1958). `InverseCalibration` the other way round, frames as a smooth curve over the value with correlated drift beside
+it (classical
 calibration by generalised least squares): it does not pull estimates towards the mean as a ridge does.
 """
 

@@ -1,1 +1,1 @@
-"""."""
+"""Analysis of recordings: calibrate, evaluate, reproduce, charts."""

@@ -3,7 +3,8 @@
 `shearloop calibrate REC… --estimator NAME --out CAL` is `shearloop calibrate recording REC…`: an estimator is fitted to
 what was recorded. A recording called as a THING is written with its folder, `./load`.
 
-A thing is a module in `shearloop.daemon.cli.calibrated` with `configure(parser)` and `run(args) -> exit status`, as a command is.
+A thing is a module in `shearloop.daemon.cli.calibrated` with `configure(parser)` and `run(args) -> exit status`, as
+a command is.
 """
 
 import argparse

@@ -1,6 +1,7 @@
 """`shearloop emulate DEVICE`: plays one device on a port or socket of its own.
 
-A device is a module in `shearloop.daemon.cli.emulated` with `configure(parser)` and `run(args) -> exit status`, as a command is.
+A device is a module in `shearloop.daemon.cli.emulated` with `configure(parser)` and `run(args) -> exit status`, as a
+command is.
 """
 
 import argparse

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager, nullcontext, suppress
+from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -176,7 +177,7 @@ class Show:
 
 def _same_code() -> dict[str, str]:
     """Return an environment in which a child in another folder runs the code that runs here."""
-    here = str(Path(__file__).resolve().parents[2])
+    here = str(Path(str(resources.files("shearloop"))).parent)
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
 
 

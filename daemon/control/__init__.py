@@ -1,1 +1,1 @@
-"""The twist controller, its margins and its identification: plain objects that are told the time and do no I/O."""
+"""Control: the loop, the controller, identification, safety, and experiments."""

@@ -81,7 +81,8 @@ def fit_creep(grips: Sequence[Stretch], *, scale_is_right: bool = False) -> Fitt
     The readings, which are noisy, are fitted to the load cell's torques, which are hardly so. With c as above,
     d = (1 - share)·c follows the torque with a time constant of time_s / (1 - share), and γ is the torque plus
     share / (1 - share)·d. (The torque fitted to the readings takes noise for shear: at 12 mN·m the scale came out 5 %
-    too small and a time constant of 20 s as 50, see benchmarks/creep_fit.py.) For each time constant of a grid share, scale
+    too small and a time constant of 20 s as 50, see benchmarks/creep_fit.py.) For each time constant of a grid
+    share, scale
     and offset are a least-squares fit; the one that leaves least wins. With `scale_is_right` the readings differ from
     the torque by creep and offset alone, and tell more of both.
     Raises UserError for fewer than twenty readings, where the torque does not fall behind the readings, and where no

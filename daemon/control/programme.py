@@ -1,4 +1,5 @@
-"""Each step of an experiment as a small program: it sees a `StepContext`, yields a `StepCommand`, and ends when it is done.
+"""Each step of an experiment as a small program: it sees a `StepContext`, yields a `StepCommand`, and ends when it
+is done.
 
 Generators read like the procedure that a person would follow at the bench; none of them knows the time of day, a
 device or the event loop. Elapsed time is the experiment's own, which stands while it is paused or held.

@@ -99,7 +99,8 @@ class StepCommand:
     """What the experiment wants now.
 
     An action is begun when it is first wished for; `number`, the step's, tells two equal actions apart. From the next
-    `StepContext` on, `StepContext.action` tells of it. `hold` numbers the angles or torques of a step while they are held, from 1.
+    `StepContext` on, `StepContext.action` tells of it. `hold` numbers the angles or torques of a step while they are
+    held, from 1.
     """
 
     wrist: WristSetpoint = Hold()

@@ -1,1 +1,1 @@
-"""The way out and in: who may connect where, what is sent to whoever listens, commands that are asked and answered."""
+"""Messages and how they travel: topics, publisher, subscriber, command server, keys."""

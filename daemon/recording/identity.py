@@ -5,6 +5,7 @@ import platform
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
+from importlib import resources
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -111,7 +112,7 @@ def software_version() -> str:
 @cache
 def code_digest() -> str:
     """Return a hash of the program's own sources: what made two recordings is the same only where it is the same."""
-    root = Path(__file__).resolve().parents[2]
+    root = Path(str(resources.files("shearloop")))
     digest = hashlib.sha256()
     for package in _PACKAGES:
         for path in sorted((root / package).rglob("*.py")):

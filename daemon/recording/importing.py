@@ -75,7 +75,8 @@ def middles(arrivals_ns: Sequence[int]) -> list[int]:
     """Return when the middle of each frame's acquisition was, from when each was read, all in nanoseconds.
 
     A frame is sent when it is complete and is read then or later, never earlier: the board's clock is the line below
-    the stamps (`shearloop.drivers.frame_clock`), here with the frames after it known as well. Its height is that of the earliest
+    the stamps (`shearloop.drivers.frame_clock`), here with the frames after it known as well. Its height is that of
+    the earliest
     of the frames around, so that a board which paused is followed.
     """
     numbered = list(enumerate(arrivals_ns))

@@ -1,1 +1,1 @@
-"""The EIT fingertips in the daemon: estimators, how they are opened, and the tasks of one fingertip and of both."""
+"""The tasks that read sensors and estimate: fingertips, shear skin, load cell."""

@@ -1,6 +1,7 @@
 """Estimators that were fitted to recordings, live: frames in, readings out. A plain object without I/O or clock.
 
-A `EstimatorSession` of `shearloop.bank.estimation` does the work; around it stand the board's flags, the operator's zero, and, where a
+A `EstimatorSession` of `shearloop.bank.estimation` does the work; around it stand the board's flags, the operator's
+zero, and, where a
 bank is configured, the place in the bank that the paper's method would name.
 """
 

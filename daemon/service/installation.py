@@ -25,8 +25,8 @@ _HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - no
 
 
 def service_file(name: str) -> str:
-    """Return the text of a file of `systemd/`, which an installed package carries as `daemon/service_files/`."""
-    return resources.files("daemon").joinpath("service_files", name).read_text(encoding="utf-8")
+    """Return the text of a file of `systemd/`, which an installed package carries as `shearloop/systemd/`."""
+    return resources.files("shearloop").joinpath("systemd", name).read_text(encoding="utf-8")
 
 
 def unit_for(program: Path) -> str:

@@ -29,7 +29,8 @@ from shearloop.drivers.ur.settings import UrSettings
 # later it takes two samples at a time. What is sent over and over (a wrist speed, a sign of life) does not wait for it.
 # What is done once (beginning or stopping a straight move, ending the turning of a wrist at rest, zeroing the wrench,
 # setting the watchdog) waits until it has seen that done, and what comes next until it has seen the robot ready again
-# (see `shearloop.drivers.ur.ready`): each so much longer at most, and a robot that hears nothing meanwhile has patience for six.
+# (see `shearloop.drivers.ur.ready`): each so much longer at most, and a robot that hears nothing meanwhile has
+# patience for six.
 _LONGEST_POLL_SLACK_NS, _SLACKS_IN_PATIENCE = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
 

@@ -1,4 +1,5 @@
-"""What crosses the pipe between the daemon and the robot's own process, as values; `shearloop.drivers.ur.wire` has the bytes."""
+"""What crosses the pipe between the daemon and the robot's own process, as values; `shearloop.drivers.ur.wire` has
+the bytes."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Final, Literal

@@ -1,4 +1,5 @@
-"""What recovering and flying need of the robot; `shearloop.drivers.ur.arm.Arm` has it. False: the robot did not take it."""
+"""What recovering and flying need of the robot; `shearloop.drivers.ur.arm.Arm` has it. False: the robot did not take
+it."""
 
 from typing import Protocol
 

@@ -1,4 +1,4 @@
-"""`python -m daemon` is `shearloop`."""
+"""`python -m shearloop` is `shearloop`."""
 
 import sys
 

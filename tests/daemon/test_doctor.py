@@ -115,16 +115,6 @@ def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert machine.disk_finding(tmp_path / "not/yet/there").state == state
 
 
-def test_what_is_not_compiled_is_noted(monkeypatch) -> None:
-    monkeypatch.setattr(machine.bank.compiled, "IS_COMPILED", True)
-    monkeypatch.setattr(machine.drivers.compiled, "cells", object())
-    assert machine.compiled_finding().state == "good"
-    monkeypatch.setattr(machine.drivers.compiled, "cells", None)
-    found = machine.compiled_finding()
-    assert found.state == "note"
-    assert "C compiler" in found.found
-
-
 @pytest.mark.parametrize(
     ("facts", "state", "part"),
     [

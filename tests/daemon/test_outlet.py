@@ -12,7 +12,7 @@ PROGRAM = """
 import os, sys
 from contextlib import closing
 from shearloop.daemon.logs import logging_to_stderr
-from shearloop.daemon.nonblocking_writer import Outlet
+from shearloop.daemon.nonblocking_writer import NonBlockingWriter as Outlet
 import structlog
 read, write = os.pipe()
 os.close(read)

@@ -107,7 +107,8 @@ class DiameterResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelScores:
-    """The score of each basis model by name, in two measures (see shearloop.bank.eit.model_scores), None where none is possible.
+    """The score of each basis model by name, in two measures (see shearloop.bank.eit.model_scores), None where none
+    is possible.
 
     envelope needs the raw frame; matching is over the torque slices.
     """

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ MODEL = "gaussian_derivative"
 # Beside a folder of recordings, where the paper's own mesh is looked for.
 PAPER_MESH = Path("reference") / "fingertip_mesh.npz"
 # Beside the packages: the fingertip by its measures.
-OWN_FINGERTIP = Path(__file__).resolve().parents[2] / "config" / "fingertips" / "paper.yaml"
+OWN_FINGERTIP = Path(str(resources.files("shearloop"))) / "config" / "fingertips" / "paper.yaml"
 
 RowProgress = Callable[[str, int, int], None]
 

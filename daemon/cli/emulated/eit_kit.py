@@ -4,6 +4,7 @@ import argparse
 import math
 from collections.abc import Iterator
 from functools import partial
+from importlib import resources
 from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.synthetic import Signals
     from shearloop.drivers.emulators.eit_kit import Fault
 
-DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
+DEMO_BANK = Path(str(resources.files("shearloop"))) / "config" / "banks" / "demo.yaml"
 # Where the paper's method finds its screwdriver: σ at rest and at the largest torque of the slices, in N·m.
 K_CM = 3.25
 SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM, LARGEST_TORQUE_NM = 1.85, 1.25, 0.14

@@ -80,7 +80,7 @@ def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
     )
     bench.run()
     assert bench.machine.phase is ExperimentPhase.DONE
-    assert bench.begun == ["MoveTo", "GripTo", "TakeZero", "GripTo", "MoveTo"]
+    assert bench.begun == ["MoveTo", "GripTo", "Tare", "GripTo", "MoveTo"]
     assert bench.machine.progress().share == 1.0
     holds = [wish for wish in bench.seen if wish.doing.startswith("holding 0.200 rad")]
     assert len(holds) * TICK_NS / 1e9 == pytest.approx(2 * 1.0, abs=0.05)

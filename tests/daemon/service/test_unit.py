@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 import zipfile
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -84,12 +85,20 @@ def test_a_wheel_carries_every_file_of_the_service_and_of_the_page(tmp_path: Pat
     subprocess.run([sys.executable, "-c", build, str(tmp_path)], cwd=source, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
+        assert "-py3-none-any" in wheel.name
+        assert {name.split("/")[0] for name in archive.namelist()} == {
+            "shearloop",
+            f"shearloop-{version('shearloop')}.dist-info",
+        }
+        for path in (path.relative_to(ROOT) for path in (ROOT / "config").rglob("*.yaml")):
+            assert f"shearloop/{path}" in archive.namelist()
+        assert "shearloop/py.typed" in archive.namelist()
         for name in (*PLACES, "realtime.conf", "shearloop.yaml"):
-            assert archive.read(f"daemon/service_files/{name}").decode() == service_file(name)
-        assets = sorted((ROOT / "daemon" / "view" / "assets").iterdir())
+            assert archive.read(f"shearloop/systemd/{name}").decode() == service_file(name)
+        assets = sorted((ROOT / "daemon" / "web" / "assets").iterdir())
         assert {"index.html", "app.js", "uPlot.LICENSE.txt"} <= {path.name for path in assets}
         for path in assets:
-            assert archive.read(f"daemon/web/assets/{path.name}") == path.read_bytes()
+            assert archive.read(f"shearloop/daemon/web/assets/{path.name}") == path.read_bytes()
 
 
 # ---- udev ---------------------------------------------------------------------------------------------------------

@@ -23,15 +23,25 @@ def lasting() -> None:
     _offload_executor.submit(int).result()
 
 
+@pytest.fixture(scope="module", autouse=True)
+def importable_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """Let worker processes import the tasks of these tests as `tests.…`, and nothing else of the repository."""
+    folder = tmp_path_factory.mktemp("path")
+    (folder / "tests").symlink_to(ROOT / "tests")
+    sys.path.insert(0, str(folder))
+    yield str(folder)
+    sys.path.remove(str(folder))
+
+
 @pytest.fixture(scope="module")
-def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def scheduler(tmp_path_factory: pytest.TempPathFactory, importable_tests: str) -> Iterator[str]:
     """Start a scheduler and two workers, all processes of their own, and return the address."""
     from distributed import Client
 
     folder = tmp_path_factory.mktemp("dask")
     found, log = folder / "scheduler.json", folder / "log"
     environment = os.environ | {
-        "PYTHONPATH": str(ROOT),
+        "PYTHONPATH": importable_tests,
         "OPENBLAS_NUM_THREADS": "1",
         # A worker is forked, also the one that takes a killed one's place, instead of importing everything anew.
         "DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD": "forkserver",

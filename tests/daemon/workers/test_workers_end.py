@@ -143,7 +143,7 @@ def test_a_local_cluster_ends_when_it_is_interrupted_and_again_while_it_ends(
         with workers("local", 1) as cluster:
             next(cluster.map(waits, (str(tmp_path / "told"), ""), [0]))
 
-    monkeypatch.setattr("daemon_workers._end_workers", again)
+    monkeypatch.setattr("shearloop.daemon.workers._end_workers", again)
     worker = interrupted_once_it_works(number, work)
     assert ended[0].status.name == "closed"
     with pytest.raises(ProcessLookupError):

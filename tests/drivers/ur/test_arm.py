@@ -54,7 +54,7 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
 
 
 def test_sample_that_has_waited_in_the_socket_is_read_as_old(arm: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    reader, now_ns = arm.Arm(SETTINGS, VERSION), 10**12
+    reader, now_ns = arm.UrArm(SETTINGS, VERSION), 10**12
     monkeypatch.setattr(arm.time, "monotonic_ns", lambda: now_ns)
     monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
     six = (0.0,) * 6
@@ -69,7 +69,7 @@ def test_kernel_that_does_not_let_threads_be_woken_late_does_not_prevent_connect
     arm: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
-    assert arm.Arm(SETTINGS, VERSION)._control.connected
+    assert arm.UrArm(SETTINGS, VERSION)._control.connected
     assert "woken more often than needed" in capsys.readouterr().err
 
 
@@ -84,7 +84,7 @@ def test_threads_of_the_client_are_woken_late_but_not_for_long_of_the_watchdogs_
         return 0
 
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=prctl))
-    arm.Arm(dataclasses.replace(SETTINGS, watchdog_hz=watchdog_hz), VERSION)
+    arm.UrArm(dataclasses.replace(SETTINGS, watchdog_hz=watchdog_hz), VERSION)
     # 0 is the default again, for what this thread starts later.
     assert asked == [slack_ms, 0]
 
@@ -120,7 +120,7 @@ def test_a_straight_move_is_asked_after_from_its_beginning_until_the_wrist_is_tu
             connected=True, latest=lambda: Received(float(next(times_s)), SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
         ),
     )
-    one = arm.Arm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS, VERSION)
     assert not one.read().moving_linearly
     one.move(MoveLinear(SIX, 0.1, 0.1))
     assert [one.read().moving_linearly for _ in range(3)] == [True] * 3
@@ -154,7 +154,7 @@ def test_nothing_is_asked_of_the_client_for_which_it_would_wait_in_vain(
 ) -> None:
     """The robot's watchdog has ended the program after a command was done, before it was ready for another."""
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
-    one = arm.Arm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS, VERSION)
     assert one.zero_wrench()
     assert not one.kick()
     assert not one.wrist(WristSpeed(0.1, 1.0))
@@ -172,7 +172,7 @@ def test_register_is_cleared_once_the_client_knows_that_no_program_runs(
 ) -> None:
     """Before, it would wait for that program to be ready."""
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
-    one = arm.Arm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS, VERSION)
     assert not one.clear_command()
     assert one._control.calls == []
     one._control.knows_of_the_end = True
@@ -203,7 +203,7 @@ def test_connection_that_the_client_has_made_anew_is_a_lost_one(
                     assert self.socket.fileno() == descriptor
 
             monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Reconnecting)
-            one = arm.Arm(SETTINGS, VERSION)
+            one = arm.UrArm(SETTINGS, VERSION)
             assert one.read().connected
             one._control.reconnect()
             assert not one.read().connected
@@ -223,12 +223,12 @@ def test_script_that_is_sent_arms_its_watchdog_by_itself(arm: ModuleType, monkey
             return True
 
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Sending)
-    one = arm.Arm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS, VERSION)
     assert one.upload()
     assert 'rtde_set_watchdog("input_int_register_0", 10, "stop")' in one._control.sent
 
     monkeypatch.setattr(arm.script_client.ScriptClient, "getScript", lambda _: "of another form\n")
-    other = arm.Arm(SETTINGS, VERSION)
+    other = arm.UrArm(SETTINGS, VERSION)
     assert other.upload()
     assert other._control.sent == "its own"
 
@@ -243,7 +243,7 @@ def test_connection_on_which_no_script_can_be_sent_is_a_lost_one(
             raise RuntimeError("write: Broken pipe")
 
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Closed)
-    one = arm.Arm(SETTINGS, VERSION)
+    one = arm.UrArm(SETTINGS, VERSION)
     assert one.read().connected
     assert not one.upload()
     assert not one.read().connected

@@ -118,7 +118,7 @@ def test_program_of_somebody_else_is_not_stopped_by_a_process_that_leaves(daemon
 
 CRASHING = """
 import threading
-from shearloop.drivers.ur import child
+from shearloop.drivers.ur import worker as child
 from shearloop.drivers.ur.messages import Configure
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 

@@ -91,11 +91,11 @@ os.write(1, encode(flight.state))
 LEAVES_IN_GOOD_ORDER = """
 import os, sys
 from shearloop.drivers.ur.messages import Disconnect
-from shearloop.drivers.ur.command_handler import Pilot
+from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
-os.write(1, encode(Pilot(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
+os.write(1, encode(CommandHandler(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
 decoder, last = Decoder(), None
 while heard := os.read(0, 1 << 16):
     for _, last in decoder.feed(heard):

@@ -55,7 +55,7 @@ SECTIONS = (
         told=(
             "daemon/control/control_loop.py",
             "daemon/control/wrist_controller.py",
-            "daemon/control/tune.py",
+            "daemon/loop/tune.py",
             "daemon/control/step_runner.py",
             "daemon/messaging/command_server.py",
         ),

@@ -56,7 +56,7 @@ async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_opera
         await cell.start({"do": "wait", "wait_s": 60})
         cell.gripper.answers = answer
         now_ns = cell.robot.flight.now_ns
-        cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.until_ended(10)
         await cell.cycles(50)
         assert "the gripper was told to open and did not" in cell.published.reasons
@@ -154,7 +154,7 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         assert cell.phase is ExperimentPhase.STOPPED
         assert "loop: ZeroDivisionError: a tick went wrong" in cell.why
         assert cell.robot.z_m == stopped_m
-        assert FaultCode.TASK_DIED in {trouble.event for trouble in cell.brain.standing.verdict.troubles}
+        assert FaultCode.TASK_DIED in {trouble.code for trouble in cell.brain.status.decision.faults}
 
 
 async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +170,7 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
 
         monkeypatch.setattr(cell.gripper, "release", at_length)
         now_ns = cell.robot.flight.now_ns
-        cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.until_ended(10)
         await heard.wait()
         tick = cell.brain.tick

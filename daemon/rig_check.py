@@ -85,4 +85,4 @@ def _why_not(drive: str, config: DaemonConfig) -> str:
         )
     if drive == SKIN and config.skin is not None:
         return "has no torque without a radius: add `skin.tool_radius_mm`, or take another"
-    return "is none of the torques that are measured: take another, or configure its device"
+    return "is not a measured torque: choose another, or configure its device"

@@ -1,7 +1,7 @@
 """Runs an experiment step by step: its commands, its steps as generators, its phases. No I/O; time is an argument.
 
-Each step is a generator that receives a `StepContext`, yields a `StepCommand`, and returns at its end. The experiment's clock stands
-while it is paused or held.
+Each step is a generator that receives a `StepContext`, yields a `StepCommand`, and returns at its end. The experiment's
+clock stands while it is paused or held.
 """
 
 from collections.abc import Callable, Generator

@@ -83,7 +83,7 @@ async def turning() -> AsyncIterator[tuple[Process, VelocityCommandSender]]:
     """Give what tells a process that turns the wrist as it was told at time 0."""
     async with driven() as cell:
         process = Process(replace(cell.state, motion="wrist", sent=TURN, clipped=()))
-        commands = VelocityCommandSender(process, SimpleNamespace(sent=lambda _: None), 4.0, pytest.fail)  # type: ignore[arg-type]
+        commands = VelocityCommandSender(process, SimpleNamespace(on_speed_sent=lambda _: None), 4.0, pytest.fail)  # type: ignore[arg-type]
         yield process, commands
 
 

@@ -110,7 +110,7 @@ def test_a_record_too_short_or_too_small_asks_for_more() -> None:
 def test_a_wrist_that_rests_and_a_reversed_sign_are_refused() -> None:
     with pytest.raises(IdentifyError, match="did not turn"):
         identify(record_of(angle_rad=np.full(record_of().angle_t_s.size, 0.2)), WINDOW_S)
-    with pytest.raises(IdentifyError, match="wrong way round"):
+    with pytest.raises(IdentifyError, match="sign of torque or wrist angle is wrong"):
         identify(record_of(stiffness=-0.25), WINDOW_S)
 
 

@@ -18,7 +18,7 @@ def test_a_silent_board_holds_the_wrist_and_then_stops_it() -> None:
     rig.silent.add("right")
     rig.run(2.5 * EIT.period_s + 0.7)
     assert (rig.speed, rig.brain.status.phase) == (0.0, "held")
-    assert "Look at the sensor's cable" in rig.brain.status.decision.reasons[0]
+    assert "Check the sensor's cable" in rig.brain.status.decision.reasons[0]
     rig.run(6)
     assert phase(rig) is ExperimentPhase.STOPPED
     assert rig.orders.stop

@@ -122,8 +122,8 @@ class WholeRig:
             self.force_n = 0.0 if orders.release else self.force_n
             return
         self.stopped = False
-        if orders.begin is not None:
-            self._begin(orders.begin)
+        if orders.action is not None:
+            self._begin(orders.action)
         assert math.isfinite(orders.wrist_rad_per_s)
         if self.brain.status.decision.response >= Response.HOLD:
             assert orders.wrist_rad_per_s == 0.0, "held, and yet it turns"

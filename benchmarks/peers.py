@@ -30,7 +30,7 @@ from shearloop.bank.eit.matching import Match, ReferenceMatcher, unit_magnitudes
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import Conductivities
 from shearloop.daemon.bank_config import load_geometry
-from shearloop.daemon.workers import Processes
+from shearloop.daemon.workers import ProcessExecutor
 
 Floats = NDArray[np.float64]
 Run = Callable[[], object]
@@ -191,7 +191,7 @@ def batches_a_minute(bank: Path, frames: Floats, turns: int) -> dict[str, Any]:
             {
                 f"{name}, one process": (lambda: matcher.matches(many), BATCH),  # noqa: B023 - runs in its turn
                 f"{name}, two processes": (
-                    lambda: list(Processes(2).map(matched, (name, bank), np.array_split(many, 2))),  # noqa: B023
+                    lambda: list(ProcessExecutor(2).map(matched, (name, bank), np.array_split(many, 2))),  # noqa: B023
                     BATCH,
                 ),
             },

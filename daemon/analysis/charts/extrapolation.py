@@ -13,7 +13,7 @@ from shearloop.bank.estimation import EstimatorSession, FrameSeries, Name, Physi
 from shearloop.daemon.analysis.charts.faults import Spoilt
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.analysis.charts.stability import Curve, Floats, Level, curve, estimates_of, judged
-from shearloop.daemon.workers import Workers, in_order
+from shearloop.daemon.workers import Executor, in_order
 
 Rows = NDArray[np.int64]
 # So many of the slices are calibrated on, those of the smallest torques or those of the largest.
@@ -66,7 +66,7 @@ def parts(torque_nm: Floats) -> dict[str, list[Part]]:
 
 
 def extrapolated(
-    split: Split, names: Sequence[Name], bank: Bank, mesh: Mesh | None, pool: Workers
+    split: Split, names: Sequence[Name], bank: Bank, mesh: Mesh | None, pool: Executor
 ) -> list[Extrapolation]:
     """Return each estimator beyond the torques that it was calibrated on; each calibration is a task of its own.
 

@@ -22,7 +22,7 @@ from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.daemon.analysis.charts.faults import FAULTS, Fault, Scene, Spoilt, scene_of
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.scene import residual_noise
-from shearloop.daemon.workers import Workers, in_order
+from shearloop.daemon.workers import Executor, in_order
 
 Floats = NDArray[np.float64]
 # Of valid estimates one in twenty may miss its 95 % interval; an estimator that is wrong so often says it is right
@@ -180,7 +180,7 @@ def scene_for(split: Split, bank: Bank) -> Scene:
 _MEAN_V = 0.13
 
 
-def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, pool: Workers) -> list[Curve]:
+def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, pool: Executor) -> list[Curve]:
     """Return all estimators through all faults on one split; each estimator is a task of its own."""
     tasks = fitted(split, names, physics)
     found = in_order(pool.map(swept, (scene_for(split, bank), str(bank.path.resolve())), tasks))

@@ -13,23 +13,15 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from shearloop.bank.eit.bounds import (
-    AllLagsBounds,
-    Left,
-    Mask,
-    Neighbourhood,
-    TakesLongError,
-    ZeroLagBounds,
-    spectra_of,
-)
-from shearloop.bank.eit.compression import COMPRESSED_CELLS, ROUNDING, Indices, compress
+from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from shearloop.bank.eit.bounds import AllLagsBounds, Left, Neighbourhood, TakesLongError, ZeroLagBounds, spectra_of
+from shearloop.bank.eit.compression import COMPRESSED_CELLS, ROUNDING, compress
 from shearloop.bank.eit.matching import (
     CHUNK_CELLS,
     RUNNER_UP_RADIUS,
     TIE,
-    FloatArray,
     Match,
     Matcher,
     ReferenceMatcher,
@@ -65,7 +57,7 @@ class _PruningMatcher(Matcher):
     # With fewer cells nothing is searched: the whole heatmap is made.
     _fewest = 0
 
-    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank, which takes about half a second for 10⁴ cells; arguments as of any matcher.
 
         Raises MatchingError as any matcher, and here, not at the first frame, where a valid cell has no signal.
@@ -138,8 +130,8 @@ class _PruningMatcher(Matcher):
         return int(cells[winner]), min(float(scores[winner]), 1.0)
 
     def _contenders(
-        self, frame: FloatArray, cells: Indices, frames: FloatArray, reached: float
-    ) -> tuple[Indices, FloatArray]:
+        self, frame: FloatArray, cells: IntArray, frames: FloatArray, reached: float
+    ) -> tuple[IntArray, FloatArray]:
         """Return those of the cells that may score `reached`, and their scores at the lags of (m, 896) frames."""
         if len(frames) > _FEW_LAGS:
             return cells, self._scores(frame[None], self._unit_signals(self._cells[cells]))[0]
@@ -178,7 +170,7 @@ class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     All cells are estimated at once, for with one lag that is a few operations on one number per cell.
     """
 
-    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as of any pruning matcher."""
         super().__init__(signals, valid, k_grid, sigma_grid)
         # Every place of the grid has the number of its cell; those that are not valid share one that is none.
@@ -212,7 +204,7 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
 
     _fewest = FEWEST_PRUNED
 
-    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as of `FastZeroLagMatcher`."""
         super().__init__(signals, valid, k_grid, sigma_grid)
         self._spectra = spectra_of(self._bank)

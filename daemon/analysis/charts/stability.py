@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import (
@@ -24,7 +24,6 @@ from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.scene import residual_noise
 from shearloop.daemon.workers import Executor, in_order
 
-Floats = NDArray[np.float64]
 # Of valid estimates one in twenty may miss its 95 % interval; an estimator that is wrong so often says it is right
 # when it is not: it breaks silently.
 BROKEN_SHARE = 0.2
@@ -68,7 +67,7 @@ def curve(fault: str, unit: str, estimator: str, levels: Iterable[Level]) -> Cur
     return Curve(fault, unit, estimator, found, mildest)
 
 
-def judged(estimates: Sequence[Estimate], truth_nm: Floats, level: float) -> Level:
+def judged(estimates: Sequence[Estimate], truth_nm: FloatArray, level: float) -> Level:
     """Return the figures of estimates against (n,) truths, of which only those that are known count."""
     known = np.isfinite(truth_nm)
     rows = [
@@ -95,13 +94,13 @@ def estimates_of(tracker: EstimatorSession, spoilt: Spoilt) -> list[Estimate]:
     return found
 
 
-def truth_of(series: FrameSeries) -> Floats:
+def truth_of(series: FrameSeries) -> FloatArray:
     """Return the (n,) torques that a series is judged by, NaN where it is not."""
     torque = series.torque_at_frames()
     return balanced(torque) if series.kind == "raw" else torque
 
 
-def balanced(truth_nm: Floats) -> Floats:
+def balanced(truth_nm: FloatArray) -> FloatArray:
     """Return (n,) truths of which as many are loaded as free of load, the rest NaN: most of a stream is free of load.
 
     Zero is easily met; an estimator that always says so would look stable.

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass as checked_dataclass
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.settings import NotNegative, Positive
 from shearloop.daemon.errors import UserError
-
-FloatArray = NDArray[np.float64]
 
 # The grid of the torque's lag behind its stamp.
 _LAG_GRID_S = np.arange(-0.4, 1.0001, 0.02)

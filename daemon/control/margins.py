@@ -24,7 +24,8 @@ from scipy.linalg import solve_discrete_lyapunov
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
 
-FloatArray = NDArray[np.float64]
+from shearloop.bank.arrays import FloatArray
+
 ComplexArray = NDArray[np.complex128]
 
 # The step response is cut at this remainder.

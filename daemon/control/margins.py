@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_lyapunov
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
-
-from shearloop.bank.arrays import FloatArray
 
 ComplexArray = NDArray[np.complex128]
 

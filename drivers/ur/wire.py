@@ -34,8 +34,8 @@ LARGEST_MESSAGE: Final = 1 << 16
 
 _MOTIONS: Final = (WristSpeed, MoveLinear, Stop)
 _TYPES: Final[tuple[Any, ...]] = (
-    *_MOTIONS, ZeroForceTorque, Enable, Unlock, Disconnect, CommandReply, RobotState, Configure, Heartbeat, RobotPhase, Failed,
-    UrSettings, UrLimits, Bound, JointRange, Workspace,
+    *_MOTIONS, ZeroForceTorque, Enable, Unlock, Disconnect, CommandReply, RobotState, Configure, Heartbeat, RobotPhase,
+    Failed, UrSettings, UrLimits, Bound, JointRange, Workspace,
 )  # fmt: skip
 _CODES: Final = {kind: code for code, kind in enumerate(_TYPES)}
 _NAMES: Final = {kind: [field.name for field in fields(kind)] for kind in _TYPES}

@@ -94,7 +94,7 @@ def test_robot_that_is_made_ready_no_more_is_told_at_once_however_soon(
             pilot._recovery.give_up("Nobody waits for it.")
         return given_up(pilot, reading, now_ns)
 
-    monkeypatch.setattr("shearloop.drivers.ur.command_handler.Pilot.tick", tick)
+    monkeypatch.setattr("shearloop.drivers.ur.command_handler.CommandHandler.tick", tick)
     timed = Timed(daemon, monkeypatch, (0.201, Unlock()), (0.4, Disconnect()), arm=arm)
     ready = [state for state in timed.states if 1000.195 < state.t_mono_ns / 1e9 < 1000.3]
     announced = next(number for number, state in enumerate(ready) if state.recovering)

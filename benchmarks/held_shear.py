@@ -11,8 +11,8 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.calibration import SkinCalibration
 from shearloop.daemon.config import LoopConfig
 from shearloop.daemon.control.experiment_schema import ExperimentFile
@@ -26,7 +26,6 @@ from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
 from shearloop.drivers.emulators.skin.daq import NOISE_V
 from shearloop.drivers.shear_skin.judge import SkinSample
 
-Floats = NDArray[np.float64]
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
 # What a reading takes from the middle of its conversion to the controller, and a speed until the wrist has it.
 AGE_S, ACTUATION_TICKS = 0.06, 2
@@ -172,7 +171,7 @@ def _experiment(hold_s: float) -> ExperimentFile:
     return ExperimentFile.model_validate({"name": "bench", "drive": "skin", "steps": steps, "limits": {"angle_rad": 1}})
 
 
-def holds_of(loop: SkinLoop, settled_s: float) -> list[Floats]:
+def holds_of(loop: SkinLoop, settled_s: float) -> list[FloatArray]:
     """Return the true force over the settled end of each hold, in the order of the set points."""
     set_points, truth = np.array(loop.set_point_n), np.array(loop.truth_n)
     set_points = np.round(set_points, 6)

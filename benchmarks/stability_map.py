@@ -17,18 +17,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.alternatives import HeldSpeed, LateCorrection
 from benchmarks.closed_loop import Loop, run
 from benchmarks.control_charts import draw_stability
 from benchmarks.plant import Plant, Sample, Sensor, Tool
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.controller import TwistController
 from shearloop.daemon.control.margins import LoopModel, gain_limit, pulse_response, seen_through_window
 from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
-
-FloatArray = NDArray[np.float64]
 
 COMMAND_S = 0.016
 ACTUATION_S = 0.02

@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.plant import EIT, LOAD_CELL, Plant, Sensor, Tool, TwinPlant
 from benchmarks.step_response import BAND, PERIOD_S, SOURCES, TARGET_NM, steps
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
 from shearloop.drivers.emulators.twin import Joint, Twin, TwinSettings
-
-FloatArray = NDArray[np.float64]
 
 # What a gel can have; 0.8 is the emulated rig's.
 GEL_NM_PER_RAD = (0.5, 1.1)

@@ -59,7 +59,7 @@ def test_two_processes_match_a_batch_as_one_does(bank, monkeypatch) -> None:
                 yield number, found
 
     monkeypatch.setattr(peers, "BATCH", 7)
-    monkeypatch.setattr(peers, "Processes", lambda _: Counted())
+    monkeypatch.setattr(peers, "ProcessExecutor", lambda _: Counted())
     found = peers.batches_a_minute(bank.path, frames, 2)
     assert list(found) == [f"{lags}, {n}" for lags in peers.MATCHERS for n in ("one process", "two processes")]
     assert parts == [2] * 6, "once to warm up, and twice in turn"

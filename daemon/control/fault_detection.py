@@ -12,9 +12,8 @@ from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, stale_after_s
 # 2.5 periods of their topics.
 ARM_STALE_S = stale_after_s("robot.state")
 HAND_STALE_S = stale_after_s("gripper.state")
-# While an experiment runs, the loop decides on each state of at least two of the robot's five cycles
-# (`shearloop.drivers.ur.pace`); a decision later than this is late.
-LONGEST_TICK_S = 0.03
+# The loop decides on each of the robot's states; a longer interval is late.
+LONGEST_TICK_S = 0.02
 # A loop later than this turned the wrist on a stale state.
 LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 # A longer absence is a paused process rather than a slow loop. CLOCK_MONOTONIC stands while the computer is suspended;

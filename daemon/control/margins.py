@@ -34,8 +34,6 @@ _FREQUENCIES = 4000
 # Above this gain the loop follows single measurements rather than their mean.
 MOST_GAIN = 0.5
 LEAST_GAIN = 1e-3
-# The longest time between two decisions while the wrist turns slowly (`shearloop.drivers.ur.pace`).
-COMMAND_PERIOD_S = 0.024
 # The delay margin that a controller must have, in measurement periods.
 DELAY_MARGIN_PERIODS = 1.0
 
@@ -285,7 +283,6 @@ def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
         wrist_bandwidth_per_s=settings.wrist_bandwidth_per_s,
         kp=settings.kp,
         ki=settings.ki,
-        command_period_s=COMMAND_PERIOD_S,
         stiffness_ratio=found.stiffness_nm_per_rad / settings.stiffness_nm_per_rad,
         lag_error_s=max(found.significant_lag_s - settings.lag_s, earliest_s),
     )

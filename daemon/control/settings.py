@@ -21,7 +21,7 @@ class LoopConfig(ConfigModel):
     wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14)
     freshness_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
     wrist_acceleration_rad_per_s2: float = Field(default=4.0, gt=0, le=1000, description="given to the robot")
-    angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=30, description="how fast the wrist approaches an angle")
+    angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=80, description="how fast the wrist approaches an angle")
     torque_bandwidth_per_s: float = Field(default=4.0, gt=0, le=30, description="how fast it approaches a torque")
     actuation_s: float = Field(default=0.02, ge=0, le=0.2, description="from sending a speed until the angle shows it")
     gain_margin: float = Field(default=2.0, ge=1, le=100)

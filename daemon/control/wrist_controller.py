@@ -1,4 +1,4 @@
-"""The wrist's controller: turns each set point into a speed, up to 125 times a second. No I/O; time is an argument."""
+"""The wrist's controller: turns each set point into a speed, 125 times a second. No I/O; time is an argument."""
 
 import math
 from collections import deque
@@ -20,11 +20,6 @@ from shearloop.daemon.control.step_runner import (
 
 # Torques that wait for the next wrist angle.
 MOST_PENDING = 64
-# A speed that was sent for an angle no further away than this is as good, for it is a tenth of what the wrist resolves,
-# and what stays the same need not be sent again.
-AS_GOOD_RAD = 2e-5
-# But no more than this share of the speed that is allowed: a slower wrist would never turn back.
-AS_GOOD_SHARE = 0.1
 # After a longer pause of the loop, the speed sent last is unknown.
 LONGEST_STEP_NS = 50_000_000
 # The largest drift of the torque at a fixed angle that counts as creep.
@@ -183,9 +178,6 @@ class WristController:
     def _towards(self, missing_rad: float, speed_rad_per_s: float) -> WristVelocity:
         bandwidth_per_s = self._config.angle_bandwidth_per_s
         speed = math.copysign(min(abs(bandwidth_per_s * missing_rad), speed_rad_per_s), missing_rad)
-        as_good_rad_per_s = min(bandwidth_per_s * AS_GOOD_RAD, AS_GOOD_SHARE * speed_rad_per_s)
-        if self._sent_rad_per_s and abs(speed - self._sent_rad_per_s) <= as_good_rad_per_s:
-            speed = self._sent_rad_per_s
         return self._bounded(speed)
 
     def _bounded(self, speed_rad_per_s: float) -> WristVelocity:

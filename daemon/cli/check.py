@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
 
     from shearloop.daemon.cli.run import checked_emulators
     from shearloop.daemon.config import load_daemon_config
-    from shearloop.daemon.rig_check import checked_experiment
+    from shearloop.daemon.rig import check_experiment
     from shearloop.daemon.sensing.opening import open_both, open_estimator
     from shearloop.daemon.sensing.torque_sources import torque_sources
 
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     if config.skin is not None:
         told["skin"] = _skin(config.skin)
     told.update(_rig(config))
-    experiment = checked_experiment(config, torque_sources(config, estimators, both))
+    experiment = check_experiment(config, torque_sources(config, estimators, both))
     if experiment is not None:
         told["experiment"] = f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.drive}"
     if args.json:

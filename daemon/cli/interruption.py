@@ -9,7 +9,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import NoReturn
 
-from shearloop.daemon.ending_signals import ending_signals
+from shearloop.daemon.process import ending_signals
 
 # After which compiled code has mostly gone on; where it has not, the same is done once more.
 AGAIN_S = 0.05

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, TextIO
 if TYPE_CHECKING:
     from shearloop.daemon.cli.demonstration import Truth
     from shearloop.daemon.config import EmulatorConfig
+    from shearloop.daemon.logs import NonBlockingWriter
     from shearloop.daemon.messaging.publisher import Listener
-    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
     from shearloop.daemon.recording.matlab_slices import SliceRecorder
 
 # Long enough for an emulator to remove its port's link, short enough for a clean stop within a second.
@@ -52,17 +52,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal, `shearloop command stop`, or the end of the experiment (`stop_when_done`)."""
-    from shearloop.daemon.ending_signals import ending_signals
-    from shearloop.daemon.gc_control import kept_from_lasting_objects
-    from shearloop.daemon.logs import logging_to_stderr
-    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
+    from shearloop.daemon.logs import NonBlockingWriter, logging_to_stderr
+    from shearloop.daemon.process import ending_signals, without_long_collections
 
     # Until the event loop takes the signals over: a service that is stopped while it starts has not failed.
     for number in ending_signals():
         if number != signal.SIGINT:
             signal.signal(number, lambda *_: sys.exit(0))
     with (
-        kept_from_lasting_objects() as collect_what_comes,
+        without_long_collections() as collect_what_comes,
         logging_to_stderr(json_lines=args.json_log) as log,
         closing(NonBlockingWriter(sys.stdout)) as out,
     ):
@@ -117,7 +115,11 @@ def _run(
                 lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: happenings.happened
             )
             listeners = (Deaths(config.emulators, processes), happenings, *listeners)
-            facts = {"log": log.facts, "shown": out.facts, **({"slices": slices.facts} if slices is not None else {})}
+            facts = {
+                "log": log.diagnostics,
+                "shown": out.diagnostics,
+                **({"slices": slices.facts} if slices is not None else {}),
+            }
             shown = (Show(out), summary) if args.show else ()
             finished = asyncio.run(run_daemon(config, (*listeners, *shown), facts, on_ready))
     finally:

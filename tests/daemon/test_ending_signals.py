@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon import gc_control as collector
+from shearloop.daemon import process
 from shearloop.daemon.cli import main, run
-from shearloop.daemon.ending_signals import ending_signals
+from shearloop.daemon.process import ending_signals
 from tests.daemon.conftest import DEADLINE_S
 
 
@@ -59,9 +59,7 @@ def test_what_ends_a_daemon_does_nothing_more_when_it_comes_again(
         came.append("again")
 
     monkeypatch.setattr(run, "_emulators", emulators)
-    monkeypatch.setattr(
-        collector, "kept_from_lasting_objects", lambda: nullcontext(partial(os.kill, os.getpid(), number))
-    )
+    monkeypatch.setattr(process, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number)))
     assert main(["run", str(config())]) == 0
     assert came == ["again"]
     assert signal.getsignal(number) is signal.SIG_DFL, "as before the command"
@@ -71,7 +69,7 @@ def test_a_command_runs_in_any_thread_and_hears_no_signals_there(
     config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ready = threading.Event()
-    monkeypatch.setattr(collector, "kept_from_lasting_objects", lambda: nullcontext(ready.set))
+    monkeypatch.setattr(process, "without_long_collections", lambda: nullcontext(ready.set))
     with ThreadPoolExecutor() as pool:
         assert pool.submit(ending_signals).result() == ()
         daemon = pool.submit(main, ["run", str(config())])

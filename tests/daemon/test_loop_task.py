@@ -273,7 +273,7 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
         cell.runner._actions.interrupt()
         arm.be(wrench=(0.0,) * 6)
         await cell.cycles(1)
-        cell.runner._actions.let_go()
+        cell.runner._actions.resume()
         await cell.until_ended()
         assert "the move ended early: force" in cell.why
         assert sum(isinstance(command, MoveLinear) for command in cell.robot.commands) == 1

@@ -15,9 +15,7 @@ from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.estimation import FrameSeries
 from shearloop.daemon.analysis.charts import scene
 from shearloop.daemon.analysis.charts.command import NAMES
-from shearloop.daemon.analysis.charts.forwards import CELLS, converged, direct, error_of, forwards
-from shearloop.daemon.analysis.charts.methods import Measured
-from shearloop.daemon.analysis.charts.picture import (
+from shearloop.daemon.analysis.charts.drawing import (
     check_takes_pictures,
     figure,
     frontier,
@@ -25,6 +23,8 @@ from shearloop.daemon.analysis.charts.picture import (
     plain_log,
     write_names,
 )
+from shearloop.daemon.analysis.charts.forwards import CELLS, converged, direct, error_of, forwards
+from shearloop.daemon.analysis.charts.methods import Measured
 from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
 from shearloop.daemon.analysis.charts.speed_accuracy import (
     Compared,

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         import matplotlib as _  # noqa: F401 - so that its absence is told before anything is measured
     except ModuleNotFoundError as error:
         raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
-    from shearloop.daemon.analysis.charts.picture import check_takes_pictures, empty_ones_removed
+    from shearloop.daemon.analysis.charts.drawing import check_takes_pictures, empty_ones_removed
 
     check_takes_pictures(args.out)
     charts: dict[str, Callable[[argparse.Namespace], list[Path]]] = {
@@ -96,7 +96,7 @@ def _speed_accuracy(args: argparse.Namespace) -> list[Path]:
 
 def _stability(args: argparse.Namespace) -> list[Path]:
     from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
-    from shearloop.daemon.analysis.charts.stability_chart import chart
+    from shearloop.daemon.analysis.charts.stability import chart
     from shearloop.daemon.workers import workers
 
     scratch, mesh = args.out / "banks", mesh_of(args.mesh)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.peers import EIDORS_CELL_S, pyeit_solver
 from shearloop.bank.eit.batch_forward import BatchForwardModel
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import Conductivities, conductivity
@@ -19,20 +19,22 @@ MODEL = "gaussian_derivative"
 # Cells all over the valid part of the paper's grid.
 CELLS = ((3.2, 1.2), (3.3, 1.9), (2.2, 1.0), (1.4, 1.4), (0.8, 2.5), (4.0, 3.5))
 DIRECT_SIZES_CM = (0.4, 0.2, 0.1, 0.05)
-# Errors fall in proportion to the mesh size: two fine meshes tell where they go (Richardson).
+# Errors fall in proportion to the mesh size: two fine meshes give the limit (Richardson extrapolation).
 CONVERGED_SIZES_CM = (0.04, 0.025)
 BATCH, BATCHES = "batch of cells", 8
-# What the peers' times are cited of. EIDORS' voltages there the direct solve gives to 1e-9.
+# The mesh of the cited times. The direct solve agrees with EIDORS' voltages on it to 1e-9.
 PAPER_TRIANGLES = 4882
+# EIDORS 3.10 with warm caches on that mesh, in seconds; it needs MATLAB or Octave, so it is cited.
+EIDORS_CELL_S = 0.034
 # pyEIT with warm caches on that mesh, cited where it is not installed.
 PYEIT_CELL_S = 0.244
 
 
 @dataclass(frozen=True, slots=True)
-class Solved:
-    """A forward method: ms per cell (median, fastest and slowest round), relative L2 error of the difference signal.
+class SolvedForward:
+    """A forward method: ms per cell (median, fastest and slowest round), and relative L2 error of the difference signal.
 
-    What is cited was not measured here; its error is None where nobody has measured it, or it is of another model.
+    `cited` times were not measured here. The error is None where it is unknown, or where the model is another one.
     """
 
     name: str
@@ -51,25 +53,25 @@ class _Solver:
     family: str
     mesh: Mesh
     solve: Callable[[], object]
-    # None where another model is solved, with other signals.
+    # None where another model is solved.
     truth: Floats | None
 
     @property
     def times(self) -> int:
-        """How often one call solves all cells."""
+        """The number of times that one call solves all cells."""
         return BATCHES if self.family.startswith(BATCH) else 1
 
 
-def forwards(
+def forward_methods(
     rounds: int,
     mesh: Mesh | None,
     sizes_cm: Sequence[float] = DIRECT_SIZES_CM,
     converged_cm: tuple[float, float] = CONVERGED_SIZES_CM,
-) -> list[Solved]:
-    """Return all forward methods: direct solves on ever finer meshes, on `mesh` too where it is given, and the peers.
+) -> list[SolvedForward]:
+    """Return all forward methods: direct and batched solves on ever finer meshes and on `mesh`, and the peers.
 
-    Methods take turns, so that a busy moment of the machine meets all of them alike. pyEIT solves on the mesh whose
-    triangles are nearest in number to the paper's, and is cited where it is not installed; EIDORS is cited.
+    Methods take turns, so that a busy moment of the machine affects all alike. pyEIT solves on the mesh with the number
+    of triangles closest to the paper's, and is cited where it is not installed. EIDORS is always cited.
     """
     coarse, fine = (own_fingertip(size).mesh() for size in converged_cm)
     truth = converged(coarse, fine, converged_cm[0] / converged_cm[1])
@@ -97,24 +99,24 @@ def forwards(
             if turn == rounds - 1:
                 own_ms = times[one.name]
                 found.append(
-                    Solved(
+                    SolvedForward(
                         one.name, one.family, len(one.mesh.triangles), float(np.median(own_ms)), min(own_ms),
                         max(own_ms), None if one.truth is None else error_of(np.asarray(signals), one.truth),
                     )
                 )  # fmt: skip
-    # Where the paper's mesh was not given, nobody knows the error of what was solved on it.
+    # EIDORS' error is known only where the paper's mesh was given.
     error = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
     found.append(_cited("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, error))
     return found if solve is not None else [*found, _cited("pyEIT", "pyEIT", PYEIT_CELL_S, None)]
 
 
-def _cited(name: str, family: str, cell_s: float, error: float | None) -> Solved:
+def _cited(name: str, family: str, cell_s: float, error: float | None) -> SolvedForward:
     cell_ms = 1e3 * cell_s
-    return Solved(f"{name} (cited)", family, PAPER_TRIANGLES, cell_ms, cell_ms, cell_ms, error, cited=True)
+    return SolvedForward(f"{name} (cited)", family, PAPER_TRIANGLES, cell_ms, cell_ms, cell_ms, error, cited=True)
 
 
 def pyeit(mesh: Mesh) -> Callable[[], object] | None:
-    """Return what solves the cells by pyEIT, with point electrodes, one after the other; None where it is not there."""
+    """Return a function that solves the cells by pyEIT, with point electrodes; None where it is not installed."""
     solve = pyeit_solver(mesh)
     if solve is None:
         return None
@@ -123,25 +125,49 @@ def pyeit(mesh: Mesh) -> Callable[[], object] | None:
     return lambda: [solve(cell) for cell in cells]
 
 
+def pyeit_solver(mesh: Mesh) -> Callable[[Floats], object] | None:
+    """Return pyEIT's forward solve of the same patterns on the same mesh, or None where it is not installed."""
+    try:
+        from pyeit.eit.fem import EITForward
+        from pyeit.eit.protocol import PyEITProtocol
+        from pyeit.mesh import PyEITMesh
+    except ImportError:
+        return None
+    nodes = np.column_stack([mesh.nodes, np.zeros(len(mesh.nodes))])
+    middles = [mesh.electrode_edges[mesh.electrode_of_edge == e][0, 0] for e in range(N_ELECTRODES)]
+    free = int(np.setdiff1d(np.arange(len(mesh.nodes)), mesh.electrode_edges)[0])
+    body = PyEITMesh(node=nodes, element=np.asarray(mesh.triangles), el_pos=np.array(middles), ref_node=free)
+    injections = CHANNELS.reshape(N_ELECTRODES, -1, 4)
+    protocol = PyEITProtocol(
+        injections[:, 0, [1, 0]].copy(), injections[:, :, 2:].copy(), np.ones(N_CHANNELS, dtype=bool)
+    )
+    solver = EITForward(body, protocol)
+
+    def solve(conductivity: Floats) -> object:
+        return solver.solve_eit(perm=conductivity)
+
+    return solve
+
+
 def batch(mesh: Mesh) -> Callable[[], Floats]:
-    """Return what solves the same signals all at once, as `bank build` does."""
+    """Return a function that solves the same signals in one batch, as `bank build` does."""
     model, of = BatchForwardModel(mesh), Conductivities(mesh)
     (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
-    # Several cells go through the elimination together; six alone would pay for lanes that are empty.
+    # The elimination takes several cells at once; six alone would leave lanes empty.
     cells = np.array([of.of(MODEL, k, s) for k, s in CELLS])
     many = np.resize(np.arange(len(CELLS)), BATCHES * len(CELLS))
     return lambda: (model.voltages(cells[many]) - homogeneous)[: len(CELLS)]
 
 
 def direct(mesh: Mesh) -> Callable[[], Floats]:
-    """Return what solves the (m, 896) difference signals of the cells on a mesh."""
+    """Return a function that solves the cells' (m, 896) difference signals one by one."""
     model = ForwardModel(mesh)
     homogeneous = model.homogeneous()
     return lambda: np.array([model.voltages(conductivity(mesh, MODEL, k, s)) - homogeneous for k, s in CELLS])
 
 
 def converged(coarse: Mesh, fine: Mesh, ratio: float) -> Floats:
-    """Return the signals that two meshes point to, the first `ratio` times as coarse, with an error of first order."""
+    """Return the extrapolated signals of two meshes, the first `ratio` times as coarse, for an error of first order."""
     first, second = direct(coarse)(), direct(fine)()
     return np.asarray(second + (second - first) / (ratio - 1.0))
 

@@ -147,6 +147,11 @@ def _plain_ticks(axis: Axis) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
+def slug(title: str) -> str:
+    """Return the part of a title before its first comma as a part of a file name."""
+    return "-".join(title.split(",", maxsplit=1)[0].replace(".", " ").replace("_", " ").split()).lower()
+
+
 def check_takes_pictures(directory: Path) -> None:
     """Raise UserError, before anything is measured, where no chart can be written into a directory.
 

@@ -1,19 +1,24 @@
-"""The daemon's own loop around the emulated skin in virtual time, over gains, delays and normal forces.
+"""The loop that holds a shear force on the emulated skin, through friction: limit cycle and offset over gain and delay.
 
-What is measured with it and why is told in `benchmarks/skin_loop.py`; the chart is in
-`daemon/analysis/charts/limit_cycle.py`.
+The daemon's own loop (identification, controller, estimator) loads 1 N, unloads to 0.6 N and loads again, in virtual
+time. The width of the true force over each hold's end is compared with 2 μFₙ, the width of friction's own band.
 """
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from shearloop.bank.skin.calibration import SkinCalibration
+from shearloop.bank.skin.calibration_file import load_calibration
+from shearloop.daemon.analysis.charts.drawing import figure, look, save
 from shearloop.daemon.config import LoopConfig
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
@@ -23,43 +28,44 @@ from shearloop.daemon.rig import make_brain
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
+from shearloop.daemon.workers import Workers, in_order
 from shearloop.drivers.emulators.skin.daq import NOISE_V
 from shearloop.drivers.shear_skin.judge import SkinSample
 
 Floats = NDArray[np.float64]
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
-# What a reading takes from the middle of its conversion to the controller, and a speed until the wrist has it.
+# From the middle of a conversion to the controller; and from a speed command to the wrist.
 AGE_S, ACTUATION_TICKS = 0.06, 2
-# A reading of a quarter of a second ago is stale: the loop holds, and there is no loop any more.
+# At 0.25 s a reading is stale and the loop holds.
 AGES_S = (0.02, 0.06, 0.1, 0.15, 0.2)
 RADIUS_MM, SET_POINTS_N = 15.0, (1.0, 0.6, 1.0)
-CALIBRATION = Path(__file__).parents[1] / "config" / "calibrations" / "skin_demo.yaml"
+CALIBRATION = Path(__file__).parents[2] / "config" / "calibrations" / "skin_demo.yaml"
 SOURCE = TorqueSource(name=SKIN, period_s=SAMPLE_TICKS * TICK_S, sticks=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Case:
-    """One run: the loop's gain and deadband, the normal force that is and the one that is configured."""
+class SkinLoopCase:
+    """One run: gain, deadband, and the true and the configured normal force."""
 
     name: str
     kp: float = 0.5
     normal_n: float = 1.0
     configured_n: float | None = None
     deadband_nm: float = 0.0003
-    # Whether the estimator takes friction out, and whether the loop is told the band that friction leaves.
+    # Whether the estimator removes friction, and whether the loop gets the band that friction leaves.
     knows_friction: bool = True
     band: bool = True
     age_s: float = AGE_S
     seed: int = 0
-    # Of each hold, of which the last three fifths count.
+    # The last three fifths of each hold are judged.
     hold_s: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
-    """What came of it, in N: the widest remaining oscillation and the largest mean distance from a set point."""
+class SkinHold:
+    """The result in N: the widest remaining oscillation, and the largest mean distance from a set point."""
 
-    case: Case
+    case: SkinLoopCase
     width_n: float
     offset_n: float
     bound_n: float
@@ -67,10 +73,10 @@ class Held:
 
 
 class SkinLoop:
-    """The daemon's loop around the emulated skin, tick by tick; nothing is waited for."""
+    """The daemon's loop around the emulated skin, tick by tick in virtual time."""
 
-    def __init__(self, case: Case, calibration: SkinCalibration) -> None:
-        """Put the tool on the skin, and everything at rest."""
+    def __init__(self, case: SkinLoopCase, calibration: SkinCalibration) -> None:
+        """Put the tool on the skin, at rest."""
         self._random = np.random.default_rng(case.seed)
         settings = SyntheticSkinSettings(radius_mm=RADIUS_MM, normal_n=case.normal_n)
         self.skin = SyntheticSkin(settings, seed=case.seed)
@@ -78,7 +84,7 @@ class SkinLoop:
         if not case.knows_friction:
             calibration = replace(calibration, friction=0.0)
         self.estimator = SkinEstimator(calibration, normal_n=configured_n)
-        # Every margin is allowed here: where the boundary lies is what is asked.
+        # The chart looks for the boundary, so every margin is allowed.
         config = LoopConfig.model_validate(
             {
                 **{"kp": case.kp, "deadband_nm": case.deadband_nm, "jump_nm": 0.006, "slip_nm": 0.006},
@@ -102,7 +108,7 @@ class SkinLoop:
         return round(self._tick * TICK_S * 1e9)
 
     def run(self, most_s: float) -> str:
-        """Run the experiment of this bench to its end; return how it ended."""
+        """Run the experiment to its end; return how it ended."""
         for _ in range(50):
             self._step()
         why = self.brain.start(_experiment(self._hold_s), self.t_ns)
@@ -173,7 +179,7 @@ def _experiment(hold_s: float) -> ExperimentFile:
 
 
 def holds_of(loop: SkinLoop, settled_s: float) -> list[Floats]:
-    """Return the true force over the settled end of each hold, in the order of the set points."""
+    """Return the true force over the settled end of each hold, in order."""
     set_points, truth = np.array(loop.set_point_n), np.array(loop.truth_n)
     set_points = np.round(set_points, 6)
     changes = np.flatnonzero(np.diff(np.nan_to_num(set_points, nan=-1.0))) + 1
@@ -182,54 +188,118 @@ def holds_of(loop: SkinLoop, settled_s: float) -> list[Floats]:
     return [truth[end - settled : end] for begin, end in pairwise(ends) if np.isfinite(set_points[begin])]
 
 
-def judge(case: Case, calibration: SkinCalibration) -> tuple[Held, SkinLoop]:
+def judge(case: SkinLoopCase, calibration: SkinCalibration) -> tuple[SkinHold, SkinLoop]:
     """Run one case."""
     loop = SkinLoop(case, calibration)
     phase = loop.run(200.0)
     bound_n = 2.0 * loop.skin.membrane.friction * case.normal_n
     found = holds_of(loop, 0.6 * case.hold_s)
     if phase != ExperimentPhase.DONE.value or len(found) != len(SET_POINTS_N):
-        return Held(case, math.nan, math.nan, bound_n, phase), loop
+        return SkinHold(case, math.nan, math.nan, bound_n, phase), loop
     width_n = max(float(np.ptp(truth)) for truth in found)
     offset_n = max(abs(float(truth.mean()) - wanted) for truth, wanted in zip(found, SET_POINTS_N, strict=True))
-    return Held(case, width_n, offset_n, bound_n, phase), loop
+    return SkinHold(case, width_n, offset_n, bound_n, phase), loop
 
 
-# The whole range that a configuration may ask for: with 1 each reading is believed outright.
+# The range of the configuration; at 1 the loop believes each reading fully.
 GAINS = (0.05, 0.15, 0.5, 1.0)
 NORMALS_N = (0.5, 1.0, 2.0)
 SEEDS = 3
 KINDS = (
-    *(Case(name=f"Fn = {n:g} N", normal_n=n) for n in NORMALS_N),
-    Case(name="Fn = 1 N, no deadband", deadband_nm=0.0),
-    Case(name="Fn = 2 N, configured as 1 N", normal_n=2.0, configured_n=1.0),
-    Case(name="Fn = 1 N, loop not told the band", band=False),
-    Case(name="Fn = 1 N, friction ignored", knows_friction=False, band=False),
+    *(SkinLoopCase(name=f"Fn = {n:g} N", normal_n=n) for n in NORMALS_N),
+    SkinLoopCase(name="Fn = 1 N, no deadband", deadband_nm=0.0),
+    SkinLoopCase(name="Fn = 2 N, configured as 1 N", normal_n=2.0, configured_n=1.0),
+    SkinLoopCase(name="Fn = 1 N, loop without the band", band=False),
+    SkinLoopCase(name="Fn = 1 N, friction ignored", knows_friction=False, band=False),
 )
 
 
-def over_gains() -> list[Case]:
-    """Return every kind of case at every gain."""
+def over_gains() -> list[SkinLoopCase]:
+    """Return all kinds of cases at all gains."""
     return [replace(kind, kp=kp, seed=10 * seed) for seed, kind in enumerate(KINDS) for kp in GAINS]
 
 
-def over_delays() -> list[Case]:
-    """Return loops that are told the band and not, at the usual and the highest gain, with older and older readings."""
-    told = Case(name="told the band")
-    not_told = Case(name="not told the band", band=False)
+def over_delays() -> list[SkinLoopCase]:
+    """Return loops with and without the band, at the usual and the highest gain, with ever older readings."""
+    with_band = SkinLoopCase(name="with the band")
+    without_band = SkinLoopCase(name="without the band", band=False)
     return [
         replace(kind, name=f"{kind.name}, kp = {kp:g}", kp=kp, age_s=age_s)
-        for kind in (told, not_told)
+        for kind in (with_band, without_band)
         for kp in (0.5, 1.0)
         for age_s in AGES_S
     ]
 
 
-def worst(calibration: SkinCalibration, case: Case) -> Held:
-    """Return the widest oscillation and the largest offset over several noises; or the run that broke off."""
+def worst(calibration: SkinCalibration, case: SkinLoopCase) -> SkinHold:
+    """Return the widest oscillation and the largest offset over several noises, or the run that broke off."""
     found = [judge(replace(case, seed=case.seed + seed), calibration)[0] for seed in range(SEEDS)]
     broken = next((held for held in found if math.isnan(held.width_n)), None)
     if broken is not None:
         return broken
     width_n, offset_n = max(held.width_n for held in found), max(held.offset_n for held in found)
     return replace(found[0], width_n=width_n, offset_n=offset_n)
+
+
+def chart(out: Path, pool: Workers) -> list[Path]:
+    """Measure all cases, draw and write `stability-skin`."""
+    calibration = load_calibration(CALIBRATION)
+    gains, delays = over_gains(), over_delays()
+    found = in_order(pool.map(worst, calibration, [*gains, *delays]))
+    shown = judge(SkinLoopCase(name="shown"), calibration)[1]
+    made = limit_cycle_figure(found[: len(gains)], found[len(gains) :], shown)
+    return save(made, {"held": [asdict(held) for held in found]}, out, "stability-skin")
+
+
+def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], loop: SkinLoop) -> Figure:
+    """Draw one run, then width and offset of all cases over the gain, and the width over the delay."""
+    made = figure(12.0, 7.5)
+    grid = made.add_gridspec(2, 3, height_ratios=(1.0, 1.3))
+    over = made.add_subplot(grid[0, :])
+    width, offset, delay = (made.add_subplot(grid[1, i]) for i in range(3))
+    _draw_run(over, loop)
+    bound = "2 μFn"
+    _draw_curves(width, gains, lambda case: case.kp, lambda held: held.width_n / held.bound_n)
+    width.set(title="Limit cycle over the gain", xlabel="gain kp", ylabel=f"peak to peak / {bound}")
+    _draw_curves(offset, gains, lambda case: case.kp, lambda held: held.offset_n / held.bound_n)
+    offset.set(title="Accuracy over the gain", xlabel="gain kp", ylabel=f"mean distance from the set point / {bound}")
+    for axes in (width, offset):
+        axes.set_xscale("log")
+        axes.set_xticks(GAINS, [f"{kp:g}" for kp in GAINS])
+        axes.minorticks_off()
+    _draw_curves(delay, delays, lambda case: case.age_s, lambda held: held.width_n / held.bound_n)
+    delay.set_xticks(AGES_S, [f"{age_s:g}" for age_s in AGES_S])
+    delay.set(title="Limit cycle over the delay", xlabel="age of a reading, s", ylabel=f"peak to peak / {bound}")
+    for axes in (width, delay, offset):
+        axes.set_ylim(-0.05, max(1.2, axes.get_ylim()[1]))
+        axes.axhline(1.0, color="black", lw=1, ls=":")
+    for axes in (width, delay):
+        axes.axhspan(-0.05, 1.0, color="#55a868", alpha=0.08, lw=0)
+        axes.annotate(f"allowed: up to {bound}", (0.02, 0.96), xycoords=("axes fraction", "data"), fontsize=8, va="top")
+    handles, labels = width.get_legend_handles_labels()
+    made.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+    delay.legend(fontsize=8)
+    for axes in (over, width, offset, delay):
+        axes.grid(alpha=0.25)
+    return made
+
+
+def _draw_run(axes: Axes, loop: SkinLoop) -> None:
+    time_s = np.arange(len(loop.truth_n)) * TICK_S
+    estimate = np.array(loop.estimate_n[: len(time_s)])
+    axes.plot(time_s, loop.truth_n, color="#1f4e79", lw=1.2, label="true shear force")
+    axes.plot(time_s[: len(estimate)], estimate, color="#c44e52", lw=0.9, label="estimate")
+    axes.plot(time_s, loop.set_point_n, color="#888888", lw=1, ls="--", label="set point")
+    axes.set(
+        title="Zero, identification, and three holds (Fn = 1 N, kp = 0.5)", xlabel="time, s", ylabel="shear force, N"
+    )
+    axes.legend(loc="upper left", fontsize=8)
+
+
+def _draw_curves(
+    axes: Axes, found: Sequence[SkinHold], over: Callable[[SkinLoopCase], float], value: Callable[[SkinHold], float]
+) -> None:
+    for number, name in enumerate(dict.fromkeys(held.case.name for held in found)):
+        mine = [held for held in found if held.case.name == name]
+        style = look(number) | {"markersize": 5, "linewidth": 1.2}
+        axes.plot([over(held.case) for held in mine], [value(held) for held in mine], label=name, **style)

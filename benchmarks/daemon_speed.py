@@ -2,9 +2,9 @@
 
     python -m benchmarks.daemon_speed --bank run/paper.bank --rig run --out run/daemon_speed.json
 
-Each figure is measured on a daemon in its own process, through a pseudo-terminal and a subscriber's socket. `--rig` is
-the folder of `benchmarks.rig_twists`: it holds the recording and the calibrations for the default estimator's latency, and
-the emulated rig's bank. Latency counts from before the last byte is written until the subscriber has the estimate.
+Each figure is measured on a daemon in its own process, through a pseudo-terminal and a subscriber's socket. Latency
+counts from before the last byte is written until the subscriber has the estimate. `--rig` is the folder of
+`benchmarks.rig_twists`, with the default estimator's recording and calibrations, and the emulated rig's bank.
 """
 
 import argparse

@@ -185,8 +185,8 @@ def main() -> None:
         print("\n| cylinders | fingertips | diameter RMSE, mm | coverage |\n|---|---|---|---|")
         for count, sides, figures in other_tools(args.bank, 5000, 4):
             found.setdefault(f"{count} cylinders", {})[" and ".join(sides)] = figures
-            columns = figures["diameter_rmse_mm"], figures["diameter_coverage_95"]
-            print(table_row(count, " and ".join(sides), *columns), flush=True)
+            rmse_mm, coverage = figures["diameter_rmse_mm"], figures["diameter_coverage_95"]
+            print(table_row(count, " and ".join(sides), rmse_mm, coverage), flush=True)
     (args.out / "estimators.json").write_text(json.dumps(found, indent=1) + "\n")
     title = f"{DEFAULT}, on frames later than its fit"
     draw(list(tracks.values()), [f"fitted to {name}" for name in tracks], title, args.out / "estimators.png")

@@ -1,11 +1,11 @@
 """Bank cells and matches beside the peers, and whether the fast matchers find the reference's cells.
 
-    python -m benchmarks.matching_speed --bank run/paper.bank --mesh MESH --recordings FOLDER --out run/matching_speed.json
+    python -m benchmarks.matching_speed --bank run/paper.bank --mesh MESH --recordings FOLDER --out FILE
 
-Methods take turns, so that a busy moment of the machine affects all alike. A ratio is of one turn; medians and quartiles
-are over the turns. `pip install -e '.[bench]'` installs pyEIT and FAISS; without them their rows are missing. EIDORS
-needs MATLAB or Octave, so its time is cited. `--every N` also checks every N-th recorded frame against the reference
-matchers, with runner-up, which takes a tenth of a second a frame and more.
+Methods take turns, so that a busy moment of the machine affects all alike. A ratio is of one turn; medians and
+quartiles are over the turns. `pip install -e '.[bench]'` installs pyEIT and FAISS; without them their rows are missing.
+EIDORS needs MATLAB or Octave, so its time is cited. `--every N` also checks every N-th recorded frame against the
+reference matchers, with runner-up, which takes a tenth of a second a frame and more.
 """
 
 import argparse

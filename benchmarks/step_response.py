@@ -2,10 +2,10 @@
 
     python -m benchmarks.step_response --out DIR [--seeds 200] [--bank run/demo.bank]
 
-For each seed the gel has another stiffness. The loop identifies it with the torque that drives, then steps to 0.10 N·m.
-A fingertip errs by 0.012 N·m a frame. Then a screw is tightened to 0.12 N·m on the load cell. With `--bank` the default
-estimator also closes the loop on the rig's own frames from both fingertips, for 20 grips. Simulated time, so the numbers
-are the same on every machine. Writes step_response.json and step_response.png.
+For each seed the gel has another stiffness. The loop identifies it with the torque that drives, then steps to
+0.10 N·m. A fingertip errs by 0.012 N·m a frame. Then a screw is tightened to 0.12 N·m on the load cell. With `--bank`
+the default estimator also closes the loop on the rig's own frames from both fingertips, for 20 grips. Simulated time,
+so the numbers are the same on every machine. Writes step_response.json and step_response.png.
 """
 
 import argparse

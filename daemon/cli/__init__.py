@@ -34,7 +34,7 @@ COMMANDS = {
     "replay": Command("shearloop.daemon.cli.replay", "send a recording through the same estimators again, as if live"),
     "evaluate": Command("shearloop.daemon.cli.evaluate", "judge a calibrated estimator on recordings or slices"),
     "chart": Command(
-        "shearloop.daemon.analysis.charts.command",
+        "shearloop.daemon.cli.chart",
         "chart speed against accuracy, stability, and how much model is needed",
     ),
     "check": Command("shearloop.daemon.cli.check", "say whether a configuration and the files it names are in order"),

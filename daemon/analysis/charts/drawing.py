@@ -157,7 +157,7 @@ def check_takes_pictures(directory: Path) -> None:
 
     One that has to be made for that is removed again: a recording that cannot be read leaves nothing behind.
     """
-    with empty_ones_removed(directory):
+    with remove_empty_folders(directory):
         try:
             directory.mkdir(parents=True, exist_ok=True)
             with TemporaryFile(dir=directory):
@@ -167,7 +167,7 @@ def check_takes_pictures(directory: Path) -> None:
 
 
 @contextmanager
-def empty_ones_removed(directory: Path) -> Iterator[None]:
+def remove_empty_folders(directory: Path) -> Iterator[None]:
     """Remove a directory, and those above it, where they were made in here and hold nothing at the end."""
     absent = [one for one in (directory, *directory.parents) if not one.exists()]
     try:

@@ -32,7 +32,7 @@ PYEIT_CELL_S = 0.244
 
 @dataclass(frozen=True, slots=True)
 class SolvedForward:
-    """A forward method: ms per cell (median, fastest and slowest round), and relative L2 error of the difference signal.
+    """A forward method: ms per cell (median, fastest and slowest round), and the signals' relative L2 error.
 
     `cited` times were not measured here. The error is None where it is unknown, or where the model is another one.
     """

@@ -30,7 +30,7 @@ ALLOWED_NOISE_NM = 0.0018
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedTool:
-    """The gripped tool. At a fixed angle its torque relaxes by `relaxing_share`, with the time constant `relaxing_s`."""
+    """The gripped tool. At a fixed angle its torque relaxes by `relaxing_share` with time constant `relaxing_s`."""
 
     stiffness_nm_per_rad: float = 0.25
     relaxing_share: float = 0.06

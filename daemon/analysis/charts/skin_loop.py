@@ -8,6 +8,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib import resources
 from itertools import pairwise
 from pathlib import Path
 
@@ -29,7 +30,6 @@ from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
 from shearloop.daemon.workers import Workers, in_order
-from shearloop.drivers.emulators.skin.daq import NOISE_V
 from shearloop.drivers.shear_skin.judge import SkinSample
 
 Floats = NDArray[np.float64]
@@ -39,7 +39,9 @@ AGE_S, ACTUATION_TICKS = 0.06, 2
 # At 0.25 s a reading is stale and the loop holds.
 AGES_S = (0.02, 0.06, 0.1, 0.15, 0.2)
 RADIUS_MM, SET_POINTS_N = 15.0, (1.0, 0.6, 1.0)
-CALIBRATION = Path(__file__).parents[2] / "config" / "calibrations" / "skin_demo.yaml"
+# Noise of one resistance, as in the emulated DAQ: 1.6 mN of shear force over both gauges.
+RELATIVE_NOISE = 0.0016 * 0.088 / 2**0.5
+CALIBRATION = Path(str(resources.files("shearloop"))) / "config" / "calibrations" / "skin_demo.yaml"
 SOURCE = TorqueSource(name=SKIN, period_s=SAMPLE_TICKS * TICK_S, sticks=True)
 
 
@@ -156,7 +158,7 @@ class SkinLoop:
 
     def _measure(self) -> None:
         self.skin.rest(SOURCE.period_s)
-        noise = self._random.normal(0.0, NOISE_V / 0.125, 2)
+        noise = self._random.normal(0.0, RELATIVE_NOISE, 2)
         r1, r2 = (ohm * (1.0 + error) for ohm, error in zip(self.skin.resistances_ohm(), noise, strict=True))
         now_ns, known_ns = self.t_ns, self.t_ns + round(self._age_s * 1e9)
         reading = self.estimator.update(SkinSample(r1, r2, 0.0, 0.0, 5e-3, now_ns, known_ns, self._samples))

@@ -51,7 +51,7 @@ _ENOUGH_CELLS = 2000
 
 @dataclass(frozen=True, slots=True)
 class TorqueMethod:
-    """One way from frame to torque; `run()` returns the later frames' torques (n,) in N·m, NaN if invalid, and ms each."""
+    """A way to a torque; `run()` returns the later frames' torques (n,) in N·m, NaN if invalid, and ms each."""
 
     name: str
     family: str

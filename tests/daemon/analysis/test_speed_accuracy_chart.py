@@ -14,7 +14,6 @@ from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.estimation import FrameSeries
 from shearloop.daemon.analysis.charts import scene
-from shearloop.daemon.analysis.charts.command import NAMES
 from shearloop.daemon.analysis.charts.drawing import (
     check_takes_pictures,
     figure,
@@ -23,21 +22,22 @@ from shearloop.daemon.analysis.charts.drawing import (
     plain_log,
     write_names,
 )
-from shearloop.daemon.analysis.charts.forwards import CELLS, converged, direct, error_of, forwards
-from shearloop.daemon.analysis.charts.methods import Measured
+from shearloop.daemon.analysis.charts.forward_methods import CELLS, converged, direct, error_of, forward_methods
+from shearloop.daemon.analysis.charts.simulated_loop import LOOPS, TrackingError, tracking_errors
 from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
 from shearloop.daemon.analysis.charts.speed_accuracy import (
-    Compared,
+    MeasuredMethod,
+    MethodComparison,
     _draw_loop,
     _draw_methods,
     _short,
-    measured,
+    compare_methods,
     often_valid,
     write,
 )
-from shearloop.daemon.analysis.charts.windows import LOOPS, Followed, followed
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.cli import main
+from shearloop.daemon.cli.chart import NAMES
 from shearloop.daemon.workers import SerialExecutor
 
 
@@ -58,7 +58,7 @@ def test_of_equally_fast_points_the_more_accurate_is_on_the_frontier() -> None:
 def test_what_calls_few_frames_valid_is_not_on_the_frontier_however_fast_and_exact(scratch: Path) -> None:
     split = splits([], 0.6, scratch)[0]
     methods = [
-        Measured(name, name, cost, cost, cost, error, None, valid)
+        MeasuredMethod(name, name, cost, cost, cost, error, None, valid)
         for name, cost, error, valid in (
             ("rare", 1.0, 0.001, 0.32),
             ("often", 2.0, 0.01, 0.60),
@@ -66,7 +66,7 @@ def test_what_calls_few_frames_valid_is_not_on_the_frontier_however_fast_and_exa
         )
     ]
     axes = figure(5, 5).add_subplot()
-    _draw_methods(axes, Compared(split, methods))
+    _draw_methods(axes, MethodComparison(split, methods))
     filled = [mark.lines[0].get_markerfacecolor() != "white" for mark in axes.containers]
     assert filled == [False, True, True]
     assert [_short(one, i in often_valid(methods)) for i, one in enumerate(methods)] == [
@@ -80,7 +80,7 @@ def test_loops_at_one_window_tell_their_noises_apart_by_their_marks() -> None:
     axes = figure(5, 5).add_subplot()
     runs = [(loop, noise, n) for loop in LOOPS[:2] for noise in (0.002, 0.01, 0.02) for n in (1, 2)]
     runs += [(LOOPS[2], noise, 1) for noise in (0.002, 0.01, 0.02)]
-    _draw_loop(axes, [Followed(loop, noise, n, n, noise, noise, noise) for loop, noise, n in runs])
+    _draw_loop(axes, [TrackingError(loop, noise, n, n, noise, noise, noise) for loop, noise, n in runs])
     looks = [
         (line.get_marker(), line.get_linestyle() if len(line.get_xdata()) > 1 else "", line.get_fillstyle())
         for line in (mark.lines[0] for mark in axes.containers)
@@ -109,8 +109,8 @@ def test_errors_fall_in_proportion_to_the_mesh_size_towards_what_two_meshes_fore
 def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Path, tmp_path: Path) -> None:
     mesh = own_fingertip(0.4).mesh()
     bank = bank_of(None, mesh, scratch, Grid(np.linspace(3.0, 3.6, 7), np.linspace(1.0, 2.1, 12)))
-    compared = [measured(split, bank, mesh, 1) for split in splits([], 0.6, scratch)]
-    solved, loop = forwards(1, None, (0.4, 0.2), (0.2, 0.1)), followed((0.004,), 1, (1, 3))
+    compared = [compare_methods(split, bank, mesh, 1) for split in splits([], 0.6, scratch)]
+    solved, loop = forward_methods(1, None, (0.4, 0.2), (0.2, 0.1)), tracking_errors((0.004,), 1, (1, 3))
     written = write(compared, solved, loop, bank, tmp_path)
     assert [path.suffix for path in written] == [".json", ".svg", ".png"]
     assert all(path.stat().st_size > 1000 for path in written)
@@ -213,8 +213,8 @@ def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(
     def solver(mesh: Mesh) -> Callable[[object], object] | None:
         return (lambda _: solved.append(len(mesh.triangles))) if there else None
 
-    monkeypatch.setattr("shearloop.daemon.analysis.charts.forwards.pyeit_solver", solver)
-    rows = forwards(2, None, (0.4, 0.2), (0.2, 0.1))
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.forward_methods.pyeit_solver", solver)
+    rows = forward_methods(2, None, (0.4, 0.2), (0.2, 0.1))
     (pyeit,) = (row for row in rows if row.family == "pyEIT")
     assert (pyeit.name, pyeit.cited) == (("pyEIT", False) if there else ("pyEIT (cited)", True))
     assert pyeit.error is None
@@ -226,8 +226,8 @@ def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(
     # Its time is that of the paper's mesh, which is not here.
     assert (eidors.cited, eidors.error) == (True, None)
     if not there:
-        monkeypatch.setattr("shearloop.daemon.analysis.charts.forwards.PAPER_TRIANGLES", rows[2].triangles)
-        again = forwards(1, None, (0.4, 0.2), (0.2, 0.1))
+        monkeypatch.setattr("shearloop.daemon.analysis.charts.forward_methods.PAPER_TRIANGLES", rows[2].triangles)
+        again = forward_methods(1, None, (0.4, 0.2), (0.2, 0.1))
         assert [row.error for row in again if row.family == "EIDORS"] == [rows[2].error]
 
 

@@ -11,14 +11,20 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics
 from shearloop.bank.estimation.reciprocity import ReciprocityCheck
-from shearloop.daemon.analysis.charts.continuity import walks
-from shearloop.daemon.analysis.charts.detectability import detectability_figure, detected
-from shearloop.daemon.analysis.charts.faults import FAULTS, lost_channels
-from shearloop.daemon.analysis.charts.rims import at_rims
+from shearloop.daemon.analysis.charts.fault_sweeps import (
+    FAULTS,
+    FaultLevel,
+    balanced,
+    fault_curve,
+    fitted,
+    judge_level,
+    lost_channels,
+    scene_for,
+    sweep,
+)
+from shearloop.daemon.analysis.charts.slice_stability import detect_mixtures, sweep_rims, walks
 from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
-from shearloop.daemon.analysis.charts.stability import Level, balanced, curve, fitted, judged, scene_for, sweep
-from shearloop.daemon.analysis.charts.stability_chart import chart
-from shearloop.daemon.analysis.charts.stability_picture import continuity_figure, sweeps_figure
+from shearloop.daemon.analysis.charts.stability import chart, continuity_figure, detectability_figure, sweeps_figure
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.workers import SerialExecutor
@@ -46,19 +52,21 @@ def estimate(torque: float, half: float = 0.01) -> Estimate:
 
 def test_figures_count_what_is_valid_and_wrong() -> None:
     truth = np.array([0.1, 0.1, 0.1, 0.1, np.nan])
-    found = judged([estimate(0.105), estimate(0.145), Estimate(valid=False), estimate(0.1), estimate(9.0)], truth, 2.0)
+    found = judge_level(
+        [estimate(0.105), estimate(0.145), Estimate(valid=False), estimate(0.1), estimate(9.0)], truth, 2.0
+    )
     assert found.valid == 0.75
     assert found.false_valid == 0.25
     assert found.bias_nm == pytest.approx(0.05 / 3)
-    assert curve("fault", "unit", "fused", [judged([estimate(0.1)], truth[:1], 0.0), found]).breaks_at == 2.0
+    assert fault_curve("fault", "unit", "fused", [judge_level([estimate(0.1)], truth[:1], 0.0), found]).breaks_at == 2.0
 
 
 @pytest.mark.parametrize(
     ("levels", "expected"), [((-0.5, -0.2, 0.0, 0.1, 0.5), 0.1), ((0.6, 0.4, 0.2), 0.6), ((1.0, 2.0), 1.0)]
 )
 def test_an_estimator_breaks_at_the_mildest_level_in_either_direction(levels, expected) -> None:
-    wrong = [Level(level, 0.0, 0.0, 1.0, 0.5 if level else 0.0) for level in levels]
-    assert curve("fault", "unit", "fused", wrong).breaks_at == expected
+    wrong = [FaultLevel(level, 0.0, 0.0, 1.0, 0.5 if level else 0.0) for level in levels]
+    assert fault_curve("fault", "unit", "fused", wrong).breaks_at == expected
 
 
 def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones() -> None:
@@ -87,7 +95,7 @@ def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts,
     stream = next(one for one in parts if one.past.kind == "raw")
     (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
     scene = scene_for(stream, bank)
-    lost = next(fault for fault in FAULTS if fault.name == "lost electrodes, not told")
+    lost = next(fault for fault in FAULTS if fault.name == "lost electrodes, unreported")
     found = sweep(EstimatorSession(calibration, bank), scene, lost)
     assert found.levels[0].valid > 0.7
     assert found.breaks_at is None
@@ -101,7 +109,7 @@ def test_the_mean_of_cells_alike_does_not_hop_and_the_rims_are_walked(parts, ban
     found = walks(slices, bank, calibrations)
     paper, alone, mean = (one.largest_hop_nm for one in found[:3])
     assert mean < 0.5 * min(paper, alone)
-    rims = list(at_rims(calibrations, bank, scratch))
+    rims = list(sweep_rims(calibrations, bank, scratch))
     assert {one.estimator for one in rims} == {"bank", "fused"}
     assert all(one.levels[0].valid > 0.5 for one in rims)
     for figure in (sweeps_figure("rims", rims), continuity_figure("slices", found)):
@@ -124,7 +132,7 @@ def drifting(n: int, seed: int) -> FrameSeries:
 def test_the_share_of_a_foreign_frame_that_passes_is_the_one_that_its_size_allows() -> None:
     """Off the slices' directions nothing but the foreign part stands out: its square adds to that of the noise."""
     series = drifting(100, 4)
-    found = detected(series, origins=(0.6,))
+    found = detect_mixtures(series, origins=(0.6,))
     past, later = series.channels[:60, 0], series.channels[60:, 0]
     opposite = CHANNELS[:, 0] >= 16
     order = np.lexsort((CHANNELS[:, 2], CHANNELS[:, 0] % 16, opposite)).reshape(2, 448)

@@ -8,18 +8,18 @@ import pytest
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import FrameSeries, Physics, fit
-from shearloop.daemon.analysis.charts import extrapolation
-from shearloop.daemon.analysis.charts.extrapolation import (
+from shearloop.daemon.analysis.charts import slice_stability
+from shearloop.daemon.analysis.charts.fault_sweeps import FaultLevel, fault_curve
+from shearloop.daemon.analysis.charts.slice_stability import (
     LARGER,
     SMALLER,
     Extrapolation,
-    extrapolated,
-    of_rows,
-    parts,
+    calibration_parts,
+    extrapolate,
+    select_rows,
 )
 from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
-from shearloop.daemon.analysis.charts.stability import Level, curve
-from shearloop.daemon.analysis.charts.stability_picture import extrapolation_figure
+from shearloop.daemon.analysis.charts.stability import extrapolation_figure
 from shearloop.daemon.analysis.evaluation import follow, judge
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.workers import SerialExecutor
@@ -44,7 +44,7 @@ def bank(scratch: Path) -> Bank:
 
 def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged() -> None:
     torque_nm = np.random.default_rng(3).permutation(np.linspace(0.0, 0.1, 101))
-    found = parts(torque_nm)
+    found = calibration_parts(torque_nm)
     assert [part.limit_nm for part in found[SMALLER]] == pytest.approx([0.08, 0.065, 0.05, 0.04, 0.03])
     assert [part.limit_nm for part in found[LARGER]] == pytest.approx([0.02, 0.035, 0.05, 0.06, 0.07])
     for which, sign in ((SMALLER, 1), (LARGER, -1)):
@@ -55,14 +55,14 @@ def test_limits_are_quantiles_and_each_slice_is_either_calibrated_on_or_judged()
 
 
 def test_of_few_torques_each_limit_is_there_once_and_none_leaves_nothing_to_judge() -> None:
-    found = parts(np.repeat([0.02, 0.06, 0.1], [20, 2, 40]))
+    found = calibration_parts(np.repeat([0.02, 0.06, 0.1], [20, 2, 40]))
     assert [part.limit_nm for part in found[SMALLER]] == [0.02]
     assert [part.limit_nm for part in found[LARGER]] == [0.06, 0.1]
 
 
 def test_chosen_slices_keep_their_own_torques(slices: FrameSeries) -> None:
     rows = np.array([1, 7, 8, 30])
-    chosen = of_rows(slices, rows)
+    chosen = select_rows(slices, rows)
     np.testing.assert_array_equal(chosen.torque_at_frames(), slices.torque_at_frames()[rows])
     np.testing.assert_array_equal(chosen.channels, slices.channels[rows])
 
@@ -72,14 +72,14 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
     slices: FrameSeries, bank: Bank, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # Of a twentieth no estimator can be made.
-    monkeypatch.setattr(extrapolation, "SHARES", (0.5, 0.05))
+    monkeypatch.setattr(slice_stability, "CALIBRATED_SHARES", (0.5, 0.05))
     some = slices.between(0, 40)
     # A slice whose torque nobody knows is neither.
     torque_nm = some.torque_nm.copy()
     torque_nm[3] = np.nan
     whole = replace(some, torque_nm=torque_nm)
     split = Split("slices", whole.between(0, 30), whole.between(30, 40), whole)
-    found = extrapolated(split, ("regression",), bank, None, SerialExecutor())
+    found = extrapolate(split, ("regression",), bank, None, SerialExecutor())
     assert [one.curve.fault for one in found] == [SMALLER, LARGER]
     assert capsys.readouterr().out.count("is left out") == 2
     known = np.delete(np.arange(40), 3)
@@ -93,7 +93,7 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
             (one.curve.levels[0], one.width_nm[0], known[:29], known[29:]),
             (one.curve.levels[1], one.width_nm[1], known[inside], known[~inside]),
         ):
-            track = follow(fit("regression", [of_rows(slices, past)], "", Physics()), of_rows(slices, future))
+            track = follow(fit("regression", [select_rows(slices, past)], "", Physics()), select_rows(slices, future))
             figures = judge([track])
             assert level.valid == figures["valid_fraction"]
             assert level.bias_nm == pytest.approx(figures["bias_nm"])
@@ -101,15 +101,15 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
             widths = [each.torque_high_nm - each.torque_low_nm for each in track.estimates if each.valid]
             assert width_nm == pytest.approx(np.median(widths))
         assert one.times_good[:2] == (1.0, one.width_nm[1] / one.width_nm[0])
-        assert one.curve.levels[2] == Level(one.curve.levels[2].level, None, None, 0.0, 0.0)
+        assert one.curve.levels[2] == FaultLevel(one.curve.levels[2].level, None, None, 0.0, 0.0)
         assert one.width_nm[2] is one.times_good[2] is None
 
 
 @pytest.mark.usefixtures("fonts")
 def test_the_picture_marks_what_breaks_and_writes_how_many_slices_were_calibrated_on() -> None:
-    levels = [Level(limit, 0.0, 0.01, 1.0, missed) for limit, missed in ((0.14, 0.0), (0.08, 0.1), (0.05, 0.9))]
+    levels = [FaultLevel(limit, 0.0, 0.01, 1.0, missed) for limit, missed in ((0.14, 0.0), (0.08, 0.1), (0.05, 0.9))]
     found = [
-        Extrapolation(curve(which, "N·m", name, levels), (29, 24, 14), (0.08, 0.04, None))
+        Extrapolation(fault_curve(which, "N·m", name, levels), (29, 24, 14), (0.08, 0.04, None))
         for which in (SMALLER, LARGER)
         for name in ("fused", "bank")
     ]

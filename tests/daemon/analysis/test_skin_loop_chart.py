@@ -6,18 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import held_shear
-from benchmarks.held_shear import CALIBRATION, Case, SkinLoop, judge
 from shearloop.bank.skin.calibration import SkinCalibration
 from shearloop.bank.skin.calibration_file import load_calibration
-from shearloop.daemon.analysis.charts import limit_cycle
+from shearloop.daemon.analysis.charts import skin_loop
+from shearloop.daemon.analysis.charts.skin_loop import CALIBRATION, SkinLoop, SkinLoopCase, judge
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile, HoldTorqueStep
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.daemon.workers import SerialExecutor
 
-CONFIG = Path(__file__).parents[2] / "config"
+CONFIG = Path(__file__).parents[3] / "config"
 
 
 @pytest.fixture(scope="module")
@@ -28,12 +27,12 @@ def calibration() -> SkinCalibration:
 @pytest.mark.parametrize(
     "case",
     [
-        Case(name="Fn = 1 N", hold_s=6.0),
-        Case(name="Fn = 2 N", normal_n=2.0, deadband_nm=0.0, kp=0.15, hold_s=6.0),
+        SkinLoopCase(name="Fn = 1 N", hold_s=6.0),
+        SkinLoopCase(name="Fn = 2 N", normal_n=2.0, deadband_nm=0.0, kp=0.15, hold_s=6.0),
     ],
 )
 def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(
-    case: Case, calibration: SkinCalibration
+    case: SkinLoopCase, calibration: SkinCalibration
 ) -> None:
     held, _ = judge(case, calibration)
     assert held.phase == "done"
@@ -43,14 +42,14 @@ def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(
 
 
 def test_the_band_is_what_does_it(calibration: SkinCalibration) -> None:
-    held, _ = judge(Case(name="not told the band", band=False, seed=5, kp=0.15, hold_s=12.0), calibration)
+    held, _ = judge(SkinLoopCase(name="not told the band", band=False, seed=5, kp=0.15, hold_s=12.0), calibration)
     assert held.width_n > held.bound_n
 
 
 def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_push(
     calibration: SkinCalibration,
 ) -> None:
-    loop = SkinLoop(Case(name="drift"), calibration)
+    loop = SkinLoop(SkinLoopCase(name="drift"), calibration)
     begin = []
     measured = loop.skin.resistances_ohm
 
@@ -70,13 +69,11 @@ def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_p
 
 @pytest.mark.usefixtures("fonts")
 def test_the_stability_chart_shows_the_limit_cycle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    case = Case(name="told the band", hold_s=4.0)
-    monkeypatch.setattr(limit_cycle, "over_gains", lambda: [case])
-    monkeypatch.setattr(limit_cycle, "over_delays", lambda: [replace(case, name="not told", band=False)])
-    monkeypatch.setattr(held_shear, "SEEDS", 1)
-    heard: list[str] = []
-    paths = limit_cycle.chart(tmp_path, SerialExecutor(), "stability-skin", lambda held: heard.append(held.case.name))
-    assert heard == ["told the band", "not told"]
+    case = SkinLoopCase(name="told the band", hold_s=4.0)
+    monkeypatch.setattr(skin_loop, "over_gains", lambda: [case])
+    monkeypatch.setattr(skin_loop, "over_delays", lambda: [replace(case, name="not told", band=False)])
+    monkeypatch.setattr(skin_loop, "SEEDS", 1)
+    paths = skin_loop.chart(tmp_path, SerialExecutor())
     assert [path.name for path in paths] == ["stability-skin.json", "stability-skin.svg", "stability-skin.png"]
     told, not_told = json.loads(paths[0].read_text())["held"]
     assert told["width_n"] <= told["bound_n"] == pytest.approx(0.08)

@@ -19,10 +19,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.io import loadmat
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank
 from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES, channels_of_line
@@ -33,7 +33,6 @@ from shearloop.bank.eit.models import Conductivities
 from shearloop.daemon.analysis.charts.forward_methods import EIDORS_CELL_S, MODEL, pyeit_solver
 from shearloop.daemon.bank_config import load_geometry
 
-Floats = NDArray[np.float64]
 Run = Callable[[], object]
 N_CELLS = 128
 N_FRAMES = 40
@@ -66,10 +65,10 @@ def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], float]:
             settings.append((k, sigma))
     model = BatchForwardModel(mesh)
 
-    def batch(some: list[tuple[float, float]]) -> Floats:
+    def batch(some: list[tuple[float, float]]) -> FloatArray:
         return model.voltages(np.array([of.of(MODEL, *each) for each in some]))
 
-    def threaded() -> list[Floats]:
+    def threaded() -> list[FloatArray]:
         with ThreadPoolExecutor(2) as pool:
             return list(pool.map(batch, [settings[i : i + 32] for i in range(0, N_CELLS, 32)]))
 
@@ -91,7 +90,7 @@ def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], float]:
     return methods, largest
 
 
-def match_methods(bank: Bank, frames: Floats) -> dict[str, tuple[Run, int]]:
+def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
     """Return the functions that match frames, with the number of frames of each call."""
     single = unit_magnitudes(frames).astype(np.float32)
     signals = np.abs(bank.signals[bank.valid]).astype(np.float32)
@@ -128,13 +127,13 @@ def match_methods(bank: Bank, frames: Floats) -> dict[str, tuple[Run, int]]:
     return methods
 
 
-def recorded_slices(recordings: Path) -> Floats:
+def recorded_slices(recordings: Path) -> FloatArray:
     """Return N_FRAMES of the recorded slices."""
     found = np.array([loadmat(file)["data_diff"].ravel() for file in sorted(recordings.glob("*_slices/*_*.mat"))])
     return np.asarray(found[np.linspace(0, len(found) - 1, N_FRAMES).astype(int)])
 
 
-def recorded_frames(folder: Path, every: int) -> Iterator[Floats]:
+def recorded_frames(folder: Path, every: int) -> Iterator[FloatArray]:
     """Yield (n, 896) differences of all slices, and of every n-th stream frame to the mean of its first ten."""
     slices = [loadmat(path)["data_diff"].ravel() for path in sorted(folder.glob("*_slices/*_*.mat"))]
     streams = [
@@ -149,7 +148,7 @@ def recorded_frames(folder: Path, every: int) -> Iterator[Floats]:
             yield part[part.any(axis=1)]
 
 
-def compare_with_reference(bank: Bank, parts: list[Floats]) -> dict[str, dict[str, float]]:
+def compare_with_reference(bank: Bank, parts: list[FloatArray]) -> dict[str, dict[str, float]]:
     """Return by matcher how many frames have the reference's cell and runner-up, and the largest score difference."""
     found = {}
     for name, (slow_kind, fast_kind) in MATCHERS.items():
@@ -183,7 +182,7 @@ def take_turns(methods: Mapping[str, tuple[Run, int]], turns: int) -> dict[str, 
     return found
 
 
-def cold_seconds(bank: Bank, frames: Floats, turns: int) -> dict[str, list[float]]:
+def cold_seconds(bank: Bank, frames: FloatArray, turns: int) -> dict[str, list[float]]:
     """Return the median seconds of a match with runner-up in every turn, with cold caches as in a daemon."""
     matchers = {name: fast.from_bank(bank) for name, (_, fast) in MATCHERS.items()}
     memory = np.zeros(CACHE_BYTES // 8)

@@ -16,8 +16,8 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.analysis.charts.drawing import figure
 from shearloop.daemon.analysis.charts.simulated_loop import (
     LoopController,
@@ -31,8 +31,6 @@ from shearloop.daemon.control.controller import TwistController
 from shearloop.daemon.control.margins import LoopModel, gain_limit, pulse_response
 from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
-
-Floats = NDArray[np.float64]
 
 COMMAND_S = 0.016
 ACTUATION_S = 0.02
@@ -143,7 +141,7 @@ def spectral_radius(case: LoopCase, age_s: float, lost: int, kp: float) -> float
     return float(np.abs(np.linalg.eigvals(cycle)).max())
 
 
-def _received_frame(case: LoopCase, model: LoopModel, seen: Floats, missed: int = 0) -> Floats:
+def _received_frame(case: LoopCase, model: LoopModel, seen: FloatArray, missed: int = 0) -> FloatArray:
     """Return the state matrix of a received frame; the state is (d[k−1] … d[k−n], integral i, correction c).
 
     Torques are in the controller's scale: a frame shows −(seen · d) times the stiffness ratio.
@@ -160,7 +158,7 @@ def _received_frame(case: LoopCase, model: LoopModel, seen: Floats, missed: int 
     return matrix
 
 
-def _lost_frame(size: int) -> Floats:
+def _lost_frame(size: int) -> FloatArray:
     """Return the state matrix of a lost frame, which changes nothing."""
     matrix = np.zeros((size + 2, size + 2))
     matrix[1:size, : size - 1] = np.eye(size - 1)
@@ -209,7 +207,7 @@ def draw(path: Path, cases: Mapping[str, Mapping[str, Sequence[Sequence[float]]]
     made.savefig(path, dpi=130)
 
 
-def _draw_region(axis: Axes, rows: Floats) -> None:
+def _draw_region(axis: Axes, rows: FloatArray) -> None:
     where, computed, simulated = np.minimum(rows, 10.0).T
     axis.fill_between(where, 0.0, computed, color=_PALE, linewidth=0.0, label="stable")
     axis.plot(where, computed, color=_INK, linewidth=1.4, label="boundary, computed")

@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.rig_twists import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
 from shearloop.daemon.analysis.charts.simulated_loop import (
@@ -46,7 +46,6 @@ from shearloop.drivers.emulators.robotiq.gripper import Gripper
 from shearloop.drivers.emulators.scene import Scene
 from shearloop.drivers.emulators.twin import Joint, Twin, TwinSettings
 
-Floats = NDArray[np.float64]
 PlantOf = Callable[[SimulatedSensor, np.random.Generator], Plant]
 
 TARGET_NM = 0.10
@@ -159,7 +158,7 @@ def _stiffness(twin: Twin) -> float:
     return 1.0 / (1.0 / twin.settings.gel_stiffness_nm_per_rad + 1.0 / twin.settings.joint_stiffness_nm_per_rad)
 
 
-def step(plant: Plant, scenario: LoopScenario) -> tuple[Floats, bool]:
+def step(plant: Plant, scenario: LoopScenario) -> tuple[FloatArray, bool]:
     """Identify the tool and step to TARGET_NM; return the true torques, and whether the margins were refused."""
     found = identified(plant, scenario)
     settings = settings_for(found, scenario)
@@ -171,7 +170,7 @@ def step(plant: Plant, scenario: LoopScenario) -> tuple[Floats, bool]:
     return run(plant, controller, scenario.hold_s).torque_nm, refused
 
 
-def steps(scenario: LoopScenario, seeds: int, plant_of: PlantOf) -> tuple[Floats, dict[str, float]]:
+def steps(scenario: LoopScenario, seeds: int, plant_of: PlantOf) -> tuple[FloatArray, dict[str, float]]:
     """Return the true torques (seed, time) after the step, and their figures of merit."""
     rows, refused = [], 0
     for seed in range(seeds):
@@ -182,12 +181,12 @@ def steps(scenario: LoopScenario, seeds: int, plant_of: PlantOf) -> tuple[Floats
     return table, judge_steps(table, scenario.settled_s) | {"refused_by_margins": refused}
 
 
-def _table(rows: Sequence[Floats]) -> Floats:
+def _table(rows: Sequence[FloatArray]) -> FloatArray:
     """Return the rows as one array; rounding of the time makes some one sample longer."""
     return np.array([row[: min(map(len, rows))] for row in rows])
 
 
-def judge_steps(torque_nm: Floats, settled_s: float) -> dict[str, float]:
+def judge_steps(torque_nm: FloatArray, settled_s: float) -> dict[str, float]:
     """Return the figures of merit of true torques (seed, time) after the step at time 0."""
     error = torque_nm / TARGET_NM - 1.0
     late = error[:, round(settled_s / PERIOD_S) :]
@@ -210,7 +209,7 @@ def calibrated_creep() -> Creep:
     rng = np.random.default_rng(26)
     plants = [TwinPlant(SimulatedTool(), each, rng) for each in (EIT, LOAD_CELL)]
     plants[1].sees_gel = False
-    series: list[Floats] = []
+    series: list[FloatArray] = []
     for plant in plants:
         rows: list[tuple[float, float]] = []
         while plant.t_s < CREEP_S:
@@ -248,9 +247,9 @@ def tightened(seed: int) -> tuple[float, float]:
     return -plant.torque_nm - TIGHTEN_NM, plant.stiffness_nm_per_rad * TIGHTEN_RAD_PER_S * LOAD_CELL.period_s
 
 
-def measure(seeds: int) -> tuple[dict[str, Any], dict[str, Floats], Floats, Floats]:
+def measure(seeds: int) -> tuple[dict[str, Any], dict[str, FloatArray], FloatArray, FloatArray]:
     """Return the figures, true torques (seed, time) by scenario, and overshoots of screws (seed,) with their limits."""
-    tables: dict[str, Floats] = {}
+    tables: dict[str, FloatArray] = {}
     numbers: dict[str, Any] = {}
     for scenario in TWIN_SCENARIOS:
         tables[scenario.name], numbers[scenario.name] = steps(scenario, seeds, rig_twin)
@@ -272,7 +271,7 @@ def rig_calibration(bank: Path, seed: int) -> Calibration:
 
 def estimator_in_the_loop(
     bank: Path, calibration: Calibration, seeds: Sequence[int]
-) -> tuple[Floats, dict[str, float]]:
+) -> tuple[FloatArray, dict[str, float]]:
     """Return the true torques (seed, time) after a step driven by the default estimator, and their figures."""
     scenario = replace(TWIN_SCENARIOS[0], hold_s=30.0)
     rows, plants = [], []
@@ -291,7 +290,7 @@ def estimator_in_the_loop(
     }
 
 
-def draw(path: Path, tables: dict[str, Floats], beyond: Floats, allowed: Floats) -> None:
+def draw(path: Path, tables: dict[str, FloatArray], beyond: FloatArray, allowed: FloatArray) -> None:
     """Draw the true torques of all seeds, and the final torques of the screws."""
     from matplotlib.figure import Figure
 

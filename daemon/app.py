@@ -184,8 +184,7 @@ class Daemon:
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Run until `stop` is called, then end every task and close the sockets; `on_ready` when all is made."""
         try:
-            with self.publisher.told():
-                await self._run_tasks(on_ready)
+            await self._run_tasks(on_ready)
             if self._experiment is not None:
                 self._experiment.end()
         finally:

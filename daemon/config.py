@@ -219,7 +219,7 @@ class LoopConfig(ConfigModel):
     wrist_speed_rad_per_s: float = Field(0.5, gt=0, le=3.14)
     freshness_s: float = Field(0.1, ge=0, le=10, description="no torque that is younger counts as stale")
     wrist_acceleration_rad_per_s2: float = Field(4.0, gt=0, le=1000, description="asked of the robot at each change")
-    angle_bandwidth_per_s: float = Field(5.0, gt=0, le=30, description="how fast the wrist closes in on an angle")
+    angle_bandwidth_per_s: float = Field(5.0, gt=0, le=80, description="how fast the wrist closes in on an angle")
     actuation_s: float = Field(0.02, ge=0, le=0.2, description="from sending a speed until the wrist's angle shows it")
     gain_margin: float = Field(2.0, ge=1, le=100)
     phase_margin_deg: float = Field(45.0, ge=0, le=90)

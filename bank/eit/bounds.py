@@ -12,20 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
+from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compression import (
-    COARSE_RANK,
-    ROUNDING,
-    SEED_LEVEL,
-    CompressedBank,
-    FloatArray,
-    Indices,
-    Single,
-    column,
-    columns,
-)
+from shearloop.bank.eit.compression import COARSE_RANK, ROUNDING, SEED_LEVEL, CompressedBank, column, columns
 
-Mask = NDArray[np.bool_]
 Spectra = Mapping[int, NDArray[np.complex64]]
 Score = Callable[[int, FloatArray], float]
 
@@ -51,11 +41,11 @@ class TakesLongError(Exception):
 class Left(NamedTuple):
     """Cells (n,), bounds of their scores (n,), and the (m, 896) frame at the lags where they may have those scores."""
 
-    cells: Indices
-    bounds: Single
+    cells: IntArray
+    bounds: Float32Array
     frames: FloatArray
 
-    def among(self, allowed: Mask) -> "Left":
+    def among(self, allowed: BoolArray) -> "Left":
         """Return what is left of some cells."""
         return Left(self.cells[allowed], self.bounds[allowed], self.frames)
 
@@ -66,11 +56,11 @@ class Neighbourhood:
     def __init__(self, rows: NDArray[np.int32], columns: NDArray[np.int32], cell: int, radius: int) -> None:
         self._rows, self._columns, self._cell, self._radius = rows, columns, cell, radius
 
-    def lacks(self, cells: Indices | slice) -> Mask:
+    def lacks(self, cells: IntArray | slice) -> BoolArray:
         """Return which of some cells are outside."""
         rows = np.abs(self._rows[cells] - self._rows[self._cell])
         columns = np.abs(self._columns[cells] - self._columns[self._cell])
-        outside: Mask = np.maximum(rows, columns) > self._radius
+        outside: BoolArray = np.maximum(rows, columns) > self._radius
         return outside
 
 
@@ -91,7 +81,7 @@ class ZeroLagBounds:
         self._bounds[:n] += self._estimates[:n]
         self._estimates[n] = self._bounds[n] = -np.inf
 
-    def leave_out(self, cells: Indices) -> None:
+    def leave_out(self, cells: IntArray) -> None:
         """Find these cells no more."""
         self._estimates[cells] = self._bounds[cells] = -np.inf
 
@@ -193,9 +183,9 @@ class AllLagsBounds:
             found.append(Left(chosen, bounds, frames[i:j]))
         return found
 
-    def _reach(self, rows: Single, at: Indices, least: Single) -> Mask:
+    def _reach(self, rows: Float32Array, at: IntArray, least: Float32Array) -> BoolArray:
         found = self._columns.take(at, axis=1).T @ rows.T
-        reach: Mask = found >= least[at, None]
+        reach: BoolArray = found >= least[at, None]
         return reach
 
     def _are_few(self, n_bounds: int) -> bool:
@@ -210,10 +200,10 @@ class AllLagsBounds:
         cells = [self._best_of(self._bank.members[group], at_0[:, i]) for i, group in enumerate(groups)]
         return [(cell, self._score(cell, frame[None])) for cell, frame in zip(cells, frames, strict=True)]
 
-    def _best_of(self, cells: Indices, parts: Single) -> int:
+    def _best_of(self, cells: IntArray, parts: Float32Array) -> int:
         return int(cells[np.argmax(self._bank.coarse.take(cells, axis=0)[:, :-2] @ parts)])
 
-    def _seeds_of(self, frame: int) -> tuple[Indices, Single, Single]:
+    def _seeds_of(self, frame: int) -> tuple[IntArray, Float32Array, Float32Array]:
         """Return the likeliest lags, (m,), the frame's numbers there (r, m), and the estimates of groups (m, n)."""
         start, end = self._parts[frame : frame + 2]
         n_seeds = min(_SEED_LAGS, end - start)
@@ -238,7 +228,7 @@ class AllLagsBounds:
         self._first_bounds = self._bank.levels[0].rows @ self._columns
         self._highest = self._first_bounds.max(axis=0)
 
-    def _frames(self, lags: Indices) -> FloatArray:
+    def _frames(self, lags: IntArray) -> FloatArray:
         return self._padded.take(lags[:, None] + _CHANNELS)
 
 

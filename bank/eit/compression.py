@@ -22,11 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from shearloop.bank.arrays import Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS
-
-FloatArray = NDArray[np.float64]
-Single = NDArray[np.float32]
-Indices = NDArray[np.int64]
 
 # A basis is fitted to about so many cells, from all over the bank: a cell is much like its neighbours.
 _FITTED_CELLS = 1024
@@ -56,8 +53,8 @@ _SQUARE_ROUNDING_64 = 1e-12
 class Level(NamedTuple):
     """Groups of cells: their rows (m, r + 2), and the group of the level before, (m,), that each is a part of."""
 
-    rows: Single
-    part_of: Indices
+    rows: Float32Array
+    part_of: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,19 +68,19 @@ class CompressedBank:
     its c and ρ, in the order of memory that suits products with all cells.
     """
 
-    basis: Single
-    fine: Single
-    coarse: Single
+    basis: Float32Array
+    fine: Float32Array
+    coarse: Float32Array
     levels: tuple[Level, ...]
     overlaps: FloatArray
-    group_of: Indices
-    members: tuple[Indices, ...]
-    centres: Indices
-    estimators: Single
-    left_out: Single
+    group_of: IntArray
+    members: tuple[IntArray, ...]
+    centres: IntArray
+    estimators: Float32Array
+    left_out: Float32Array
 
 
-def compress(unit_signals: Callable[[Indices], FloatArray], cells: Indices) -> CompressedBank:
+def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) -> CompressedBank:
     """Compress the unit signals of n cells; `unit_signals` gives those, (m, 896), of m of these cells."""
     gram, total = np.zeros((N_CHANNELS, N_CHANNELS)), np.zeros(N_CHANNELS)
     n, fitted = len(cells), cells[:: max(len(cells) // _FITTED_CELLS, 1)]
@@ -132,7 +129,7 @@ def compress(unit_signals: Callable[[Indices], FloatArray], cells: Indices) -> C
     )
 
 
-def column(parts: Single, rank: int) -> tuple[Single, np.float32]:
+def column(parts: Float32Array, rank: int) -> tuple[Float32Array, np.float32]:
     """Return the (r + 2,) column of a frame y of norm 1, and its t at a lower rank; parts (r,) are Φᵀ y."""
     along, coarse, rest = float(parts[0]) ** 2, parts[1:rank], parts[rank:]
     across = float(coarse @ coarse)
@@ -145,7 +142,7 @@ def column(parts: Single, rank: int) -> tuple[Single, np.float32]:
     return found, t
 
 
-def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Single:
+def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Float32Array:
     """Return the (r + 2, n) columns of n frames y: parts (r, n) are Φᵀ y, squared_norms (n,) are ‖y‖²."""
     across = np.einsum("ij,ij->j", parts[1:], parts[1:])
     found = np.empty((len(parts) + 2, parts.shape[1]), dtype=np.float32)
@@ -155,28 +152,28 @@ def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Sing
     return found
 
 
-def _parts(cells: Indices) -> Iterable[Indices]:
+def _parts(cells: IntArray) -> Iterable[IntArray]:
     return (cells[start : start + COMPRESSED_CELLS] for start in range(0, len(cells), COMPRESSED_CELLS))
 
 
-def _rows_of_cells(numbers: FloatArray) -> Single:
+def _rows_of_cells(numbers: FloatArray) -> Float32Array:
     rows = np.zeros((len(numbers), numbers.shape[1] + 2), dtype=np.float32)
     rows[:, :-2] = numbers
     rows[:, -1] = np.sqrt(np.maximum(1 - np.einsum("ij,ij->i", numbers, numbers), 0.0) + _SQUARE_ROUNDING_64)
     return rows
 
 
-def _bounding(cells: Single) -> Single:
+def _bounding(cells: Float32Array) -> Float32Array:
     """Return the row that bounds all of some cells."""
     centre = cells[:, :-2].mean(axis=0)
     # Of the first direction and of what is left out the largest.
-    row: Single = cells.max(axis=0)
+    row: Float32Array = cells.max(axis=0)
     row[1:-2] = centre[1:]
     row[-2] = math.sqrt(_squared_distances(cells[:, 1:-2], centre[1:]).max())
     return row
 
 
-def _partitions(cells: Single, sizes: Sequence[int]) -> list[list[tuple[Indices, Single]]]:
+def _partitions(cells: Float32Array, sizes: Sequence[int]) -> list[list[tuple[IntArray, Float32Array]]]:
     """Split the cells into groups, as many as each of the rising sizes says, or fewer where cells are alike.
 
     Returns of each size the groups' cells, and the row that bounds those.
@@ -186,7 +183,7 @@ def _partitions(cells: Single, sizes: Sequence[int]) -> list[list[tuple[Indices,
     """
     order = count()
 
-    def entry(chosen: Indices) -> tuple[float, int, Indices, Single]:
+    def entry(chosen: IntArray) -> tuple[float, int, IntArray, Float32Array]:
         row = _bounding(cells[chosen])
         radius, left_out = row[-2:].tolist()
         width = (radius + _USUAL_T * left_out) * len(chosen) ** _CROWDING if radius > ROUNDING else 0.0
@@ -207,12 +204,12 @@ def _partitions(cells: Single, sizes: Sequence[int]) -> list[list[tuple[Indices,
     return found
 
 
-def _central(cells: Single, chosen: Indices) -> int:
+def _central(cells: Float32Array, chosen: IntArray) -> int:
     points = cells[chosen, :-2]
     return int(chosen[np.argmin(_squared_distances(points, points.mean(axis=0)))])
 
 
-def _squared_distances(points: Single, place: Single) -> Single:
+def _squared_distances(points: Float32Array, place: Float32Array) -> Float32Array:
     apart = points - place
-    squares: Single = np.einsum("ij,ij->i", apart, apart)
+    squares: Float32Array = np.einsum("ij,ij->i", apart, apart)
     return squares

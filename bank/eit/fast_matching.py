@@ -13,25 +13,15 @@ from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from shearloop.bank.eit.bounds import (
-    AllLagsBounds,
-    Left,
-    Mask,
-    Neighbourhood,
-    TakesLongError,
-    ZeroLagBounds,
-    spectra_of,
-)
-from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_search import search_of
-from shearloop.bank.eit.compression import COMPRESSED_CELLS, ROUNDING, Indices, compress
+from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from shearloop.bank.eit.bounds import AllLagsBounds, Left, Neighbourhood, TakesLongError, ZeroLagBounds, spectra_of
+from shearloop.bank.eit.compression import COMPRESSED_CELLS, ROUNDING, compress
 from shearloop.bank.eit.matching import (
     CHUNK_CELLS,
     RUNNER_UP_RADIUS,
     TIE,
-    FloatArray,
     Match,
     Matcher,
     ReferenceMatcher,
@@ -57,10 +47,6 @@ FEWEST_PRUNED = 300
 _QUICK_SCORES = 1 << 13
 
 
-# Number and score of the best cell, then of the runner-up.
-Searched = tuple[int, float, int, float]
-
-
 class _Undecided(Exception):  # noqa: N818 - it is not an error
     """It hangs on the rounding of float64 which cells tie."""
 
@@ -71,7 +57,7 @@ class _PruningMatcher(Matcher):
     # With fewer cells nothing is searched: the whole heatmap is made.
     _fewest = 0
 
-    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank, which takes about half a second for 10⁴ cells; arguments as of any matcher.
 
         Raises MatchingError as any matcher, and here, not at the first frame, where a valid cell has no signal.
@@ -81,12 +67,6 @@ class _PruningMatcher(Matcher):
         chunks = self._chunks(COMPRESSED_CELLS)
         self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in chunks])
         self._row, self._column = (each.astype(np.int32) for each in np.divmod(self._cells, valid.shape[1]))
-        self._compiled = search_of(
-            *(self._bank, self._signals, self._cells, self._norms, (self._row, self._column)),
-            tie=TIE,
-            tie_rounding=_ROUNDING_64,
-            radius=RUNNER_UP_RADIUS,
-        )
 
     def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
         """Return what `best_match` finds in the heatmap of one (896,) difference, at a fraction of its cost.
@@ -94,9 +74,6 @@ class _PruningMatcher(Matcher):
         Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
         """
         if len(self._cells) >= self._fewest:
-            found = self._found(difference, runner_up, len(self._cells))
-            if found is not None:
-                return found
             frame = unit_magnitude(difference)
             with suppress(_Undecided):
                 return self._search(frame, runner_up)
@@ -110,9 +87,6 @@ class _PruningMatcher(Matcher):
         """
         if len(self._cells) < self._fewest:
             return super().match(difference)
-        found = self._found(difference, True, _QUICK_SCORES)
-        if found is not None:
-            return found
         try:
             return self._search(unit_magnitude(difference), runner_up=True, quick=True)
         except (_Undecided, TakesLongError):
@@ -127,21 +101,6 @@ class _PruningMatcher(Matcher):
         # Wrong input is told before any work.
         unit_magnitudes(frames)
         return [self.match(frame, runner_up=False) for frame in frames]
-
-    def _found(self, difference: ArrayLike, runner_up: bool, most_scores: int) -> Match | None:
-        """Return the match, or None: nothing is compiled, or numpy has to decide, or to say what is wrong."""
-        values = np.asarray(difference, dtype=np.float64)
-        if values.shape != (N_CHANNELS,):
-            return None
-        found = self._compiled_search(np.ascontiguousarray(values), runner_up, most_scores)
-        if found is None:
-            return None
-        cell, score, other, other_score = found
-        return self._match((cell, score), None if other < 0 else (other, other_score))
-
-    @abstractmethod
-    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
-        """Return the numbers and scores of the best cell and the runner-up, −1 if there is none; None as `_found`."""
 
     @abstractmethod
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match: ...
@@ -171,8 +130,8 @@ class _PruningMatcher(Matcher):
         return int(cells[winner]), min(float(scores[winner]), 1.0)
 
     def _contenders(
-        self, frame: FloatArray, cells: Indices, frames: FloatArray, reached: float
-    ) -> tuple[Indices, FloatArray]:
+        self, frame: FloatArray, cells: IntArray, frames: FloatArray, reached: float
+    ) -> tuple[IntArray, FloatArray]:
         """Return those of the cells that may score `reached`, and their scores at the lags of (m, 896) frames."""
         if len(frames) > _FEW_LAGS:
             return cells, self._scores(frame[None], self._unit_signals(self._cells[cells]))[0]
@@ -208,19 +167,15 @@ class _PruningMatcher(Matcher):
 class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     """Matches at lag 0 alone; its heatmaps are those of `ZeroLagMatcher`, at that one's price.
 
-    Where there was a compiler, one call searches. Without, all cells are estimated at once, for with one lag that is a
-    few operations on one number per cell.
+    All cells are estimated at once, for with one lag that is a few operations on one number per cell.
     """
 
-    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as of any pruning matcher."""
         super().__init__(signals, valid, k_grid, sigma_grid)
         # Every place of the grid has the number of its cell; those that are not valid share one that is none.
         self._numbers = np.full(valid.shape, len(self._cells))
         self._numbers[valid] = np.arange(len(self._cells))
-
-    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
-        return None if self._compiled is None else self._compiled.match(difference, runner_up, most_scores)
 
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match:
         bounds = ZeroLagBounds(self._bank, frame)
@@ -249,7 +204,7 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
 
     _fewest = FEWEST_PRUNED
 
-    def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
+    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Compress the bank; arguments and errors as of `FastZeroLagMatcher`."""
         super().__init__(signals, valid, k_grid, sigma_grid)
         self._spectra = spectra_of(self._bank)
@@ -292,9 +247,6 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
             (left,) = bounds.left([least])
         left = left.among(peak.lacks(left.cells))
         return self._match(best, self._settled(frame, left, least, quick=quick) if len(left.cells) else None)
-
-    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
-        return None if self._compiled is None else self._compiled.match_at_all_lags(difference, runner_up, most_scores)
 
     def _around(self, cell: int, radius: int) -> Neighbourhood:
         return Neighbourhood(self._row, self._column, cell, radius)

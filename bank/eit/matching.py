@@ -10,19 +10,17 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 from scipy.special import chdtri
 
+from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_search import energy as compiled_energy
 from shearloop.bank.errors import MatchingError
-
-FloatArray = NDArray[np.float64]
 
 # Scores that differ by less are the same to rounding: of those the first cell in (k, σ) order is taken.
 TIE = 1e-12
@@ -62,9 +60,7 @@ class NoSignal:
 class Matcher(ABC):
     """Scores differences against all valid cells of a bank; keeps no state between calls."""
 
-    def __init__(
-        self, signals: NDArray[np.float32], valid: NDArray[np.bool_], k_grid: FloatArray, sigma_grid: FloatArray
-    ) -> None:
+    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Take (K, S, 896) difference signals, (K, S) validity, and the (K,) and (S,) grids.
 
         The signals are not copied; those of cells that are not valid are never read. Raises MatchingError when the
@@ -84,11 +80,6 @@ class Matcher(ABC):
         # Not as a memory map, whose indexing is slow.
         self._signals = np.asarray(signals).reshape(-1, N_CHANNELS)
         self._cells = np.flatnonzero(valid)
-
-    def __reduce__(self) -> tuple[type[Self], tuple[NDArray[Any], ...]]:
-        """Copy or send it as what it is made of: what is compiled for it cannot be copied, and is made anew."""
-        signals = self._signals.reshape(*self.valid.shape, N_CHANNELS)
-        return type(self), (signals, self.valid, self.k_grid, self.sigma_grid)
 
     @classmethod
     def from_bank(cls, bank: Bank) -> Self:
@@ -131,12 +122,12 @@ class Matcher(ABC):
         """
         return best_match(self.heatmap(difference), self.k_grid, self.sigma_grid)
 
-    def _chunks(self, size: int = CHUNK_CELLS) -> Iterator[NDArray[np.int64]]:
+    def _chunks(self, size: int = CHUNK_CELLS) -> Iterator[IntArray]:
         """Yield the numbers of all valid cells, as many at a time as are in memory at once."""
         for start in range(0, len(self._cells), size):
             yield self._cells[start : start + size]
 
-    def _unit_signals(self, cells: NDArray[np.int64]) -> FloatArray:
+    def _unit_signals(self, cells: IntArray) -> FloatArray:
         magnitudes = self._magnitudes(cells)
         norms = np.linalg.norm(magnitudes, axis=1, keepdims=True)
         # Below the least normal number float32 has lost the digits.
@@ -144,7 +135,7 @@ class Matcher(ABC):
             raise MatchingError("a cell that the bank calls valid has no finite signal; build the bank anew")
         return np.asarray(magnitudes / norms)
 
-    def _magnitudes(self, cells: NDArray[np.int64]) -> FloatArray:
+    def _magnitudes(self, cells: IntArray) -> FloatArray:
         return np.abs(self._signals.take(cells, axis=0), dtype=np.float64)
 
     @abstractmethod
@@ -221,12 +212,10 @@ def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal 
         raise MatchingError(
             f"a difference has {N_CHANNELS} channels; the arrays have shapes {values.shape}, {noise.shape}"
         )
-    energy = compiled_energy(values, noise) if noise.shape == values.shape else None
-    if energy is None:
-        if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
-            raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
-        with np.errstate(over="ignore"):  # far above the noise is all that matters
-            energy = float(np.sum((values / noise) ** 2))
+    if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
+        raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
+    with np.errstate(over="ignore"):  # far above the noise is all that matters
+        energy = float(np.sum((values / noise) ** 2))
     least = _LEAST_ENERGY
     if energy > least:
         return None

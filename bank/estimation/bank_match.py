@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, smoothed_along_channels
 from shearloop.bank.eit.fast_matching import FastMatcher
-from shearloop.bank.estimation.values import FloatArray
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
     from shearloop.daemon.analysis.charts.drawing import check_takes_pictures, remove_empty_folders
     from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
-    from shearloop.daemon.workers import workers
+    from shearloop.daemon.workers import open_executor
 
     check_takes_pictures(args.out)
     scratch = args.out / "banks"
@@ -55,8 +55,8 @@ def run(args: argparse.Namespace) -> int:
         if args.name == "scene":
             from shearloop.daemon.analysis.charts import scene
 
-            with workers(args.cluster, args.jobs) as pool:
-                paths = scene.chart(parts, args.out, pool)
+            with open_executor(args.cluster, args.jobs) as executor:
+                paths = scene.chart(parts, args.out, executor)
         else:
             mesh = mesh_of(args.mesh)
             bank = bank_of(args.bank, mesh, scratch)
@@ -68,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
             else:
                 from shearloop.daemon.analysis.charts import stability
 
-                with workers(args.cluster, args.jobs) as pool:
-                    paths = stability.chart(parts, bank, mesh, scratch, args.out, pool)
+                with open_executor(args.cluster, args.jobs) as executor:
+                    paths = stability.chart(parts, bank, mesh, scratch, args.out, executor)
     for path in paths:
         print(path)
     return 0

@@ -10,11 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.errors import UserError
-
-FloatArray = NDArray[np.float64]
 
 _TIMES_S = np.geomspace(2.0, 200.0, 60)
 # Fewer readings than this, and the noise decides.

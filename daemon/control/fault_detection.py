@@ -11,9 +11,8 @@ from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, stale_after_s
 # 2.5 periods of their topics. The arm stands still by itself when it hears nothing for 0.3 s.
 ARM_STALE_S = stale_after_s("robot.state")
 HAND_STALE_S = stale_after_s("gripper.state")
-# While an experiment runs the brain is asked at each state that the robot's process tells, of at least two cycles in
-# five (`shearloop.drivers.ur.pace`), and is late where that takes longer than this.
-LONGEST_TICK_S = 0.03
+# The loop decides at each of the robot's states, and is late where that takes longer than this.
+LONGEST_TICK_S = 0.02
 # Later than this, and the state that was last decided upon had become stale while the wrist turned on it.
 LATEST_LOOP_S = ARM_STALE_S - LONGEST_TICK_S
 # A loop that is away for longer was hardly slow: its process was paused. The robot's process has stopped the arm

@@ -4,11 +4,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.errors import UserError
-
-FloatArray = NDArray[np.float64]
 
 # Where the lag of the torque behind its stamp is looked for.
 _LAG_GRID_S = np.arange(-0.4, 1.0001, 0.02)

@@ -21,7 +21,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from shearloop.bank.arrays import FloatArray
+
 ComplexArray = NDArray[np.complex128]
 
 # The wrist has arrived when so little of a step is left; the response is cut there.

@@ -13,8 +13,6 @@ from shearloop.daemon.control.settings import ControllerSettings
 # Above this the loop answers single measurements rather than what they have in common.
 MOST_GAIN = 0.5
 LEAST_GAIN = 1e-3
-# The longest stretch between two decisions, of a wrist that turns slowly (`shearloop.drivers.ur.pace`).
-COMMAND_PERIOD_S = 0.024
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +66,6 @@ def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
         wrist_bandwidth_per_s=settings.wrist_bandwidth_per_s,
         kp=settings.kp,
         ki=settings.ki,
-        command_period_s=COMMAND_PERIOD_S,
         stiffness_ratio=found.stiffness_nm_per_rad / settings.stiffness_nm_per_rad,
         lag_error_s=max(found.significant_lag_s - settings.lag_s, earliest_s),
     )

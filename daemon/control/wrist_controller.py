@@ -1,4 +1,4 @@
-"""What the wrist does for each wish: a speed in rad/s, up to 125 times a second. No I/O; times are passed in."""
+"""What the wrist does for each wish: a speed in rad/s, 125 times a second. No I/O; times are passed in."""
 
 import math
 from collections import deque
@@ -22,11 +22,6 @@ from shearloop.daemon.control.tuning import RequiredMargins, refusal
 
 # Torques that wait for an angle: while the wrist stands they may be many, and the latest say what has become of it.
 MOST_HEARD = 64
-# A speed that was sent for an angle no further away than this is as good, for it is a tenth of what the wrist resolves,
-# and what stays the same need not be sent again.
-AS_GOOD_RAD = 2e-5
-# But no more than this share of the speed that is allowed: a slower wrist would never turn back.
-AS_GOOD_SHARE = 0.1
 # A loop that was away for longer than this does not know what it sent last.
 LONGEST_STEP_NS = 50_000_000
 
@@ -201,9 +196,6 @@ class WristController:
     def _towards(self, missing_rad: float, speed_rad_per_s: float) -> WristVelocity:
         bandwidth_per_s = self._settings.angle_bandwidth_per_s
         speed = math.copysign(min(abs(bandwidth_per_s * missing_rad), speed_rad_per_s), missing_rad)
-        as_good_rad_per_s = min(bandwidth_per_s * AS_GOOD_RAD, AS_GOOD_SHARE * speed_rad_per_s)
-        if self._sent_rad_per_s and abs(speed - self._sent_rad_per_s) <= as_good_rad_per_s:
-            speed = self._sent_rad_per_s
         return self._bounded(speed)
 
     def _bounded(self, speed_rad_per_s: float) -> WristVelocity:

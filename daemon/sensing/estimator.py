@@ -7,19 +7,17 @@ the bank, and the best cell's sigma and k become torque and diameter through the
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.matching import Match, signal_above_noise
 from shearloop.bank.eit.polynomial import Interval
 from shearloop.bank.estimation import Measured
 from shearloop.bank.estimation.fingertip_validator import LEAST_NOISE_V
 from shearloop.drivers.eit_kit import Frame
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 # Above this share of unusable channels the match would be made of what is left over.
 LARGEST_UNUSABLE_SHARE = 0.10

@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.polynomial import Interval
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, Measured, TactileFrame
-from shearloop.daemon.sensing.estimator import FloatArray, Matcher, Reading
+from shearloop.daemon.sensing.estimator import Matcher, Reading
 from shearloop.drivers.eit_kit import Frame
 
 # These take a millisecond, always the same few products; the others search a bank or reconstruct.

@@ -38,19 +38,10 @@ class Robot(UrRobot):
         self.flight.fly(5)
         self._held: list[tuple[Callable[[CommandReply], None], CommandReply]] = []
         self._unread: list[tuple[int, Message]] = []
-        # Of how many cycles the daemon needs one.
-        self.of_cycles = 1
         # For how many cycles there is no process yet.
         self.gone_for = 0
 
-    def ease(self, cycles: int) -> None:
-        self.of_cycles = cycles
-
-    def hurry(self) -> None:
-        self.of_cycles = 1
-
     def tell(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
-        self.hurry()
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
@@ -99,8 +90,7 @@ class Robot(UrRobot):
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
         arm.be(t_mono_ns=self.flight.now_ns)
         self.flight.fly(1)
-        if self.flight.cycle % self.of_cycles == 0:
-            self._unread.append((0, self.flight.state))
+        self._unread.append((0, self.flight.state))
         if not read:
             return
         held, self._held = self._held, []

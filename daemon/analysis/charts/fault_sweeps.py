@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.errors import BankError
@@ -23,10 +24,9 @@ from shearloop.bank.estimation.bank_match import Registration
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.scene import residual_noise
-from shearloop.daemon.workers import Workers, in_order
+from shearloop.daemon.workers import Executor, in_order
 from shearloop.drivers.eit_format import ADC_STEP_V
 
-Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 
@@ -35,9 +35,9 @@ class FaultScene:
     """Frames of a recording, the idle fingertips' voltages `idle` (m, 896), and another fingertip's frame `foreign`."""
 
     series: FrameSeries
-    idle: Floats
+    idle: FloatArray
     noise_v: float
-    foreign: Floats
+    foreign: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +58,7 @@ class FrameFault:
     apply: Callable[[FaultScene, float, np.random.Generator], FaultyFrames]
 
 
-def _with_channels(scene: FaultScene, channels: Floats) -> FrameSeries:
+def _with_channels(scene: FaultScene, channels: FloatArray) -> FrameSeries:
     """Return the frames with other channels; differences are magnitudes."""
     return replace(scene.series, channels=np.abs(channels) if scene.series.kind == "difference" else channels)
 
@@ -160,7 +160,7 @@ FAULTS = (
 )
 
 
-def scene_of(series: FrameSeries, idle: Floats, noise_v: float, seed: int = 7) -> FaultScene:
+def scene_of(series: FrameSeries, idle: FloatArray, noise_v: float, seed: int = 7) -> FaultScene:
     """Return a scene; its foreign frame has the mean frame's voltages at shuffled channels."""
     rng = np.random.default_rng(seed)
     mean = series.channels.mean(axis=0)
@@ -212,7 +212,7 @@ def fault_curve(fault: str, unit: str, estimator: str, levels: Iterable[FaultLev
     return FaultCurve(fault, unit, estimator, found, mildest)
 
 
-def judge_level(estimates: Sequence[Estimate], truth_nm: Floats, level: float) -> FaultLevel:
+def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: float) -> FaultLevel:
     """Return the figures of estimates against (n,) truths; NaN truths do not count."""
     known = np.isfinite(truth_nm)
     rows = [
@@ -239,13 +239,13 @@ def estimate_frames(tracker: EstimatorSession, faulty: FaultyFrames) -> list[Est
     return found
 
 
-def true_torques(series: FrameSeries) -> Floats:
+def true_torques(series: FrameSeries) -> FloatArray:
     """Return the (n,) true torques of a series, NaN for frames that do not count."""
     torque = series.torque_at_frames()
     return balanced(torque) if series.kind == "raw" else torque
 
 
-def balanced(truth_nm: Floats) -> Floats:
+def balanced(truth_nm: FloatArray) -> FloatArray:
     """Return (n,) truths with as many loaded frames as free ones, the rest NaN.
 
     Most of a stream is free of load: an estimator that always says zero would look stable.
@@ -321,10 +321,10 @@ def scene_for(split: Split, bank: Bank) -> FaultScene:
     return scene_of(series, idle, float(np.median(channel_noise(split.past.channels[:, 0]))))
 
 
-def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, pool: Workers) -> list[FaultCurve]:
+def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, executor: Executor) -> list[FaultCurve]:
     """Return the curves of all estimators through all faults; each estimator is one task for the workers."""
     tasks = fitted(split, names, physics)
-    found = in_order(pool.map(sweep_estimator, (scene_for(split, bank), str(bank.path.resolve())), tasks))
+    found = in_order(executor.map(sweep_estimator, (scene_for(split, bank), str(bank.path.resolve())), tasks))
     return [one for curves in found for one in curves]
 
 

@@ -5,8 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.eit.forward import ForwardModel
@@ -14,7 +14,6 @@ from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import Conductivities, conductivity
 from shearloop.daemon.analysis.charts.sources import own_fingertip
 
-Floats = NDArray[np.float64]
 MODEL = "gaussian_derivative"
 # Cells all over the valid part of the paper's grid.
 CELLS = ((3.2, 1.2), (3.3, 1.9), (2.2, 1.0), (1.4, 1.4), (0.8, 2.5), (4.0, 3.5))
@@ -54,7 +53,7 @@ class _Solver:
     mesh: Mesh
     solve: Callable[[], object]
     # None where another model is solved.
-    truth: Floats | None
+    truth: FloatArray | None
 
     @property
     def times(self) -> int:
@@ -125,7 +124,7 @@ def pyeit(mesh: Mesh) -> Callable[[], object] | None:
     return lambda: [solve(cell) for cell in cells]
 
 
-def pyeit_solver(mesh: Mesh) -> Callable[[Floats], object] | None:
+def pyeit_solver(mesh: Mesh) -> Callable[[FloatArray], object] | None:
     """Return pyEIT's forward solve of the same patterns on the same mesh, or None where it is not installed."""
     try:
         from pyeit.eit.fem import EITForward
@@ -143,13 +142,13 @@ def pyeit_solver(mesh: Mesh) -> Callable[[Floats], object] | None:
     )
     solver = EITForward(body, protocol)
 
-    def solve(conductivity: Floats) -> object:
+    def solve(conductivity: FloatArray) -> object:
         return solver.solve_eit(perm=conductivity)
 
     return solve
 
 
-def batch(mesh: Mesh) -> Callable[[], Floats]:
+def batch(mesh: Mesh) -> Callable[[], FloatArray]:
     """Return a function that solves the same signals in one batch, as `bank build` does."""
     model, of = BatchForwardModel(mesh), Conductivities(mesh)
     (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
@@ -159,19 +158,19 @@ def batch(mesh: Mesh) -> Callable[[], Floats]:
     return lambda: (model.voltages(cells[many]) - homogeneous)[: len(CELLS)]
 
 
-def direct(mesh: Mesh) -> Callable[[], Floats]:
+def direct(mesh: Mesh) -> Callable[[], FloatArray]:
     """Return a function that solves the cells' (m, 896) difference signals one by one."""
     model = ForwardModel(mesh)
     homogeneous = model.homogeneous()
     return lambda: np.array([model.voltages(conductivity(mesh, MODEL, k, s)) - homogeneous for k, s in CELLS])
 
 
-def converged(coarse: Mesh, fine: Mesh, ratio: float) -> Floats:
+def converged(coarse: Mesh, fine: Mesh, ratio: float) -> FloatArray:
     """Return the extrapolated signals of two meshes, the first `ratio` times as coarse, for an error of first order."""
     first, second = direct(coarse)(), direct(fine)()
     return np.asarray(second + (second - first) / (ratio - 1.0))
 
 
-def error_of(signals: Floats, truth: Floats) -> float:
+def error_of(signals: FloatArray, truth: FloatArray) -> float:
     """Return the median over the cells of ‖signal − truth‖ / ‖truth‖."""
     return float(np.median(np.linalg.norm(signals - truth, axis=1) / np.linalg.norm(truth, axis=1)))

@@ -14,14 +14,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.controller import TwistController, WristCommand
 from shearloop.daemon.control.excitation import ExciteSettings, StiffnessExcitation
 from shearloop.daemon.control.identify import ToolModel
 from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.daemon.control.tuning import gain_for_noise, integral_gain
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
-
-Floats = NDArray[np.float64]
 
 PERIOD_S = 0.008
 # The standard deviation of torque that noise may cause; it sets the gain.
@@ -219,9 +218,9 @@ class UncompensatedController:
 class Trace:
     """A run, one row per command period: time, true torque, wrist angle (n,), and whether the wrist was held."""
 
-    t_s: Floats
-    torque_nm: Floats
-    angle_rad: Floats
+    t_s: FloatArray
+    torque_nm: FloatArray
+    angle_rad: FloatArray
     held: NDArray[np.bool_]
 
 

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.calibration import SkinCalibration
 from shearloop.bank.skin.calibration_file import load_calibration
 from shearloop.daemon.analysis.charts.drawing import figure, look, save
@@ -29,10 +29,9 @@ from shearloop.daemon.rig import make_brain
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
-from shearloop.daemon.workers import Workers, in_order
+from shearloop.daemon.workers import Executor, in_order
 from shearloop.drivers.shear_skin.judge import SkinSample
 
-Floats = NDArray[np.float64]
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
 # From the middle of a conversion to the controller; and from a speed command to the wrist.
 AGE_S, ACTUATION_TICKS = 0.06, 2
@@ -180,7 +179,7 @@ def _experiment(hold_s: float) -> ExperimentFile:
     return ExperimentFile.model_validate({"name": "bench", "drive": "skin", "steps": steps, "limits": {"angle_rad": 1}})
 
 
-def holds_of(loop: SkinLoop, settled_s: float) -> list[Floats]:
+def holds_of(loop: SkinLoop, settled_s: float) -> list[FloatArray]:
     """Return the true force over the settled end of each hold, in order."""
     set_points, truth = np.array(loop.set_point_n), np.array(loop.truth_n)
     set_points = np.round(set_points, 6)
@@ -243,11 +242,11 @@ def worst(calibration: SkinCalibration, case: SkinLoopCase) -> SkinHold:
     return replace(found[0], width_n=width_n, offset_n=offset_n)
 
 
-def chart(out: Path, pool: Workers) -> list[Path]:
+def chart(out: Path, executor: Executor) -> list[Path]:
     """Measure all cases, draw and write `stability-skin`."""
     calibration = load_calibration(CALIBRATION)
     gains, delays = over_gains(), over_delays()
-    found = in_order(pool.map(worst, calibration, [*gains, *delays]))
+    found = in_order(executor.map(worst, calibration, [*gains, *delays]))
     shown = judge(SkinLoopCase(name="shown"), calibration)[1]
     made = limit_cycle_figure(found[: len(gains)], found[len(gains) :], shown)
     return save(made, {"held": [asdict(held) for held in found]}, out, "stability-skin")

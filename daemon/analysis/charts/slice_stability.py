@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.forward import ForwardModel
@@ -38,9 +39,8 @@ from shearloop.daemon.analysis.charts.sources import (
     torque_of,
 )
 from shearloop.daemon.synthetic import Synthesiser
-from shearloop.daemon.workers import Workers, in_order
+from shearloop.daemon.workers import Executor, in_order
 
-Floats = NDArray[np.float64]
 STEPS = 25
 
 
@@ -49,7 +49,7 @@ class ContinuityWalk:
     """Torques (n,) in N·m along a path through frames, NaN where not valid; `share_nm` is the fair share of a step."""
 
     name: str
-    torque_nm: Floats
+    torque_nm: FloatArray
     share_nm: float
 
     @property
@@ -64,7 +64,7 @@ class ContinuityWalk:
         return int(np.count_nonzero(np.nan_to_num(np.abs(np.diff(self.torque_nm))) > 10 * self.share_nm))
 
 
-def path_through(split: Split) -> tuple[Floats, float]:
+def path_through(split: Split) -> tuple[FloatArray, float]:
     """Return (n, 896) differences from the smallest to the largest later torque, and a step's fair share in N·m."""
     torque = split.future.torque_at_frames()
     frames = np.abs(split.future.channels[np.argsort(torque), 0])
@@ -93,14 +93,14 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
     return found
 
 
-def _read(split: Split, locator: BankMatcher, path: Floats) -> Floats:
-    def features(frames: Floats) -> Floats:
+def _read(split: Split, locator: BankMatcher, path: FloatArray) -> FloatArray:
+    def features(frames: FloatArray) -> FloatArray:
         sigma = np.array([locator.locate(one).sigma for one in frames])
         return np.column_stack([sigma, sigma**2])
 
     past = features(np.abs(split.past.channels[:, 0]))
     reader = fit_reader(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=(1e-9,))
-    read: Callable[[Floats], float] = lambda one: reader.read(one)[0]  # noqa: E731
+    read: Callable[[FloatArray], float] = lambda one: reader.read(one)[0]  # noqa: E731
     return np.array([read(one) for one in features(path)])
 
 
@@ -139,7 +139,7 @@ class Extrapolation:
         return tuple(None if good is None or width is None else width / good for width in self.width_nm)
 
 
-def calibration_parts(torque_nm: Floats) -> dict[str, list[CalibrationPart]]:
+def calibration_parts(torque_nm: FloatArray) -> dict[str, list[CalibrationPart]]:
     """Return the parts of (n,) torques by direction, with ever fewer torques; limits are quantiles.
 
     A limit that leaves no slice to judge is left out.
@@ -156,7 +156,7 @@ def calibration_parts(torque_nm: Floats) -> dict[str, list[CalibrationPart]]:
 
 
 def extrapolate(
-    split: Split, names: Sequence[Name], bank: Bank, mesh: Mesh | None, pool: Workers
+    split: Split, names: Sequence[Name], bank: Bank, mesh: Mesh | None, executor: Executor
 ) -> list[Extrapolation]:
     """Return each estimator beyond the torques it was calibrated on; each calibration is one task for the workers.
 
@@ -170,7 +170,7 @@ def extrapolate(
     }
     shared, beyond = (known, str(bank.path.resolve()), mesh), calibration_parts(known.torque_nm)
     tasks = [(name, part) for name in names for part in (earlier[SMALLER], *beyond[SMALLER], *beyond[LARGER])]
-    outcomes = dict(zip(tasks, in_order(pool.map(judge_others, shared, tasks)), strict=True))
+    outcomes = dict(zip(tasks, in_order(executor.map(judge_others, shared, tasks)), strict=True))
     found = []
     for which, some in beyond.items():
         for name in names:
@@ -284,7 +284,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
     return found
 
 
-def _misfits(twins: ReciprocityCheck, frames: Floats) -> Floats:
+def _misfits(twins: ReciprocityCheck, frames: FloatArray) -> FloatArray:
     usable = np.ones(N_CHANNELS, dtype=np.bool_)
     return np.array([twins.misfit(one, usable) for one in frames]) / twins.largest_misfit
 
@@ -328,9 +328,9 @@ class _SolvedFrames(Synthesiser):
         super().__init__(bank, seed=seed)
         self._forward = ForwardModel(own_fingertip(PLAYED_MESH_SIZE_CM).mesh())
         self._homogeneous = self._forward.homogeneous()
-        self._solved: dict[tuple[float, float], Floats] = {}
+        self._solved: dict[tuple[float, float], FloatArray] = {}
 
-    def signal(self, k: float, sigma: float | Floats) -> Floats:
+    def signal(self, k: float, sigma: float | FloatArray) -> FloatArray:
         """Return the (896,) difference signal of one k and σ, solved once."""
         place = k, float(np.mean(sigma))
         if place not in self._solved:
@@ -355,7 +355,7 @@ def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -
             yield fault_curve(rim.name, rim.unit, tracker.calibration.estimator, levels)
 
 
-def _series(synthesiser: Synthesiser, homogeneous: Floats, k: float, sigma: float) -> FrameSeries:
+def _series(synthesiser: Synthesiser, homogeneous: FloatArray, k: float, sigma: float) -> FrameSeries:
     frames = np.array([np.abs(mean_frame(synthesiser, k, sigma, 1.0) - homogeneous) for _ in range(_FRAMES)])[:, None]
     t_s = np.arange(float(_FRAMES))
     return FrameSeries(

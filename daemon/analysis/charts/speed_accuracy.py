@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
@@ -38,7 +39,6 @@ from shearloop.daemon.analysis.charts.simulated_loop import GAIN, LOOPS, Trackin
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.analysis.evaluation import follow
 
-Floats = NDArray[np.float64]
 Single = NDArray[np.float32]
 RANKS = (4, 8, 16, 32, 64, 128)
 CHANNEL_COUNTS = (8, 16, 32, 64, 128, 272, 512)
@@ -55,7 +55,7 @@ class TorqueMethod:
 
     name: str
     family: str
-    run: Callable[[], tuple[Floats, Floats]]
+    run: Callable[[], tuple[FloatArray, FloatArray]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +72,10 @@ class MeasuredMethod:
     valid_fraction: float
 
 
-def measure(methods: list[TorqueMethod], truth_nm: Floats, rounds: int) -> list[MeasuredMethod]:
+def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> list[MeasuredMethod]:
     """Run all methods in turn, `rounds` times, so that a busy moment of the machine affects all alike."""
     times: dict[str, list[float]] = {method.name: [] for method in methods}
-    torques: dict[str, Floats] = {}
+    torques: dict[str, FloatArray] = {}
     for _ in range(rounds):
         for method in methods:
             torques[method.name], latency_ms = method.run()
@@ -116,7 +116,7 @@ def estimators(
         yield TorqueMethod(f"{name}{count}", family, partial(_run_estimator, calibration, future, physics.bank))
 
 
-def _run_estimator(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[Floats, Floats]:
+def _run_estimator(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[FloatArray, FloatArray]:
     track = follow(calibration, future, bank)
     torque = [np.nan if one.torque_nm is None else one.torque_nm for one in track.estimates]
     return np.array(torque), track.latency_ms
@@ -138,7 +138,7 @@ def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
     shapes = np.abs(bank.signals.reshape(-1, bank.signals.shape[-1])[cells])
     shapes /= np.linalg.norm(shapes, axis=1, keepdims=True)
 
-    def best_of(scores: Callable[[Single], Single]) -> Callable[[Floats], float]:
+    def best_of(scores: Callable[[Single], Single]) -> Callable[[FloatArray], float]:
         column = sigma[cells % len(sigma)]
         return lambda x: float(column[np.argmax(scores((x / np.linalg.norm(x)).astype(np.float32)))])
 
@@ -151,7 +151,7 @@ def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
         yield _read_by(split, f"rank {rank}", "zero lag, bank of rank r", best_of(scores))
 
 
-def _sigma_by(matcher: Matcher) -> Callable[[Floats], float]:
+def _sigma_by(matcher: Matcher) -> Callable[[FloatArray], float]:
     if isinstance(matcher, FastMatcher | FastZeroLagMatcher):
         return lambda x: matcher.match(x, runner_up=False).sigma
     return lambda x: matcher.match(x).sigma
@@ -181,12 +181,12 @@ def fewer_channels(split: Split) -> Iterator[TorqueMethod]:
         )
 
 
-def _read_some(reader: IntervalRegressor, channels: NDArray[np.int64], difference: Floats) -> float:
+def _read_some(reader: IntervalRegressor, channels: NDArray[np.int64], difference: FloatArray) -> float:
     return reader.read(difference[channels])[0]
 
 
-def _read_by(split: Split, name: str, family: str, locate: Callable[[Floats], float]) -> TorqueMethod:
-    def features(difference: Floats) -> Floats:
+def _read_by(split: Split, name: str, family: str, locate: Callable[[FloatArray], float]) -> TorqueMethod:
+    def features(difference: FloatArray) -> FloatArray:
         sigma = float(locate(difference))
         return np.array([sigma, sigma**2])
 
@@ -195,10 +195,10 @@ def _read_by(split: Split, name: str, family: str, locate: Callable[[Floats], fl
     return TorqueMethod(name, family, _timed(split, lambda x: reader.read(features(x))[0]))
 
 
-def _timed(split: Split, read: Callable[[Floats], float]) -> Callable[[], tuple[Floats, Floats]]:
+def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tuple[FloatArray, FloatArray]]:
     frames = np.abs(split.future.channels[:, 0])
 
-    def run() -> tuple[Floats, Floats]:
+    def run() -> tuple[FloatArray, FloatArray]:
         values, times = [], []
         for frame in frames:
             begun = time.perf_counter()

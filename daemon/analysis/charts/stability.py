@@ -28,19 +28,19 @@ from shearloop.daemon.analysis.charts.slice_stability import (
 )
 from shearloop.daemon.analysis.charts.sources import Split, splits
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.workers import Workers
+from shearloop.daemon.workers import Executor
 
 SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
 STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "fused")
 SHIFTS_S = (-0.54, -0.27, -0.13, 0.0, 0.13, 0.27, 0.54, 1.08)
 
 
-def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, pool: Workers) -> list[Path]:
+def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, executor: Executor) -> list[Path]:
     """Measure, draw and write a chart per recording, the checks of slices, the bank's rim, and the loop on the skin."""
     physics, written = Physics(bank, mesh), []
     names = {"raw": STREAM_NAMES, "difference": SLICE_NAMES}
     for split in parts:
-        curves = sweeps(split, names[split.past.kind], physics, bank, pool)
+        curves = sweeps(split, names[split.past.kind], physics, bank, executor)
         if split.past.kind == "raw":
             curves += misaligned(split, STREAM_NAMES, physics, SHIFTS_S)
         if not curves:
@@ -49,20 +49,20 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
             )
         written += _written(f"stability-{slug(split.title)}", split.title, curves, out)
         if split.past.kind == "difference":
-            written += _of_slices(split, bank, mesh, out, pool)
+            written += _of_slices(split, bank, mesh, out, executor)
     synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
     curves = list(sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
     written += _written("stability-rims", "the rim of the bank, on synthetic slices", curves, out)
-    return written + skin_loop.chart(out, pool)
+    return written + skin_loop.chart(out, executor)
 
 
-def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, pool: Workers) -> list[Path]:
+def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Executor) -> list[Path]:
     """Write the charts of slices: continuity, torques beyond the calibrated ones, foreign frames."""
     name, physics = slug(split.title), Physics(bank, mesh)
     found = walks(split, bank, fitted(split, ("regression", "fused"), physics))
     rows = [asdict(one) | {"largest_hop_nm": one.largest_hop_nm, "hops": one.hops} for one in found]
     written = save(continuity_figure(split.title, found), {"steps": STEPS, "walks": rows}, out, f"continuity-{name}")
-    beyond = extrapolate(split, SLICE_NAMES, bank, mesh, pool)
+    beyond = extrapolate(split, SLICE_NAMES, bank, mesh, executor)
     content = {
         "broken_share": BROKEN_SHARE,
         "title": split.title,

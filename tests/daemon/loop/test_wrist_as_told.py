@@ -1,4 +1,4 @@
-"""The wrist closes in on an angle by the states that the robot's process tells, which are not those of each cycle."""
+"""The wrist closes in on an angle, decided upon at each of the robot's states."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -14,8 +14,6 @@ from shearloop.daemon.control.velocity_sender import VelocityCommandSender
 from shearloop.daemon.control.wrist_controller import WristController, WristSettings
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply
-from shearloop.drivers.ur.news import News
-from shearloop.drivers.ur.pace import Pace
 from tests.drivers.ur.flight import SETTINGS, flying
 
 FASTEST_PER_S = next(
@@ -25,7 +23,7 @@ FASTEST_PER_S = next(
 
 def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> list[float]:
     """Return how far from the angle the wrist is in each cycle."""
-    flight, news, pace = flying(), News(), Pace(SETTINGS, 0.0)
+    flight = flying()
     settings = WristSettings(angle_bandwidth_per_s=bandwidth_per_s)
     wrist = WristController(
         TorqueSource(name="load_cell", period_s=0.1), settings, lambda *_: pytest.fail("no loop is closed")
@@ -42,17 +40,15 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
     brain = SimpleNamespace(sent=wrist.sent, note_refusal=pytest.fail)
     commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain), 4.0, pytest.fail)
     origin_rad, errors = flight.state.wrist_rad, []
-    for pace.cycle in range(cycles):
+    for _ in range(cycles):
         flight.fly(1)
         state = flight.state
         errors.append(state.wrist_rad - origin_rad - angle_rad)
-        if pace.tells(rests=False, news=news.brings(state)):
-            news.tell(state)
-            robot.state = state
-            while replies:
-                replies.pop()()
-            turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
-            commands.turn(turn.speed_rad_per_s, flight.now_ns)
+        robot.state = state
+        while replies:
+            replies.pop()()
+        turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
+        commands.turn(turn.speed_rad_per_s)
     return errors
 
 

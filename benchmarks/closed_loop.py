@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.plant import Plant, Sample
 from shearloop.daemon.control.controller import WristCommand
-from shearloop.daemon.control.excitation import ExciteSettings, StiffnessExcitation
+from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation
 
 
 class Loop(Protocol):

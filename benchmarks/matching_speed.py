@@ -26,22 +26,21 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank
 from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES, channels_of_line
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher, best_match, unit_magnitudes
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import Conductivities
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.daemon.analysis.charts.forward_methods import EIDORS_CELL_S, MODEL, pyeit_solver
 from shearloop.daemon.bank_config import load_geometry
 
 Run = Callable[[], object]
 N_CELLS = 128
 N_FRAMES = 40
-BATCH = 2_000
 # Memory written before each cold match: more than the caches of one core.
 CACHE_BYTES = 64 << 20
-MATCHERS: dict[str, tuple[type[Matcher], type[FastMatcher | FastZeroLagMatcher]]] = {
-    "all lags": (ReferenceMatcher, FastMatcher),
-    "zero lag": (ZeroLagMatcher, FastZeroLagMatcher),
+MATCHERS: dict[str, tuple[type[Matcher], type[PrunedMatcher | PrunedZeroLagMatcher]]] = {
+    "all lags": (ReferenceMatcher, PrunedMatcher),
+    "zero lag": (ZeroLagMatcher, PrunedZeroLagMatcher),
 }
 # Peers and own methods by the row they are compared with.
 RATIOS = {
@@ -97,8 +96,7 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
     signals /= np.linalg.norm(signals, axis=1, keepdims=True)
     length = fft.next_fast_len(2 * N_CHANNELS - 1, real=True)
     spectra = np.conj(fft.rfft(signals, length)).astype(np.complex64)
-    every, zero = FastMatcher.from_bank(bank), FastZeroLagMatcher.from_bank(bank)
-    many = np.tile(frames, (-(-BATCH // len(frames)), 1))[:BATCH]
+    every, zero = PrunedMatcher.from_bank(bank), PrunedZeroLagMatcher.from_bank(bank)
     n = len(frames)
 
     def by_fft() -> list[int]:
@@ -109,11 +107,9 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
     methods: dict[str, tuple[Run, int]] = {
         "zero lag, fast": (lambda: [zero.match(frame, runner_up=False) for frame in frames], n),
         "zero lag, fast, with runner-up": (lambda: [zero.match(frame) for frame in frames], n),
-        "zero lag, fast, in batches": (lambda: zero.matches(many), BATCH),
         "zero lag, numpy float32": (lambda: [int(np.argmax(signals @ frame)) for frame in single], n),
         "all lags, fast": (lambda: [every.match(frame, runner_up=False) for frame in frames], n),
         "all lags, fast, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
-        "all lags, fast, in batches": (lambda: every.matches(many), BATCH),
         "all lags, numpy float32 FFT": (by_fft, 4),
     }
     try:
@@ -153,19 +149,15 @@ def compare_with_reference(bank: Bank, parts: list[FloatArray]) -> dict[str, dic
     found = {}
     for name, (slow_kind, fast_kind) in MATCHERS.items():
         reference, fast = slow_kind.from_bank(bank), fast_kind.from_bank(bank)
-        frames = same = same_in_batches = 0
+        frames = same = 0
         furthest = 0.0
         for part in parts:
-            batch = fast.matches(part)
-            for frame, heatmap, batched in zip(part, reference.heatmaps(part), batch, strict=True):
+            for frame, heatmap in zip(part, reference.heatmaps(part), strict=True):
                 slow, quick = best_match(heatmap, bank.k_grid, bank.sigma_grid), fast.match(frame)
                 frames += 1
                 same += (slow.cell, slow.runner_up_cell) == (quick.cell, quick.runner_up_cell)
-                same_in_batches += batched.cell == quick.cell
                 furthest = max(furthest, abs(slow.score - quick.score))
-        found[name] = {
-            "frames": frames, "same": same, "same_in_batches": same_in_batches, "largest_score_difference": furthest,
-        }  # fmt: skip
+        found[name] = {"frames": frames, "same": same, "largest_score_difference": furthest}
     return found
 
 

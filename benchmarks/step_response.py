@@ -39,7 +39,8 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
 )
 from shearloop.daemon.cli.emulated.frames import frame_maker
 from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
-from shearloop.daemon.control.tuning import RequiredMargins, refusal
+from shearloop.daemon.control.margins import margin_refusal
+from shearloop.daemon.control.settings import LoopConfig
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
 from shearloop.drivers.emulators.rig import SIDES, FrameOf
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
@@ -166,7 +167,7 @@ def step(plant: Plant, scenario: LoopScenario) -> tuple[FloatArray, bool]:
     while controller.state.innovation_nm is None:
         run(plant, controller, plant.period_s)
     controller.set_point(TARGET_NM)
-    refused = refusal(settings, found, RequiredMargins()) is not None
+    refused = margin_refusal(settings, found, LoopConfig()) is not None
     return run(plant, controller, scenario.hold_s).torque_nm, refused
 
 

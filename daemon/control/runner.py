@@ -42,7 +42,7 @@ RELEASED_WITHIN_S = 7.0
 
 def wrench_source(rate_hz: float) -> TorqueSource:
     """Return how often the wrench's torque comes, of a robot that tells its state so often: with those published."""
-    return TorqueSource(name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, of_the_arm=True)
+    return TorqueSource(name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, from_robot=True)
 
 
 class ControlLoopRunner:
@@ -121,9 +121,9 @@ class ControlLoopRunner:
                     # in time, and a loop that is late again and again would not be late for more than a moment.
                     return
             # From one decision to the next: what a decision itself takes is late as well.
-            self._brain.senses.late_s = max(0.0, passed_s - self._longest_s)
+            self._brain.inputs.late_s = max(0.0, passed_s - self._longest_s)
             self._decided_ns = now_ns
-            self._brain.senses.died = self._deaths()
+            self._brain.inputs.died = self._deaths()
             self._carry_out(self._brain.tick(now_ns))
             self._tell(now_ns)
             self._listen()
@@ -203,7 +203,7 @@ class ControlLoopRunner:
         }
 
     def _sense(self, state: RobotState) -> None:
-        self._brain.senses.arm = ArmStatus(
+        self._brain.inputs.arm = ArmStatus(
             wrist_rad=state.wrist_rad,
             # The moment that the controller speaks of: one that repeats itself is as stale as one that is silent.
             t_ns=state.t_mono_ns - state.age_ns,
@@ -214,7 +214,7 @@ class ControlLoopRunner:
         if (number := state.cycle // PUBLISH_EVERY) != self._published:
             self._published = number
             # The wrench is what the tool does to the wrist; the torque on the tool is its opposite.
-            self._brain.hear(
+            self._brain.on_torque(
                 TorqueSample(WRENCH, -state.wrist_torque_nm, "", state.t_mono_ns - state.age_ns, self._clock.now_ns())
             )
             self._publisher.publish(robot_state(state))
@@ -246,8 +246,8 @@ class ControlLoopRunner:
             self._actions.let_go()
         elif self._actions.hold_back():
             self._wrist.stop()
-        if orders.begin is not None:
-            self._begin(partial(self._actions.perform, orders.begin), self._brain.action_ended)
+        if orders.action is not None:
+            self._begin(partial(self._actions.perform, orders.action), self._brain.on_action_ended)
         self._wrist.turn(orders.wrist_rad_per_s)
 
     def _died_of(self, error: Exception) -> None:
@@ -271,7 +271,7 @@ class ControlLoopRunner:
     def _has_released(self, failure: str) -> None:
         if failure:
             structlog.get_logger().error("the gripper was told to open and did not", why=failure)
-        self._brain.release_ended(failure)
+        self._brain.on_release_ended(failure)
 
     def _break_off(self) -> None:
         """End the action that is under way; fingers that move go on by themselves, and are told not to."""
@@ -284,27 +284,27 @@ class ControlLoopRunner:
     def _has_halted(self, failure: str) -> None:
         if failure:
             structlog.get_logger().error("the fingers were told to stop and did not", why=failure)
-            self._brain.note_refusal(f"the fingers were told to stop and did not: {failure}")
+            self._brain.on_command_refused(f"the fingers were told to stop and did not: {failure}")
 
     def _cancel_action(self) -> None:
         if self._action is not None:
             self._action.cancel()
 
     def _tell(self, now_ns: int) -> None:
-        standing, experiment = self._brain.standing, self._brain.experiment
+        status, experiment = self._brain.status, self._brain.experiment
         key = (
-            standing.phase,
-            tuple(trouble.event for trouble in standing.verdict.troubles),
-            standing.turn.reasons,
-            experiment and experiment.number,
+            status.phase,
+            tuple(trouble.code for trouble in status.decision.faults),
+            status.velocity.reasons,
+            experiment and experiment.step_number,
         )
-        held = experiment.wish.hold if experiment is not None else 0
+        held = experiment.command.hold_number if experiment is not None else 0
         if (key, held) == (self._told, self._told_hold) and now_ns - self._told_ns < LOOP_STATE_PERIOD_S * 1e9:
             return
         self._told_hold = held
         if key != self._told:
             structlog.get_logger().info(
-                "loop", phase=standing.phase, doing=standing.doing, reasons=" ".join(standing.verdict.reasons)
+                "loop", phase=status.phase, doing=status.activity, reasons=" ".join(status.decision.reasons)
             )
         self._told, self._told_ns = key, now_ns
         self._publisher.publish(loop_state(self._brain, self._wrist.sent_rad_per_s, now_ns))

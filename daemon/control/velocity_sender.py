@@ -59,8 +59,8 @@ class VelocityCommandSender:
             if not reply.accepted:
                 # Without a process there is nobody who could have refused it.
                 gone = self._robot.state is None
-                (self._brain.note_unanswered if gone else self._brain.note_refusal)(reply.refused)
+                (self._brain.on_command_unanswered if gone else self._brain.on_command_refused)(reply.refused)
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self._brain.sent(self.sent_rad_per_s)
+            self._brain.on_speed_sent(self.sent_rad_per_s)
         except Exception as error:  # noqa: BLE001 - not the robot's process, which has answered, but the next tick's
             self._died_of(error)

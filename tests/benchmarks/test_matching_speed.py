@@ -34,7 +34,6 @@ def test_methods_take_turns() -> None:
 
 def test_fast_solvers_and_matchers_agree_with_slow_ones(bank: Bank, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(matching_speed, "N_CELLS", 20)
-    monkeypatch.setattr(matching_speed, "BATCH", 7)
     methods, error = matching_speed.cell_methods(small_fingertip())
     assert 0 < error < 1e-9
     one, two = methods["batch, one thread"][0](), np.vstack(methods["batch, two threads"][0]())
@@ -44,7 +43,7 @@ def test_fast_solvers_and_matchers_agree_with_slow_ones(bank: Bank, monkeypatch:
     quick, plain = (matches[name][0]() for name in ("zero lag, fast", "zero lag, numpy float32"))
     assert [bank.signals.shape[1] * each.cell[0] + each.cell[1] for each in quick] == plain
     for found in matching_speed.compare_with_reference(bank, [frames[:4], frames[4:]]).values():
-        assert found["same"] == found["same_in_batches"] == found["frames"] == 10
+        assert found["same"] == found["frames"] == 10
         assert found["largest_score_difference"] < 1e-12
 
 
@@ -60,7 +59,7 @@ def test_the_caches_are_overwritten_before_each_cold_match(bank: Bank, monkeypat
         def match(self, _: object) -> None:
             happened.append("match")
 
-    for kind in (matching_speed.FastMatcher, matching_speed.FastZeroLagMatcher):
+    for kind in (matching_speed.PrunedMatcher, matching_speed.PrunedZeroLagMatcher):
         monkeypatch.setattr(kind, "from_bank", lambda _: Matcher())
     monkeypatch.setattr(matching_speed.np, "zeros", lambda _: Memory())
     found = matching_speed.cold_seconds(bank, np.ones((3, 896)), turns=2)

@@ -4,19 +4,15 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from functools import partial
 from typing import Any
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.fault_detection import MonitorSettings
 from shearloop.daemon.control.loop_inputs import GripperStatus
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
-from shearloop.daemon.control.step_commands import GripTo
-from shearloop.daemon.control.step_runner import ExperimentPhase
-from shearloop.daemon.control.tune import TuneSettings, tuned
-from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Message, MoveLinear, RobotState, WristSpeed
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
@@ -167,8 +163,7 @@ class Cell:
     def __init__(self) -> None:
         self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
         source = wrench_source(SETTINGS.rate_hz)
-        wrist = WristController(source, WristSettings(), partial(tuned, TuneSettings()))
-        self.brain = ControlLoop({WRENCH: wrist}, MonitorSettings(), {WRENCH: source}, ("robot",))
+        self.brain = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
         self.died: Mapping[str, str] = {}
 
         async def no_zero() -> str:
@@ -190,7 +185,7 @@ class Cell:
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):
-            self.brain.senses.hand = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
+            self.brain.inputs.gripper = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
             self.robot.cycle()
             # A state is sensed, decided upon and answered within a few turns of the event loop.
             for _ in range(8):
@@ -218,7 +213,7 @@ class Cell:
     @property
     def why(self) -> str:
         assert self.brain.experiment is not None
-        return self.brain.experiment.why
+        return self.brain.experiment.stop_reason
 
     @property
     def state(self) -> RobotState:

@@ -54,10 +54,10 @@ async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_opera
         await cell.start({"do": "wait", "wait_s": 60})
         cell.gripper.answers = answer
         now_ns = cell.robot.flight.now_ns
-        cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.until_ended(10)
         await cell.cycles(50)
-        assert "the gripper was told to open and did not" in cell.published.reasons
+        assert "the gripper did not open" in cell.published.reasons
         assert "the gripper does not answer" in cell.published.reasons
         assert "the torque is beyond its limit" in cell.published.reasons, "and why it was to open"
         unlocking = asyncio.create_task(cell.loop.unlock())
@@ -152,7 +152,7 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         assert cell.phase is ExperimentPhase.STOPPED
         assert "loop: ZeroDivisionError: a tick went wrong" in cell.why
         assert cell.robot.z_m == stopped_m
-        assert FaultCode.TASK_DIED in {trouble.event for trouble in cell.brain.standing.verdict.troubles}
+        assert FaultCode.TASK_DIED in {trouble.code for trouble in cell.brain.status.decision.faults}
 
 
 async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,7 +168,7 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
 
         monkeypatch.setattr(cell.gripper, "release", at_length)
         now_ns = cell.robot.flight.now_ns
-        cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.until_ended(10)
         await heard.wait()
         tick = cell.brain.tick
@@ -186,7 +186,7 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
             await cell.task
         cell.drive()
         await cell.cycles(20)
-        assert "the gripper was told to open and did not" in cell.published.reasons
+        assert "the gripper did not open" in cell.published.reasons
         assert "it did not open" in cell.published.reasons
 
 

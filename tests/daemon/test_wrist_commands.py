@@ -28,7 +28,7 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         # What is clipped is told in each cycle, so that one is unanswered whenever the process dies.
         cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
         await cell.cycles(20)
-        cell.brain.senses.lost["robot"] = "The robot's process died of SIGKILL."
+        cell.brain.inputs.lost["robot"] = "The robot's process died of SIGKILL."
         cell.robot.die(50)
         cell.loop.decide_now()
         assert cell.phase is ExperimentPhase.STOPPED
@@ -37,6 +37,6 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         assert cell.why.endswith("once the robot is connected again, `shearloop command unlock`.")
         # Neither was the stop that comes next, of which there is nobody to hear.
         cell.loop.decide_now()
-        told = " ".join(cell.brain.standing.verdict.reasons)
+        told = " ".join(cell.brain.status.decision.reasons)
         assert "not connected" in told
         assert "a command was refused" not in told

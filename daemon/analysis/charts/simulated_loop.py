@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.controller import TwistController, WristCommand
-from shearloop.daemon.control.excitation import ExciteSettings, StiffnessExcitation
-from shearloop.daemon.control.identify import ToolModel
+from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
+from shearloop.daemon.control.margins import gain_for_noise, integral_gain
 from shearloop.daemon.control.settings import ControllerSettings
-from shearloop.daemon.control.tuning import gain_for_noise, integral_gain
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
 
 PERIOD_S = 0.008
@@ -268,7 +267,10 @@ class LoopScenario:
 def _excite(sensor: SimulatedSensor, dwell_s: float, share: float) -> ExciteSettings:
     return ExciteSettings(
         amplitude_rad=0.35, sample_period_s=sensor.period_s, window_s=sensor.window_s, torque_limit_nm=0.17,
-        stiffness_share=share, dwell_s=dwell_s,
+        stiffness_share=share,
+        speed_rad_per_s=0.5,
+        acceleration_rad_per_s2=2.0,
+        bandwidth_per_s=5.0, dwell_s=dwell_s,
     )  # fmt: skip
 
 

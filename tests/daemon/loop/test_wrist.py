@@ -1,25 +1,22 @@
 """The speed of the wrist for a wish: near what is asked."""
 
-from dataclasses import replace
-from functools import partial
-
 import pytest
 
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.control.step_commands import MoveToAngle
-from shearloop.daemon.control.tune import TuneSettings, tuned
-from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import MoveToAngle
+from shearloop.daemon.control.wrist_controller import WristController
 
 CYCLE_NS = 8_000_000
-SETTINGS = WristSettings()
+SETTINGS = LoopConfig()
 # A tenth of what the wrist resolves.
 CLOSE_RAD = 2e-5
 # Without anything under way: what is sent shows in the angle at once.
-AT_ONCE = WristSettings(actuation_s=0.0)
+AT_ONCE = LoopConfig(actuation_s=0.0)
 
 
-def wrist(settings: WristSettings = AT_ONCE) -> WristController:
-    return WristController(TorqueSource(name="load_cell", period_s=0.1), settings, partial(tuned, TuneSettings()))
+def wrist(config: LoopConfig = AT_ONCE) -> WristController:
+    return WristController(TorqueSource(name="load_cell", period_s=0.1), config)
 
 
 def test_a_wrist_that_stands_sets_out_for_however_little() -> None:
@@ -31,7 +28,7 @@ def test_a_held_angle_is_kept() -> None:
     one, angle_rad, errors_rad = wrist(), 0.0, []
     for cycle in range(1000):
         speed = one.turn(MoveToAngle(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
-        one.sent(speed)
+        one.on_speed_sent(speed)
         angle_rad += speed * CYCLE_NS / 1e9
         errors_rad.append(abs(angle_rad - 0.15))
     # From two seconds after the arrival on.
@@ -43,7 +40,7 @@ def test_a_held_angle_is_kept() -> None:
 def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(
     allowed_rad_per_s: float, bandwidth_per_s: float
 ) -> None:
-    one, angle_rad, t_ns = wrist(replace(AT_ONCE, angle_bandwidth_per_s=bandwidth_per_s)), 0.0, 10**9
+    one, angle_rad, t_ns = wrist(AT_ONCE.model_copy(update={"angle_bandwidth_per_s": bandwidth_per_s})), 0.0, 10**9
     way_rad = 200 * CYCLE_NS / 1e9 * allowed_rad_per_s
     # As long as the way takes, and as its last part does at this bandwidth.
     cycles = round(300 + 12.0 / bandwidth_per_s / (CYCLE_NS / 1e9))
@@ -51,7 +48,7 @@ def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(
         for _ in range(2 * cycles):
             speed = one.turn(MoveToAngle(goal_rad, allowed_rad_per_s), t_ns, angle_rad, 0.0).speed_rad_per_s
             assert abs(speed) <= allowed_rad_per_s
-            one.sent(speed)
+            one.on_speed_sent(speed)
             angle_rad += speed * CYCLE_NS / 1e9
             t_ns += CYCLE_NS
         assert angle_rad == pytest.approx(goal_rad, abs=1.5 * CLOSE_RAD)

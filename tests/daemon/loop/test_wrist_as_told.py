@@ -6,12 +6,12 @@ from typing import cast
 
 import pytest
 
-from shearloop.daemon.config import LoopConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.control.step_commands import MoveToAngle
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import MoveToAngle
 from shearloop.daemon.control.velocity_sender import VelocityCommandSender
-from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply
 from tests.drivers.ur.flight import SETTINGS, flying
@@ -24,10 +24,8 @@ FASTEST_PER_S = next(
 def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> list[float]:
     """Return how far from the angle the wrist is in each cycle."""
     flight = flying()
-    settings = WristSettings(angle_bandwidth_per_s=bandwidth_per_s)
-    wrist = WristController(
-        TorqueSource(name="load_cell", period_s=0.1), settings, lambda *_: pytest.fail("no loop is closed")
-    )
+    config = LoopConfig(angle_bandwidth_per_s=bandwidth_per_s)
+    wrist = WristController(TorqueSource(name="load_cell", period_s=0.1), config)
     replies: list[Callable[[], None]] = []
 
     def tell(command: Command, answered: Callable[[CommandReply], None]) -> None:
@@ -37,7 +35,7 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
         replies.append(lambda: answered(reply))
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, tell=tell)
-    brain = SimpleNamespace(sent=wrist.sent, note_refusal=pytest.fail)
+    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail)
     commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain), 4.0, pytest.fail)
     origin_rad, errors = flight.state.wrist_rad, []
     for _ in range(cycles):

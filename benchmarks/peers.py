@@ -25,10 +25,10 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank
 from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Match, ReferenceMatcher, unit_magnitudes
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import Conductivities
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.daemon.bank_config import load_geometry
 from shearloop.daemon.workers import ProcessExecutor
 
@@ -43,7 +43,10 @@ N_CHECKED = 10
 BATCH = 20_000
 # Written between two frames that are to be matched cold: more than what a processor's core has of its own.
 OTHERS_BYTES = 64 << 20
-MATCHERS: dict[str, type[FastMatcher | FastZeroLagMatcher]] = {"all lags": FastMatcher, "zero lag": FastZeroLagMatcher}
+MATCHERS: dict[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
+    "all lags": PrunedMatcher,
+    "zero lag": PrunedZeroLagMatcher,
+}
 
 
 def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], dict[str, float]]:
@@ -115,7 +118,7 @@ def match_methods(bank: Bank, frames: FloatArray) -> tuple[dict[str, tuple[Run, 
     signals /= np.linalg.norm(signals, axis=1, keepdims=True)
     length = fft.next_fast_len(2 * N_CHANNELS - 1, real=True)
     spectra = np.conj(fft.rfft(signals, length)).astype(np.complex64)
-    zero, every = FastZeroLagMatcher.from_bank(bank), FastMatcher.from_bank(bank)
+    zero, every = PrunedZeroLagMatcher.from_bank(bank), PrunedMatcher.from_bank(bank)
     reference = ReferenceMatcher.from_bank(bank)
     n = len(frames)
 
@@ -171,7 +174,7 @@ def batches_a_minute(bank: Path, frames: FloatArray, turns: int) -> dict[str, An
         matcher = kind.from_bank(Bank.open(bank))
         seconds = take_turns(
             {
-                f"{name}, one process": (lambda: matcher.matches(many), BATCH),  # noqa: B023 - runs in its turn
+                f"{name}, one process": (lambda: [matcher.match(one, runner_up=False) for one in many], BATCH),  # noqa: B023 - runs in its turn
                 f"{name}, two processes": (
                     lambda: list(ProcessExecutor(2).map(matched, (name, bank), np.array_split(many, 2))),  # noqa: B023
                     BATCH,
@@ -186,7 +189,8 @@ def batches_a_minute(bank: Path, frames: FloatArray, turns: int) -> dict[str, An
 def matched(shared: tuple[str, Path], frames: FloatArray) -> list[Match]:
     """Return the matches of (n, 896) differences, wherever this runs."""
     name, bank = shared
-    return MATCHERS[name].from_bank(Bank.open(bank)).matches(frames)
+    matcher = MATCHERS[name].from_bank(Bank.open(bank))
+    return [matcher.match(frame, runner_up=False) for frame in frames]
 
 
 def take_turns(methods: Mapping[str, tuple[Run, int]], turns: int) -> dict[str, list[float]]:

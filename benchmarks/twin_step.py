@@ -58,7 +58,7 @@ def rig_twin(sensor: Sensor, rng: np.random.Generator) -> Plant:
     creep = Creep(calibrated_creep().share, calibrated_creep().time_s) if eit and CREEP_IS_CORRECTED else None
     twin = Twin(TwinSettings(gel_stiffness_nm_per_rad=float(rng.uniform(*GEL_NM_PER_RAD))))
     plain = replace(sensor, relaxing_share=0.0, play_nm=0.0)
-    return TwinPlant(Tool(), plain, rng, as_told=True, twin=twin, sees_gel=eit, creep=creep)
+    return TwinPlant(Tool(), plain, rng, twin=twin, sees_gel=eit, creep=creep)
 
 
 def tightened(seed: int) -> tuple[float, float]:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from shearloop.bank.arrays import Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit
 from shearloop.bank.estimation.bank_match import NOT_TURNED, NearestCell
@@ -106,9 +106,9 @@ def matchers(split: Split, bank: Bank) -> Iterator[Method]:
     sigma = bank.sigma_grid
     for name, family, kind in (
         ("paper: all lags, reference", "all lags", ReferenceMatcher),
-        ("all lags, fast and exact", "all lags", FastMatcher),
+        ("all lags, fast and exact", "all lags", PrunedMatcher),
         ("zero lag, reference", "zero lag", ZeroLagMatcher),
-        ("zero lag, fast and exact", "zero lag", FastZeroLagMatcher),
+        ("zero lag, fast and exact", "zero lag", PrunedZeroLagMatcher),
     ):
         yield _read_by(split, name, family, _sigma_by(kind.from_bank(bank)))
     nearest = NearestCell(bank, NOT_TURNED)
@@ -131,7 +131,7 @@ def matchers(split: Split, bank: Bank) -> Iterator[Method]:
 
 
 def _sigma_by(matcher: Matcher) -> Callable[[FloatArray], float]:
-    if isinstance(matcher, FastMatcher | FastZeroLagMatcher):
+    if isinstance(matcher, PrunedMatcher | PrunedZeroLagMatcher):
         return lambda x: matcher.match(x, runner_up=False).sigma
     return lambda x: matcher.match(x).sigma
 

@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.cluster import add_cluster
+from shearloop.daemon.cli.options import add_cluster
 
 NAMES = {
     "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",

@@ -12,7 +12,7 @@ from matplotlib.text import Text
 
 from benchmarks.closed_loop import Trace
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 
 mpl.use("Agg")
 mpl.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "savefig.dpi": 130})

@@ -36,7 +36,7 @@ from benchmarks.daemon_parts import (
 )
 from benchmarks.fused_latency import fused_latency
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.daemon.messaging.request import request
+from shearloop.daemon.messaging.client import send_command
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
 
 REPEATS = 5
@@ -211,10 +211,10 @@ def _listened(health: "zmq.Socket[bytes]", seconds: float) -> dict[str, Any]:
 def _started(commands: str, experiment: Path) -> None:
     """Begin an experiment, with the operator's word for what waits for it."""
     until = time.monotonic() + SETTLING_S
-    while not (reply := request(commands, {"command": "start", "experiment": str(experiment)}, SETTLING_S))["ok"]:
+    while not (reply := send_command(commands, {"command": "start", "experiment": str(experiment)}, SETTLING_S))["ok"]:
         if time.monotonic() > until:
-            raise RuntimeError(reply["why"])
-        request(commands, {"command": "unlock"}, SETTLING_S)
+            raise RuntimeError(reply["reason"])
+        send_command(commands, {"command": "unlock"}, SETTLING_S)
 
 
 def shared_bank(bank: Path) -> dict[str, Any]:

@@ -21,8 +21,7 @@ import numpy as np
 from benchmarks.daemon_parts import memory_mb
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.messages import Message, wire_map
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.messages import TOPICS, Message, wire_map
 from shearloop.daemon.recording.identity import Identity
 from shearloop.daemon.recording.recorder import FLUSH_S, Recorder
 from shearloop.drivers.raw_event import InputKind, RawEvent

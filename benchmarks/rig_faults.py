@@ -32,9 +32,8 @@ import zmq
 from numpy.typing import NDArray
 
 from benchmarks.rig_configuration import write_configuration
-from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.client import send_command
+from shearloop.daemon.messaging.messages import TOPICS, decode
 from shearloop.daemon.service.realtime import high_priority
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import UrSettings, read_settings
@@ -109,7 +108,7 @@ class Bench:
 
     def command(self, name: str, **arguments: Any) -> dict[str, Any]:
         """Send a command to the daemon and return its reply."""
-        return request(f"ipc://{self.folder}/commands", {"command": name, **arguments}, DEADLINE_S)
+        return send_command(f"ipc://{self.folder}/commands", {"command": name, **arguments}, DEADLINE_S)
 
     def until(
         self, topic: str, is_so: Callable[[dict[str, Any]], bool], within_s: float = DEADLINE_S
@@ -156,7 +155,7 @@ class Bench:
         end_s = time.monotonic() + DEADLINE_S
         while not (reply := self.command("start", experiment=str(path)))["ok"]:
             if time.monotonic() > end_s:
-                raise RuntimeError(reply["why"])
+                raise RuntimeError(reply["reason"])
             time.sleep(0.2)
             self.command("unlock")
 
@@ -223,11 +222,11 @@ def measure_faults(bench: Bench) -> list[dict[str, Any]]:
                 "then": last["phase"],
                 "sentence": state["reasons"],
                 "next_experiment": end["phase"],
-                "next_doing": end["doing"],
+                "next_doing": end["activity"],
             }
         )
         print(f"{fault.line:18} {after_s * 1e3:7.0f} ms, {after_s / period_s:5.1f} periods of {fault.topic:14} "
-              f"{state['response']:20} then {end['phase']} {end['doing'][:160]}", flush=True)  # fmt: skip
+              f"{state['response']:20} then {end['phase']} {end['activity'][:160]}", flush=True)  # fmt: skip
     return found
 
 

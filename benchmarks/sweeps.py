@@ -143,7 +143,7 @@ async def sweep(daemon: Daemon, ends: Ends, path: Path) -> float:
     async with asyncio.timeout(DEADLINE_S):
         await started
     if ends.last["phase"] != "done":
-        raise RuntimeError(f"the sweep was stopped: {ends.last['doing']}")
+        raise RuntimeError(f"the sweep was stopped: {ends.last['activity']}")
     return time.monotonic() - began_s
 
 
@@ -155,8 +155,8 @@ async def measure(args: argparse.Namespace, folder: Path) -> dict[str, Any]:
     async with rig(args, folder) as commands:
         with zmq.asyncio.Context() as context:
             daemon = Daemon(load_daemon_config(configuration(args, folder)), context)
-            daemon.publisher.listen(slices)
-            daemon.publisher.listen(ends)
+            daemon.publisher.add_listener(slices)
+            daemon.publisher.add_listener(ends)
             task = asyncio.create_task(daemon.run())
             try:
                 for name, (file, diameters) in runs.items():

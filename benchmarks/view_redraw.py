@@ -77,7 +77,7 @@ def rig_messages(t_ns: int, turn: int) -> Iterator[Message]:
     if turn % 2 == 0:
         yield LoadTorque(
             source="load_cell", t_mono_ns=t_ns, torque_nm=torque_nm, raw=0.0,
-            saturated=False, spike=False, valid=True, why="",
+            saturated=False, spike=False, valid=True, reason="",
         )  # fmt: skip
     if turn % 13 == 0:
         yield from _estimate(t_ns, turn, torque_nm)
@@ -103,7 +103,7 @@ def _estimate(t_ns: int, turn: int, torque_nm: float) -> Iterator[Message]:
         score=0.9,
         runner_up=0.89,
         valid=True,
-        why="",
+        reason="",
         frame=turn,
         latency_s=0.005,
     )
@@ -125,15 +125,15 @@ def _once_a_second(t_ns: int, torque_nm: float) -> Iterator[Message]:
         experiment="bench",
         step=1,
         steps=1,
-        doing="swinging",
+        activity="swinging",
         progress=0.5,
         remaining_s=10.0,
-        driving="right",
+        torque_source="right",
         torque_nm=torque_nm,
         set_point_nm=0.1,
         ramp_nm=torque_nm,
         expected_nm=torque_nm,
-        speed_wanted_rad_per_s=0.0,
+        speed_command_rad_per_s=0.0,
         speed_sent_rad_per_s=0.0,
         response="note",
         reasons="",

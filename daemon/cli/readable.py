@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.messages import TOPICS
 
 _ENVELOPE = ("timestamp", "t_mono_ns", "seq", "source", "topic")
 
@@ -40,7 +40,7 @@ def _plain(value: object) -> object:
 
 def _estimate(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
-        return f"no estimate: {content['why']}"
+        return f"no estimate: {content['reason']}"
     diameter = "" if content["diameter_mm"] is None else f"   diameter {content['diameter_mm']:5.1f} mm"
     cell = "" if content["k"] is None else f"   k {content['k']:.3f}  sigma {content['sigma']:.3f} cm"
     score = "" if content["score"] is None else f"   score {content['score']:.3f}"
@@ -50,7 +50,7 @@ def _estimate(content: Mapping[str, Any]) -> str:
 
 def _shear(content: Mapping[str, Any]) -> str:
     if not content["valid"]:
-        return f"no force: {content['why']}"
+        return f"no force: {content['reason']}"
     interval = f"[{content['shear_low_n']:+.3f}, {content['shear_high_n']:+.3f}]"
     torque = "" if content["torque_nm"] is None else f"   torque {content['torque_nm']:+.4f} N·m"
     told = "within the deadband" if content["deadband"] else content["direction"]
@@ -62,7 +62,7 @@ def _health(content: Mapping[str, Any]) -> str:
     for name, facts in content["tasks"].items():
         state = "done" if facts.get("done") else "alive" if facts.get("alive", True) else "DEAD"
         errors = "".join(f", {count} {kind}" for kind, count in (facts.get("errors") or {}).items())
-        trouble = f" ({facts['trouble']})" if facts.get("trouble") else ""
+        trouble = f" ({facts['error']})" if facts.get("error") else ""
         restarts = f", {facts['restarts']} restarts" if facts.get("restarts") else ""
         tasks.append(f"{name} {state}{restarts}{errors}{trouble}")
     return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)

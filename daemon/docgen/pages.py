@@ -12,8 +12,7 @@ import numpy as np
 from shearloop.daemon.cli.command import COMMANDS
 from shearloop.daemon.control.safety import TABLE, Response
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
-from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, TOPICS
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, Message
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = Path("docs/examples")
@@ -109,7 +108,7 @@ def _commands() -> str:
 
 The daemon answers on a ZeroMQ ROUTER socket (`commands`, by default `{COMMAND_ADDRESS}`); a REQ or DEALER socket asks.
 A request is one msgpack map, `{{"command": NAME}}` with what the command takes beside it. Each is answered once, with
-`{{"ok": true, …}}` or `{{"ok": false, "why": SENTENCE}}`. Limits are in [security.md](security.md);
+`{{"ok": true, …}}` or `{{"ok": false, "reason": SENTENCE}}`. Limits are in [security.md](security.md);
 `shearloop command NAME --json` does the same from a shell.
 
 {table(("command", "what it does"), rows)}

@@ -300,7 +300,7 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("unplug load", "no new torque has come"),
+        ("unplug load", "no new torque has arrived"),
         ("gripper fault 14", "the gripper reports a fault"),
         ("gripper drop", "the gripper no longer holds an object"),
     ],

@@ -15,3 +15,4 @@ while True:
         print(message["reason"], flush=True)
     elif topic == b"eit.frame":
         channels = np.frombuffer(message["channels"], "<f4").reshape(message["channels_shape"])
+        print(message["timestamp"], message["source"], channels.max(), flush=True)

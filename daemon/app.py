@@ -22,11 +22,10 @@ from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.health import HealthReporter, TaskFacts
 from shearloop.daemon.logs import log_link
-from shearloop.daemon.messaging.addresses import open_stop_address
+from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
-from shearloop.daemon.process import ending_signals
 from shearloop.daemon.recording.identity import Attached, identity_of, notes_of
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import Rig, check_experiment, make_load_cell
@@ -40,6 +39,7 @@ from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
 from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.raw_event import Tap, no_tap
@@ -79,7 +79,7 @@ class Daemon:
             opened.callback(self._commands.close)
             self._open_stop: CommandServer | None = None
             if "commands" in config.network_addresses:
-                address = open_stop_address(config.commands)
+                address = local_stop_address(config.commands)
                 self._open_stop = CommandServer(context, address, commands.open_handlers())
                 opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
@@ -327,7 +327,7 @@ def _recorder(
     if config.recording is None:
         return None
     recorder = Recorder(config.recording.folder, identity_of(config), clock, busy=busy, on_failure=on_failure)
-    publisher.listen(recorder.record)
+    publisher.add_listener(recorder.record)
     return recorder
 
 
@@ -371,7 +371,7 @@ async def run_daemon(
     with zmq.asyncio.Context() as context:
         daemon = Daemon(config, context)
         for listener in listeners:
-            daemon.publisher.listen(listener)
+            daemon.publisher.add_listener(listener)
         for name, told in facts.items():
             daemon.health.add(name, told)
         ending = ending_signals()

@@ -68,9 +68,9 @@ class NonBlockingWriter:
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the writer's part of `health`."""
         if not self.lost:
-            return {"errors": {}, "trouble": ""}
+            return {"errors": {}, "error": ""}
         error = f"{self.lost} texts were dropped without a reader; Ctrl-Q resumes a terminal stopped with Ctrl-S"
-        return {"errors": {"unread": self.lost}, "trouble": error}
+        return {"errors": {"unread": self.lost}, "error": error}
 
     def _report_lost(self, timeout_s: float = 0.0) -> None:
         """Mark the place of dropped texts; raises queue.Full without room in time."""

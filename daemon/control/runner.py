@@ -168,7 +168,7 @@ class ControlLoopRunner:
             "connected": self._robot.state is not None,
             "states": self._robot.states,
             "errors": errors,
-            "trouble": "" if self._robot.link.status == "up" else self._robot.link.sentence,
+            "error": "" if self._robot.link.status == "up" else self._robot.link.sentence,
         }
 
     @property
@@ -327,11 +327,11 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         step_name=experiment.step.do if experiment is not None else "",
         slices=experiment.file.slices or "" if experiment is not None else "",
         hold=experiment.command.hold_number if experiment is not None else 0,
-        doing=status.activity,
+        activity=status.activity,
         progress=progress.share if progress else 0.0,
         remaining_s=progress.remaining_s if progress else 0.0,
         tool_mm=experiment.file.tool_mm if experiment is not None else None,
-        driving=driving,
+        torque_source=driving,
         torque_nm=latest.torque_nm if latest is not None else None,
         set_point_nm=estimates.set_point_nm if estimates else None,
         ramp_nm=estimates.ramp_nm if estimates else None,
@@ -339,7 +339,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         stiffness_nm_per_rad=tool.stiffness_nm_per_rad if tool is not None else None,
         delay_s=tool.age_s + tool.significant_lag_s if tool is not None else None,
         noise_nm=tool.noise_nm if tool is not None else None,
-        speed_wanted_rad_per_s=status.velocity.speed_rad_per_s,
+        speed_command_rad_per_s=status.velocity.speed_rad_per_s,
         speed_sent_rad_per_s=sent_rad_per_s,
         response=status.decision.response.name.lower().replace("_", " "),
         reasons=" ".join((*status.decision.reasons, *status.velocity.reasons)),

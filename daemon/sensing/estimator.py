@@ -41,9 +41,6 @@ class Matcher(Protocol):
     def match(self, difference: FloatArray) -> Match:
         """Return the best cell of a (896,) difference, and its runner-up."""
 
-    def match_quickly(self, difference: FloatArray) -> Match | None:
-        """Return the same, or None where that takes more than a few milliseconds."""
-
     def heatmap(self, difference: FloatArray) -> FloatArray:
         """Return the (k, sigma) scores of a (896,) difference, NaN at cells that are not valid."""
 
@@ -189,8 +186,7 @@ class Estimator:
         found = self._difference(frame)
         if isinstance(found, Reading):
             return found
-        match = self._matcher.match_quickly(found.difference)
-        return None if match is None else self._read(found, match)
+        return None
 
     def _difference(self, frame: Frame) -> "_Difference | Reading":
         """Return what is to be matched, or why there is nothing; only then the frame has been taken in."""

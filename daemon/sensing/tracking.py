@@ -100,7 +100,7 @@ class TrackedEstimator:
             match = Match(estimate.k, estimate.sigma, (0, 0), estimate.score, estimate.runner_up, None)
         elif self._scoring is not None and first is not None and first.any():
             matcher = self._scoring.matcher
-            match = matcher.match_quickly(first) if at_once else matcher.match(first)
+            match = None if at_once else matcher.match(first)
             if match is None:
                 # The session has moved on by this frame already.
                 self._unmatched = frames, estimate, first

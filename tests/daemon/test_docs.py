@@ -1,5 +1,6 @@
 """The pages name only commands, options, files and pages that there are."""
 
+import ast
 import re
 import shlex
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.cli import COMMANDS
-from shearloop.daemon.cli.completion import whole_parser
+from shearloop.daemon.cli.completion import full_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -22,7 +23,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_and_options_exist(page: Path) -> None:
-    parsers = next(action for action in whole_parser()._actions if action.dest == "command").choices
+    parsers = next(action for action in full_parser()._actions if action.dest == "command").choices
     assert parsers is not None
     for text in re.findall(r"(?:^ {4}|`)(?:sudo )?(?:[./\w-]*/)?shearloop ([^`\n]*)", page.read_text(), re.MULTILINE):
         words = shlex.split(text.split(" #")[0].split(";")[0], comments=False) if text.count("'") % 2 == 0 else []
@@ -39,6 +40,35 @@ def test_what_the_readme_records_is_ignored_by_git() -> None:
     folders = {Path(one).parts[0] for one in re.findall(r"--record (\S+)", (ROOT / "README.md").read_text())}
     assert folders
     assert {f"/{folder}/" for folder in folders} <= set((ROOT / ".gitignore").read_text().splitlines())
+
+
+def program_texts() -> list[str]:
+    """Return the string literals of the code, with `…` in place of each formatted value."""
+
+    def text(node: ast.AST) -> str:
+        match node:
+            case ast.Constant(value=str(value)):
+                return re.sub(r"\{\w+\}", "…", value)
+            case ast.JoinedStr(values=parts):
+                return "".join(text(part) for part in parts)
+            case _:
+                return "…"
+
+    return [
+        text(node)
+        for folder in ("bank", "drivers", "daemon")
+        for path in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+    ]
+
+
+def test_every_message_of_the_troubleshooting_page_exists_in_the_code() -> None:
+    quoted = re.findall(r'^\| "(.*?)" \||\("(.*?)"\)', (ROOT / "docs/troubleshooting.md").read_text(), re.MULTILINE)
+    messages = ["".join(pair) for pair in quoted]
+    texts = program_texts()
+    assert len(messages) >= 30
+    assert [message for message in messages if not any(message in text for text in texts)] == []
 
 
 def _options(parser) -> set[str]:  # type: ignore[no-untyped-def]

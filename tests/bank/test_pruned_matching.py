@@ -1,0 +1,284 @@
+"""Fast matching: the same cell, score and runner-up as the slow matcher finds, whatever the frame and the bank."""
+
+import copy
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from scipy.io import loadmat
+
+from shearloop.bank.eit import compression, pruned_matching
+from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
+from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher
+from shearloop.bank.errors import MatchingError
+from tests.bank.small_banks import (
+    BANK,
+    KINDS,
+    PAIRS,
+    SHAPE,
+    assert_same,
+    bank_of_five_alone,
+    bank_of_noise,
+    both,
+    cells,
+    pair,
+    two_contacts,
+    without_runner_up,
+)
+
+amplitudes = hnp.arrays(np.float64, N_CHANNELS, elements=st.floats(-10, 10, width=32)).filter(np.any)
+
+
+def test_a_bank_of_few_cells_is_not_searched_and_matches_the_same() -> None:
+    signals, valid = BANK[0][:6], BANK[1][:6]
+    assert 0 < valid.sum() < pruned_matching.MIN_PRUNED_CELLS <= BANK[1].sum()
+    slow, fast = pair(ReferenceMatcher, PrunedMatcher, (signals, valid))
+    frame = np.random.default_rng(3).normal(size=N_CHANNELS)
+    assert fast.match(frame) == slow.match(frame)
+    assert fast.match(frame, runner_up=False) == without_runner_up(slow.match(frame))
+
+
+@both
+def test_a_matcher_that_was_copied_matches_the_same(slow: Matcher, fast: PrunedMatcher) -> None:
+    frame = np.random.default_rng(5).normal(size=N_CHANNELS)
+    for one in (slow, fast):
+        # As pickling does, which sends it to another process.
+        again = copy.deepcopy(one)
+        assert type(again) is type(one)
+        assert again.match(frame) == one.match(frame)
+
+
+@both
+@given(frame=amplitudes)
+@settings(max_examples=25, deadline=None)
+def test_random_frames(slow: Matcher, fast: PrunedMatcher, frame: np.ndarray) -> None:
+    assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+@given(
+    cell=cells,
+    other=cells,
+    share=st.sampled_from([0.0, 1e-9, 0.3, 0.5]),
+    noise=st.sampled_from([0.0, 1e-7, 1e-3, 0.3]),
+    lag=st.sampled_from([0, 0, 1, -28, 300, -890]),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=50, deadline=None)
+def test_frames_like_those_of_the_bank(slow, fast, cell, other, share, noise, lag, seed) -> None:
+    signals = BANK[0].astype(np.float64)
+    frame = np.abs((1 - share) * signals[cell] + share * signals[other])
+    frame += noise * np.abs(np.random.default_rng(seed).normal(size=N_CHANNELS))
+    moved = np.zeros(N_CHANNELS)
+    moved[max(lag, 0) : N_CHANNELS + min(lag, 0)] = frame[max(-lag, 0) : N_CHANNELS - max(lag, 0)]
+    if moved.any():
+        assert_same(fast.match(moved), slow.match(moved))
+
+
+@both
+@given(
+    channels=st.lists(st.integers(0, N_CHANNELS - 1), min_size=1, max_size=3), size=st.sampled_from([1e-300, 1, 1e300])
+)
+@settings(max_examples=15, deadline=None)
+def test_frames_of_single_channels(slow, fast, channels, size) -> None:
+    frame = np.zeros(N_CHANNELS)
+    frame[channels] = size
+    assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+def test_constant_frames_and_cells_that_tie(slow, fast) -> None:
+    for frame in (np.ones(N_CHANNELS), BANK[0][12, 6], BANK[0][20, 3], np.arange(N_CHANNELS), np.eye(N_CHANNELS)[895]):
+        assert_same(fast.match(frame), slow.match(frame))
+    assert fast.match(BANK[0][12, 6]).cell == (10, 3)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(n_k=st.integers(1, 14), n_sigma=st.integers(1, 14), few=st.integers(1, 40), seed=st.integers(0, 1000))
+@settings(max_examples=8, deadline=None)
+def test_banks_of_a_few_numbers_where_many_cells_tie(kind, n_k, n_sigma, few, seed) -> None:
+    random = np.random.default_rng(seed)
+    signals = np.zeros((n_k, n_sigma, N_CHANNELS), dtype=np.float32)
+    signals[..., random.choice(N_CHANNELS, few)] = random.choice([0, 1, 2, 1e-3], (n_k, n_sigma, few))
+    valid, frame = signals.any(axis=2), random.choice([0, 1, 0.5], N_CHANNELS, p=[0.9, 0.05, 0.05])
+    if valid.any() and frame.any():
+        slow, fast = pair(*kind, (signals, valid))
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("bank", [BANK, bank_of_noise()], ids=["smooth", "noise"])
+def test_a_basis_that_is_fitted_to_few_cells_bounds_all(kind, bank, monkeypatch) -> None:
+    monkeypatch.setattr(compression, "_FITTED_CELLS", 5)
+    slow, fast = pair(*kind, bank)
+    random = np.random.default_rng(7)
+    for signal in bank[0][bank[1]][::40]:
+        frame = signal + 0.3 * signal.std() * random.normal(size=N_CHANNELS)
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast) -> None:
+    frame = np.random.default_rng(7).normal(size=N_CHANNELS)
+    assert fast.match(frame, runner_up=False) == without_runner_up(fast.match(frame))
+    np.testing.assert_array_equal(fast.heatmap(frame), slow.heatmap(frame))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cells_that_all_score_nothing_tie(kind) -> None:
+    """Wherever the search begins: the first one is the lowest of all."""
+    slow, fast = pair(*kind, bank_of_noise(n_live=40))
+    frame = np.eye(N_CHANNELS)[-1]
+    assert_same(fast.match(frame, runner_up=False), without_runner_up(slow.match(frame)))
+    if isinstance(slow, ZeroLagMatcher):
+        assert fast.match(frame).cell == (0, 0)
+
+
+@both
+def test_several_threads_find_with_one_matcher_what_one_finds(slow, fast) -> None:
+    frames = [two_contacts(seed) for seed in range(12)]
+    expected = [fast.match(frame) for frame in frames]
+    for one, frame in zip(expected, frames, strict=True):
+        assert_same(one, slow.match(frame))
+    # As often as the interpreter can, one goes on while another is under way.
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            found = [pool.submit(fast.match, frame) for _ in range(8) for frame in frames]
+            assert [each.result() for each in found] == expected * 8
+    finally:
+        sys.setswitchinterval(interval)
+
+
+@both
+def test_what_cannot_be_matched_is_refused_alike(slow, fast) -> None:
+    for frame, says in (
+        (np.zeros(N_CHANNELS), "zero in all channels"),
+        (np.full(N_CHANNELS, np.nan), "not finite"),
+        (np.ones((1, N_CHANNELS)), "has shape"),
+        (np.ones((N_CHANNELS, 1)), "has shape"),
+    ):
+        for matcher in (slow, fast):
+            with pytest.raises(MatchingError, match=says):
+                matcher.match(frame)
+    with pytest.raises(MatchingError, match="build the bank again"):
+        type(fast)(np.zeros_like(BANK[0]), BANK[1], np.arange(22.0), np.arange(20.0))
+
+
+def recorded_differences(shared: Path) -> Iterator[np.ndarray]:
+    for path in sorted((shared / "recordings").glob("*_slices/*_*.mat")):
+        yield loadmat(path)["data_diff"].ravel()
+    for path in sorted((shared / "recordings" / "streams").glob("*/*.mat")):
+        for values in loadmat(path).values():
+            if getattr(values, "shape", (0, 0))[-1] == 1025:
+                channels = channels_of_line(values[:, 1:])
+                yield from channels[20::701] - channels[:10].mean(axis=0)
+
+
+@pytest.fixture(scope="module")
+def recorded_frames(shared: Path) -> list[np.ndarray]:
+    return list(recorded_differences(shared))
+
+
+@both
+def test_recorded_frames(recorded_frames: list[np.ndarray], slow, fast) -> None:
+    """Far from anything in this bank, as they are from every bank: a hard case."""
+    assert len(recorded_frames) > 60
+    for frame in recorded_frames:
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@pytest.mark.parametrize("kind", KINDS[:1])
+@pytest.mark.parametrize("far", [30, 640])
+def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_from_lag_0(kind, far) -> None:
+    """Both that are high at lag 0 are in the peak of the best cell, and nothing at its own lag is as high.
+
+    At lag 640 so little of the frame overlaps with the bank that the lag is left out at first.
+    """
+    bank, alone = bank_of_five_alone()
+    slow, fast = pair(*kind, bank)
+    frame = np.zeros(N_CHANNELS)
+    for name, size, lag in (("left", 5, 0), ("right", 4.8, 0), ("between", 6, 7), ("below", 2, 7), ("above", 3.5, far)):
+        frame[lag:] += size * bank[0][alone[name]][: N_CHANNELS - lag]
+    expected = slow.match(frame)
+    assert (expected.cell, expected.runner_up_cell) == (alone["between"], alone["above"])
+    assert_same(fast.match(frame), expected)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_of_cells_that_tie_but_for_rounding_the_first_is_found(kind) -> None:
+    """Two cells of two channels each; the frame has both, the first of them a little smaller."""
+    signals, valid = bank_of_noise(n_live=40)
+    signals[3, 3] = signals[9, 9] = 0.0
+    signals[3, 3, [200, 300]] = signals[9, 9, [600, 750]] = 1.0
+    slow, fast = pair(*kind, (signals, valid))
+    for smaller, cell in ((0.0, (3, 3)), (4e-13, (3, 3)), (4e-12, (9, 9))):
+        frame = np.zeros(N_CHANNELS)
+        frame[[200, 300]], frame[[600, 750]] = 1.0 - smaller, 1.0
+        assert slow.match(frame).cell == cell
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_the_outermost_lags_are_searched(first) -> None:
+    signals, valid = bank_of_noise()
+    signals[14, 5] = 0.1
+    signals[14, 5, 0 if first else -1] = 30.0
+    slow, fast = pair(*KINDS[0], (signals, valid))
+    frame = np.eye(N_CHANNELS)[-1 if first else 0]
+    assert slow.match(frame).cell == (14, 5)
+    assert_same(fast.match(frame), slow.match(frame))
+
+
+@pytest.mark.parametrize("seed", [0, 6, 191, 192, 1859, 2887, *range(100, 130)])
+def test_frames_of_two_contacts(seed) -> None:
+    """In one of eight the known runner-up lies in the best cell's peak, and the search begins again."""
+    slow, fast = PAIRS[0]
+    assert_same(fast.match(two_contacts(seed)), slow.match(two_contacts(seed)))
+
+
+def test_of_lags_that_tie_the_highest_score_is_returned() -> None:
+    """The frame, of two channels, is a cell's signal at lag 0, and nearly so at lag 100."""
+    signals, valid = bank_of_noise(n_live=40)
+    signals[3, 3] = 0.0
+    signals[3, 3, [200, 700]] = 1.0
+    slow, fast = pair(*KINDS[0], (signals, valid))
+    for at_0, at_100 in ((1.0, 1.0 - 7e-13), (1.0 - 7e-13, 1.0)):
+        frame = np.zeros(N_CHANNELS)
+        frame[[200, 700]], frame[[300, 800]] = at_0, at_100
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cells_that_float32_hardly_tells_apart(kind) -> None:
+    """Next to nothing is left out of the basis, so the bounds have no room for their own rounding."""
+    random = np.random.default_rng(3)
+    signals = 1 + 1e-3 * (random.random((*SHAPE, 3)) @ random.random((3, N_CHANNELS)))
+    slow, fast = pair(*kind, (signals.astype(np.float32), np.ones(SHAPE, dtype=np.bool_)))
+    for frame in signals.reshape(-1, N_CHANNELS)[::22]:
+        assert_same(fast.match(frame), slow.match(frame))
+
+
+@both
+def test_no_score_is_above_1(slow, fast) -> None:
+    """Rounding may carry the score of a cell's own signal past it."""
+    del slow
+    assert max(fast.match(signal.astype(np.float64)).score for signal in BANK[0][BANK[1]][::5]) == 1.0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_signals_in_another_order_or_of_another_type_match_the_same(kind) -> None:
+    spread = np.zeros((*SHAPE, 2 * N_CHANNELS), np.float32)
+    spread[..., ::2] = BANK[0]
+    frame = BANK[0][6, 6] + BANK[0][16, 5]
+    for signals in (spread[..., ::2], BANK[0].astype(np.float64), BANK[0].astype(">f4")):
+        slow, fast = pair(*kind, (signals, BANK[1]))
+        assert_same(fast.match(frame), slow.match(frame))

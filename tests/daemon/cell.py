@@ -21,7 +21,7 @@ SPEED_M_PER_S = 0.1
 
 
 class Robot(UrRobot):
-    """The client with the pilot in the same process, and an arm that moves in straight lines too."""
+    """The client with the command handler in the same process, and an arm that moves in straight lines too."""
 
     def __init__(self) -> None:
         super().__init__(SETTINGS)

@@ -115,7 +115,7 @@ def test_a_straight_move_is_asked_after_from_its_beginning_until_the_wrist_is_tu
     times_s = iter(range(1, 100))
     monkeypatch.setattr(
         arm,
-        "Receiver",
+        "RtdeReceiver",
         lambda *_: SimpleNamespace(
             connected=True, latest=lambda: ReceivedSample(float(next(times_s)), SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
         ),

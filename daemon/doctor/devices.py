@@ -16,8 +16,8 @@ from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.doctor.checks import Finding, from_error, good, note, trouble
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
 from shearloop.daemon.ports import access_trouble
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.drivers.eit_kit import EitKit
@@ -257,7 +257,7 @@ class TopicLog:
 def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
     """Return the status of a running daemon's tasks; None when no daemon answers."""
     try:
-        tasks = request(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
+        tasks = send_command(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
     except UserError:
         return None
     return tasks if isinstance(tasks, dict) else {}
@@ -297,7 +297,7 @@ def check_daemon(
         if frames := received.get(("eit.frame", name)):
             yield check_channels(name, frames.saturated, frames.dead, len(frames.times_ns))
         estimates = received.get(("eit.estimate", name))
-        if estimates and (reason := estimates.latest.get("why")):
+        if estimates and (reason := estimates.latest.get("reason")):
             yield note(f"estimate of {name}", "not valid", str(reason), "see docs/troubleshooting.md")
     loop = received.get(("loop.state", "loop"))
     if loop and (reasons := loop.latest.get("reasons")):
@@ -308,7 +308,7 @@ def check_task(name: str, status: Mapping[str, Any]) -> Finding:
     """Judge one task by the counters that it reports."""
     subject = f"task {name}"
     counted = ", ".join(f"{count} × {kind}" for kind, count in (status.get("errors") or {}).items() if count)
-    reason = str(status.get("trouble") or status.get("last_loss") or "")
+    reason = str(status.get("error") or status.get("last_loss") or "")
     restarts, last_error = status.get("restarts", 0), str(status.get("last_error", ""))
     read_log = "read the daemon's log; report it if it comes back"
     if status.get("alive") is False:

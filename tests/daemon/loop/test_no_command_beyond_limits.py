@@ -1,4 +1,4 @@
-"""Random experiments, faults and timings through brain and handler: not one command to the arm is outside its limits."""
+"""Random experiments, faults and timings through loop and handler: no command to the arm exceeds its limits."""
 
 import dataclasses
 import math
@@ -90,7 +90,7 @@ class CheckedArm(FakeArm):
 
 
 class WholeRig:
-    """Brain and handler with the twin between them, a control cycle at a time; what LoopTask does, without its ports."""
+    """Control loop and command handler with the twin between them, one cycle at a time."""
 
     def __init__(self) -> None:
         self.brain, self.arm, self.twin = brain(), CheckedArm(), Twin(TwinSettings())

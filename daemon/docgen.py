@@ -54,9 +54,9 @@ def _introduction() -> str:
 Written by `make docs` from `daemon/messaging/messages.py`; change it there.
 
 The daemon publishes on a ZeroMQ PUB socket (`publish`, by default `{PUBLISH_ADDRESS}`). A message has two frames:
-the topic, and a [msgpack](https://msgpack.org) map with text keys. Numbers, booleans and texts are plain keys. A missing
-value is nil. An array is msgpack `bin`: little-endian float32 in C order, with its shape in `NAME_shape`. Plotting tools
-ignore both. `shearloop listen TOPIC --json` prints one message per line as JSON.
+the topic, and a [msgpack](https://msgpack.org) map with text keys. Numbers, booleans and texts are plain keys. A
+missing value is nil. An array is msgpack `bin`: little-endian float32 in C order, with its shape in `NAME_shape`.
+Plotting tools ignore both. `shearloop listen TOPIC --json` prints one message per line as JSON.
 
 PlotJuggler: see [live-view.md](live-view.md#plotjuggler).
 

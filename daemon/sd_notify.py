@@ -1,14 +1,11 @@
-"""Tells systemd how the service is: sd_notify(3), without its library."""
+"""Sends the service's state to systemd: sd_notify(3) without its library."""
 
 import os
 import socket
 
 
 def notify(*states: str) -> bool:
-    """Send states such as `READY=1` to the service manager; return False where no manager listens.
-
-    It never waits: a manager that does not read is told again by the next call.
-    """
+    """Send states such as `READY=1`, without blocking; return False if no service manager receives them."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return False

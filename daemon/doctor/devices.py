@@ -18,8 +18,8 @@ from shearloop.daemon.doctor.checks import Finding, from_error, good, note, trou
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.messaging.request import request
-from shearloop.daemon.ports import access_trouble
 from shearloop.daemon.rig import make_gripper_client
+from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hx711 import LoadCalibration
@@ -62,7 +62,7 @@ def check_port(name: str, device: SerialDevice) -> Finding:
         path = find_port(serial_number=device.serial_number, path=str(device.path) if device.path else None)
     except DriverError as error:
         return from_error(subject, error, "the board is not plugged in, or has another serial number")
-    denied = access_trouble(path)
+    denied = access_error(path)
     if denied:
         what, _, cure = denied.partition("; ")
         return trouble(subject, f"{path} exists, but {what}", "the daemon cannot read the board", cure)

@@ -21,7 +21,7 @@ from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.health import HealthReporter, TaskFacts
 from shearloop.daemon.links import log_link
-from shearloop.daemon.messaging.addresses import open_stop_address
+from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
@@ -80,7 +80,7 @@ class Daemon:
             opened.callback(self._commands.close)
             self._open_stop: CommandServer | None = None
             if "commands" in config.network_addresses:
-                address = open_stop_address(config.commands)
+                address = local_stop_address(config.commands)
                 self._open_stop = CommandServer(context, address, commands.open_handlers())
                 opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
@@ -331,7 +331,7 @@ def _recorder(
     if config.recording is None:
         return None
     recorder = Recorder(config.recording.folder, identity_of(config), clock, busy=busy, on_failure=on_failure)
-    publisher.listen(recorder.record)
+    publisher.add_listener(recorder.record)
     return recorder
 
 
@@ -379,7 +379,7 @@ async def run_daemon(
     with zmq.asyncio.Context() as context:
         daemon = Daemon(config, context)
         for listener in listeners:
-            daemon.publisher.listen(listener)
+            daemon.publisher.add_listener(listener)
         for name, told in facts.items():
             daemon.health.add(name, told)
         ending = ending_signals()

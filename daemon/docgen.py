@@ -12,8 +12,7 @@ import numpy as np
 from shearloop.daemon.cli.command import COMMANDS
 from shearloop.daemon.control.safety import TABLE, Response
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
-from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, TOPICS
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, Message
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = Path("docs/examples")
@@ -107,7 +106,7 @@ def _commands() -> str:
 
 The daemon answers on a ZeroMQ ROUTER socket (`commands`, by default `{COMMAND_ADDRESS}`). Use a REQ or DEALER socket.
 A request is a msgpack map: `{{"command": NAME}}` and the command's arguments. Each gets one reply:
-`{{"ok": true, …}}` or `{{"ok": false, "why": REASON}}`. Limits are in [security.md](security.md).
+`{{"ok": true, …}}` or `{{"ok": false, "reason": REASON}}`. Limits are in [security.md](security.md).
 `shearloop command NAME --json` sends a command from a shell.
 
 {table(("command", "what it does"), rows)}

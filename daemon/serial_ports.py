@@ -19,7 +19,7 @@ BY_SERIAL = Path("/dev/shearloop")
 
 @dataclass(frozen=True, slots=True)
 class SerialPortInfo:
-    """One port. Unknown texts are empty; `trouble` says why the user may not open it."""
+    """One port. Unknown texts are empty; `error` says why the user may not open it."""
 
     path: str
     serial_number: str
@@ -27,7 +27,7 @@ class SerialPortInfo:
     description: str
     likely: str
     stable_name: str
-    trouble: str
+    error: str
 
     @property
     def named_by(self) -> str:
@@ -53,7 +53,7 @@ def list_serial_ports() -> list[SerialPortInfo]:
                 description=port.description if port.description != "n/a" else "",
                 likely=BOARDS.get(port.vid or 0, ""),
                 stable_name=_stable_name(port.device, port.serial_number),
-                trouble=access_error(port.device),
+                error=access_error(port.device),
             )
         )
     return found

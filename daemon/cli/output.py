@@ -63,7 +63,7 @@ def message_json(topic: str, content: Mapping[str, Any]) -> str:
 
 def _estimate(_: str, content: Mapping[str, Any]) -> str:
     if not content["valid"]:
-        return f"no estimate: {content['why']}"
+        return f"no estimate: {content['reason']}"
     diameter = "" if content["diameter_mm"] is None else f"   diameter {content['diameter_mm']:5.1f} mm"
     cell = "" if content["k"] is None else f"   k {content['k']:.3f}  sigma {content['sigma']:.3f} cm"
     score = "" if content["score"] is None else f"   score {content['score']:.3f}"
@@ -73,7 +73,7 @@ def _estimate(_: str, content: Mapping[str, Any]) -> str:
 
 def _shear(_: str, content: Mapping[str, Any]) -> str:
     if not content["valid"]:
-        return f"no force: {content['why']}"
+        return f"no force: {content['reason']}"
     interval = f"[{content['shear_low_n']:+.3f}, {content['shear_high_n']:+.3f}]"
     torque = "" if content["torque_nm"] is None else f"   torque {content['torque_nm']:+.4f} N·m"
     direction = "within the deadband" if content["deadband"] else content["direction"]
@@ -86,13 +86,13 @@ def _health(_: str, content: Mapping[str, Any]) -> str:
         state = "done" if status.get("done") else "alive" if status.get("alive", True) else "DEAD"
         restarts = f", {status['restarts']} restarts" if status.get("restarts") else ""
         errors = "".join(f", {count} {kind}" for kind, count in (status.get("errors") or {}).items())
-        reason = f" ({status['trouble']})" if status.get("trouble") else ""
+        reason = f" ({status['error']})" if status.get("error") else ""
         tasks.append(f"{name} {state}{restarts}{errors}{reason}")
     return f"{content['memory_mb']:.0f} MB  {content['cpu_percent']:.1f} % CPU  " + "; ".join(tasks)
 
 
 def _columns(topic: str, content: Mapping[str, Any]) -> str:
-    from shearloop.daemon.messaging.topics import TOPICS
+    from shearloop.daemon.messaging.messages import TOPICS
 
     fields = dataclasses.fields(TOPICS[topic]) if topic in TOPICS else ()
     units = {item.name: f" {item.metadata['unit']}" for item in fields if item.metadata.get("unit")}

@@ -27,6 +27,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"    device: {port.named_by}")
         if not port.serial_number:
             print("    it has no serial number: leave it in the same socket")
-        if port.trouble:
-            print(f"    {port.trouble}")
+        if port.error:
+            print(f"    {port.error}")
     return 0

@@ -96,8 +96,8 @@ async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, ar
         opened.callback(publisher.close)
         replay = Replay(run, ReplayPipeline(config, run.asides(), publisher), publisher, clock)
         if args.show:
-            publisher.listen(EstimatePrinter(sys.stdout))
-        while args.wait and not publisher.subscribed:  # noqa: ASYNC110 - it is told when it is asked
+            publisher.add_listener(EstimatePrinter(sys.stdout))
+        while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - it is told when it is asked
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, run.messages, "message"))
         await replay.play(speed, progress)

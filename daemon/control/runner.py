@@ -199,7 +199,7 @@ class ControlLoopRunner:
             "connected": self._robot.state is not None,
             "states": self._robot.states,
             "errors": errors,
-            "trouble": "" if self._robot.link.status == "up" else self._robot.link.sentence,
+            "error": "" if self._robot.link.status == "up" else self._robot.link.sentence,
         }
 
     def _sense(self, state: RobotState) -> None:

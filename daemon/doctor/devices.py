@@ -16,8 +16,8 @@ from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.doctor.checks import Finding, from_error, good, note, trouble
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.serial_ports import access_error
 from shearloop.drivers.eit_kit import EitKit
@@ -247,7 +247,7 @@ def _rate_hz(times_ns: list[int]) -> float | None:
 def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
     """Return the status of a running daemon's tasks; None when no daemon answers."""
     try:
-        tasks = request(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
+        tasks = send_command(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
     except UserError:
         return None
     return tasks if isinstance(tasks, dict) else {}
@@ -285,7 +285,7 @@ def check_daemon(
             saturated, dead = (max(int(frame.get(key) or 0) for frame in frames) for key in ("saturated", "dead"))
             yield check_channels(name, saturated, dead, len(frames))
         estimates = received.get(("eit.estimate", name))
-        if estimates and (reason := estimates[-1].get("why")):
+        if estimates and (reason := estimates[-1].get("reason")):
             yield note(f"estimate of {name}", "not valid", str(reason), "see docs/troubleshooting.md")
     states = received.get(("loop.state", "loop"))
     if states and (reasons := states[-1].get("reasons")):
@@ -296,7 +296,7 @@ def check_task(name: str, status: Mapping[str, Any]) -> Finding:
     """Judge one task by the counters that it reports."""
     subject = f"task {name}"
     counted = ", ".join(f"{count} × {kind}" for kind, count in (status.get("errors") or {}).items() if count)
-    reason = str(status.get("trouble") or status.get("last_loss") or "")
+    reason = str(status.get("error") or status.get("last_loss") or "")
     restarts, last_error = status.get("restarts", 0), str(status.get("last_error", ""))
     read_log = "read the daemon's log; report it if it comes back"
     if status.get("alive") is False:

@@ -14,13 +14,24 @@ from functools import partial
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin import closed_form
-from shearloop.bank.skin.annulus import MESH_56, MESH_112, MESH_448, MESH_1792, MeshSize, condense
-from shearloop.bank.skin.contact import follow, gauge_strains
-from shearloop.bank.skin.gauge import response_of_strains
-from shearloop.bank.skin.membrane import paper_membrane, section_membrane
-from shearloop.bank.skin.section import PAPER_SECTION
-from shearloop.bank.skin.synthetic import loading, loop, responses
+from shearloop.bank.skin.membrane import (
+    PAPER_SECTION,
+    loading_response,
+    paper_membrane,
+    response_of_strains,
+    section_membrane,
+)
+from shearloop.bank.skin.plane_strain import (
+    MESH_56,
+    MESH_112,
+    MESH_448,
+    MESH_1792,
+    MeshSize,
+    condense,
+    follow,
+    gauge_strains,
+)
+from shearloop.bank.skin.statistics import loading, loop, responses
 
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0
 Model = Callable[[FloatArray], FloatArray]
@@ -36,7 +47,7 @@ def models() -> dict[str, Model]:
     """Return the models by name."""
     return {
         "closed form": lambda path: np.array(
-            [closed_form.loading_response(PAPER_SECTION, NORMAL_N, shear) for shear in path.tolist()]
+            [loading_response(PAPER_SECTION, NORMAL_N, shear) for shear in path.tolist()]
         ),
         "1-D, paper's F/(EA)": partial(responses, paper_membrane(), normal_n=NORMAL_N),
         "1-D, section's EA": partial(responses, section_membrane(), normal_n=NORMAL_N),

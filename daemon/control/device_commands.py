@@ -62,7 +62,7 @@ class VelocityCommandSender:
     def _send(self, command: WristSpeed | Stop) -> None:
         self._unanswered += 1
         try:
-            self._robot.tell(command, self._on_reply)
+            self._robot.send_nowait(command, self._on_reply)
         except Exception as error:  # noqa: BLE001 - reported by the next tick, which ends the experiment
             self._unanswered -= 1
             self._on_error(error)
@@ -71,9 +71,9 @@ class VelocityCommandSender:
         self._unanswered -= 1
         try:
             if not reply.accepted and self._robot.state is None:
-                self._control_loop.on_command_unanswered(reply.refused)
+                self._control_loop.on_command_unanswered(reply.refusal)
             elif not reply.accepted:
-                self._control_loop.on_command_refused(reply.refused)
+                self._control_loop.on_command_refused(reply.refusal)
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
             self._control_loop.on_speed_sent(self.sent_rad_per_s)
         except Exception as error:  # noqa: BLE001 - an error of the loop must not end the robot's process
@@ -150,7 +150,7 @@ class ActionExecutor:
         if error := await self._rest():
             return error
         reply = await self._robot.send(ZeroForceTorque())
-        return reply.refused if not reply.accepted else await self._tare()
+        return reply.refusal if not reply.accepted else await self._tare()
 
     async def _move(self, action: MoveTo) -> str:
         pose = action.pose_m_rad
@@ -180,16 +180,16 @@ class ActionExecutor:
         """Send a straight move and wait for its end; return an error, or an empty string."""
         reply = await self._robot.send(command)
         if not reply.accepted:
-            return reply.refused
+            return reply.refusal
         for reason in reply.clipped:
             structlog.get_logger().warning("the move was clipped", reason=reason)
         while True:
             state = await self._robot.next_state()
-            if state.motion_id != previous_id and state.ended:
-                if state.ended not in (ARRIVED, STOPPED_ON_COMMAND):
+            if state.motion_id != previous_id and state.end_reason:
+                if state.end_reason not in (ARRIVED, STOPPED_ON_COMMAND):
                     # It ended by itself, just before an interruption; do not repeat it.
                     self._interrupted = False
-                return "" if state.ended == ARRIVED else f"the move ended early: {state.ended}"
+                return "" if state.end_reason == ARRIVED else f"the move ended early: {state.end_reason}"
 
 
 def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:

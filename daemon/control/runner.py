@@ -126,7 +126,7 @@ class ControlLoopRunner:
             return self._control_loop.start(file, self._clock.now_ns())
         reply = await self._robot.send(Enable())
         if not reply.accepted:
-            return reply.refused
+            return reply.refusal
         with suppress(TimeoutError):
             async with asyncio.timeout(ENABLED_WITHIN_S):
                 while (state := await self._robot.next_state()).blocked:
@@ -153,7 +153,7 @@ class ControlLoopRunner:
         """Enable robot and gripper after a stop, on the operator's command; return None, or why not."""
         reply = await self._robot.send(Unlock())
         if not reply.accepted:
-            return reply.refused
+            return reply.refusal
         if self._gripper is not None and (error := await self._gripper.unlock()):
             return error
         self._control_loop.acknowledge()
@@ -162,8 +162,8 @@ class ControlLoopRunner:
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the robot's part of `health`."""
         errors = dict(self._robot.losses)
-        if self._robot.stops_in_vain:
-            errors["paused program not stopped"] = self._robot.stops_in_vain
+        if self._robot.failed_program_stops:
+            errors["paused program not stopped"] = self._robot.failed_program_stops
         return {
             "connected": self._robot.state is not None,
             "states": self._robot.states,

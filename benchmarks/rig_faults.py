@@ -178,7 +178,9 @@ def _process(*arguments: str, **options: Any) -> Iterator["subprocess.Popen[byte
 
 def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
     path = folder / f"{name}.yaml"
-    begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
+    # The estimator needs seven seconds of the grip.
+    grip = [{"do": "grip", "width_mm": 5, "force_n": 60}, {"do": "wait", "wait_s": 8}]
+    begin = [{"do": "release"}, {"do": "tare"}, *grip]
     content = {"name": name, "drive": "load_cell", "limits": {"torque_nm": 0.3}, "steps": [*begin, *steps]}
     path.write_text(yaml.safe_dump(content))
     return path

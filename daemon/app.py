@@ -14,7 +14,6 @@ import zmq
 import zmq.asyncio
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
-from shearloop.daemon import sd_notify
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands, needed
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
@@ -40,6 +39,7 @@ from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
 from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.eit_kit import EitKit
@@ -203,9 +203,9 @@ class Daemon:
             running = [group.create_task(task, name=name) for name, task in self._tasks()]
             structlog.get_logger().info("running", fingertips=list(self._fingertips))
             on_ready()
-            sd_notify.notify("READY=1")
+            notify("READY=1")
             await self._stop.wait()
-            sd_notify.notify("STOPPING=1")
+            notify("STOPPING=1")
             if self._rig is not None:
                 self._rig.end()
                 if self._experiment is not None:

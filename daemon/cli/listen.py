@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print messages until interrupted, or until enough have come."""
-    from shearloop.daemon.cli.message_lines import message_json, message_line
+    from shearloop.daemon.cli.output import message_json, message_line
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.messaging.client import QUIET_S, check_timeout_s, receive_messages
     from shearloop.daemon.messaging.messages import TOPICS

@@ -85,8 +85,7 @@ def parsed_speed(text: str) -> float:
 async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, args: argparse.Namespace) -> "Comparison":
     import zmq.asyncio
 
-    from shearloop.daemon.cli.message_lines import EstimatePrinter
-    from shearloop.daemon.cli.output import progress_bar
+    from shearloop.daemon.cli.output import EstimatePrinter, progress_bar
     from shearloop.daemon.messaging.publisher import Publisher
     from shearloop.daemon.recording.replay import Replay, ReplayClock
     from shearloop.daemon.recording.replay_pipeline import ReplayPipeline

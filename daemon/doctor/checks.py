@@ -18,9 +18,9 @@ from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, F
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.ports import ports_there
 from shearloop.daemon.sensing.opening import on_word, open_both, open_estimator
 from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.daemon.serial_ports import list_serial_ports
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.settings import read_settings
 
@@ -141,7 +141,7 @@ def check_disk(folder: Path) -> Finding:
 
 def check_ports() -> Finding:
     """List the USB serial ports with their serial numbers."""
-    ports = ports_there()
+    ports = list_serial_ports()
     if not ports:
         return note(
             "USB serial ports",
@@ -150,7 +150,7 @@ def check_ports() -> Finding:
             "plug the boards in; look at `sudo dmesg | tail`",
         )
     shown = ", ".join(f"{port.path} ({port.serial_number or 'without a serial number'})" for port in ports)
-    denied = "; ".join(f"{port.path}: {port.trouble}" for port in ports if port.trouble)
+    denied = "; ".join(f"{port.path}: {port.error}" for port in ports if port.error)
     if denied:
         return note("USB serial ports", shown, denied, "see `shearloop ports`")
     return good("USB serial ports", shown)

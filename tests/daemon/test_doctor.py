@@ -24,7 +24,7 @@ from shearloop.daemon.doctor.checks import (
 from shearloop.daemon.doctor.devices import check_channels, check_rate, check_task
 from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
-from shearloop.daemon.ports import PortThere
+from shearloop.daemon.serial_ports import SerialPortInfo
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
@@ -190,7 +190,7 @@ def test_ports_are_listed_with_what_a_configuration_names_them_by(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there: list[Any] = []
-    monkeypatch.setattr("shearloop.daemon.ports.sorted", lambda ports: ports, raising=False)
+    monkeypatch.setattr("shearloop.daemon.serial_ports.sorted", lambda ports: ports, raising=False)
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: there)
     assert main(["ports"]) == 0
     assert "there is no serial port" in capsys.readouterr().out
@@ -206,14 +206,14 @@ def test_ports_are_listed_with_what_a_configuration_names_them_by(
 
 
 def test_each_denied_port_is_reported_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    def port(path: str, trouble: str) -> PortThere:
-        return PortThere(path, "1", "", "", "", "", trouble)
+    def port(path: str, trouble: str) -> SerialPortInfo:
+        return SerialPortInfo(path, "1", "", "", "", "", trouble)
 
     there = [
         port("/dev/ttyACM0", ""),
         port("/dev/ttyUSB0", "another program holds it"),
         port("/dev/ttyUSB1", "no right"),
     ]
-    monkeypatch.setattr("shearloop.daemon.doctor.checks.ports_there", lambda: there)
+    monkeypatch.setattr("shearloop.daemon.doctor.checks.list_serial_ports", lambda: there)
     found = check_ports()
     assert (found.state, found.means) == ("note", "/dev/ttyUSB0: another program holds it; /dev/ttyUSB1: no right")

@@ -10,8 +10,8 @@ import json
 import numpy as np
 
 from shearloop.daemon.control.creep import Stretch, fit_creep
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.emulators.scene import Twin, TwinSettings
 
 TWISTED_RAD, HELD_S, TWISTS = 0.15, 40.0, 10
 NOISES_NM = (0.003, 0.006, 0.012)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import line_of_channels
 from shearloop.daemon.messaging.messages import decode
-from shearloop.drivers.eit_line import TRANSFER_NS
+from shearloop.drivers.eit_kit import TRANSFER_NS
 
 READY_S = 30.0
 USB_PACKET_BYTES = 512

@@ -37,7 +37,7 @@ from benchmarks.daemon_parts import (
 from benchmarks.fused_latency import fused_latency
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.daemon.messaging.request import request
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 REPEATS = 5
 # Between frames whose latency is measured: long enough for the daemon to be idle again.

@@ -23,8 +23,8 @@ from shearloop.daemon.rig import make_brain
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
-from shearloop.drivers.emulators.skin.daq import NOISE_V
-from shearloop.drivers.shear_skin.judge import SkinSample
+from shearloop.drivers.emulators.skin import NOISE_V
+from shearloop.drivers.shear_skin.skin import SkinSample
 
 Floats = NDArray[np.float64]
 TICK_S, SAMPLE_TICKS = 0.008, 12.5

@@ -10,8 +10,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from shearloop.daemon.control.creep import Creep
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.emulators.twin import Twin
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.emulators.scene import Twin
 from shearloop.drivers.ur.news import ANGLE_NEWS_RAD
 from shearloop.drivers.ur.pace import quiet_is_due
 

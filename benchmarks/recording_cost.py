@@ -25,7 +25,7 @@ from shearloop.daemon.messaging.messages import Message, wire_map
 from shearloop.daemon.messaging.topics import TOPICS
 from shearloop.daemon.recording.identity import Identity
 from shearloop.daemon.recording.recorder import FLUSH_S, Recorder
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 STEP_S = 0.04
 SOURCES = {"eit.frame": ("right", "left"), "eit.estimate": ("right", "left", "both")}

@@ -13,7 +13,7 @@ import numpy as np
 from shearloop.bank.skin.calibration_file import COLUMNS, read_table, save_calibration
 from shearloop.bank.skin.calibration_fit import fit_calibration
 from shearloop.daemon.synthetic_skin import SyntheticSkin, calibration_table
-from shearloop.drivers.emulators.skin.daq import NOISE_V
+from shearloop.drivers.emulators.skin import NOISE_V
 
 # The noise of one gauge, relative to the 0.125 V across it.
 NOISE = NOISE_V / 0.125

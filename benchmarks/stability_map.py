@@ -26,7 +26,7 @@ from benchmarks.plant import Plant, Sample, Sensor, Tool
 from shearloop.daemon.control.controller import TwistController
 from shearloop.daemon.control.margins import LoopModel, gain_limit, pulse_response, seen_through_window
 from shearloop.daemon.control.settings import ControllerSettings
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 FloatArray = NDArray[np.float64]
 

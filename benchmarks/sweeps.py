@@ -30,7 +30,7 @@ from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.programme import expected_s
 from shearloop.daemon.recording.matlab_slices import SliceRecorder
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 EXPERIMENTS = Path("config/experiments")
 DIAMETERS_MM = (10, 20, 30, 40)

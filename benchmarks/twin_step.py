@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.plant import EIT, LOAD_CELL, Plant, Sensor, Tool, TwinPlant
 from benchmarks.step_response import BAND, PERIOD_S, SOURCES, TARGET_NM, steps
 from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
-from shearloop.drivers.emulators.twin import Joint, Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Joint, Twin, TwinSettings
 
 FloatArray = NDArray[np.float64]
 

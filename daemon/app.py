@@ -42,9 +42,9 @@ from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
 from shearloop.daemon.sensing.tracking import TrackedEstimator
 from shearloop.daemon.supervisor import Supervisor
+from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.eit_kit import EitKit
-from shearloop.drivers.raw_event import Tap, no_tap
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 
 
 class Daemon:
@@ -283,8 +283,8 @@ class Daemon:
         """Begin the configured experiment no more, and return it; None where it was not waited for."""
         return self._experiment.give_up() if self._experiment is not None else None
 
-    def _tap(self, source: str) -> Tap:
-        return no_tap if self._recorder is None else self._recorder.tap(source)
+    def _tap(self, source: str) -> OnRaw:
+        return ignore_raw if self._recorder is None else self._recorder.tap(source)
 
     def _busy(self) -> bool:
         """Return whether an experiment is running."""
@@ -340,7 +340,7 @@ def _board(
     config: FingertipConfig,
     name: str,
     on_event: Callable[[LinkEvent], None],
-    tap: Tap,
+    tap: OnRaw,
     both: CombinedFingertipTask | None,
 ) -> EitKit:
     return EitKit(

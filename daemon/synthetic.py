@@ -12,7 +12,7 @@ from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channels
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.daemon.errors import UserError
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 
 # Of the recorded frames: their mean, and the standard deviation of a channel from frame to frame.
 MEAN_V = 0.13

@@ -13,12 +13,11 @@ from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig
 from shearloop.daemon.doctor.finding import Finding, from_sentence, good, note, trouble
 from shearloop.daemon.ports import access_trouble
 from shearloop.daemon.rig import make_gripper_client
+from shearloop.drivers.connection import find_port
 from shearloop.drivers.eit_kit import EitKit, Frame
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.hx711 import LoadCalibration
-from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
-from shearloop.drivers.serial_port import find_port
 from shearloop.drivers.ur.controller_query import look
 from shearloop.drivers.ur.settings import read_settings
 

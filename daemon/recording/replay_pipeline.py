@@ -17,9 +17,9 @@ from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
 from shearloop.daemon.sensing.skin_setup import RecordedSkin
 from shearloop.daemon.sensing.skin_task import SKIN
-from shearloop.drivers.eit_line import Frame, FrameParser
-from shearloop.drivers.hx711 import LoadParser
-from shearloop.drivers.raw_event import RawEvent
+from shearloop.drivers.eit_kit import Frame, FrameParser
+from shearloop.drivers.load_cell import LoadParser
+from shearloop.drivers.serial_sensor import RawEvent
 
 # What is made anew; everything else of a recording is sent as it was recorded.
 MADE_ANEW = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topic)

@@ -10,8 +10,7 @@ from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.waiting import Waiting
-from shearloop.drivers.hx711 import LoadSample
-from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 LOAD_CELL = "load_cell"
 # Two seconds at 10.9 Hz; their mean is known ten times better than one reading moves.

@@ -11,7 +11,7 @@ from shearloop.bank.skin.calibration import SkinCalibration
 from shearloop.bank.skin.membrane import Direction, ShearInterval
 from shearloop.bank.skin.tracking import DirectionFinder, ForceFollower
 from shearloop.daemon.sensing.skin_zero import RefusedZero, Zero, ZeroTaker
-from shearloop.drivers.shear_skin.judge import SkinSample
+from shearloop.drivers.shear_skin.skin import SkinSample
 
 # The gauge on the slack side is never stretched, and compressed by at most so much of the other's stretch (the 2-D
 # reference gives 0.125, see docs/skin-models.md).

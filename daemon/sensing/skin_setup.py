@@ -15,16 +15,20 @@ from shearloop.daemon.messaging.messages import SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_DAQ, SKIN_SOURCE, SkinTask, shear_message
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
-from shearloop.drivers.serial_port import DEFAULT_BAUD, Link, LinkEvent, SerialLink
-from shearloop.drivers.shear_skin.adc_board import AdcBoard, PairParser
-from shearloop.drivers.shear_skin.daq import Daq
-from shearloop.drivers.shear_skin.judge import CircuitLimits, SampleValidator
-from shearloop.drivers.shear_skin.scanner import RecordedScanner, ScpiScanner
-from shearloop.drivers.shear_skin.skin import ShearSkin
-from shearloop.drivers.shear_skin.source import PERIOD_S as SOURCE_PERIOD_S
-from shearloop.drivers.shear_skin.source import Keithley6430, RecordedSource, SourceReading
-from shearloop.drivers.tcp_port import TcpLink
+from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkEvent, SerialLink, TcpLink
+from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
+from shearloop.drivers.shear_skin.instruments import SOURCE_PERIOD_S as SOURCE_PERIOD_S
+from shearloop.drivers.shear_skin.instruments import (
+    AdcBoard,
+    Daq,
+    Keithley6430,
+    PairParser,
+    RecordedScanner,
+    RecordedSource,
+    ScpiScanner,
+    SourceReading,
+)
+from shearloop.drivers.shear_skin.skin import CircuitLimits, SampleValidator, ShearSkin
 
 # The paper's bound.
 MOST_WARMING_K = 5.0
@@ -37,7 +41,7 @@ def make_skin(
     publisher: Publisher,
     clock: Clock,
     hear: Callable[[TorqueSample], None] = lambda _: None,
-    tap: Callable[[str], Tap] = lambda _: no_tap,
+    tap: Callable[[str], OnRaw] = lambda _: ignore_raw,
 ) -> SkinTask:
     """Return the skin's task; raises BankError when its calibration cannot be used. Nothing is opened yet.
 
@@ -139,12 +143,12 @@ def _limits(calibration: SkinCalibration) -> CircuitLimits:
     return CircuitLimits(resistance_ohm=sum(calibration.rest_ohm) / 2.0)
 
 
-def _current_source(config: SkinSourceConfig, tap: Tap) -> Keithley6430:
+def _current_source(config: SkinSourceConfig, tap: OnRaw) -> Keithley6430:
     link = _link(config.socket, config.serial, config.baud, partial(log_link, "skin source"))
     return Keithley6430(link, config.current_ma * 1e-3, config.compliance_v, SOURCE_PERIOD_S, tap=tap)
 
 
-def _daq(config: SkinDaqConfig, tap: Tap) -> Daq:
+def _daq(config: SkinDaqConfig, tap: OnRaw) -> Daq:
     on_event = partial(log_link, "skin daq")
     if config.scanner is not None:
         link = _link(config.scanner.socket, None, DEFAULT_BAUD, on_event)

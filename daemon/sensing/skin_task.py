@@ -9,9 +9,8 @@ from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.waiting import Waiting
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
-from shearloop.drivers.shear_skin.judge import SkinSample
-from shearloop.drivers.shear_skin.skin import ShearSkin
+from shearloop.drivers.serial_sensor import InputKind, RawEvent, ignore_raw
+from shearloop.drivers.shear_skin.skin import ShearSkin, SkinSample
 
 SKIN = "skin"
 # What its instruments are called in health and in recordings.
@@ -31,7 +30,7 @@ class SkinTask:
         clock: Clock,
         hear: Callable[[TorqueSample], None] = lambda _: None,
         tool_radius_mm: float | None = None,
-        tap: Tap = no_tap,
+        tap: Tap = ignore_raw,
     ) -> None:
         """Take what is to be tied together; `tap` hears of each tare."""
         self._tap = tap

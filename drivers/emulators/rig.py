@@ -11,18 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.emulators import eit_kit, hx711
-from shearloop.drivers.emulators.eit_kit import EitKitBoard
-from shearloop.drivers.emulators.hx711 import Hx711Board, Sketch
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.emulators import boards as eit_kit
+from shearloop.drivers.emulators import boards as hx711
+from shearloop.drivers.emulators.boards import EitKitBoard, Hx711Board, Sketch
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
 from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
 from shearloop.drivers.emulators.robotiq.player import GripperPlayer
 from shearloop.drivers.emulators.robotiq.urcap_face import PORT, UrcapServer
-from shearloop.drivers.emulators.scene import FloatArray, Scene, Truth
-from shearloop.drivers.emulators.skin.circuit import Gauges
-from shearloop.drivers.emulators.skin.instruments import SkinInstruments
-from shearloop.drivers.emulators.twin import Joint, TwinSettings
+from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, Truth, TwinSettings
+from shearloop.drivers.emulators.skin import Gauges, SkinInstruments
 from shearloop.drivers.emulators.ur.faults import FAULTS, obey
 from shearloop.drivers.emulators.ur.make import Make
 from shearloop.drivers.emulators.ur.robot import Robot, RobotEvent

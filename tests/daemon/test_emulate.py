@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from shearloop.daemon.cli import EXIT_USAGE, main
-from shearloop.drivers.eit_format import ADC_STEP_V
-from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame
 
 # Guards against a test that hangs; none of them waits for so long.
 DEADLINE_S = 60
@@ -188,13 +187,13 @@ def test_a_mistake_is_one_sentence_and_status_two(
 
 
 def test_help_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
-    from shearloop.drivers.emulators.eit_kit import FaultKind
+    from shearloop.drivers.emulators.boards import BoardFaultKind
 
     with pytest.raises(SystemExit) as ended:
         main(["emulate", "eit-kit", "--help"])
     assert ended.value.code == 0
     told = capsys.readouterr().out
-    assert [kind.value for kind in FaultKind if kind.value not in told] == []
+    assert [kind.value for kind in BoardFaultKind if kind.value not in told] == []
 
 
 def test_the_command_runs_without_a_terminal(tmp_path: Path) -> None:

@@ -10,15 +10,10 @@ import pytest
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.cli.emulated.skin_push import PushedSkin
+from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
-from shearloop.drivers.serial_port import Link, SerialLink
-from shearloop.drivers.shear_skin.adc_board import AdcBoard
-from shearloop.drivers.shear_skin.daq import Daq
-from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
-from shearloop.drivers.shear_skin.scanner import ScpiScanner
-from shearloop.drivers.shear_skin.skin import ShearSkin
-from shearloop.drivers.shear_skin.source import Keithley6430
-from shearloop.drivers.tcp_port import TcpLink
+from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 SPEED = 20

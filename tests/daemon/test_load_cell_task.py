@@ -7,7 +7,7 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
 from shearloop.daemon.sensing.load_cell_task import ZERO_DEADLINE_S, ZERO_SAMPLES, LoadCellTask
-from shearloop.drivers.hx711 import LoadSample
+from shearloop.drivers.load_cell import LoadSample
 
 
 class Board:

@@ -21,7 +21,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.messaging.request import request
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 

@@ -7,18 +7,22 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
-from shearloop.drivers import eit_format, eit_line
-from shearloop.drivers.eit_format import (
+from shearloop.drivers import eit_kit as eit_format
+from shearloop.drivers import eit_kit as eit_line
+from shearloop.drivers.eit_kit import (
     ADC_STEP_V,
     FULL_SCALE_SINE_RMS_V,
     LINE_BYTES,
-    LONGEST_LINE_BYTES,
+    MAX_LINE_BYTES,
+    NOMINAL_PERIOD_NS,
+    TRANSFER_NS,
+    Frame,
     FrameError,
     FrameErrorKind,
+    FrameParser,
     read_line,
 )
-from shearloop.drivers.eit_line import NOMINAL_PERIOD_NS, TRANSFER_NS, Frame, FrameParser
-from shearloop.drivers.emulators.eit_kit import format_line
+from shearloop.drivers.emulators.boards import format_line
 
 PERIOD_NS = NOMINAL_PERIOD_NS
 
@@ -219,7 +223,7 @@ def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage: bytes, times
     parser = FrameParser(ZERO_SLOTS)
     for _ in range(times):
         assert parser.feed(garbage, 0) == []
-        assert len(parser._begun) <= LONGEST_LINE_BYTES
+        assert len(parser._begun) <= MAX_LINE_BYTES
     parser.feed(b"\n", 0)
     assert [frame.line + b"\n" for frame in parser.feed(GOOD, 0)] == [GOOD]
 

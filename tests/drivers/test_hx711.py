@@ -7,21 +7,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.calibration_file import CalibrationError, load_calibration, save_calibration
-from shearloop.drivers.hx711 import (
+from shearloop.drivers.errors import DeviceCalibrationError
+from shearloop.drivers.load_cell import (
     COUNTS_MAX,
     COUNTS_MIN,
     MAX_LINE_BYTES,
     PERIOD_NS,
     RATE_HZ,
     STUCK_AFTER,
-    Despiker,
     LoadCalibration,
     LoadLimits,
     LoadParser,
     LoadSample,
-    refusals,
+    SpikeFilter,
+    describe_errors,
 )
+from shearloop.drivers.yaml_files import load_calibration, save_calibration
 
 TORQUE_LINES = LoadCalibration.of_torque_lines()
 STREAMS = {
@@ -99,7 +100,7 @@ def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line: str,
     parser = LoadParser(TORQUE_LINES)
     assert feed_lines(parser, [line]) == []
     assert dict(parser.refused) == {kind: 1}
-    (sentence,) = refusals(parser)
+    (sentence,) = describe_errors(parser)
     assert "(1 times)" in sentence
 
 
@@ -158,7 +159,7 @@ torques = st.floats(-1.7, 1.7)
 
 @given(torques, torques, st.integers(3, 10))
 def test_a_real_step_is_believed_after_three_agreeing_values(before: float, after: float, n: int) -> None:
-    despiker = Despiker(LoadLimits())
+    despiker = SpikeFilter(LoadLimits())
     assert not any(despiker.is_spike(before, k * PERIOD_NS) for k in range(5))
     flags = [despiker.is_spike(after, (5 + k) * PERIOD_NS) for k in range(n)]
     assert flags[0] == (abs(after - before) > 2.0 * PERIOD_NS * 1e-9)
@@ -173,12 +174,12 @@ def test_one_corrupted_value_in_a_moving_signal_is_flagged_alone(steps: list[flo
         values.append(level)
     where = data.draw(st.integers(1, len(values) - 1))
     values[where] = values[where - 1] + data.draw(st.sampled_from([-1, 1])) * data.draw(st.floats(0.2, 1e9))
-    despiker = Despiker(LoadLimits())
+    despiker = SpikeFilter(LoadLimits())
     assert [k for k, v in enumerate(values) if despiker.is_spike(v, k * PERIOD_NS)] == [where]
 
 
 def test_after_a_gap_the_rig_may_have_moved_further() -> None:
-    despiker = Despiker(LoadLimits())
+    despiker = SpikeFilter(LoadLimits())
     assert not despiker.is_spike(0.0, 0)
     assert not despiker.is_spike(1.5, 10**9)
 
@@ -222,13 +223,13 @@ def test_a_calibration_survives_its_file(tmp_path: Path) -> None:
 def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "load.yaml"
     path.write_text(text)
-    with pytest.raises(CalibrationError, match=said) as refused:
+    with pytest.raises(DeviceCalibrationError, match=said) as refused:
         load_calibration(path, LoadCalibration)
     assert str(path) in str(refused.value)
 
 
 def test_a_missing_calibration_file_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="shearloop calibrate"):
+    with pytest.raises(DeviceCalibrationError, match="shearloop calibrate"):
         load_calibration(tmp_path / "none.yaml", LoadCalibration)
-    with pytest.raises(CalibrationError, match="cannot be written"):
+    with pytest.raises(DeviceCalibrationError, match="cannot be written"):
         save_calibration(tmp_path / "no/such/folder.yaml", TORQUE_LINES)

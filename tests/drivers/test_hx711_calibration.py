@@ -7,15 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.calibration_file import CalibrationError
-from shearloop.drivers.hx711 import COUNTS_MAX, LoadCalibration, LoadParser, LoadSample
-from shearloop.drivers.hx711_calibration import (
-    STANDARD_GRAVITY,
-    UNCALIBRATED,
-    CalibrationBounds,
-    LoadCalibrator,
-    tare,
-)
+from shearloop.drivers.errors import DeviceCalibrationError
+from shearloop.drivers.load_calibration import STANDARD_GRAVITY, UNCALIBRATED, CalibrationBounds, LoadCalibrator, tare
+from shearloop.drivers.load_cell import COUNTS_MAX, LoadCalibration, LoadParser, LoadSample
 
 BOUNDS = CalibrationBounds()
 STEP = BOUNDS.skip_samples + BOUNDS.samples_per_step
@@ -73,7 +67,7 @@ def test_a_board_that_sends_newton_metres_is_calibrated_the_same_way() -> None:
 
 def refused(calibrator: LoadCalibrator, signal: list[LoadSample]) -> str:
     calibrator.ready()
-    with pytest.raises(CalibrationError) as error:
+    with pytest.raises(DeviceCalibrationError) as error:
         any(calibrator.feed(sample) for sample in signal)
     return str(error.value)
 
@@ -111,7 +105,7 @@ def test_noise_is_refused_beyond_the_bound_and_beyond_a_share_of_the_change() ->
 def test_masses_off_the_line_or_in_the_wrong_order_are_refused() -> None:
     bent = LoadCalibrator([100.0, 200.0])
     calibrate(bent, lambda mass_g: noisy(420 * mass_g * (0.8 if mass_g == 200 else 1.0)))
-    with pytest.raises(CalibrationError, match="straight line"):
+    with pytest.raises(DeviceCalibrationError, match="straight line"):
         bent.result()
     swapped = LoadCalibrator([100.0, 200.0])
     swapped.ready()
@@ -140,13 +134,13 @@ def test_samples_between_the_steps_count_for_nothing() -> None:
     calibrator = after_empty([100.0])
     assert not any(calibrator.feed(sample) for sample in noisy(1e6))
     assert len(calibrator.levels) == 1
-    with pytest.raises(CalibrationError, match="1 steps"):
+    with pytest.raises(DeviceCalibrationError, match="1 steps"):
         calibrator.result()
 
 
 @pytest.mark.parametrize("masses_g", [[], [0.0], [-5.0], [float("nan")], [float("inf")], [100.0, 100.0]])
 def test_masses_that_no_line_goes_through_are_refused(masses_g: list[float]) -> None:
-    with pytest.raises(CalibrationError, match="mass"):
+    with pytest.raises(DeviceCalibrationError, match="mass"):
         LoadCalibrator(masses_g)
 
 
@@ -155,5 +149,5 @@ def test_a_tare_moves_the_zero_and_keeps_the_scale() -> None:
     after = tare(before, noisy(8000.0), BOUNDS)
     assert after.nm_per_count == before.nm_per_count
     assert after.torque_nm(8000.0) == pytest.approx(0, abs=200 * 2e-5 * 0.035)
-    with pytest.raises(CalibrationError, match="Only 4"):
+    with pytest.raises(DeviceCalibrationError, match="Only 4"):
         tare(before, noisy(8000.0)[:4], BOUNDS)

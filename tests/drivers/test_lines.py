@@ -5,7 +5,7 @@ import tracemalloc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.line_splitter import LineSplitter
+from shearloop.drivers.serial_sensor import LineSplitter
 
 LONGEST = 8
 

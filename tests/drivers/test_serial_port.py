@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers import serial_port
-from shearloop.drivers.emulators.pty_port import PtyPort
+from shearloop.drivers import connection as serial_port
+from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, SerialPort, find_port
+from shearloop.drivers.emulators.ports import PtyPort
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink, SerialPort, find_port
 
 SECOND_NS = 1_000_000_000
 # Guards against a test that hangs; none of them waits for so long.

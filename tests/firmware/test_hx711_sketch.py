@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.hx711 import COUNTS_MAX, COUNTS_MIN, LoadCalibration, LoadParser
+from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN, LoadCalibration, LoadParser
 
 SKETCH = Path(__file__).resolve().parents[2] / "firmware/hx711_torque/hx711_torque.ino"
 

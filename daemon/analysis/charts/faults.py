@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.bank_match import Registration
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
     from shearloop.bank.eit.mesh import Mesh
     from shearloop.daemon.synthetic import Signals
-    from shearloop.drivers.emulators.eit_kit import Fault
 
 DEMO_BANK = Path(str(resources.files("shearloop"))) / "config" / "banks" / "demo.yaml"
 # Where the paper's method finds its screwdriver: σ at rest and at the largest torque of the slices, in N·m.
@@ -69,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
     from shearloop.daemon.cli.emulated.console import play
     from shearloop.daemon.errors import UserError
-    from shearloop.drivers.eit_format import FRAME_PERIOD_S
-    from shearloop.drivers.emulators.eit_kit import EitKitBoard, read_fault
+    from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+    from shearloop.drivers.emulators.boards import EitKitBoard, parse_fault
 
     if not (math.isfinite(args.speed) and args.speed > 0):
         raise UserError(f"--speed {args.speed:g} is not above 0")
@@ -84,19 +83,19 @@ def run(args: argparse.Namespace) -> int:
         on_port=partial(print, flush=True),
         seed=args.seed,
     )
-    play(board.run(), lambda line: board.inject(read_fault(line)))
+    play(board.run(), lambda line: board.inject(parse_fault(line)))
     return 0
 
 
 def _fault_at(text: str) -> tuple[int, "Fault"]:
     from shearloop.daemon.errors import UserError
-    from shearloop.drivers.emulators.eit_kit import read_fault
+    from shearloop.drivers.emulators.boards import parse_fault
 
     name, _, frame = text.partition("@")
     if not frame.isdecimal():
         raise UserError(f"--fault {text} names no frame; write NAME@FRAME, for instance cut-line@20")
     try:
-        return int(frame), read_fault(name)
+        return int(frame), parse_fault(name)
     except ValueError as error:
         raise UserError(f"--fault {text}: {error}") from None
 

@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
     from shearloop.daemon.cli.emulated.console import play
     from shearloop.daemon.errors import UserError
-    from shearloop.drivers.emulators.hx711 import PAPER_SKETCH, PERIOD_S, Hx711Board, Sketch, read_fault
+    from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, PAPER_SKETCH, Hx711Board, Sketch, parse_fault
 
     if not (math.isfinite(args.speed) and args.speed > 0):
         raise UserError(f"--speed {args.speed:g} is not above 0")
@@ -42,20 +42,20 @@ def run(args: argparse.Namespace) -> int:
     board = Hx711Board(
         torque.next,
         PAPER_SKETCH if args.paper_sketch else Sketch(),
-        period_s=PERIOD_S / args.speed,
+        period_s=LOAD_PERIOD_S / args.speed,
         link=checked_link(args.link),
         on_port=partial(print, flush=True),
         seed=args.seed,
     )
     for text in args.fault:
         try:
-            board.inject(read_fault(text))
+            board.inject(parse_fault(text))
         except ValueError as error:
             raise UserError(f"--fault {text}: {error}") from None
 
     def on_command(line: str) -> None:
         if not torque.told(line):
-            board.inject(read_fault(line))
+            board.inject(parse_fault(line))
 
     play(board.run(), on_command)
     return 0

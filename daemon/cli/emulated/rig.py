@@ -112,9 +112,9 @@ def _settings(args: argparse.Namespace) -> "RigSettings":
     from dataclasses import replace
 
     from shearloop.daemon.errors import UserError
-    from shearloop.drivers.emulators.hx711 import PAPER_SKETCH
-    from shearloop.drivers.emulators.rig import NOISE_NM, RigSettings, joint_of
-    from shearloop.drivers.emulators.twin import TwinSettings
+    from shearloop.drivers.emulators.boards import PAPER_SKETCH
+    from shearloop.drivers.emulators.rig import NOISE_NM, RigSettings
+    from shearloop.drivers.emulators.scene import Joint, TwinSettings
     from shearloop.drivers.emulators.ur.make import Make
 
     for name in ("speed", "arm_speed", "gel_stiffness"):
@@ -128,7 +128,7 @@ def _settings(args: argparse.Namespace) -> "RigSettings":
         run_dir=args.run_dir,
         host=args.host,
         gripper=args.gripper,
-        twin=TwinSettings(joint=joint_of(args.joint), gel_stiffness_nm_per_rad=args.gel_stiffness),
+        twin=TwinSettings(joint=Joint(args.joint), gel_stiffness_nm_per_rad=args.gel_stiffness),
         diameter_mm=args.diameter_mm,
         speed=args.speed,
         arm_speed=args.arm_speed,

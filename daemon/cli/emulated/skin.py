@@ -8,7 +8,7 @@ from shearloop.daemon.cli.emulated import skin_place
 
 if TYPE_CHECKING:
     from shearloop.daemon.cli.emulated.skin_push import PushedSkin
-    from shearloop.drivers.emulators.skin.instruments import SkinInstruments
+    from shearloop.drivers.emulators.skin import SkinInstruments
     from shearloop.drivers.emulators.ur.server import Controller
 
 EPILOG = """Prints where source and DAQ are, again each time they are there. Commands, one a line on standard input:
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.cli.emulated.skin_push import PushedSkin
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.synthetic_skin import SyntheticSkinSettings
-    from shearloop.drivers.emulators.skin.instruments import SkinInstruments
+    from shearloop.drivers.emulators.skin import SkinInstruments
     from shearloop.drivers.emulators.ur.faults import obey
 
     _check(args)

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 from shearloop.daemon.cli.emulated import skin_instrument, skin_place
 
 if TYPE_CHECKING:
-    from shearloop.drivers.emulators.skin.circuit import Circuit
-    from shearloop.drivers.emulators.skin.instruments import Played
+    from shearloop.drivers.emulators.skin import Circuit, Played
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,7 +22,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop; 5 mA flow all the time."""
-    from shearloop.drivers.emulators.skin.instruments import play_daq
+    from shearloop.drivers.emulators.skin import play_daq
 
     where = skin_place.place(args, "")
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from shearloop.daemon.cli.emulated import skin_place
 
 if TYPE_CHECKING:
-    from shearloop.drivers.emulators.skin.circuit import Circuit
-    from shearloop.drivers.emulators.skin.instruments import Played
+    from shearloop.drivers.emulators.skin import Circuit, Played
 
 EPILOG = (
     "Prints the port's path or address, again each time it is there. On standard input: `shear N` and `normal N` push "
@@ -31,7 +30,7 @@ def play_instrument(args: argparse.Namespace, make: "Callable[[Circuit, argparse
     from shearloop.daemon.cli.emulated.console import play
     from shearloop.daemon.cli.emulated.skin_push import PushedSkin
     from shearloop.daemon.errors import UserError
-    from shearloop.drivers.emulators.skin.circuit import Circuit, befall
+    from shearloop.drivers.emulators.skin import Circuit
 
     skin_place.check_speed(args.speed)
     pushed = PushedSkin(args.seed)
@@ -42,7 +41,7 @@ def play_instrument(args: argparse.Namespace, make: "Callable[[Circuit, argparse
         if pushed.told(line):
             return
         try:
-            befall(circuit, line, time.monotonic())
+            Circuit(circuit, line, time.monotonic())
         except ValueError:
             instrument.command(line)
 

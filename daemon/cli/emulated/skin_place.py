@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from shearloop.daemon.cli.emulated.link import checked_link
 
 if TYPE_CHECKING:
-    from shearloop.drivers.emulators.skin.instruments import Place
+    from shearloop.drivers.emulators.skin import Place
 
 
 def add_place(parser: argparse.ArgumentParser, prefix: str, link_help: str, port_help: str) -> None:

@@ -18,7 +18,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Play until told to stop."""
-    from shearloop.drivers.emulators.skin.instruments import play_source
+    from shearloop.drivers.emulators.skin import play_source
 
     where = skin_place.place(args, "")
     return skin_instrument.play_instrument(

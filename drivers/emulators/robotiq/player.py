@@ -3,7 +3,7 @@
 import asyncio
 from typing import Protocol
 
-from shearloop.drivers.emulators.outage import Outage
+from shearloop.drivers.emulators.ports import Outage
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
 
 STEP_S = 0.008

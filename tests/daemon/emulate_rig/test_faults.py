@@ -6,11 +6,11 @@ from contextlib import AsyncExitStack
 
 import pytest
 
+from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.errors import DeviceLostError, DriverError
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import ObjectStatus
-from shearloop.drivers.serial_port import LinkEvent
 from shearloop.drivers.ur.client import UrLinkEvent as RobotLink
 from shearloop.drivers.ur.messages import Unlock
 from tests.daemon.emulate_rig.rig import (

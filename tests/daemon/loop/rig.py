@@ -15,7 +15,7 @@ from shearloop.daemon.control.step_commands import Action, GripTo
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.daemon.control.tune import TuneSettings, tuned
 from shearloop.daemon.control.wrist_controller import WristController, WristSettings
-from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Twin, TwinSettings
 
 TICK_S = 0.008
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)

@@ -13,7 +13,7 @@ from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, Torqu
 from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_commands import Action, GripTo, MoveTo
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
 from tests.daemon.loop.rig import EIT, brain

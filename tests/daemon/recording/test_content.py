@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from shearloop.daemon.recording.content import as_json, input_json, input_of
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 # Half of a surrogate pair too: Python has that for each byte of a file's name that is no UTF-8.
 texts = st.text(st.characters())

@@ -12,7 +12,7 @@ from shearloop.daemon.messaging.messages import EitFrame, Message, wire_map
 from shearloop.daemon.messaging.topics import TOPICS
 from shearloop.daemon.recording.content import input_json, message_json
 from shearloop.daemon.recording.schema import INPUT, completed, schemas
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.sample_messages import sample
 
 PLAIN = {"boolean", "string", "number", "integer"}

@@ -13,7 +13,7 @@ from shearloop.bank.skin.calibration_fit import fit_calibration
 from shearloop.bank.skin.membrane import Direction
 from shearloop.daemon.sensing.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
 from shearloop.daemon.synthetic_skin import REST_OHM, SyntheticSkin, SyntheticSkinSettings, calibration_table
-from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
+from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 
 NOISE = 1e-4
 PERIOD_NS = 100_000_000

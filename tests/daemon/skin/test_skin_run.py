@@ -16,7 +16,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.request import request
 from shearloop.daemon.synthetic_skin import SyntheticSkin
-from shearloop.drivers.emulators.skin.instruments import SkinInstruments
+from shearloop.drivers.emulators.skin import SkinInstruments
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.test_run import collector, running
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
 from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
 from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
 from shearloop.drivers.emulators.robotiq.urcap_face import UrcapServer
@@ -20,7 +21,6 @@ from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy
 
 STEP_S = 0.01
 # Between two looks of the driver at its clock.

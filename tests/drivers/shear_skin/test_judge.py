@@ -6,9 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.shear_skin.daq import Voltages
-from shearloop.drivers.shear_skin.judge import SampleValidator, SkinFault, SkinSample
-from shearloop.drivers.shear_skin.source import SourceReading
+from shearloop.drivers.shear_skin.instruments import SourceReading, Voltages
+from shearloop.drivers.shear_skin.skin import SampleValidator, SkinFault, SkinSample
 
 CURRENT_A, SOURCE_S, DAQ_S = 5e-3, 0.5, 0.1
 GOOD = SourceReading(0, output_on=True, voltage_v=0.252, current_a=CURRENT_A)

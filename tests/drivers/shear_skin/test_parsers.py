@@ -9,10 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.shear_skin.adc_board import BAUD_RATE, PairParser
-from shearloop.drivers.shear_skin.scanner import read_scan
-from shearloop.drivers.shear_skin.scpi import LONGEST_REPLY, Reply, ReplyLines, numbers
-from shearloop.drivers.shear_skin.source import read_elements
+from shearloop.drivers.shear_skin.instruments import ADC_BAUD, PairParser, read_elements, read_scan
+from shearloop.drivers.shear_skin.scpi import MAX_REPLY_BYTES, Reply, ReplyLines, parse_numbers
 
 PERIOD_NS = 100_000_000
 VOLTS = st.floats(-0.6, 0.6).map(lambda volts: round(volts, 6))
@@ -70,7 +68,7 @@ def test_lines_that_arrive_together_are_a_period_apart() -> None:
     parser = PairParser()
     parser.feed(b"\n", 0)
     first, second = parser.feed(b"0.125000,0.126000\r\n" * 2, 10**9)
-    assert second.t_mid_ns == 10**9 - 19 * (10 * 10**9 // BAUD_RATE) - PERIOD_NS // 2
+    assert second.t_mid_ns == 10**9 - 19 * (10 * 10**9 // ADC_BAUD) - PERIOD_NS // 2
     assert second.t_mid_ns - first.t_mid_ns == PERIOD_NS
     assert first.t_arrival_ns == second.t_arrival_ns == 10**9
 
@@ -84,7 +82,7 @@ def test_replies_come_through_whatever_ends_their_lines(replies: list[str], cuts
         assert not lines.refused
 
 
-@given(st.binary(max_size=2 * LONGEST_REPLY), CUTS)
+@given(st.binary(max_size=2 * MAX_REPLY_BYTES), CUTS)
 def test_no_bytes_break_the_reply_lines(noise: bytes, cuts: list[int]) -> None:
     lines = ReplyLines()
     for part in slices(noise, cuts):
@@ -134,4 +132,4 @@ def test_a_reading_that_was_not_made_is_refused(text: str) -> None:
 def test_an_overload_of_the_scanner_is_told_by_channel() -> None:
     voltages = read_scan(Reply("+9.90000000E+37,-1.25000000E-01", 100, 300))
     assert (voltages.over_1, voltages.over_2, voltages.t_mid_ns) == (True, False, 200)
-    assert numbers("-1,2.5E3", 2, "It") == [-1.0, 2500.0]
+    assert parse_numbers("-1,2.5E3", 2, "It") == [-1.0, 2500.0]

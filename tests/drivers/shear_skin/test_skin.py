@@ -10,18 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.emulators.skin import daq as played_daq
-from shearloop.drivers.emulators.skin.circuit import Circuit, befall
-from shearloop.drivers.emulators.skin.keithley import EmulatedKeithley6430 as PlayedSource
-from shearloop.drivers.emulators.skin.servers import Outages, ScpiSerial, ScpiSocket
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
-from shearloop.drivers.shear_skin.adc_board import AdcBoard
-from shearloop.drivers.shear_skin.daq import Daq
-from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
-from shearloop.drivers.shear_skin.scanner import ScpiScanner
-from shearloop.drivers.shear_skin.skin import ShearSkin
-from shearloop.drivers.shear_skin.source import BAUD_RATE, OUTPUT, READ, Keithley6430
-from shearloop.drivers.tcp_port import TcpLink
+from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, TcpLink
+from shearloop.drivers.emulators import skin as played_daq
+from shearloop.drivers.emulators.scpi import FaultyServer, ScpiSerial, ScpiSocket
+from shearloop.drivers.emulators.skin import Circuit
+from shearloop.drivers.emulators.skin import EmulatedKeithley6430 as PlayedSource
+from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Daq, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 
 R1, R2 = 24.6, 25.3
 RATE_HZ = 500.0
@@ -33,7 +28,7 @@ DEADLINE_S = 30
 class Bench:
     circuit: Circuit
     played: PlayedSource
-    source: Outages
+    source: FaultyServer
     reader: Callable[[str], None]
     skin: ShearSkin
     samples: list[SkinSample] = field(default_factory=list)
@@ -81,12 +76,12 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         way_in = ScpiSerial(played.feed, folder / "source", lambda _: ready.release(), answer_s=0.0)
     else:
         way_in = ScpiSocket(played.feed, on_port=lambda _: ready.release(), answer_s=0.0)
-    outages = Outages(way_in)
+    outages = FaultyServer(way_in)
     players = [outages.run]
     scanner = ScpiSocket(
         played_daq.Scanner(circuit, time.monotonic).feed, on_port=lambda _: ready.release(), answer_s=0.0
     )
-    scanner_outages = Outages(scanner)
+    scanner_outages = FaultyServer(scanner)
     board = played_daq.EmulatedAdcBoard(
         circuit, time.monotonic, period_s=1 / RATE_HZ, link=folder / "adc", on_port=lambda _: ready.release()
     )
@@ -96,7 +91,7 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         await ready.acquire()
 
     source_link = (
-        SerialLink(path=str(folder / "source"), baud=BAUD_RATE, policy=policy, on_event=on_event)
+        SerialLink(path=str(folder / "source"), baud=SOURCE_BAUD, policy=policy, on_event=on_event)
         if isinstance(way_in, ScpiSerial)
         else TcpLink("127.0.0.1", way_in.port, policy=policy, on_event=on_event)
     )
@@ -187,9 +182,9 @@ async def test_each_fault_of_the_circuit_is_named_and_goes_away_with_its_cause(t
     async with a_bench(tmp_path, serial_source=False, adc=adc) as bench:
         await bench.next_says()
         for text, faults in FAULTS:
-            befall(bench.circuit, text, time.monotonic())
+            Circuit(bench.circuit, text, time.monotonic())
             await bench.next_says(*faults)
-            befall(bench.circuit, "mend", time.monotonic())
+            Circuit(bench.circuit, "mend", time.monotonic())
             await bench.next_says()
         errors = bench.skin.facts()["errors"]
         assert isinstance(errors, dict)

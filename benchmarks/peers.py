@@ -108,20 +108,6 @@ def pyeit_solver(mesh: Mesh) -> Callable[[Floats], object] | None:
     return solve
 
 
-class _ZeroLagByNumpy(FastZeroLagMatcher):
-    """As where there was no C compiler."""
-
-    def _compiled_search(self, *_: object) -> None:
-        return None
-
-
-class _AllLagsByNumpy(FastMatcher):
-    """As where there was no C compiler."""
-
-    def _compiled_search(self, *_: object) -> None:
-        return None
-
-
 def match_methods(bank: Bank, frames: Floats) -> tuple[dict[str, tuple[Run, int]], int]:
     """Return what finds the best cell of every frame, and in how many frames the fast ones find the reference's."""
     units = unit_magnitudes(frames)
@@ -131,7 +117,6 @@ def match_methods(bank: Bank, frames: Floats) -> tuple[dict[str, tuple[Run, int]
     length = fft.next_fast_len(2 * N_CHANNELS - 1, real=True)
     spectra = np.conj(fft.rfft(signals, length)).astype(np.complex64)
     zero, every = FastZeroLagMatcher.from_bank(bank), FastMatcher.from_bank(bank)
-    plain_zero, plain_every = _ZeroLagByNumpy.from_bank(bank), _AllLagsByNumpy.from_bank(bank)
     reference = ReferenceMatcher.from_bank(bank)
     n = len(frames)
 
@@ -143,11 +128,9 @@ def match_methods(bank: Bank, frames: Floats) -> tuple[dict[str, tuple[Run, int]
     methods: dict[str, tuple[Run, int]] = {
         "zero lag, fast": (lambda: [zero.match(frame, runner_up=False) for frame in frames], n),
         "zero lag, fast, with runner-up": (lambda: [zero.match(frame) for frame in frames], n),
-        "zero lag, fast, with runner-up, not compiled": (lambda: [plain_zero.match(frame) for frame in frames], n),
         "zero lag, numpy float32": (lambda: [int(np.argmax(signals @ frame)) for frame in single], n),
         "all lags, fast": (lambda: [every.match(frame, runner_up=False) for frame in frames], n),
         "all lags, fast, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
-        "all lags, fast, with runner-up, not compiled": (lambda: [plain_every.match(frame) for frame in frames], n),
         "all lags, numpy float32 FFT": (by_fft, 4),
     }
     try:
@@ -225,13 +208,7 @@ def cold_seconds(bank: Bank, frames: Floats, turns: int) -> dict[str, list[float
 
     So frames come in a daemon, half a second apart.
     """
-    kinds = {
-        "zero lag": FastZeroLagMatcher,
-        "zero lag, not compiled": _ZeroLagByNumpy,
-        "all lags": FastMatcher,
-        "all lags, not compiled": _AllLagsByNumpy,
-    }
-    matchers = {name: kind.from_bank(bank) for name, kind in kinds.items()}
+    matchers = {name: kind.from_bank(bank) for name, kind in MATCHERS.items()}
     others = np.zeros(OTHERS_BYTES // 8)
     found: dict[str, list[float]] = {name: [] for name in matchers}
     for _ in range(turns):

@@ -24,8 +24,6 @@ from shearloop.bank.eit.bounds import (
     ZeroLagBounds,
     spectra_of,
 )
-from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_search import search_of
 from shearloop.bank.eit.compression import COMPRESSED_CELLS, ROUNDING, Indices, compress
 from shearloop.bank.eit.matching import (
     CHUNK_CELLS,
@@ -57,10 +55,6 @@ FEWEST_PRUNED = 300
 _QUICK_SCORES = 1 << 13
 
 
-# Number and score of the best cell, then of the runner-up.
-Searched = tuple[int, float, int, float]
-
-
 class _Undecided(Exception):  # noqa: N818 - it is not an error
     """It hangs on the rounding of float64 which cells tie."""
 
@@ -81,12 +75,6 @@ class _PruningMatcher(Matcher):
         chunks = self._chunks(COMPRESSED_CELLS)
         self._norms = np.concatenate([np.linalg.norm(self._magnitudes(cells), axis=1) for cells in chunks])
         self._row, self._column = (each.astype(np.int32) for each in np.divmod(self._cells, valid.shape[1]))
-        self._compiled = search_of(
-            *(self._bank, self._signals, self._cells, self._norms, (self._row, self._column)),
-            tie=TIE,
-            tie_rounding=_ROUNDING_64,
-            radius=RUNNER_UP_RADIUS,
-        )
 
     def match(self, difference: ArrayLike, *, runner_up: bool = True) -> Match:
         """Return what `best_match` finds in the heatmap of one (896,) difference, at a fraction of its cost.
@@ -94,9 +82,6 @@ class _PruningMatcher(Matcher):
         Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
         """
         if len(self._cells) >= self._fewest:
-            found = self._found(difference, runner_up, len(self._cells))
-            if found is not None:
-                return found
             frame = unit_magnitude(difference)
             with suppress(_Undecided):
                 return self._search(frame, runner_up)
@@ -110,9 +95,6 @@ class _PruningMatcher(Matcher):
         """
         if len(self._cells) < self._fewest:
             return super().match(difference)
-        found = self._found(difference, True, _QUICK_SCORES)
-        if found is not None:
-            return found
         try:
             return self._search(unit_magnitude(difference), runner_up=True, quick=True)
         except (_Undecided, TakesLongError):
@@ -127,21 +109,6 @@ class _PruningMatcher(Matcher):
         # Wrong input is told before any work.
         unit_magnitudes(frames)
         return [self.match(frame, runner_up=False) for frame in frames]
-
-    def _found(self, difference: ArrayLike, runner_up: bool, most_scores: int) -> Match | None:
-        """Return the match, or None: nothing is compiled, or numpy has to decide, or to say what is wrong."""
-        values = np.asarray(difference, dtype=np.float64)
-        if values.shape != (N_CHANNELS,):
-            return None
-        found = self._compiled_search(np.ascontiguousarray(values), runner_up, most_scores)
-        if found is None:
-            return None
-        cell, score, other, other_score = found
-        return self._match((cell, score), None if other < 0 else (other, other_score))
-
-    @abstractmethod
-    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
-        """Return the numbers and scores of the best cell and the runner-up, −1 if there is none; None as `_found`."""
 
     @abstractmethod
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match: ...
@@ -208,8 +175,7 @@ class _PruningMatcher(Matcher):
 class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
     """Matches at lag 0 alone; its heatmaps are those of `ZeroLagMatcher`, at that one's price.
 
-    Where there was a compiler, one call searches. Without, all cells are estimated at once, for with one lag that is a
-    few operations on one number per cell.
+    All cells are estimated at once, for with one lag that is a few operations on one number per cell.
     """
 
     def __init__(self, signals: NDArray[np.float32], valid: Mask, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
@@ -218,9 +184,6 @@ class FastZeroLagMatcher(_PruningMatcher, ZeroLagMatcher):
         # Every place of the grid has the number of its cell; those that are not valid share one that is none.
         self._numbers = np.full(valid.shape, len(self._cells))
         self._numbers[valid] = np.arange(len(self._cells))
-
-    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
-        return None if self._compiled is None else self._compiled.match(difference, runner_up, most_scores)
 
     def _search(self, frame: FloatArray, runner_up: bool, *, quick: bool = False) -> Match:
         bounds = ZeroLagBounds(self._bank, frame)
@@ -292,9 +255,6 @@ class FastMatcher(_PruningMatcher, ReferenceMatcher):
             (left,) = bounds.left([least])
         left = left.among(peak.lacks(left.cells))
         return self._match(best, self._settled(frame, left, least, quick=quick) if len(left.cells) else None)
-
-    def _compiled_search(self, difference: FloatArray, runner_up: bool, most_scores: int) -> Searched | None:
-        return None if self._compiled is None else self._compiled.match_at_all_lags(difference, runner_up, most_scores)
 
     def _around(self, cell: int, radius: int) -> Neighbourhood:
         return Neighbourhood(self._row, self._column, cell, radius)

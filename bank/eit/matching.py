@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,7 +19,6 @@ from scipy.special import chdtri
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_search import energy as compiled_energy
 from shearloop.bank.errors import MatchingError
 
 FloatArray = NDArray[np.float64]
@@ -84,11 +83,6 @@ class Matcher(ABC):
         # Not as a memory map, whose indexing is slow.
         self._signals = np.asarray(signals).reshape(-1, N_CHANNELS)
         self._cells = np.flatnonzero(valid)
-
-    def __reduce__(self) -> tuple[type[Self], tuple[NDArray[Any], ...]]:
-        """Copy or send it as what it is made of: what is compiled for it cannot be copied, and is made anew."""
-        signals = self._signals.reshape(*self.valid.shape, N_CHANNELS)
-        return type(self), (signals, self.valid, self.k_grid, self.sigma_grid)
 
     @classmethod
     def from_bank(cls, bank: Bank) -> Self:
@@ -221,12 +215,10 @@ def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal 
         raise MatchingError(
             f"a difference has {N_CHANNELS} channels; the arrays have shapes {values.shape}, {noise.shape}"
         )
-    energy = compiled_energy(values, noise) if noise.shape == values.shape else None
-    if energy is None:
-        if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
-            raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
-        with np.errstate(over="ignore"):  # far above the noise is all that matters
-            energy = float(np.sum((values / noise) ** 2))
+    if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
+        raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
+    with np.errstate(over="ignore"):  # far above the noise is all that matters
+        energy = float(np.sum((values / noise) ** 2))
     least = _LEAST_ENERGY
     if energy > least:
         return None

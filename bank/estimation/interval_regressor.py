@@ -6,7 +6,6 @@ from typing import TypeAlias
 
 import numpy as np
 
-from shearloop.bank.eit.compiled_frames import n_beyond
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
 from shearloop.bank.estimation.intervals import Intervals
 from shearloop.bank.estimation.regressors import InverseCalibration, Ridge, TobitRidge
@@ -104,7 +103,7 @@ class IntervalRegressor:
                 f"the {name} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to "
                 f"{self.high:.3g} {unit}",
             )
-        if len(self.reach) and n_beyond(features, self.mean_feature, self.reach, _LARGEST_REACH):
+        if len(self.reach) and bool((np.abs(features - self.mean_feature) > _LARGEST_REACH * self.reach).any()):
             return ("the frame moves further or faster than any at calibration",)
         return ()
 

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from shearloop.bank.eit.compiled_frames import deviation
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.values import BoolArray, FloatArray
 
@@ -68,7 +67,7 @@ class Ridge:
 
     def value(self, features: FloatArray) -> float:
         """Return the value of (d,) features."""
-        return self.offset + deviation(features, self.mean, self.weights)
+        return self.offset + float((features - self.mean) @ self.weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +116,7 @@ class TobitRidge:
 
     def value(self, features: FloatArray) -> float:
         """Return the latent value of (d,) features."""
-        return self.offset + deviation(features, self.mean, self.weights)
+        return self.offset + float((features - self.mean) @ self.weights)
 
 
 def _below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:

@@ -10,11 +10,11 @@ for long is told by.
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_frames import follow
 from shearloop.bank.estimation.fingertip_validator import (
     LARGEST_JUMPING_SHARE,
     STEP_FRAMES,
@@ -25,7 +25,6 @@ from shearloop.bank.estimation.grip import Grip
 from shearloop.bank.estimation.temporal_features import TemporalFeatures
 from shearloop.bank.estimation.validity import Guards
 from shearloop.bank.estimation.values import BoolArray, FloatArray, TactileFrame, everywhere
-from shearloop.bank.estimation.views import Placed
 
 # Frames that an idle baseline is averaged over at the most recent end.
 BASELINE_FRAMES = 10
@@ -57,6 +56,18 @@ class ProcessedFrame:
     usable: BoolArray
 
 
+class _Placed(NamedTuple):
+    """Where a frame lies: the score of each side's grip, and the (m, 896) difference to the idle frame.
+
+    At the calibration's gain, as are the (m·p,) places of the frame and of its difference along the directions.
+    """
+
+    grips: list[float]
+    difference: FloatArray
+    place: FloatArray
+    from_idle: FloatArray
+
+
 class SessionState:
     """The state of one session; every frame goes through `see` in order."""
 
@@ -68,7 +79,7 @@ class SessionState:
         idle_frames: int = 0,
     ) -> None:
         """Begin a session; its first `idle_frames` usable frames are, on somebody's word, of untouched fingertips."""
-        self._guards = Guards(guards, motion)
+        self._guards = Guards(guards)
         # The board's, where it is known beforehand: of one that leaves out half of its frames it cannot be learned.
         self._period_s = period_s
         self._motion = motion
@@ -168,17 +179,11 @@ class SessionState:
     def _looked_at(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, Sequence[str], Sequence[float]]:
         """Return the channels, which are usable, why a side says nothing, and which share of each side's jumps.
 
-        Of an ordinary frame one call says it all. Without a frame before there are no shares.
+        Without a frame before there are no shares.
         """
-        if self._before is not None:
-            look = self._guards.views.look(frame.channels, frame.usable, self._lost, self._before)
-            if look is not None and not (self._some_unknown and np.count_nonzero(look.usable & self._unknown)):
-                self._lost = look.lost
-                return look.channels, look.usable, (), look.jumping_shares
         usable = unsaturated(frame.channels, frame.usable)
         channels = self._filled(frame.channels, usable)
         why, lost = self._guards.seen(channels, usable)
-        self._guards.views.prepare(frame.usable, lost)
         # Channels that are lost for longer are left out; while they are being lost they count as jumping.
         judged = usable & ~((lost & self._lost) | self._unknown)
         shares = self._guards.jumping_shares(channels, self._before, judged) if self._before is not None else ()
@@ -233,15 +238,12 @@ class SessionState:
             for _ in range(1 + self._missing):
                 self._stand_in()
 
-    def _placed(self, channels: FloatArray, usable: BoolArray) -> Placed:
+    def _placed(self, channels: FloatArray, usable: BoolArray) -> _Placed:
         """Return where a frame lies at the calibration's gain, which does not change while it is gripped."""
-        placed = self._guards.views.place(channels, usable, self._baselines, self._gains)
-        if placed is not None:
-            return placed
         grips, difference = self._guards.grips(channels, self._baselines), self._difference(channels, usable)
         at_gain = np.array([channels, difference]) / self._gains
         places = self._motion.places(at_gain) if self._motion is not None else np.zeros((2, 0))
-        return Placed(grips, at_gain[1], *places)
+        return _Placed(grips, at_gain[1], *places)
 
     def _taken_for_idle(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
         self._refused, self._before = None, channels
@@ -291,7 +293,7 @@ class SessionState:
         if self._n_held == 1:
             self._held = difference.copy()
         else:
-            follow(self._held, difference, self._n_held)
+            self._held += (difference - self._held) / self._n_held
 
     def _holds(self, layer: int, score: float) -> bool:
         """Return whether a fingertip is gripped; with a baseline of a few frames only an outright grip is one."""

@@ -7,7 +7,6 @@ from typing import Self
 import numpy as np
 
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_frames import motion
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 from shearloop.bank.estimation.values import BoolArray, FloatArray
 
@@ -68,7 +67,9 @@ class TemporalFeatures:
 
         n_lags · m·p of motion, the nearest lag first, and m·p of place after them where `placed` is true.
         """
-        return motion(tuple(places), from_idle if self.placed else None)
+        rows = np.array(places)
+        moved = (rows[-1] - rows[-2::-1]).ravel()
+        return np.concatenate([moved, from_idle]) if self.placed else moved
 
 
 def _along(shapes: FloatArray, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:

@@ -5,28 +5,18 @@ than what it computes: so all sides are compared in the same calls.
 """
 
 import math
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_frames import fingertips_of
 from shearloop.bank.estimation.fingertip_validator import (
-    FEWEST_AT_RAIL,
-    FEWEST_COMPARED,
     LARGEST_DEVIATION,
     LARGEST_UNUSABLE_SHARE,
-    SMALL_V,
     FingertipValidator,
     Known,
     relative_to,
 )
-from shearloop.bank.estimation.temporal_features import TemporalFeatures
 from shearloop.bank.estimation.values import BoolArray, FloatArray, everywhere
-from shearloop.bank.estimation.views import Views
-
-if TYPE_CHECKING:
-    from shearloop.bank.eit._frames import Fingertips
 
 # A channel that jumps from frame to frame by more than this many times its noise, and this much, is disturbed.
 JUMP_NOISES, JUMP_V = 6.0, 0.008
@@ -38,10 +28,9 @@ _LOST_SHARE = 0.6
 class Guards:
     """All that is known of the m sides' fingertips; frames are (m, 896) in volts."""
 
-    def __init__(self, sides: tuple[FingertipValidator, ...], motion: TemporalFeatures | None = None) -> None:
-        """Take the guards in the order of a frame's sides, and the motion whose directions `place` goes along."""
+    def __init__(self, sides: tuple[FingertipValidator, ...]) -> None:
+        """Take the guards in the order of a frame's sides."""
         self.sides = sides
-        self._motion = motion
         self.idle: FloatArray = np.array([guard.idle for guard in sides])
         self.gripped: FloatArray = np.array([guard.gripped for guard in sides])
         noise = np.array([guard.noise for guard in sides])
@@ -50,34 +39,8 @@ class Guards:
         self._jump_limits_v = np.maximum(JUMP_NOISES * np.sqrt(2.0) * noise, JUMP_V)
         self._frames = np.stack([self.idle, self.gripped], axis=1)
         self._known = Known(self._frames)
-        self._weights = np.array([guard.grip_weights for guard in sides])
-        self._directions = motion.directions if motion is not None else np.zeros((len(sides), 0, N_CHANNELS))
         # The numbers of the sides at which a step in the frames tells a release.
         self.stepping = [i for i, one in enumerate(sides) if max(one.step_limit, one.fall_limit) < math.inf]
-        # What looks at ordinary frames in a few calls.
-        self.views = Views(len(sides), self._directions.size // N_CHANNELS, self._fingertips)
-
-    def _fingertips(self, told: BoolArray, lost: BoolArray) -> "Fingertips | None":
-        """Return what is known of the fingertips while these are told to be usable, and these are lost, compiled."""
-        usable = told & ~lost
-        if any(self.too_few(usable)):
-            return None
-        known = Known(self._frames, told[:, None])
-        moves = np.zeros((2, len(self.sides), 0, N_CHANNELS))
-        if self._motion is not None and not everywhere(usable):
-            each = [self._motion.readings(i, usable[i], guard) for i, guard in enumerate(self.sides)]
-            moves = np.stack(each, axis=1)
-        jump_limits_v = np.where(usable, self._jump_limits_v, np.inf)
-        return fingertips_of(
-            *(known.frames, jump_limits_v, self._weights, self._directions, known.counts),
-            (told, lost),
-            (moves[0], moves[1]),
-            fewest_at_rail=FEWEST_AT_RAIL,
-            fewest_compared=FEWEST_COMPARED,
-            largest_deviation=LARGEST_DEVIATION,
-            lost_share=_LOST_SHARE,
-            small_v=SMALL_V,
-        )
 
     def too_few(self, usable: BoolArray) -> list[str]:
         """Return for each side why it has too few usable channels, empty texts where it has enough."""

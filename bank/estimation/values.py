@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_frames import all_finite
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 
@@ -121,8 +120,8 @@ class TactileFrame:
         """Return a frame; channels that are not finite are never usable."""
         # One after the other in memory, so that a sum over channels is the same to the bit whoever made the frame.
         channels = np.ascontiguousarray(channels)
-        if not all_finite(channels):
-            finite = np.isfinite(channels)
+        finite = np.isfinite(channels)
+        if not everywhere(finite):
             channels = np.where(finite, channels, 0.0)
             usable = finite if usable is None else finite & usable
         return cls(t_s, channels, np.ones(channels.shape, dtype=np.bool_) if usable is None else usable)

@@ -9,9 +9,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from shearloop.bank.eit import compiled as bank_compiled
 from shearloop.daemon.doctor.finding import Finding, good, note, trouble
-from shearloop.drivers import compiled as drivers_compiled
 
 # An hour of recording is some 80 MB.
 LITTLE_DISK_BYTES, NO_DISK_BYTES = 2e9, 2e8
@@ -26,7 +24,6 @@ def examine_machine() -> Iterator[Finding]:
     yield clock_finding(time.time(), clock_state())
     yield memory_finding()
     yield robot_library_finding()
-    yield compiled_finding()
 
 
 def clock_state() -> int:
@@ -98,16 +95,3 @@ def robot_library_finding() -> Finding:
             "use Python 3.11 or 3.12 on x86-64, then `pip install ur-rtde`",
         )
     return good("robot's library", f"ur-rtde is installed, Python {version}")
-
-
-def compiled_finding() -> Finding:
-    """Say whether the way from a frame to its estimate is compiled, for which installing needs a C compiler."""
-    if bank_compiled.IS_COMPILED and drivers_compiled.cells is not None:
-        return good("compiled parts", "reading a frame and matching it are compiled")
-    return note(
-        "compiled parts",
-        "reading a frame and matching it are not compiled: there was no C compiler when this was installed, or their "
-        "sources have changed since",
-        "the same estimates come half a millisecond to a millisecond later",
-        "`sudo apt install gcc python3-dev`, then install shearloop again",
-    )

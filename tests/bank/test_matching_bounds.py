@@ -10,10 +10,10 @@ from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.compression import COARSE_RANK, ROUNDING, columns
 from shearloop.bank.eit.fast_matching import FastMatcher
 from shearloop.bank.eit.matching import Matcher, unit_magnitude, unit_magnitudes
-from tests.bank.small_banks import BANK, PAIRS, assert_same, by_numpy, cells, without_runner_up
+from tests.bank.small_banks import BANK, PAIRS, assert_same, both, cells, without_runner_up
 
 
-@by_numpy
+@both
 @pytest.mark.parametrize(("module", "limit", "value"), [(bounds, "_MOST_BOUNDS", 10), (fast_matching, "_FEW_LAGS", 0)])
 def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, module, limit, value) -> None:
     monkeypatch.setattr(module, limit, value)
@@ -73,7 +73,7 @@ def test_no_bound_at_any_lag_is_below_its_score(chosen, noise, seed) -> None:
             assert (left.bounds - each[left.cells])[reaching].min() >= -ROUNDING / 2
 
 
-@by_numpy
+@both
 def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
     """What makes it fast: of a frame near to the bank's, most cells are never read."""
     read = []
@@ -89,7 +89,7 @@ def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
     assert sum(read) < BANK[1].sum() / 4
 
 
-@by_numpy
+@both
 def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, monkeypatch) -> None:
     frame = BANK[0][6, 6] + BANK[0][16, 5]
     expected = slow.match(frame)
@@ -116,7 +116,7 @@ def test_frames_of_a_batch_that_are_hard_are_matched_alone(monkeypatch, module, 
     assert len(alone) == 3
 
 
-@by_numpy
+@both
 def test_a_quick_match_is_the_same_or_none(slow, fast, monkeypatch) -> None:
     frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(8).normal(size=N_CHANNELS))
     for limit in ("_QUICK_SCORES", "_FEW_LAGS"):

@@ -21,7 +21,7 @@ from benchmarks.step_response import PERIOD_S, SOURCES, TARGET_NM, identified, j
 from benchmarks.twin_step import AMPLITUDE_RAD
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
-from shearloop.daemon.cli.emulated.frames import frame_maker
+from shearloop.daemon.synthetic import frame_maker
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators.rig import SIDES, FrameOf
 from shearloop.drivers.emulators.robotiq.gripper import Gripper

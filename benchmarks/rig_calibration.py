@@ -14,7 +14,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.eit.matching import ReferenceMatcher, best_match
-from shearloop.daemon.cli.emulated.frames import frame_maker
+from shearloop.daemon.synthetic import frame_maker
 
 TORQUES_NM = np.linspace(-0.06, 0.18, 49)
 DIAMETERS_MM = (10.0, 20.0, 30.0, 40.0)

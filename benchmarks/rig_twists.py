@@ -20,10 +20,10 @@ from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, FrameSeries, fit
 from shearloop.daemon.analysis.evaluation import follow, judge
 from shearloop.daemon.analysis.series import series_of
-from shearloop.daemon.cli.emulated.frames import frame_maker
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
 from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.daemon.synthetic import frame_maker
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S
 from shearloop.drivers.emulators.rig import NOISE_NM, SIDES, FrameOf

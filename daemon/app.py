@@ -36,7 +36,6 @@ from shearloop.daemon.sensing.estimation import EstimatorTask
 from shearloop.daemon.sensing.fingertip import FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
-from shearloop.daemon.sensing.skin_setup import make_skin
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
@@ -111,7 +110,7 @@ class Daemon:
             )
         self._skin: SkinTask | None = None
         if config.skin is not None:
-            self._skin = make_skin(config.skin, self.publisher, self._clock, hear, self._tap)
+            self._skin = SkinTask(config.skin, self.publisher, self._clock, hear, self._tap)
         diameters = FingertipDiameters(BOTH)
         if self._rig is not None and self._rig.gripper is not None:
             self._rig.gripper.fingertips_say = diameters.at
@@ -168,10 +167,10 @@ class Daemon:
         if self._both is not None:
             health.add(BOTH, self._both.facts)
         if self._skin is not None:
-            health.add(SKIN, self._skin.facts)
-            health.add(SKIN_SOURCE, self._skin.source_facts)
+            health.add(SKIN, self._skin.diagnostics)
+            health.add(SKIN_SOURCE, self._skin.source_diagnostics)
         if self._load_cell is not None:
-            health.add(LOAD_CELL, self._load_cell.facts)
+            health.add(LOAD_CELL, self._load_cell.diagnostics)
         if self._rig is not None:
             health.add("robot", self._rig.loop.facts)
             if self._rig.gripper is not None:
@@ -349,7 +348,7 @@ def _board(
         zero_slots=ZERO_SLOTS,
         frame_period_s=config.frame_period_s,
         on_event=on_event,
-        tap=tap,
+        on_raw=tap,
         **({"on_frame": partial(both.take, name)} if both is not None else {}),
     )
 

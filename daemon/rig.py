@@ -47,7 +47,7 @@ def make_load_cell(
     clock: Clock,
     hear: Callable[[TorqueSample], None],
     on_event: Callable[[LinkEvent], None],
-    tap: Tap = ignore_raw,
+    tap: OnRaw = ignore_raw,
 ) -> LoadCellTask:
     """Return the load cell's task; raises DriverError when its calibration cannot be used."""
     calibration = load_cell_calibration(config)
@@ -58,7 +58,7 @@ def make_load_cell(
         path=device.path,
         rate_hz=config.rate_hz,
         on_event=on_event,
-        tap=tap,
+        on_raw=tap,
     )
     return LoadCellTask(board, publisher, clock, hear, config.rate_hz)
 

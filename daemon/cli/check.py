@@ -95,8 +95,8 @@ def _skin(config: "SkinConfig") -> str:
     import math
 
     from shearloop.bank.skin.calibration_file import load_calibration
-    from shearloop.daemon.sensing.skin_setup import check_circuit
-    from shearloop.daemon.sensing.skin_zero import MOST_CHANGE
+    from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
+    from shearloop.daemon.sensing.skin_task import check_circuit
 
     calibration = load_calibration(config.calibration)
     check_circuit(config, calibration)
@@ -105,6 +105,6 @@ def _skin(config: "SkinConfig") -> str:
         f"calibration {config.calibration} to {calibration.tension_n[0]:+.1f} … {calibration.tension_n[-1]:+.1f} N, "
         f"± {calibration.prediction_half_width_n:.3f} N, {radius}"
     )
-    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MOST_CHANGE:
+    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MAX_CHANGE:
         told += "; its gauges are too much alike at rest for swapped wires to be noticed: see the sign of a push"
     return told

@@ -121,7 +121,7 @@ async def _fingertip(name: str, config: FingertipConfig, seconds: float) -> list
         async with asyncio.timeout(seconds), contextlib.aclosing(board.frames()) as heard:
             async for frame in heard:
                 frames.append(frame)  # noqa: PERF401 - what came before the time is up is kept
-    facts = board.facts()
+    facts = board.diagnostics()
     if not frames and facts["last_loss"]:
         return [port, from_sentence(f"rate of {name}", str(facts["last_loss"]), "no frame came")]
     findings = [
@@ -133,7 +133,7 @@ async def _fingertip(name: str, config: FingertipConfig, seconds: float) -> list
         findings.append(
             note(
                 f"lines of {name}",
-                f"{sum(refused.values())} refused; {facts['last_refusal']}",
+                f"{sum(refused.values())} refused; {facts['last_frame_error']}",
                 "a bad cable, or another program on the same board",
                 "exchange the USB cable",
             )

@@ -290,4 +290,5 @@ class Scene:
         """Return a quantity (n,) in the middles of n equal parts of the last `duration_s`."""
         middles_s = self.time_s - duration_s * (1.0 - (np.arange(n) + 0.5) / n)
         times_s = [moment.time_s for moment in self._moments]
-        return np.interp(middles_s, times_s, [getattr(moment, name) for moment in self._moments])
+        values = [getattr(moment, name) for moment in self._moments]
+        return np.asarray(np.interp(middles_s, times_s, values))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.cli.emulated.skin_push import PushedSkin
+from shearloop.daemon.cli.emulate.skin import PushedSkin
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner

@@ -6,7 +6,7 @@ import pytest
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
-from shearloop.daemon.sensing.load_cell_task import ZERO_DEADLINE_S, ZERO_SAMPLES, LoadCellTask
+from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask
 from shearloop.drivers.load_cell import LoadSample
 
 
@@ -133,7 +133,7 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
     async with reading() as (task, board):
         task.tare()
         await board.send(8388607.0, saturated=True)
-        later_ns = Clock().now_ns() + round((ZERO_DEADLINE_S + 1.0) * 1e9)
+        later_ns = Clock().now_ns() + round((ZERO_TIMEOUT_S + 1.0) * 1e9)
         for seq in range(2 * ZERO_SAMPLES):
             board.sent.put_nowait(LoadSample(9.0, 0.1, later_ns + seq, later_ns + seq, seq))
         await board.sent.join()

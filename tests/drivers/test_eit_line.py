@@ -7,8 +7,19 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
-from shearloop.drivers.eit_kit import ADC_STEP_V, FULL_SCALE_SINE_RMS_V, LINE_BYTES, MAX_LINE_BYTES, FrameError, FrameErrorKind, read_line
-from shearloop.drivers.eit_kit import NOMINAL_PERIOD_NS, TRANSFER_NS, Frame, FrameParser
+from shearloop.drivers.eit_kit import (
+    ADC_STEP_V,
+    FULL_SCALE_SINE_RMS_V,
+    LINE_BYTES,
+    MAX_LINE_BYTES,
+    NOMINAL_PERIOD_NS,
+    TRANSFER_NS,
+    Frame,
+    FrameError,
+    FrameErrorKind,
+    FrameParser,
+    read_line,
+)
 from shearloop.drivers.emulators.boards import format_line
 
 PERIOD_NS = NOMINAL_PERIOD_NS

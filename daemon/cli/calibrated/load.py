@@ -134,7 +134,7 @@ class _Session:
         while not self._calibrator.finished:
             await self._operator.ask(f"{self._calibrator.prompt} Then press Enter.")
             self._step = asyncio.get_running_loop().create_future()
-            self._calibrator.ready()
+            self._calibrator.start_step()
             try:
                 await self._step
             except DeviceCalibrationError as error:

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from benchmarks.peers import MATCHERS, OTHERS_BYTES
 from benchmarks.same_maxima import recorded
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
 N_HOT, N_COLD = 5, 3
 SHARES = (50, 90, 99, 100)
 
 
-def seconds(matcher: FastMatcher | FastZeroLagMatcher, frame: NDArray[np.float64]) -> float:
+def seconds(matcher: PrunedMatcher | PrunedZeroLagMatcher, frame: NDArray[np.float64]) -> float:
     """Return what a match with runner-up takes of the processor."""
     begun = time.thread_time_ns()
     matcher.match(frame)

@@ -20,7 +20,6 @@ from shearloop.daemon.commands import Commands, needed
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.ending_signals import ending_signals
 from shearloop.daemon.health import HealthReporter, TaskFacts
 from shearloop.daemon.links import log_link
 from shearloop.daemon.messaging.addresses import open_stop_address
@@ -40,6 +39,7 @@ from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
 from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.eit_kit import EitKit
@@ -101,7 +101,7 @@ class Daemon:
             )
             if config.experiment is not None:
                 self._experiment = ConfiguredExperiment(config.experiment, self._begin, self._rig.loop.ended)
-        hear = self._rig.brain.hear if self._rig is not None else lambda _: None
+        hear = self._rig.brain.on_torque if self._rig is not None else lambda _: None
         self._load_cell = self._rig.load_cell if self._rig is not None else None
         if self._rig is None and config.load_cell is not None:
             # Measured and recorded beside the fingertips, while something else twists.
@@ -183,8 +183,7 @@ class Daemon:
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Run until `stop` is called, then end every task and close the sockets; `on_ready` when all is made."""
         try:
-            with self.publisher.told():
-                await self._run_tasks(on_ready)
+            await self._run_tasks(on_ready)
             if self._experiment is not None:
                 self._experiment.end()
         finally:
@@ -292,7 +291,7 @@ class Daemon:
 
     def _recording_failed(self, why: str) -> None:
         if self._rig is not None:
-            self._rig.brain.senses.recording_failed = why
+            self._rig.brain.inputs.recording_error = why
 
     def _tell_of_recordings(self) -> None:
         if self._recorder is None:

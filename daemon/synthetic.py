@@ -8,6 +8,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank, BankDefinition
 from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.calibration import Calibration
@@ -15,8 +16,6 @@ from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channe
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.eit_kit import ADC_STEP_V
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 # Mean and frame-to-frame standard deviation of the recorded frames.
 MEAN_V = 0.13
@@ -43,7 +42,7 @@ class SolvedSignals:
     sigma_grid: FloatArray
     homogeneous: FloatArray
     signals: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    valid: BoolArray
 
 
 Signals: TypeAlias = Bank | SolvedSignals
@@ -232,7 +231,7 @@ def _sigma_range(bank: Bank, within: float) -> tuple[float, float]:
     return float(bank.sigma_grid[first]), float(bank.sigma_grid[last])
 
 
-def _run(flags: NDArray[np.bool_], at: int) -> tuple[int, int]:
+def _run(flags: BoolArray, at: int) -> tuple[int, int]:
     """Return the first and last index of the true values around an index."""
     missing = np.flatnonzero(~flags)
     first = int(missing[missing < at].max(initial=-1)) + 1

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, smoothed_along_channels
-from shearloop.bank.eit.fast_matching import FastMatcher
-from shearloop.bank.estimation.values import FloatArray
+from shearloop.bank.eit.pruned_matching import PrunedMatcher
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh
@@ -62,7 +62,7 @@ class BestCell:
     """The paper's method: the heatmap's maximum over all lags, found without the rest of the heatmap."""
 
     def __init__(self, bank: Bank) -> None:
-        self._matcher = FastMatcher.from_bank(bank)
+        self._matcher = PrunedMatcher.from_bank(bank)
 
     def locate(self, difference: FloatArray) -> BankMatch:
         """Return the place of the heatmap's maximum."""

@@ -6,6 +6,7 @@ from typing import Literal, Self
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
 from shearloop.bank.errors import CalibrationError
@@ -17,7 +18,7 @@ from shearloop.bank.estimation.imputation import ChannelImputer
 from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.temporal_features import TemporalFeatures
-from shearloop.bank.estimation.values import FloatArray, Kind
+from shearloop.bank.estimation.values import Kind
 
 Name = Literal["paper", "bank", "regression", "reconstruction", "fused"]
 NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")

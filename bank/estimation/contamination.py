@@ -10,11 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS, N_ELECTRODES
 from shearloop.bank.estimation.bank_match import Registration
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.regressors import Rows
-from shearloop.bank.estimation.values import FloatArray
 
 # Every eighth of a turn, as it is and mirrored, but for the own numbering; the charts judge by other foreign frames.
 # Of a few alone the outcome depends on which: single ones ask for half to twice as much as the median.
@@ -30,7 +29,7 @@ _ALL = np.ones(N_CHANNELS, dtype=np.bool_)
 class Passing:
     """The (q,) rows that were mixed with something, and of each mixture the (q, d) features and (q,) nearness."""
 
-    rows: Rows
+    rows: IntArray
     features: FloatArray
     nearness: FloatArray
 
@@ -50,12 +49,12 @@ class ContaminationTest:
         self._guards: dict[bytes, NoveltyDetector] = {}
         self._features: dict[tuple[int, int, float], FloatArray] = {}
 
-    def difficulty(self, past: Rows, future: Rows) -> FloatArray:
+    def difficulty(self, past: IntArray, future: IntArray) -> FloatArray:
         """Return how much wider the intervals of (q,) later slices are, by a guard of the earlier ones."""
         guard = self._guard(past)
         return np.array([guard.widening(one, _ALL) for one in self._differences[future]])
 
-    def passing(self, past: Rows, future: Rows) -> Passing:
+    def passing(self, past: IntArray, future: IntArray) -> Passing:
         """Return the mixtures of later slices that a guard of the earlier ones lets pass."""
         guard = self._guard(past)
         chosen = future[np.unique(np.linspace(0, len(future) - 1, min(len(future), _MOST_LATER)).astype(int))]
@@ -75,7 +74,7 @@ class ContaminationTest:
                     features.append(self._features[key])
         return Passing(np.array(rows, dtype=np.int64), np.array(features), np.array(nearness))
 
-    def _guard(self, past: Rows) -> NoveltyDetector:
+    def _guard(self, past: IntArray) -> NoveltyDetector:
         key = past.tobytes()
         if key not in self._guards:
             self._guards[key] = NoveltyDetector.fit(self._differences[past])

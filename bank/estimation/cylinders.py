@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
 from shearloop.bank.estimation.interval_regressor import LEAST_HALF_WIDTH, Head, IntervalRegressor
@@ -22,7 +23,6 @@ from shearloop.bank.estimation.intervals import Intervals
 from shearloop.bank.estimation.reciprocity import paired
 from shearloop.bank.estimation.regressors import Ridge
 from shearloop.bank.estimation.session_state import BASELINE_FRAMES
-from shearloop.bank.estimation.values import BoolArray, FloatArray
 
 # Nothing holds a line back. Each ridge on single frames, which diameters were read from before, had a penalty.
 _STRENGTH = 0.0

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shearloop.bank.estimation.values import BoolArray, FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray
 
 
 def coordinates(directions: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:

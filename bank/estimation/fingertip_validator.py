@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.values import BoolArray, FloatArray, everywhere
+from shearloop.bank.estimation.values import everywhere
 
 # One step of the board's converter, as measured on recorded frames; its rounding is the least noise there is.
 _CONVERTER_STEP_V = 0.00215
@@ -160,7 +160,7 @@ class Known:
         ]
 
 
-def _medians(rows: FloatArray, counts: NDArray[np.int64]) -> list[float]:
+def _medians(rows: FloatArray, counts: IntArray) -> list[float]:
     """Return the median of the first `counts` (n,) sorted values of each (…, 896) row; NaN sorts last; 0 of none."""
     # Half the price of np.partition.
     ordered = np.sort(rows, axis=-1).reshape(-1, N_CHANNELS)

@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation.bank_match import BankMatcher
 from shearloop.bank.estimation.calibrated import NEEDS_BANK, Calibration, Name, locator_for
 from shearloop.bank.estimation.fitting_regressor import STRENGTHS
 from shearloop.bank.estimation.interval_regressor import Head
 from shearloop.bank.estimation.regressors import Ridge
-from shearloop.bank.estimation.values import FloatArray
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh

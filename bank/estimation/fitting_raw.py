@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.alignment import torque_within
 from shearloop.bank.estimation.bank_match import BankMatcher, register, settle_half_turn
@@ -19,7 +20,7 @@ from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimation.regressors import Ridge, TobitRidge, later_origins
 from shearloop.bank.estimation.session_state import SessionState
 from shearloop.bank.estimation.temporal_features import TemporalFeatures
-from shearloop.bank.estimation.values import FloatArray, FrameSeries, Measured, TactileFrame, distinct
+from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, distinct
 
 # Directions of motion per fingertip, and frames back: 13 frames are 7 s, about twice the gel's creep.
 _N_DIRECTIONS, _N_LAGS = 4, 12

@@ -5,25 +5,24 @@ from typing import TypeAlias
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.contamination import Passing
 from shearloop.bank.estimation.interval_regressor import LEAST_HALF_WIDTH, Head, IntervalRegressor, shown
 from shearloop.bank.estimation.intervals import LEVEL, Intervals, for_few
 from shearloop.bank.estimation.regressors import (
     InverseCalibration,
-    Rows,
     TobitRidge,
     best_strength,
     later_splits,
     left_out_blocks,
 )
-from shearloop.bank.estimation.values import BoolArray, FloatArray
 
 HeadOf: TypeAlias = Callable[[FloatArray, FloatArray, float], Head]
 # From (earlier, later) rows to how much harder each of the later ones is to read than is typical of the earlier ones.
-Difficulty: TypeAlias = Callable[[Rows, Rows], FloatArray]
+Difficulty: TypeAlias = Callable[[IntArray, IntArray], FloatArray]
 # From the same to the later ones mixed with what is foreign to them, as far as that passes.
-Mixed: TypeAlias = Callable[[Rows, Rows], Passing]
+Mixed: TypeAlias = Callable[[IntArray, IntArray], Passing]
 
 # Penalties to choose from, in units of the features' sum of squares.
 STRENGTHS = tuple(10.0**power for power in range(-6, 1))
@@ -55,7 +54,7 @@ def fit_reader(
     *,
     strengths: tuple[float, ...] = STRENGTHS,
     limit_reach: bool = False,
-    left_out: Sequence[tuple[Rows, Rows]] = (),
+    left_out: Sequence[tuple[IntArray, IntArray]] = (),
     difficulty: Difficulty | None = None,
     mixed: Mixed | None = None,
     within: tuple[FloatArray, FloatArray] | None = None,
@@ -77,7 +76,7 @@ def fit_reader(
             f"{np.max(values, initial=-np.inf):.3g} determine no calibration; record more, at different loads"
         )
 
-    def judged(strength: float, past: Rows, future: Rows) -> tuple[FloatArray, FloatArray]:
+    def judged(strength: float, past: IntArray, future: IntArray) -> tuple[FloatArray, FloatArray]:
         return _judged(features, values, head_of, strength, past, future)
 
     # Of the candidates the one that does best on what comes later …
@@ -155,7 +154,7 @@ def _hidden(
     return max(float(np.quantile(found, LEVEL)), 0.0), max(float(-np.quantile(found, 1 - LEVEL)), 0.0)
 
 
-def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[Rows], Head], sign: int) -> float:
+def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[IntArray], Head], sign: int) -> float:
     """Return the value at or below which (for the sign −1: above which) a reading may be of anything further out.
 
     The outermost values are left out and read by what is left. If they are read at its end instead of beyond it, or
@@ -168,7 +167,7 @@ def _end(head: Head, features: FloatArray, values: FloatArray, refit: Callable[[
     n_out = int((outward <= outward[order[round(_AT_END * len(values)) - 1]]).sum())
     out, kept = order[:n_out], np.sort(order[n_out:])
 
-    def read(by: Head, rows: Rows) -> float:
+    def read(by: Head, rows: IntArray) -> float:
         return float(np.median([sign * shown(by, one) for one in by.predict(features[rows])]))
 
     found, read_now = float(outward.min()), read(head, order[: max(n_out // 2, 1)])
@@ -206,19 +205,19 @@ def error_on_later(features: FloatArray, values: FloatArray, head_of: HeadOf, st
     return float(np.mean(found))
 
 
-def _splits(values: FloatArray) -> list[tuple[Rows, Rows]]:
+def _splits(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
     return [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
 
 
 def _best(features: FloatArray, values: FloatArray, head_of: HeadOf, strengths: tuple[float, ...]) -> float:
-    def error(strength: float, past: Rows, future: Rows) -> float:
+    def error(strength: float, past: IntArray, future: IntArray) -> float:
         return float((_judged(features, values, head_of, strength, past, future)[1] ** 2).mean())
 
     return best_strength(strengths, error, _splits(values))
 
 
 def _judged(
-    features: FloatArray, values: FloatArray, head_of: HeadOf, strength: float, past: Rows, future: Rows
+    features: FloatArray, values: FloatArray, head_of: HeadOf, strength: float, past: IntArray, future: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return what a head fitted to the past says of the future, and how far that is from the truth."""
     head = head_of(features[past], values[past], strength)

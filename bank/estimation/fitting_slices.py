@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher
 from shearloop.bank.estimation.calibrated import Calibration, OutputModel, columns_for, features_of
@@ -15,7 +16,7 @@ from shearloop.bank.estimation.interval_regressor import Head
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import InverseCalibration, later_origins
 from shearloop.bank.estimation.soundness import parts_of
-from shearloop.bank.estimation.values import FloatArray, FrameSeries
+from shearloop.bank.estimation.values import FrameSeries
 
 # The curve of frames over torque and over diameter: degree, directions of drift, and whether there is a trend. Of the
 # torque's the mean error over six origins (19 to 44 of 49 slices, judged on all that follow) was least for these

@@ -5,8 +5,8 @@ from typing import Self
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.values import BoolArray, FloatArray
 
 # On the emulated rig, the recorded stream and formulas, from 2 to 16 of them, what is read of filled frames stays the
 # same within a tenth of its error.

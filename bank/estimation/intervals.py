@@ -11,9 +11,9 @@ from typing import Self
 import numpy as np
 from scipy.special import stdtrit
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.values import FloatArray
 
 LEVEL = 0.95
 LEAST_IN_STRATUM = 20

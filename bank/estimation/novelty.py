@@ -11,6 +11,7 @@ from typing import Self
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.directions import coordinates
@@ -19,7 +20,6 @@ from shearloop.bank.estimation.intervals import LEVEL
 from shearloop.bank.estimation.reciprocity import ReciprocityCheck
 from shearloop.bank.estimation.regressors import left_out_blocks
 from shearloop.bank.estimation.soundness import LEAST_NOISE, check_slices
-from shearloop.bank.estimation.values import BoolArray, FloatArray
 
 # Beyond the largest misfit and reach of blocks left out: on the recorded slices the later ones stay within 1.37 and 1.5
 # times of them after two repeats, and within once after four.

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.estimation.fitting_regressor import STRENGTHS
-from shearloop.bank.estimation.regressors import Ridge, Rows, best_strength, later_splits, ranked_channels
-from shearloop.bank.estimation.values import FloatArray
+from shearloop.bank.estimation.regressors import Ridge, best_strength, later_splits, ranked_channels
 
 
 def accuracy_over_channels(
@@ -24,7 +24,7 @@ def accuracy_over_channels(
     for count in counts:
         best = differences[:, order[:count]]
 
-        def error(strength: float, rows: Rows, later: Rows, best: FloatArray = best) -> float:
+        def error(strength: float, rows: IntArray, later: IntArray, best: FloatArray = best) -> float:
             ridge = Ridge.fit(best[rows], values[rows], strength)
             return float(((ridge.predict(best[later]) - values[later]) ** 2).mean())
 

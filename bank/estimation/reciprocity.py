@@ -11,10 +11,10 @@ from typing import Self
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.estimation.directions import coordinates
 from shearloop.bank.estimation.regressors import left_out_blocks
-from shearloop.bank.estimation.values import BoolArray, FloatArray
 
 # Directions in which slices vary, which are looked away from.
 _DIRECTIONS = 12

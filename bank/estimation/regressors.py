@@ -9,14 +9,13 @@ calibration by generalised least squares): it does not pull estimates towards th
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self, TypeAlias
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.values import BoolArray, FloatArray
 
 # Readings below this share of the largest torque count as "the lever does not touch".
 CENSORED_SHARE = 0.02
@@ -31,8 +30,6 @@ _CURVATURE = 3.0
 _TREND, N_TREND = 30.0, 2
 # The paper's own number: with so many of the 896 channels its regression was four fifths as good as with all.
 N_RANKED = 272
-
-Rows: TypeAlias = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +135,7 @@ class InverseCalibration:
     The value of a frame minimises (x − curve)ᵀ Σ⁻¹ (x − curve), Σ = driftᵀ diag(drift_variance) drift + noise² I.
     """
 
-    channels: NDArray[np.int64]
+    channels: IntArray
     spread: FloatArray
     coefficients: FloatArray
     trend: FloatArray
@@ -270,14 +267,14 @@ def _refined(grid: FloatArray, cost: FloatArray) -> float:
     return float(grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (grid[1] - grid[0]))
 
 
-def left_out_blocks(n: int) -> Iterator[tuple[Rows, Rows]]:
+def left_out_blocks(n: int) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield pairs of (rest, block) for N_BLOCKS blocks of n rows, each of them one stretch of time."""
     block = np.arange(n) * N_BLOCKS // n
     for one in range(N_BLOCKS):
         yield np.flatnonzero(block != one), np.flatnonzero(block == one)
 
 
-def later_origins(n: int) -> list[tuple[Rows, Rows]]:
+def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:
     """Return pairs of (earlier, all later) parts of n rows, from six tenths of the time on: what is yet to come.
 
     There are none where the first has fewer rows than tell how good this calibration is.
@@ -288,14 +285,14 @@ def later_origins(n: int) -> list[tuple[Rows, Rows]]:
     return [(np.arange(cut), np.arange(cut, n)) for cut in range(first, n - 1, max(1, n // N_ORIGINS))]
 
 
-def ranked_channels(frames: FloatArray, values: FloatArray) -> NDArray[np.int64]:
+def ranked_channels(frames: FloatArray, values: FloatArray) -> IntArray:
     """Return the numbers of the (n, d) frames' channels by falling |correlation| with the (n,) values."""
     spread = frames.std(axis=0)
     covariance = np.abs((frames - frames.mean(axis=0)).T @ (values - values.mean()))
     return np.argsort(-covariance / np.where(spread > 0, spread, np.inf), kind="stable")
 
 
-def later_splits(n: int) -> Iterator[tuple[Rows, Rows]]:
+def later_splits(n: int) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield pairs of (earlier, later) parts of n rows in time order: fit on the one, judge on the other."""
     for share in (0.4, 0.6, 0.8):
         cut, end = round(n * share), round(n * min(share + 0.2, 1.0))
@@ -305,8 +302,8 @@ def later_splits(n: int) -> Iterator[tuple[Rows, Rows]]:
 
 def best_strength(
     strengths: Sequence[float],
-    error_of: Callable[[float, Rows, Rows], float],
-    splits: Sequence[tuple[Rows, Rows]],
+    error_of: Callable[[float, IntArray, IntArray], float],
+    splits: Sequence[tuple[IntArray, IntArray]],
 ) -> float:
     """Return the strength with the least mean squared error on the later parts; of equals, the strongest."""
     if not splits:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
@@ -24,7 +25,7 @@ from shearloop.bank.estimation.imputation import died
 from shearloop.bank.estimation.novelty import FAMILIAR, Judgement, NoveltyDetector
 from shearloop.bank.estimation.regressors import Ridge
 from shearloop.bank.estimation.session_state import SessionState
-from shearloop.bank.estimation.values import BoolArray, Estimate, FloatArray, Measured, TactileFrame
+from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
 
 _UNITS = {"torque": "N·m", "diameter": "mm"}
 _REPEATED = ("the board sent the same frame again",)

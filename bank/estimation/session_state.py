@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation.fingertip_validator import (
     LARGEST_JUMPING_SHARE,
@@ -24,7 +25,7 @@ from shearloop.bank.estimation.fingertip_validator import (
 from shearloop.bank.estimation.grip import Grip
 from shearloop.bank.estimation.temporal_features import TemporalFeatures
 from shearloop.bank.estimation.validity import Guards
-from shearloop.bank.estimation.values import BoolArray, FloatArray, TactileFrame, everywhere
+from shearloop.bank.estimation.values import TactileFrame, everywhere
 
 # Frames that an idle baseline is averaged over at the most recent end.
 BASELINE_FRAMES = 10

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import LARGEST_UNUSABLE_SHARE
-from shearloop.bank.estimation.regressors import Rows, later_origins, left_out_blocks
-from shearloop.bank.estimation.values import FloatArray
+from shearloop.bank.estimation.regressors import later_origins, left_out_blocks
 
 # What is less than this share of a slice is rounding: a board's converter alone makes thousands of times as much.
 LEAST_NOISE = 1e-6
@@ -29,7 +29,7 @@ def check_slices(differences: FloatArray) -> None:
             )
 
 
-def parts_of(n: int) -> Iterator[Rows]:
+def parts_of(n: int) -> Iterator[IntArray]:
     """Yield the rows of all slices, then of each part of them that something is fitted to by itself."""
     yield np.arange(n)
     for rest, _ in left_out_blocks(n):

@@ -6,9 +6,9 @@ from typing import Self
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.values import BoolArray, FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation.fingertip_validator import (
     LARGEST_DEVIATION,
@@ -16,7 +17,7 @@ from shearloop.bank.estimation.fingertip_validator import (
     Known,
     relative_to,
 )
-from shearloop.bank.estimation.values import BoolArray, FloatArray, everywhere
+from shearloop.bank.estimation.values import everywhere
 
 # A channel that jumps from frame to frame by more than this many times its noise, and this much, is disturbed.
 JUMP_NOISES, JUMP_V = 6.0, 0.008

@@ -201,7 +201,7 @@ def skin_source(config: SkinConfig) -> TorqueSource | None:
     """Return the skin as a source of torque; None without a radius."""
     if config.tool_radius_mm is None:
         return None
-    return TorqueSource(name=SKIN, period_s=1.0 / config.daq.rate_hz, sticks=True)
+    return TorqueSource(name=SKIN, period_s=1.0 / config.daq.rate_hz, has_friction_band=True)
 
 
 def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:

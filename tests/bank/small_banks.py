@@ -7,8 +7,8 @@ import pytest
 from hypothesis import strategies as st
 
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
 SHAPE = (22, 20)
 
@@ -56,13 +56,13 @@ def pair(slow: type[Matcher], fast: type[Matcher], bank: tuple[np.ndarray, np.nd
     return slow(*bank, *grids), fast(*bank, *grids)
 
 
-class Searching(FastMatcher):
+class Searching(PrunedMatcher):
     """Searches however few cells there are."""
 
-    _fewest = 0
+    _min_cells = 0
 
 
-KINDS = ((ReferenceMatcher, Searching), (ZeroLagMatcher, FastZeroLagMatcher))
+KINDS = ((ReferenceMatcher, Searching), (ZeroLagMatcher, PrunedZeroLagMatcher))
 BANK = smooth_bank()
 PAIRS = [pair(*kind, BANK) for kind in KINDS]
 NAMES = ["all lags", "zero lag"]

@@ -8,7 +8,8 @@ from math import isnan
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result
 
 if TYPE_CHECKING:
     from shearloop.bank.estimation import Calibration, FrameSeries
@@ -68,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation.archive import ARCHIVE_MAGIC
     from shearloop.daemon.analysis.copies import check_no_copies, check_paths_differ
     from shearloop.daemon.analysis.series import part_of, read_series, series_of
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.cli.recorded import parsed_part, parsed_sides
-    from shearloop.daemon.cli.writing_over import check_writes_over
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.reader import read_recording
     from shearloop.daemon.recording.schema import LARGEST_DIAMETER_MM
@@ -82,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
         raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
     sides = parsed_sides(args.sides)
-    check_writes_over(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
+    check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     check_paths_differ(args.recordings)
     series = [(path, one) for path in args.recordings for one in read_series(path, sides, tool_mm)]
     parts = [part_of(one, start, stop) for _, one in series]
@@ -157,7 +158,7 @@ def run(args: argparse.Namespace) -> int:
             "with --tool-mm."
         )
         sentences.append(unknown if known_mm is None else f"Its tool is of {known_mm:.3g} mm.")
-    tell(told, sentences, as_json=args.json)
+    print_result(told, sentences, as_json=args.json)
     return 0
 
 

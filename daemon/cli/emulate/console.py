@@ -12,8 +12,8 @@ from collections.abc import Callable, Coroutine, Iterator
 from functools import partial
 from pathlib import Path
 
-from shearloop.daemon.ending_signals import ending_signals
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.signals import ending_signals
 
 STDIN = 0
 READ_BYTES = 4096

@@ -13,7 +13,7 @@ import pytest
 
 from shearloop.daemon import gc_control as collector
 from shearloop.daemon.cli import main, run
-from shearloop.daemon.ending_signals import ending_signals
+from shearloop.daemon.signals import ending_signals
 from tests.daemon.conftest import DEADLINE_S
 
 
@@ -58,7 +58,7 @@ def test_what_ends_a_daemon_does_nothing_more_when_it_comes_again(
         signal.raise_signal(number)
         came.append("again")
 
-    monkeypatch.setattr(run, "_emulators", emulators)
+    monkeypatch.setattr(run, "_run_emulators", emulators)
     monkeypatch.setattr(
         collector, "kept_from_lasting_objects", lambda: nullcontext(partial(os.kill, os.getpid(), number))
     )

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat
 
-from shearloop.bank.eit import compression, fast_matching
+from shearloop.bank.eit import compression, pruned_matching
 from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
-from shearloop.bank.eit.fast_matching import FastMatcher
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher
 from shearloop.bank.errors import MatchingError
 from tests.bank.small_banks import (
     BANK,
@@ -38,16 +38,15 @@ amplitudes = hnp.arrays(np.float64, N_CHANNELS, elements=st.floats(-10, 10, widt
 
 def test_a_bank_of_few_cells_is_not_searched_and_matches_the_same() -> None:
     signals, valid = BANK[0][:6], BANK[1][:6]
-    assert 0 < valid.sum() < fast_matching.FEWEST_PRUNED <= BANK[1].sum()
-    slow, fast = pair(ReferenceMatcher, FastMatcher, (signals, valid))
+    assert 0 < valid.sum() < pruned_matching.MIN_PRUNED_CELLS <= BANK[1].sum()
+    slow, fast = pair(ReferenceMatcher, PrunedMatcher, (signals, valid))
     frame = np.random.default_rng(3).normal(size=N_CHANNELS)
-    assert fast.match(frame) == fast.match_quickly(frame) == slow.match(frame)
+    assert fast.match(frame) == slow.match(frame)
     assert fast.match(frame, runner_up=False) == without_runner_up(slow.match(frame))
-    assert fast.matches([frame])[0].cell == slow.match(frame).cell
 
 
 @both
-def test_a_matcher_that_was_copied_matches_the_same(slow: Matcher, fast: FastMatcher) -> None:
+def test_a_matcher_that_was_copied_matches_the_same(slow: Matcher, fast: PrunedMatcher) -> None:
     frame = np.random.default_rng(5).normal(size=N_CHANNELS)
     for one in (slow, fast):
         # As pickling does, which sends it to another process.
@@ -59,7 +58,7 @@ def test_a_matcher_that_was_copied_matches_the_same(slow: Matcher, fast: FastMat
 @both
 @given(frame=amplitudes)
 @settings(max_examples=25, deadline=None)
-def test_random_frames(slow: Matcher, fast: FastMatcher, frame: np.ndarray) -> None:
+def test_random_frames(slow: Matcher, fast: PrunedMatcher, frame: np.ndarray) -> None:
     assert_same(fast.match(frame), slow.match(frame))
 
 
@@ -126,20 +125,6 @@ def test_a_basis_that_is_fitted_to_few_cells_bounds_all(kind, bank, monkeypatch)
 
 
 @both
-def test_a_batch_is_its_frames_in_their_order(slow, fast) -> None:
-    random = np.random.default_rng(5)
-    frames = random.normal(size=(19, N_CHANNELS)) + 3 * BANK[0][BANK[1]][random.integers(0, BANK[1].sum(), 19)]
-    alone = [fast.match(frame, runner_up=False) for frame in frames]
-    assert [match.cell for match in alone] == [slow.match(frame).cell for frame in frames]
-    for together, one in zip(fast.matches(frames), alone, strict=True):
-        assert_same(together, one)
-    assert fast.matches(frames[:0]) == []
-    frames[-1] = 0.0
-    with pytest.raises(MatchingError, match="zero in all channels"):
-        fast.matches(frames)
-
-
-@both
 def test_the_maximum_alone_is_the_same_without_the_runner_up(slow, fast) -> None:
     frame = np.random.default_rng(7).normal(size=N_CHANNELS)
     assert fast.match(frame, runner_up=False) == without_runner_up(fast.match(frame))
@@ -184,10 +169,7 @@ def test_what_cannot_be_matched_is_refused_alike(slow, fast) -> None:
         for matcher in (slow, fast):
             with pytest.raises(MatchingError, match=says):
                 matcher.match(frame)
-            if matcher is fast:
-                with pytest.raises(MatchingError, match=says):
-                    matcher.match_quickly(frame)
-    with pytest.raises(MatchingError, match="build the bank anew"):
+    with pytest.raises(MatchingError, match="build the bank again"):
         type(fast)(np.zeros_like(BANK[0]), BANK[1], np.arange(22.0), np.arange(20.0))
 
 
@@ -229,7 +211,6 @@ def test_the_runner_up_may_be_at_a_lag_at_which_nothing_reaches_what_is_known_fr
     expected = slow.match(frame)
     assert (expected.cell, expected.runner_up_cell) == (alone["between"], alone["above"])
     assert_same(fast.match(frame), expected)
-    assert_same(fast.match_quickly(frame), expected)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -9,7 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.cli.writing_over import check_writes_over
+from shearloop.daemon.cli.options import check_overwrite
 from shearloop.daemon.errors import UserError
 
 MCAP = b"\x89MCAP0\r\n and what cannot be recorded again"
@@ -44,7 +44,7 @@ def test_no_command_writes_over_another_s_file(
     there.write_bytes(content)
     bank = Path(__file__).parents[3] / "config" / "banks" / "demo.yaml"
     assert main([*command.format(bank=bank).split(), str(there)]) == 2
-    assert f"{there} is there already, and is not {kind}: it was left as it is" in capsys.readouterr().err
+    assert f"{there} exists and is not {kind}: it was not changed" in capsys.readouterr().err
     assert there.read_bytes() == content
 
 
@@ -52,19 +52,19 @@ def test_no_command_writes_over_another_s_file(
 def test_text_is_written_over_text_alone(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(UserError, match="is not a configuration"):
-        check_writes_over(tmp_path / "file", "a configuration")
+        check_overwrite(tmp_path / "file", "a configuration")
 
 
 def test_what_is_of_the_kind_or_empty_or_no_file_may_be_written_over(tmp_path: Path) -> None:
     file = tmp_path / "file"
-    check_writes_over(file, "a bank", b"BANK")
+    check_overwrite(file, "a bank", b"BANK")
     file.touch()
-    check_writes_over(file, "a bank", b"BANK")
+    check_overwrite(file, "a bank", b"BANK")
     file.write_bytes(b"BANK of old")
-    check_writes_over(file, "a bank", b"BANK")
+    check_overwrite(file, "a bank", b"BANK")
     # The last character that is looked at lies half beyond the end.
     file.write_text("x" * 511 + "σ", encoding="utf-8")
-    check_writes_over(file, "a configuration")
+    check_overwrite(file, "a configuration")
     os.mkfifo(tmp_path / "pipe")
-    check_writes_over(tmp_path / "pipe", "a bank", b"BANK")
-    check_writes_over(tmp_path, "a bank", b"BANK")
+    check_overwrite(tmp_path / "pipe", "a bank", b"BANK")
+    check_overwrite(tmp_path, "a bank", b"BANK")

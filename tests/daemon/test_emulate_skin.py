@@ -10,6 +10,7 @@ import pytest
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.cli.emulate.skin import PushedSkin
+from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
 from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
@@ -118,8 +119,8 @@ def test_mistakes_on_the_command_line_are_sentences(
 
 
 def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
-    pushed = PushedSkin()
-    skin = RigSkin(lambda nm, gripped: pushed.gripped(nm, gripped=gripped, lever_m=0.02), pushed.resistances_ohm)
+    pushed = PushedSkin(SyntheticSkin())
+    skin = RigSkin(lambda nm, gripped: pushed.follow_grip(nm, gripped=gripped, lever_m=0.02), pushed.resistances_ohm)
     rig = EmulatedRig(RigSettings(run_dir=tmp_path, skin=True), lambda *_: np.zeros(1024), skin=skin)
     robot, gripper = rig.controller.robot, rig.scene.gripper
 

@@ -211,7 +211,7 @@ async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_h
             for _ in range(25):
                 await frames.get()
             facts = (await health.get())["tasks"]["right"]
-            while facts["openings"] < 2 or facts["frames"] < 25:
+            while facts["connections"] < 2 or facts["frames"] < 25:
                 facts = (await health.get())["tasks"]["right"]
             assert facts["alive"]
             assert facts["errors"]["wrong_count"] >= 1

@@ -51,7 +51,7 @@ async def play(
 ) -> tuple[EitKit, list[Frame], list[LinkEvent]]:
     link = tmp_path / "eit"
     events: list[LinkEvent] = []
-    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, faults=faults)):
+    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=faults)):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=link, frame_period_s=PERIOD_S, on_event=events.append)
         frames = await take(kit, n_frames)
     return kit, frames, events
@@ -68,19 +68,19 @@ async def test_every_frame_arrives_once_and_in_order(tmp_path: Path) -> None:
     assert [frame.line + b"\n" for frame in frames] == [format_line(line) for line in lines]
     assert [frame.seq for frame in frames] == list(range(60))
     assert [event.up for event in events] == [True]
-    facts = kit.facts()
+    facts = kit.diagnostics()
     assert (facts["frames"], facts["errors"], facts["connected"]) == (60, {}, False)
 
 
 async def test_the_rate_is_told_once_it_is_measured(tmp_path: Path) -> None:
     async with running(EitKitBoard(cycle(some_lines(4)), period_s=PERIOD_S, link=tmp_path / "eit")):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
-        assert kit.facts()["measured_hz"] is None
+        assert kit.diagnostics()["measured_hz"] is None
         async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
             async for _ in arriving:
-                if kit.facts()["measured_hz"] is not None:
+                if kit.diagnostics()["measured_hz"] is not None:
                     break
-    assert kit.facts()["measured_hz"] == pytest.approx(1 / kit.period_s)
+    assert kit.diagnostics()["measured_hz"] == pytest.approx(1 / kit.period_s)
 
 
 async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> None:
@@ -117,9 +117,9 @@ async def test_a_fault_costs_its_own_frame_at_most_and_is_counted(
     lines = some_lines(6)
     kit, frames, _ = await play(lines, 6 - lost, tmp_path, {3: BoardFault(fault)})
     assert_same(frames, lines[:3] + lines[3 + lost :])
-    facts = kit.facts()
+    facts = kit.diagnostics()
     assert facts["errors"] == {kind.name.lower(): 1}
-    assert kind.value in str(facts["last_refusal"])
+    assert kind.value in str(facts["last_frame_error"])
 
 
 async def test_a_repeated_line_is_handed_over_as_such(tmp_path: Path) -> None:
@@ -128,17 +128,17 @@ async def test_a_repeated_line_is_handed_over_as_such(tmp_path: Path) -> None:
 
 
 async def test_a_board_that_fell_silent_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(eit_kit, "SHORTEST_SILENCE_S", 0.05)
+    monkeypatch.setattr(eit_kit, "MIN_SILENCE_S", 0.05)
     lines = some_lines(8)
     kit, frames, events = await play(lines, 8, tmp_path, {4: BoardFault(BoardFaultKind.SILENCE)})
     assert_same(frames, lines)
-    assert cast("int", kit.facts()["silences"]) >= 1  # more when the machine is slow
-    assert kit.facts()["openings"] == 1
+    assert cast("int", kit.diagnostics()["silences"]) >= 1  # more when the machine is slow
+    assert kit.diagnostics()["connections"] == 1
     assert len(events) == 1
 
 
 async def test_a_board_that_stays_silent_is_opened_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(eit_kit, "SHORTEST_SILENCE_S", 0.02)
+    monkeypatch.setattr(eit_kit, "MIN_SILENCE_S", 0.02)
     monkeypatch.setattr(eit_kit, "STARTS_BEFORE_REOPENING", 2)
     lines = some_lines(5)
     kit, frames, events = await play(cycle(lines), 10, tmp_path, {2: BoardFault(BoardFaultKind.SILENCE, 0.5)})
@@ -146,7 +146,7 @@ async def test_a_board_that_stays_silent_is_opened_anew(tmp_path: Path, monkeypa
     places = [[line.tolist() for line in lines].index(frame.raw.tolist()) for frame in frames]
     assert places[:2] == [0, 1]
     assert places[2:] == [(places[2] + n) % 5 for n in range(8)]
-    assert cast("int", kit.facts()["openings"]) >= 2
+    assert cast("int", kit.diagnostics()["connections"]) >= 2
     assert any("open but silent" in event.sentence for event in events)
 
 
@@ -154,8 +154,8 @@ async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path: Pa
     lines = some_lines(12)
     kit, frames, events = await play(lines, 11, tmp_path, {6: BoardFault(BoardFaultKind.UNPLUG, 0.05)})
     assert_same(frames, [*lines[:6], *lines[7:]])
-    facts = kit.facts()
-    assert facts["openings"] == 2
+    facts = kit.diagnostics()
+    assert facts["connections"] == 2
     assert facts["errors"] == {}
     assert facts["unfinished"] == 1, "the half of a line that was under way"
     assert [event.up for event in events if not event.repeated] == [True, False, True]
@@ -173,7 +173,7 @@ async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next
     places = [sent.index(frame.raw.tolist()) for frame in second]
     assert places == list(range(places[0], places[0] + 10))
     assert places[0] >= 10
-    assert kit.facts()["errors"] == {}
+    assert kit.diagnostics()["errors"] == {}
 
 
 async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path: Path) -> None:

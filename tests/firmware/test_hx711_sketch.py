@@ -74,4 +74,4 @@ def test_the_sketch_reads_the_converter_and_speaks_the_drivers_language(tmp_path
     samples = parser.feed(done.stdout.encode(), 0)
     assert [sample.raw for sample in samples] == counts
     assert [sample.saturated for sample in samples] == [count in (COUNTS_MAX, COUNTS_MIN) for count in counts]
-    assert not parser.refused
+    assert not parser.errors

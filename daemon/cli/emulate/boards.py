@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from shearloop.daemon.synthetic import Signals
     from shearloop.drivers.emulators.boards import BoardFault, PlayedBoard
 
-DEMO_BANK = Path(__file__).resolve().parents[4] / "config" / "banks" / "demo.yaml"
+DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
 # The paper's screwdriver: σ at rest and at the largest torque of its peak samples, in N·m.
 K_CM = 3.25
 SIGMA_AT_REST_CM, SIGMA_AT_LARGEST_CM, LARGEST_TORQUE_NM = 1.85, 1.25, 0.14

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE, SkinZero, SkinZeroTaker, str
+from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE, SkinZero, SkinZeroTaker
 
 REST, SLOPE = (24.6, 25.3), 0.088
 NOISE = 1e-4
@@ -25,7 +25,7 @@ def taken(r1: "np.ndarray | float", r2: "np.ndarray | float", seed: int = 0, n: 
 def refusal(r1: "np.ndarray | float", r2: "np.ndarray | float") -> str:
     found = taken(r1, r2)
     assert isinstance(found, str)
-    return found.why
+    return found
 
 
 def test_a_skin_at_rest_gives_its_mean_and_its_noise() -> None:

@@ -38,9 +38,9 @@ def test_what_it_sends_is_what_the_driver_reads(seed: int) -> None:
 
 
 def test_faults_are_read_from_their_names() -> None:
-    assert parse_fault("cut-line") == BoardFault(BoardFaultKind.CUT_LINE)
-    assert parse_fault(" silence 3\n") == BoardFault(BoardFaultKind.SILENCE, 3.0)
-    assert parse_fault("unplug:0.5") == BoardFault(BoardFaultKind.UNPLUG, 0.5)
+    assert parse_fault("cut-line", EitKitBoard.faults) == BoardFault(BoardFaultKind.CUT_LINE)
+    assert parse_fault(" silence 3\n", EitKitBoard.faults) == BoardFault(BoardFaultKind.SILENCE, 3.0)
+    assert parse_fault("unplug:0.5", EitKitBoard.faults) == BoardFault(BoardFaultKind.UNPLUG, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_faults_are_read_from_their_names() -> None:
 )
 def test_what_is_no_fault_is_said_to_be_none(text: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        parse_fault(text)
+        parse_fault(text, EitKitBoard.faults)
 
 
 async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last_frame() -> None:

@@ -87,8 +87,8 @@ async def test_torque_comes_through_from_either_sketch(
             assert sample.trusted
             assert min(abs(sample.torque_nm - torque_nm) for torque_nm in sent) < 6 * noise_nm
         assert rig.samples[-1].torque_nm == pytest.approx(0.059, abs=6 * noise_nm)
-        assert rig.cell.facts()["errors"] == {}
-        assert rig.cell.facts()["flagged"] == 1  # the first line, whose beginning may be missing
+        assert rig.cell.diagnostics()["errors"] == {}
+        assert rig.cell.diagnostics()["flagged"] == 1  # the first line, whose beginning may be missing
 
 
 async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_path: Path) -> None:
@@ -96,13 +96,13 @@ async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_p
         await rig.until(lambda: len(rig.samples) > 5)
         rig.board.inject(BoardFault(BoardFaultKind.SPIKE))
         rig.board.inject(BoardFault(BoardFaultKind.GARBAGE))
-        await rig.until(lambda: rig.cell.facts()["errors"])
+        await rig.until(lambda: rig.cell.diagnostics()["errors"])
         await rig.until(lambda: [sample for sample in rig.samples if sample.spike])
         n = len(rig.samples)
         await rig.until(lambda: len(rig.samples) > n + 5)
         assert [sample.raw for sample in rig.samples if sample.spike] == [38399996]
-        assert rig.cell.facts()["errors"] == {"not_decimal": 1}
-        assert "no decimal number" in str(rig.cell.facts()["refusals"])
+        assert rig.cell.diagnostics()["errors"] == {"not_decimal": 1}
+        assert "not a decimal" in str(rig.cell.diagnostics()["error_details"])
         assert all(sample.trusted for sample in rig.samples[n:])
 
 
@@ -138,7 +138,7 @@ async def test_an_unplugged_board_is_lost_and_found_again(tmp_path: Path) -> Non
         await rig.until(lambda: len(rig.samples) > n + 3)
         assert rig.samples[n].partial
         assert rig.samples[n].seq == rig.samples[n - 1].seq + 1
-        assert rig.cell.facts()["openings"] == 2
+        assert rig.cell.diagnostics()["connections"] == 2
         assert "gone" in next(event.sentence for event in rig.events if not event.up)
 
 
@@ -163,10 +163,14 @@ async def test_a_tare_takes_effect_with_the_next_sample(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["spark", "spike:3", "jump", "jump:high", "silence:-1", "unplug:nan", "stuck:inf"])
 def test_a_fault_that_does_not_exist_is_explained(text: str) -> None:
     with pytest.raises(ValueError, match=r"write|there are"):
-        parse_fault(text)
+        parse_fault(text, Hx711Board.faults)
 
 
 def test_faults_are_read_as_they_are_typed() -> None:
-    assert parse_fault("silence:3") == parse_fault(" silence 3 ") == BoardFault(BoardFaultKind.SILENCE, 3.0)
-    assert parse_fault("jump:-0.05") == BoardFault(BoardFaultKind.JUMP, -0.05)
-    assert parse_fault("spike") == BoardFault(BoardFaultKind.SPIKE)
+    assert (
+        parse_fault("silence:3", Hx711Board.faults)
+        == parse_fault(" silence 3 ", Hx711Board.faults)
+        == BoardFault(BoardFaultKind.SILENCE, 3.0)
+    )
+    assert parse_fault("jump:-0.05", Hx711Board.faults) == BoardFault(BoardFaultKind.JUMP, -0.05)
+    assert parse_fault("spike", Hx711Board.faults) == BoardFault(BoardFaultKind.SPIKE)

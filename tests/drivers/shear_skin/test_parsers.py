@@ -31,8 +31,8 @@ def test_every_line_of_the_board_comes_through_in_any_slices(pairs: list[tuple[f
     found = [voltages for part in slices(data, cuts) for voltages in parser.feed(part, 10**9)]
     assert [(one.v1_v, one.v2_v) for one in found] == pairs
     assert [(one.over_1, one.over_2) for one in found] == [(abs(a) >= 0.51174, abs(b) >= 0.51174) for a, b in pairs]
-    assert parser.first_partials == 1
-    assert not parser.refused
+    assert parser.partial_lines == 1
+    assert not parser.errors
 
 
 @given(st.binary(max_size=600), CUTS)
@@ -50,7 +50,7 @@ def test_no_bytes_break_the_board_s_parser_and_a_sound_line_comes_through_after_
 def test_refused_lines_are_counted_by_kind() -> None:
     parser = PairParser()
     parser.feed(b"cut\n0.1,0.2,0.3\n0.1\n0,1\nnan,0.1\n\r\n" + b"1" * 50 + b"\n0.100000,0.200000\n", 0)
-    assert parser.refused == {"not two decimals": 4, "empty": 1, "too long": 1}
+    assert parser.errors == {"not two decimals": 4, "empty": 1, "too long": 1}
 
 
 def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
@@ -61,7 +61,7 @@ def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
     assert parser.feed(b"0.125000,0.126000\n", 1) == [], "after the opening a line may be under way"
     (found,) = parser.feed(b"0.127000,0.128000\n", 2)
     assert (found.v1_v, found.v2_v) == (0.127, 0.128)
-    assert parser.refused == {"unfinished": 1}
+    assert parser.errors == {"unfinished": 1}
 
 
 def test_lines_that_arrive_together_are_a_period_apart() -> None:
@@ -79,7 +79,7 @@ def test_replies_come_through_whatever_ends_their_lines(replies: list[str], cuts
         lines = ReplyLines()
         data = b"".join(reply.encode() + end for reply in replies)
         assert [text for part in slices(data, cuts) for text in lines.feed(part)] == [r.strip() for r in replies]
-        assert not lines.refused
+        assert not lines.errors
 
 
 @given(st.binary(max_size=2 * MAX_REPLY_BYTES), CUTS)
@@ -96,7 +96,7 @@ def test_a_flood_without_an_end_is_counted_once_and_forgotten() -> None:
     for _ in range(10):
         assert lines.feed(b"7" * 300) == []
     assert lines.feed(b"\n\xff\n0\n") == ["0"]
-    assert lines.refused == {"too long": 1, "not ASCII": 1}
+    assert lines.errors == {"too long": 1, "not ASCII": 1}
 
 
 @given(st.text(max_size=80))

@@ -33,7 +33,7 @@ COMMANDS = {
         ("recording", "cli.recording", "inspect recordings, repair them, and export them as tables"),
         ("replay", "cli.replay", "send a recording through the same estimators again, as if live"),
         ("evaluate", "cli.evaluate", "judge a calibrated estimator on recordings or slices"),
-        ("chart", "analysis.charts.command", "chart speed against accuracy, stability, and how much model is needed"),
+        ("chart", "cli.chart", "chart speed against accuracy, stability, and how much model is needed"),
         ("check", "cli.check", "check a configuration and the files it names"),
         ("listen", "cli.listen", "print what a running daemon publishes"),
         ("command", "cli.command", "send a command to a running daemon: tare, start, pause, stop, unlock …"),

@@ -1,0 +1,97 @@
+"""The generated pages match the code, and their programs run."""
+
+import asyncio
+import dataclasses
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import zmq
+
+from shearloop.daemon.clock import Clock
+from shearloop.daemon.control.safety import TABLE
+from shearloop.daemon.docgen import ROOT, pages
+from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.messaging.messages import EitEstimate, EitFrame
+from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.messaging.topics import TOPICS
+from tests.daemon.conftest import DEADLINE_S
+from tests.daemon.sample_messages import sample
+
+
+@pytest.fixture(scope="module")
+def written() -> dict[str, str]:
+    """Return the generated pages by name."""
+    return {path.name: text for path, text in pages(ROOT).items()}
+
+
+@pytest.mark.parametrize("name", ["messages.md", "safety.md"])
+def test_a_page_is_up_to_date(written: dict[str, str], name: str) -> None:
+    assert len(written) == 2
+    found = (ROOT / "docs" / name).read_text(encoding="utf-8")
+    assert found == written[name], f"docs/{name} is out of date: run `make docs` and commit it"
+
+
+def test_every_topic_and_key_is_listed(written: dict[str, str]) -> None:
+    for topic, kind in TOPICS.items():
+        assert f"### `{topic}`" in written["messages.md"]
+        for key in (item.name for item in dataclasses.fields(kind)):
+            assert f"| `{key}` |" in written["messages.md"]
+
+
+def test_every_row_of_the_safety_table_is_on_the_page(written: dict[str, str]) -> None:
+    for rule in TABLE.values():
+        assert rule.cure in written["safety.md"]
+
+
+async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
+    program = (ROOT / "docs/examples/subscriber.py").read_text()
+    address = f"ipc://{tmp_path}/publish"
+    script = tmp_path / "subscriber.py"
+    script.write_text(program.replace("tcp://127.0.0.1:7761", address))
+    frame, estimate = sample(EitFrame), sample(EitEstimate)
+    with zmq.Context() as context:
+        publisher = Publisher(context, address, Clock())
+        process = await asyncio.create_subprocess_exec(sys.executable, str(script), stdout=subprocess.PIPE)
+        try:
+            async with asyncio.timeout(DEADLINE_S):
+                assert process.stdout is not None
+                seen = asyncio.create_task(process.stdout.readline())
+                while not seen.done():
+                    # Until it has subscribed.
+                    publisher.publish(estimate)
+                    await asyncio.wait([seen], timeout=0.05)
+                assert b"text 0.5 " in seen.result()
+                publisher.publish(frame)
+                while b"text 5.0" not in await process.stdout.readline():
+                    pass
+        finally:
+            process.kill()
+            await process.communicate()
+            await asyncio.sleep(0)
+            publisher.close()
+
+
+@pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
+def test_a_subscriber_asks_for_topics_and_keys_that_there_are(name: str) -> None:
+    """MATLAB is on no machine of ours, so what its subscriber reads is held to the schema of the messages."""
+    program = (ROOT / "docs/examples" / name).read_text()
+    topics = set(re.findall(r'"((?:eit|load|skin|robot|gripper|loop)\.[a-z]*)"', program))
+    assert topics
+    assert all(any(topic.startswith(beginning) for topic in TOPICS) for beginning in topics)
+    assert f"{PUBLISH_ADDRESS}" in program
+    reads = set(re.findall(r'message\["(\w+)"\]|message\.(\w+)', program))
+    named = {key.removesuffix("_shape") for pair in reads for key in pair if key}
+    assert "timestamp" in named
+    known = {item.name for topic in ("eit.estimate", "eit.frame") for item in dataclasses.fields(TOPICS[topic])}
+    assert named - {"timestamp", "seq"} <= known
+
+
+@pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
+def test_a_subscriber_is_about_a_dozen_lines(name: str) -> None:
+    lines = (ROOT / "docs/examples" / name).read_text().splitlines()
+    code = [line for line in lines if line.strip() and not line.lstrip().startswith(("//", "%", '"""', "#", "import"))]
+    assert len(code) <= 15
+    assert "eit." in "".join(code)

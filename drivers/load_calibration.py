@@ -49,7 +49,7 @@ class LoadCalibrationResult:
 def measure_level(samples: Sequence[LoadSample], mass_g: float) -> Level:
     """Return the level of samples under a constant load.
 
-    Raises DeviceCalibrationError if they are too few, saturated, flat, corrupted or noisy. Up to a tenth may be corrupted.
+    Up to a tenth may be corrupted. Raises DeviceCalibrationError if they are too few, saturated, flat or noisy.
     """
     if any(sample.saturated for sample in samples):
         raise DeviceCalibrationError(

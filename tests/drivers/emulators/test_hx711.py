@@ -108,6 +108,7 @@ async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_p
 
 async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
+        await rig.until(lambda: rig.samples)
         rig.board.inject(BoardFault(BoardFaultKind.SATURATION, 0.01))
         await rig.until(lambda: [sample for sample in rig.samples if sample.saturated])
         await rig.until(lambda: rig.samples[-1].trusted)

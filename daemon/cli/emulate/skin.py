@@ -26,7 +26,8 @@ SWEEP_PERIOD_S = 20.0
 # The gauges' drift advances in steps of this.
 REST_S = 1.0
 CURE = "choose another port or bind address"
-SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear. Commands, one a line on standard input:
+SKIN_EPILOG = """Prints the addresses of source and DAQ, again each time they appear.
+Commands, one a line on standard input:
   shear N, normal N              push the skin (not while a robot turns it)
   open 1|2, short 1|2, reversed 1|2, swapped, drift 1|2 SHARE_PER_S, leads OHM, mend
                                  faults of the circuit

@@ -62,12 +62,12 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
     client: GripperClient
     if way == "socket":
         server = UrcapServer(model, port=0)
-        await server.bring_back()
+        await server.restore()
         client = SocketClient("127.0.0.1", server.port, reply_deadline_s=0.2)
     else:
         link = tmp_path / "gripper"
         server = ModbusServer(model, link)
-        await server.bring_back()
+        await server.restore()
         client = ModbusClient(path=str(link), reply_deadline_s=0.2)
     rig = Rig(model, server)
     driver = rig.driver = RobotiqGripper(

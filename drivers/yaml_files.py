@@ -1,7 +1,5 @@
 """YAML files: read with unique keys, validated as calibrations, and replaced atomically when written."""
 
-import os
-import tempfile
 from collections.abc import Hashable
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
@@ -10,6 +8,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from shearloop.drivers.errors import DeviceCalibrationError, DriverError
+from shearloop.files import replace_file
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -81,14 +80,7 @@ def save_calibration(path: Path, calibration: CalibrationModel) -> None:
     """Write the calibration atomically: a reader sees the old file or the new one."""
     text = yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     try:
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=path.parent, prefix=path.name, delete=False
-        ) as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        # Temporary files are private; any user may run the daemon.
-        os.chmod(file.name, 0o644)
-        os.replace(file.name, path)
+        with replace_file(path) as file:
+            file.write(text.encode())
     except OSError as error:
         raise DeviceCalibrationError(f"{path}: cannot be written ({error.strerror})") from error

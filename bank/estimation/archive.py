@@ -17,8 +17,9 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.stored import check_made_with, check_version, replaced
+from shearloop.bank.eit.stored import check_made_with, check_version
 from shearloop.bank.errors import CalibrationError
+from shearloop.files import replace_file
 
 FORMAT_VERSION = 3
 _KIND = "shearloop estimator calibration"
@@ -45,7 +46,7 @@ def write_archive(path: str | Path, identities: Mapping[str, str], content: Any)
     }
     text = yaml.safe_dump(header, sort_keys=False, allow_unicode=True, width=120).encode()
     try:
-        with replaced(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        with replace_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
             for name, data in {_HEADER: text, **members}.items():
                 archive.writestr(zipfile.ZipInfo(name, _DATE), data)
     except OSError as error:

@@ -21,9 +21,9 @@ from scipy.io import savemat
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import channels_of_line
-from shearloop.bank.eit.stored import replaced
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import Scalar
+from shearloop.files import replace_file
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
 WINDOW_FRAMES, STD_FRAMES = 9, 9 / 5
@@ -97,7 +97,7 @@ class SliceRecorder:
         """Return what health tells of the slices."""
         with self._counting:
             missed = dict(self.missed)
-            return {"slices": self.written.total(), "errors": missed, "trouble": next(reversed(missed), "")}
+            return {"slices": self.written.total(), "errors": missed, "error": next(reversed(missed), "")}
 
     def close(self) -> None:
         """Write the hold that still waited for a later frame, and wait until everything is written."""
@@ -143,7 +143,7 @@ class SliceRecorder:
         if self._held is not None and held != self._held[0]:
             if self._pending is not None:
                 self._write(self._pending)
-            self._pending = _Hold(self._held[1], now_ns, content["slices"], self._source(content["driving"]))
+            self._pending = _Hold(self._held[1], now_ns, content["slices"], self._source(content["torque_source"]))
             self._held = None
         if held and self._held is None:
             self._held = (held, now_ns)
@@ -240,7 +240,7 @@ def _save(path: Path, **arrays: Any) -> None:
     """Write a MATLAB file, whole or not at all; raises OSError where it cannot be."""
     content = io.BytesIO()
     savemat(content, arrays)  # type: ignore[arg-type]  # any file will do
-    with replaced(path) as file:
+    with replace_file(path) as file:
         file.write(content.getbuffer())
 
 

@@ -81,8 +81,8 @@ class LoadCellTask:
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the board's values for `health`."""
         found = self._board.diagnostics()
-        trouble = self._zero_error if found["connected"] else found["last_loss"]
-        return {**found, "expected_hz": 1.0 / self.source.period_s, "trouble": trouble}
+        error = self._zero_error if found["connected"] else found["last_loss"]
+        return {**found, "expected_hz": 1.0 / self.source.period_s, "error": error}
 
     def _take_zero(self, sample: LoadSample) -> None:
         if self._zeroing is None:
@@ -113,7 +113,7 @@ def load_message(sample: LoadSample) -> LoadTorque:
         saturated=sample.saturated,
         spike=sample.spike,
         valid=sample.trusted,
-        why=_reason(sample),
+        reason=_reason(sample),
     )
 
 

@@ -4,9 +4,8 @@ import contextlib
 from collections.abc import Callable, Mapping
 from functools import partial
 
-from shearloop.bank.skin.calibration import SkinCalibration
-from shearloop.bank.skin.calibration_file import load_calibration
-from shearloop.bank.skin.gauge import joule_heating_k
+from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
+from shearloop.bank.skin.membrane import joule_heating_k
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
@@ -107,7 +106,7 @@ class SkinTask:
         return {
             **self._skin.diagnostics(),
             "valid": self._valid,
-            "trouble": self._reason,
+            "error": self._reason,
             "zero_1_ohm": zero.r1_ohm if zero is not None else None,
             "zero_2_ohm": zero.r2_ohm if zero is not None else None,
             "drift_per_hour": self._estimator.drift_per_hour,
@@ -120,7 +119,7 @@ class SkinTask:
     def _publish(self, sample: SkinSample, reading: SkinReading) -> None:
         now_ns = self._clock.now_ns()
         message = shear_message(sample, reading, self._radius_m, now_ns)
-        self._reason = message.why
+        self._reason = message.reason
         self._valid += reading.valid
         if self._radius_m is not None:
             self._on_torque(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
@@ -182,7 +181,7 @@ def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | No
         deadband=interval is not None and interval.in_deadband,
         direction=reading.direction.value,
         valid=reading.valid,
-        why="; ".join(reading.reasons),
+        reason="; ".join(reading.reasons),
         sample=sample.seq,
         missed=sample.missed,
         latency_s=(now_ns - sample.t_arrival_ns) / 1e9,

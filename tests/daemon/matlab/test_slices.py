@@ -23,7 +23,7 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
         "step_name": "twist",
         "hold": 0,
         "slices": "torque",
-        "driving": "load_cell",
+        "torque_source": "load_cell",
         **changes,
     }
 
@@ -244,7 +244,7 @@ def unwritable(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
         def full(_descriptor: int) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        monkeypatch.setattr("shearloop.bank.eit.stored.os.fsync", full)
+        monkeypatch.setattr("shearloop.files.os.fsync", full)
     return tmp_path
 
 
@@ -257,7 +257,7 @@ def test_a_folder_that_cannot_be_written_kills_nobody_and_is_told(unwritable: Pa
     facts = sweep.recorder.facts()
     assert facts["slices"] == 0
     assert facts["errors"] == sweep.recorder.missed
-    assert "cannot be written" in str(facts["trouble"])
+    assert "cannot be written" in str(facts["error"])
     assert not list(unwritable.glob("torque_slices/*")), "nothing half written is left"
 
 

@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import line_of_channels
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.sensing.both import BOTH
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
@@ -385,10 +385,10 @@ def _listen(health: "zmq.Socket[bytes]", seconds: float) -> None:
 def _start(commands: str, experiment: Path) -> None:
     """Start an experiment, unlocking as the operator does."""
     until = time.monotonic() + SETTLING_S
-    while not (reply := request(commands, {"command": "start", "experiment": str(experiment)}, SETTLING_S))["ok"]:
+    while not (reply := send_command(commands, {"command": "start", "experiment": str(experiment)}, SETTLING_S))["ok"]:
         if time.monotonic() > until:
-            raise RuntimeError(reply["why"])
-        request(commands, {"command": "unlock"}, SETTLING_S)
+            raise RuntimeError(reply["reason"])
+        send_command(commands, {"command": "unlock"}, SETTLING_S)
 
 
 def command_s(*arguments: str, repeats: int = 1) -> float:

@@ -27,9 +27,8 @@ from typing import Any
 import yaml
 import zmq
 
-from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.client import send_command
+from shearloop.daemon.messaging.messages import TOPICS, decode
 
 DEADLINE_S = 90.0
 
@@ -117,7 +116,7 @@ class RunningRig:
 
     def command(self, name: str, **arguments: Any) -> dict[str, Any]:
         """Send the daemon a command; return its reply."""
-        return request(f"ipc://{self.folder}/commands", {"command": name, **arguments}, DEADLINE_S)
+        return send_command(f"ipc://{self.folder}/commands", {"command": name, **arguments}, DEADLINE_S)
 
     def wait_for(self, topic: str, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Return the first new message of a topic that meets a condition."""
@@ -158,7 +157,7 @@ class RunningRig:
         end_s = time.monotonic() + DEADLINE_S
         while not (reply := self.command("start", experiment=str(path)))["ok"]:
             if time.monotonic() > end_s:
-                raise RuntimeError(reply["why"])
+                raise RuntimeError(reply["reason"])
             time.sleep(0.2)
             self.command("unlock")
 
@@ -179,7 +178,9 @@ def _process(*arguments: str, **options: Any) -> Iterator["subprocess.Popen[byte
 
 def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
     path = folder / f"{name}.yaml"
-    begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
+    # The estimator needs seven seconds of the grip.
+    grip = [{"do": "grip", "width_mm": 5, "force_n": 60}, {"do": "wait", "wait_s": 8}]
+    begin = [{"do": "release"}, {"do": "tare"}, *grip]
     content = {"name": name, "drive": "load_cell", "limits": {"torque_nm": 0.3}, "steps": [*begin, *steps]}
     path.write_text(yaml.safe_dump(content))
     return path

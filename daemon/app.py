@@ -14,7 +14,6 @@ import zmq
 import zmq.asyncio
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
-from shearloop.daemon import sd_notify
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands, needed
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
@@ -22,7 +21,7 @@ from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.health import HealthReporter, TaskFacts
 from shearloop.daemon.links import log_link
-from shearloop.daemon.messaging.addresses import open_stop_address
+from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
@@ -40,6 +39,7 @@ from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
 from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.eit_kit import EitKit
@@ -80,7 +80,7 @@ class Daemon:
             opened.callback(self._commands.close)
             self._open_stop: CommandServer | None = None
             if "commands" in config.network_addresses:
-                address = open_stop_address(config.commands)
+                address = local_stop_address(config.commands)
                 self._open_stop = CommandServer(context, address, commands.open_handlers())
                 opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
@@ -203,9 +203,9 @@ class Daemon:
             running = [group.create_task(task, name=name) for name, task in self._tasks()]
             structlog.get_logger().info("running", fingertips=list(self._fingertips))
             on_ready()
-            sd_notify.notify("READY=1")
+            notify("READY=1")
             await self._stop.wait()
-            sd_notify.notify("STOPPING=1")
+            notify("STOPPING=1")
             if self._rig is not None:
                 self._rig.end()
                 if self._experiment is not None:
@@ -331,7 +331,7 @@ def _recorder(
     if config.recording is None:
         return None
     recorder = Recorder(config.recording.folder, identity_of(config), clock, busy=busy, on_failure=on_failure)
-    publisher.listen(recorder.record)
+    publisher.add_listener(recorder.record)
     return recorder
 
 
@@ -379,7 +379,7 @@ async def run_daemon(
     with zmq.asyncio.Context() as context:
         daemon = Daemon(config, context)
         for listener in listeners:
-            daemon.publisher.listen(listener)
+            daemon.publisher.add_listener(listener)
         for name, told in facts.items():
             daemon.health.add(name, told)
         ending = ending_signals()

@@ -13,9 +13,9 @@ from shearloop.daemon.messaging.addresses import (
     COMMAND_ADDRESS,
     LARGEST_PORT,
     PUBLISH_ADDRESS,
-    has_a_port,
-    open_to_the_network,
-    stays_on_this_machine,
+    has_valid_port,
+    is_local,
+    network_refusal,
 )
 
 # What else a daemon has a task of, publishes as, drives by or records under. A fingertip of such a name would be taken
@@ -31,7 +31,7 @@ TAKEN_NAMES = frozenset(
 def _known_transport(address: str) -> str:
     if not address.startswith(("ipc://", "tcp://")):
         raise ValueError("must be ipc or a tcp address, for this machine alone a loopback one: tcp://127.0.0.1:7761")
-    if not has_a_port(address):
+    if not has_valid_port(address):
         raise ValueError(f"must end in a port, a whole number up to {LARGEST_PORT}, as in tcp://127.0.0.1:7761")
     return address
 
@@ -266,7 +266,7 @@ class DaemonConfig(ConfigModel):
             raise ValueError("`both` needs two `fingertips`, named as the sides of its calibration: right and left")
         for key, address in self.network_addresses.items():
             if self.curve is None:
-                raise ValueError(open_to_the_network(address, key))
+                raise ValueError(network_refusal(address, key))
         if self.publish == self.commands and not self.publish.endswith(":*"):
             raise ValueError(f"`publish` and `commands` are both {self.publish}; give each an address of its own")
         for port, keys in self._ports().items():
@@ -295,7 +295,7 @@ class DaemonConfig(ConfigModel):
     def network_addresses(self) -> dict[str, str]:
         """The keys and addresses that can be reached from beyond this machine."""
         addresses = {"publish": self.publish, "commands": self.commands}
-        return {key: address for key, address in addresses.items() if not stays_on_this_machine(address)}
+        return {key: address for key, address in addresses.items() if not is_local(address)}
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:

@@ -76,10 +76,10 @@ class NonBlockingWriter:
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of it."""
         if not self.lost:
-            return {"errors": {}, "trouble": ""}
+            return {"errors": {}, "error": ""}
         return {
             "errors": {"unread": self.lost},
-            "trouble": f"{self.lost} texts are lost that nobody read; a terminal that was stopped with Ctrl-S goes on "
+            "error": f"{self.lost} texts are lost that nobody read; a terminal that was stopped with Ctrl-S goes on "
             "with Ctrl-Q",
         }
 

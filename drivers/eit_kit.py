@@ -96,7 +96,7 @@ class EitKit(SerialSensor[Frame]):
             "frames": parser.frames,
             "errors": {kind.name.lower(): count for kind, count in parser.refused.items()},
             "last_refusal": "" if parser.last_refusal is None else str(parser.last_refusal),
-            "first_partials": parser.first_partials,
+            "partial_lines": parser.partial_lines,
             "unfinished": parser.unfinished,
             "silences": self._silences,
             "expected_hz": self._expected_hz,

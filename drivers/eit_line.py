@@ -57,7 +57,7 @@ class FrameParser:
     """Turns bytes, in any slicing, into frames; refuses what is no frame, counts it by kind and names the last.
 
     `zero_slots` (1024,) is true where the injection pattern makes the value 0. Counted apart from `refused`, being
-    nobody's fault: `first_partials`, lines that were under way when listening began, and `unfinished`, lines that had
+    nobody's fault: `partial_lines`, lines that were under way when listening began, and `unfinished`, lines that had
     begun when it ended.
     """
 
@@ -76,7 +76,7 @@ class FrameParser:
         self.frames = 0
         self.refused: Counter[FrameErrorKind] = Counter()
         self.last_refusal: FrameError | None = None
-        self.first_partials = 0
+        self.partial_lines = 0
         self.unfinished = 0
         self._zero_slots = zero_slots
         self._slots = np.flatnonzero(~zero_slots)
@@ -168,7 +168,7 @@ class FrameParser:
         if not isinstance(values, FrameError):
             return line, values
         if self._first and values.kind in _PARTIAL and len(line) < LINE_BYTES:
-            self.first_partials += 1
+            self.partial_lines += 1
         else:
             self._refuse(values)
         return None

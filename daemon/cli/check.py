@@ -83,10 +83,10 @@ def _rig(config: "DaemonConfig") -> dict[str, str]:
 
 
 def _clients(curve: "CurveConfig") -> str:
-    from shearloop.daemon.messaging.keys import admitted_clients, load_server_keys
+    from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys
 
     load_server_keys(curve.server_key)
-    return ", ".join(sorted(admitted_clients(curve.clients).values()))
+    return ", ".join(sorted(check_allowed_clients(curve.clients).values()))
 
 
 def _skin(config: "SkinConfig") -> str:

@@ -4,8 +4,13 @@ import argparse
 from pathlib import Path
 
 from shearloop.daemon.cli.connection import add_connection, client_keys
-from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, needs_keys, stop_address
-from shearloop.daemon.messaging.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
+from shearloop.daemon.messaging.addresses import (
+    COMMAND_ADDRESS,
+    COMMAND_TIMEOUT_S,
+    UNLOCK_TIMEOUT_S,
+    needs_keys,
+    stop_address,
+)
 
 COMMANDS = {
     "tare": "take the zero of the torque sensors anew: nothing gripped, no experiment running",
@@ -65,8 +70,7 @@ def run(args: argparse.Namespace) -> int:
     import json
     import sys
 
-    from shearloop.daemon.messaging.request import request
-    from shearloop.daemon.messaging.subscriber import checked_timeout_s
+    from shearloop.daemon.messaging.client import check_timeout_s, send_command
 
     arguments = {} if args.source is None else {"source": args.source}
     if args.heatmap is not None:
@@ -80,17 +84,17 @@ def run(args: argparse.Namespace) -> int:
         address = stop_address(address)
     else:
         keys = client_keys(args)
-    timeout_s = COMMAND_TIMEOUT_S if args.timeout is None else checked_timeout_s(args.timeout)
+    timeout_s = COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
     if args.name == "unlock" and args.timeout is None:
         # That nobody is there is said at once all the same.
-        request(address, {"command": "status"}, COMMAND_TIMEOUT_S, keys)
+        send_command(address, {"command": "status"}, COMMAND_TIMEOUT_S, keys)
         timeout_s = UNLOCK_TIMEOUT_S
-    reply = request(address, {"command": args.name, **arguments}, timeout_s, keys)
+    reply = send_command(address, {"command": args.name, **arguments}, timeout_s, keys)
     accepted = bool(reply.pop("ok", False))
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
     elif accepted:
         print(f"{args.name}: done" if not reply else f"{args.name}: {json.dumps(reply, ensure_ascii=False, indent=2)}")
     else:
-        print(f"shearloop command: {args.name} was refused: {reply.get('why')}", file=sys.stderr)
+        print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
     return 0 if accepted else 1

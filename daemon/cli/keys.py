@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _server(args: argparse.Namespace) -> None:
-    from shearloop.daemon.messaging.keys import cannot_write, make_key_pair
+    from shearloop.daemon.messaging.keys import make_key_pair, write_error
 
     public, secret = make_key_pair(args.dir, "server")
     clients = args.dir / "clients"
@@ -47,7 +47,7 @@ def _server(args: argparse.Namespace) -> None:
         clients.mkdir(exist_ok=True)
         clients.chmod(0o755)
     except OSError as error:
-        raise cannot_write(error) from error
+        raise write_error(error) from error
     sentences = [
         f"{secret}: the daemon's secret key, for its eyes alone",
         f"{public}: give this file to every client, as ~/.config/shearloop/server.key",
@@ -72,7 +72,7 @@ def _client(args: argparse.Namespace) -> None:
 
 def _allow(args: argparse.Namespace) -> None:
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.messaging.keys import allowed_clients, cannot_write, load_public_key, write_public_key
+    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, write_error, write_public_key
 
     public = load_public_key(args.key)
     name, clients = args.name or args.key.stem, args.dir / "clients"
@@ -87,13 +87,13 @@ def _allow(args: argparse.Namespace) -> None:
             f"there is a client {name!r} already; choose another with --name, or revoke it first"
         ) from error
     except OSError as error:
-        raise cannot_write(error) from error
+        raise write_error(error) from error
     print_result({"allowed": name}, [f"{name} may connect from now on"], as_json=args.json)
 
 
 def _revoke(args: argparse.Namespace) -> None:
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.messaging.keys import allowed_clients, cannot_write
+    from shearloop.daemon.messaging.keys import allowed_clients, write_error
 
     clients = args.dir / "clients"
     _check_name(args.name)
@@ -103,7 +103,7 @@ def _revoke(args: argparse.Namespace) -> None:
         known = ", ".join(sorted(allowed_clients(clients).values())) or "nobody"
         raise UserError(f"there is no client {args.name!r}; allowed is {known}") from error
     except OSError as error:
-        raise cannot_write(error) from error
+        raise write_error(error) from error
     sentence = f"{args.name} may connect no more; restart the daemon to end a connection that is open"
     print_result({"revoked": args.name}, [sentence], as_json=args.json)
 

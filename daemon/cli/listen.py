@@ -32,10 +32,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print messages until interrupted, or until enough have come."""
-    from shearloop.daemon.cli.message_lines import message_json, message_line
+    from shearloop.daemon.cli.output import message_json, message_line
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.messaging.subscriber import QUIET_S, checked_timeout_s, messages
-    from shearloop.daemon.messaging.topics import TOPICS
+    from shearloop.daemon.messaging.client import QUIET_S, check_timeout_s, receive_messages
+    from shearloop.daemon.messaging.messages import TOPICS
 
     for topic in args.topics:
         if not any(known.startswith(topic) for known in TOPICS):
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     if args.count is not None and args.count < 1:
         raise UserError(f"--count {args.count} is not a number of messages; give 1 or more")
     if args.timeout is not None:
-        checked_timeout_s(args.timeout)
+        check_timeout_s(args.timeout)
     write = message_json if args.json else message_line
 
     def tell_quiet() -> None:
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         )
 
     try:
-        heard = messages(args.connect, args.topics, args.timeout, client_keys(args), tell_quiet)
+        heard = receive_messages(args.connect, args.topics, args.timeout, client_keys(args), tell_quiet)
         for number, (topic, content) in enumerate(heard, start=1):
             print(write(topic, content), flush=True)
             if number == args.count:

@@ -85,8 +85,7 @@ def parsed_speed(text: str) -> float:
 async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, args: argparse.Namespace) -> "Comparison":
     import zmq.asyncio
 
-    from shearloop.daemon.cli.message_lines import EstimatePrinter
-    from shearloop.daemon.cli.output import progress_bar
+    from shearloop.daemon.cli.output import EstimatePrinter, progress_bar
     from shearloop.daemon.messaging.publisher import Publisher
     from shearloop.daemon.recording.replay import Replay, ReplayClock
     from shearloop.daemon.recording.replay_pipeline import ReplayPipeline
@@ -97,8 +96,8 @@ async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, ar
         opened.callback(publisher.close)
         replay = Replay(run, ReplayPipeline(config, run.asides(), publisher), publisher, clock)
         if args.show:
-            publisher.listen(EstimatePrinter(sys.stdout))
-        while args.wait and not publisher.subscribed:  # noqa: ASYNC110 - it is told when it is asked
+            publisher.add_listener(EstimatePrinter(sys.stdout))
+        while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - it is told when it is asked
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, run.messages, "message"))
         await replay.play(speed, progress)

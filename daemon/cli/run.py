@@ -71,11 +71,11 @@ def _run(
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
     from shearloop.daemon.cli.demonstration import Deaths, Happenings, Truth
-    from shearloop.daemon.cli.message_lines import EstimatePrinter
+    from shearloop.daemon.cli.output import EstimatePrinter
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
     from shearloop.daemon.errors import UserError
+    from shearloop.daemon.realtime import high_priority, lock_memory
     from shearloop.daemon.run_summary import RunSummary
-    from shearloop.daemon.service.realtime import high_priority, lock_memory
 
     config = load_daemon_config(args.config)
     emulators = config.emulators

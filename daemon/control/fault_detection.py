@@ -7,7 +7,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopInputs, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.settings import LoopConfig
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, stale_after_s
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 
 # 2.5 periods of their topics.
 ARM_STALE_S = stale_after_s("robot.state")

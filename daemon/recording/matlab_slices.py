@@ -97,7 +97,7 @@ class SliceRecorder:
         """Return what health tells of the slices."""
         with self._counting:
             missed = dict(self.missed)
-            return {"slices": self.written.total(), "errors": missed, "trouble": next(reversed(missed), "")}
+            return {"slices": self.written.total(), "errors": missed, "error": next(reversed(missed), "")}
 
     def close(self) -> None:
         """Write the hold that still waited for a later frame, and wait until everything is written."""
@@ -143,7 +143,7 @@ class SliceRecorder:
         if self._held is not None and held != self._held[0]:
             if self._pending is not None:
                 self._write(self._pending)
-            self._pending = _Hold(self._held[1], now_ns, content["slices"], self._source(content["driving"]))
+            self._pending = _Hold(self._held[1], now_ns, content["slices"], self._source(content["torque_source"]))
             self._held = None
         if held and self._held is None:
             self._held = (held, now_ns)

@@ -156,7 +156,7 @@ class RecordedRun:
                 "saturated": False,
                 "spike": False,
                 "valid": True,
-                "why": "",
+                "reason": "",
                 **content,
                 "timestamp": log_ns / 1e9,
                 "t_mono_ns": log_ns,

@@ -164,7 +164,7 @@ class Recorder:
             "file_bytes": self._file.bytes_written,
             "waiting_bytes": self._waiting_bytes,
             "errors": {kind: n for kind, n in (("dropped", self._dropped), ("unwritable", self._unwritable)) if n},
-            "trouble": self.failure or self._last_unwritable,
+            "error": self.failure or self._last_unwritable,
         }
 
     def write(self) -> None:

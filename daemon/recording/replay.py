@@ -114,7 +114,7 @@ class Replay:
         self.comparison = Comparison(run.counts)
         if run.has_inputs:
             # Of a recording from elsewhere nothing is compared, and what was kept for it would be kept for ever.
-            publisher.listen(self.comparison.made)
+            publisher.add_listener(self.comparison.made)
 
     async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
         """Replay all of it, `speed` times as fast as it happened; math.inf waits for nothing."""

@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame, EitHeatmap, LoadTorque
 
 FRAME_TOPIC = EitFrame.topic
 LOAD_TOPIC = LoadTorque.topic

@@ -157,7 +157,7 @@ class EstimatorTask:
             TorqueSample(
                 self.name,
                 torque.value if torque is not None else None,
-                message.why,
+                message.reason,
                 message.t_mono_ns - reading.lag_ns,
                 now_ns,
             )
@@ -183,7 +183,7 @@ def estimate_message(name: str, frames: tuple[Frame, ...], reading: Reading, now
         score=match.score if match else None,
         runner_up=match.runner_up if match else None,
         valid=reading.valid,
-        why="; ".join(reading.why),
+        reason="; ".join(reading.why),
         frame=frames[0].seq,
         latency_s=(now_ns - max(frame.t_arrival_ns for frame in frames)) / 1e9,
     )

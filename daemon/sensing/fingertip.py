@@ -74,14 +74,14 @@ class FingertipTask:
         return {
             **facts,
             "rate_hz": facts["measured_hz"],
-            "trouble": facts["last_refusal"] if facts["connected"] else facts["last_loss"],
+            "error": facts["last_refusal"] if facts["connected"] else facts["last_loss"],
             "estimates": self.estimation.count,
             "backlog": self._backlog.qsize(),
         }
 
     async def _publish_heatmap(self, frame: Frame, reading: Reading) -> None:
         """Publish all scores where somebody looks at them, at their own price: no estimate waits for them."""
-        if not (self.always_heatmap or self._publisher.wanted(EitHeatmap.topic)) or not self._backlog.empty():
+        if not (self.always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic)) or not self._backlog.empty():
             return
         estimator = self.estimation.estimator
         heatmap = await asyncio.to_thread(estimator.heatmap, reading)

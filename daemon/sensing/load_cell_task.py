@@ -81,7 +81,7 @@ class LoadCellTask:
         """Return what health tells of the board."""
         facts = self._board.facts()
         told = {"expected_hz": 1.0 / self.source.period_s}
-        return {**facts, **told, "trouble": self._untaken if facts["connected"] else facts["last_loss"]}
+        return {**facts, **told, "error": self._untaken if facts["connected"] else facts["last_loss"]}
 
     def _take_zero(self, sample: LoadSample) -> None:
         self._why = _why(sample)
@@ -114,7 +114,7 @@ def load_message(sample: LoadSample) -> LoadTorque:
         saturated=sample.saturated,
         spike=sample.spike,
         valid=sample.trusted,
-        why=_why(sample),
+        reason=_why(sample),
     )
 
 

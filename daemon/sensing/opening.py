@@ -12,7 +12,7 @@ from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatch
 from shearloop.bank.estimation import Calibration as FittedCalibration
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
 from shearloop.daemon.sensing.estimator import LONGEST_GAP_NS, Estimator
 from shearloop.daemon.sensing.tracking import Scoring, TrackedEstimator
 

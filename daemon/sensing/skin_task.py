@@ -78,7 +78,7 @@ class SkinTask:
         return {
             **self._skin.facts(),
             "valid": self._valid,
-            "trouble": self._why,
+            "error": self._why,
             "zero_1_ohm": zero.r1_ohm if zero is not None else None,
             "zero_2_ohm": zero.r2_ohm if zero is not None else None,
             "drift_per_hour": self._estimator.drift_per_hour,
@@ -97,7 +97,7 @@ class SkinTask:
     def _publish(self, sample: SkinSample, reading: SkinReading) -> None:
         now_ns = self._clock.now_ns()
         message = shear_message(sample, reading, self._radius_m, now_ns)
-        self._why = message.why
+        self._why = message.reason
         self._valid += reading.valid
         if self._radius_m is not None:
             self._hear(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
@@ -123,7 +123,7 @@ def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | No
         deadband=interval is not None and interval.in_deadband,
         direction=reading.direction.value,
         valid=reading.valid,
-        why="; ".join(reading.why),
+        reason="; ".join(reading.why),
         sample=sample.seq,
         missed=sample.missed,
         latency_s=(now_ns - sample.t_arrival_ns) / 1e9,

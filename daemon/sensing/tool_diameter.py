@@ -5,7 +5,7 @@ from typing import TypeAlias
 
 from shearloop.bank.eit.polynomial import Interval
 from shearloop.bank.estimation import Measured, fused
-from shearloop.daemon.messaging.topics import stale_after_s
+from shearloop.daemon.messaging.messages import stale_after_s
 
 # Which source says a diameter, None for none, and when it said so.
 HearDiameter: TypeAlias = Callable[[str, Interval | None, int], None]

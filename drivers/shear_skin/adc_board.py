@@ -32,13 +32,13 @@ REFUSED_LINES = {
 class PairParser:
     """Turns the board's bytes, in whatever slices they come, into voltages; counts by kind what it refuses. No I/O.
 
-    Counted apart, being nobody's fault: `first_partials`, lines that may have been under way when listening began.
+    Counted apart, being nobody's fault: `partial_lines`, lines that may have been under way when listening began.
     """
 
     def __init__(self, rate_hz: float = RATE_HZ, full_scale_v: float = FULL_SCALE_V) -> None:
         self._lines = LineSplitter(MAX_LINE_BYTES)
         self._refused: Counter[str] = Counter()
-        self.first_partials = 0
+        self.partial_lines = 0
         self._period_ns = round(1e9 / rate_hz)
         self._end_v = _AT_THE_END * full_scale_v
         self._last_mid_ns: int | None = None
@@ -74,7 +74,7 @@ class PairParser:
             pair = None if line is None else self._pair(line)
             first, self._first = self._first, False
             if first:
-                self.first_partials += 1
+                self.partial_lines += 1
             elif line is not None and pair is not None:
                 found.append(self._voltages(*pair, len(line) + 1, t_arrival_ns - age * self._period_ns, t_arrival_ns))
         return found
@@ -133,7 +133,7 @@ class AdcBoard:
         return {
             **self._board.facts(),
             "lines": self._lines,
-            "first_partials": self._parser.first_partials,
+            "partial_lines": self._parser.partial_lines,
             "errors": dict(refused),
             "refusals": " ".join(refusals),
         }

@@ -24,7 +24,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank.build import MODELS as MODELS_IN_HELP
 from shearloop.daemon.cli.completion import full_parser
-from shearloop.daemon.cli.message_lines import message_json, message_line
+from shearloop.daemon.cli.output import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import decode, encode
@@ -162,10 +162,10 @@ def test_a_calibration_of_another_bank_is_refused_by_name(
         (["listen", "--connect", "here", "--timeout", "1"], "'here' is not an address"),
         (
             ["listen", "--connect", "tcp://127.0.0.1:70000", "--timeout", "0.05"],
-            "tcp://127.0.0.1:70000 ends in no port",
+            "tcp://127.0.0.1:70000 has no valid port",
         ),
         (["command", "stop", "--connect", "tcp://127.0.0.1:7762a", "--timeout", "0.05"], "a whole number up to 65535"),
-        (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "nothing was heard"),
+        (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no message came"),
         (["command", "tare", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no daemon answered"),
     ],
 )
@@ -201,7 +201,7 @@ def test_what_a_signal_interrupts_says_so_except_listening_which_ends_so(
     monkeypatch.setattr("shearloop.daemon.cli.evaluate.run", interrupted)
     assert main(["evaluate", "a.cal", "b.mcap"]) == status
     assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
-    monkeypatch.setattr("shearloop.daemon.messaging.subscriber.messages", interrupted)
+    monkeypatch.setattr("shearloop.daemon.messaging.client.receive_messages", interrupted)
     assert main(["listen"]) == status
     assert capsys.readouterr() == ("", "")
 
@@ -317,14 +317,14 @@ def test_messages_are_readable() -> None:
                 "sigma": 1.5,
                 "score": 0.75,
                 "valid": True,
-                "why": "",
+                "reason": "",
             }
         )
     )
     line = message_line("eit.estimate", content)
     assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
-    invalid = {**content, "valid": False, "why": "no signal"}
+    invalid = {**content, "valid": False, "reason": "no signal"}
     assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
 
 
@@ -369,7 +369,7 @@ def test_unlocking_is_waited_for_and_an_absent_daemon_is_told_at_once(
         asked.append((content["command"], timeout_s))
         return {"ok": True}
 
-    monkeypatch.setattr("shearloop.daemon.messaging.request.request", answers)
+    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
     assert main(["command", "unlock"]) == 0
     assert main(["command", "unlock", "--timeout", "5"]) == 0
     assert main(["command", "stop"]) == 0

@@ -14,9 +14,8 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.safety import TABLE
 from shearloop.daemon.docgen import ROOT, pages
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
-from shearloop.daemon.messaging.messages import EitEstimate, EitFrame
+from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.messaging.topics import TOPICS
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.sample_messages import sample
 

@@ -111,7 +111,7 @@ async def test_a_slow_board_has_the_time_that_its_readings_take() -> None:
             board.sent.put_nowait(LoadSample(3.0, 0.1, now_ns + number * 10**9, now_ns + number * 10**9, number))
         await board.sent.join()
         assert board.tares == [3.0]
-        assert task.facts()["trouble"] == ""
+        assert task.facts()["error"] == ""
 
 
 async def test_readings_that_know_of_the_load_before_are_not_of_the_zero() -> None:
@@ -138,10 +138,10 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
             board.sent.put_nowait(LoadSample(9.0, 0.1, later_ns + seq, later_ns + seq, seq))
         await board.sent.join()
         assert board.tares == []
-        assert "was not taken within 15 s" in str(task.facts()["trouble"])
+        assert "was not taken within 15 s" in str(task.facts()["error"])
         task._clock = Later()
         task.tare()
-        assert task.facts()["trouble"] == ""
+        assert task.facts()["error"] == ""
         later_ns = task._clock.now_ns() + 10**9
         for seq in range(ZERO_SAMPLES):
             board.sent.put_nowait(LoadSample(3.0, 0.1, later_ns + seq, later_ns + seq, seq))
@@ -160,5 +160,5 @@ async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(f
         await board.send(5.0, 1)
     spoilt, good = published.messages
     assert not spoilt.valid
-    assert why in spoilt.why
-    assert (good.valid, good.why) == (True, "")
+    assert why in spoilt.reason
+    assert (good.valid, good.reason) == (True, "")

@@ -29,7 +29,7 @@ def test_what_is_written_comes_out_in_order_and_all_of_it_at_the_end() -> None:
         for number in range(1000):
             assert outlet.write(f"{number}\n") == len(f"{number}\n")
     assert stream.getvalue().splitlines() == [str(number) for number in range(1000)]
-    assert outlet.facts() == {"errors": {}, "trouble": ""}
+    assert outlet.facts() == {"errors": {}, "error": ""}
 
 
 class Terminal(io.StringIO):
@@ -54,7 +54,7 @@ def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_t
         outlet.write(f"{number}\n")
     assert outlet.lost == 3
     assert outlet.facts()["errors"] == {"unread": 3}
-    assert "Ctrl-Q" in str(outlet.facts()["trouble"])
+    assert "Ctrl-Q" in str(outlet.facts()["error"])
     outlet.close(timeout_s=0.0)
     assert outlet._thread.is_alive(), "the end waits no longer than it is told"
     terminal.goes_on.set()

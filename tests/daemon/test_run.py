@@ -19,8 +19,8 @@ from scipy.io import savemat
 from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
 from shearloop.drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
@@ -114,7 +114,7 @@ def collector(daemon: Daemon, topic: str) -> "asyncio.Queue[dict[str, Any]]":
         if name == topic:
             queue.put_nowait(content)
 
-    daemon.publisher.listen(listen)
+    daemon.publisher.add_listener(listen)
     return queue
 
 
@@ -130,16 +130,16 @@ async def test_commands_tare_tell_the_status_and_stop(config: Write, tmp_path: P
         ):
             while not (await estimates.get())["valid"]:
                 continue
-            reply = await asyncio.to_thread(request, address, {"command": "tare"}, DEADLINE_S)
+            reply = await asyncio.to_thread(send_command, address, {"command": "tare"}, DEADLINE_S)
             assert reply == {"ok": True, "tared": ["right"]}
-            while "taking the homogeneous frame, 1 of 10" not in (await estimates.get())["why"]:
+            while "taking the homogeneous frame, 1 of 10" not in (await estimates.get())["reason"]:
                 continue
-            reply = await asyncio.to_thread(request, address, {"command": "tare", "source": "left"}, DEADLINE_S)
-            assert reply == {"ok": False, "why": "there is no sensor 'left' to tare; there are right"}
-            status = await asyncio.to_thread(request, address, {"command": "status"}, DEADLINE_S)
+            reply = await asyncio.to_thread(send_command, address, {"command": "tare", "source": "left"}, DEADLINE_S)
+            assert reply == {"ok": False, "reason": "there is no sensor 'left' to tare; there are right"}
+            status = await asyncio.to_thread(send_command, address, {"command": "status"}, DEADLINE_S)
             assert status["tasks"]["right"]["connected"]
             assert status["tasks"]["commands"]["errors"] == {"tare refused": 1}
-        assert (await asyncio.to_thread(request, address, {"command": "stop"}, DEADLINE_S))["ok"]
+        assert (await asyncio.to_thread(send_command, address, {"command": "stop"}, DEADLINE_S))["ok"]
         await daemon.stopped()
 
 
@@ -188,11 +188,11 @@ async def test_a_stop_calls_off_an_experiment_that_waits_for_its_devices_and_spa
         while not (await health.get())["tasks"]["experiment"]["alive"]:
             continue
         stop = {"command": "stop", "spare_daemon": True}
-        reply = await asyncio.to_thread(request, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
+        reply = await asyncio.to_thread(send_command, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
         assert reply == {"ok": True, "stopped": "the start of loosen.yaml"}
         while not (await health.get())["tasks"]["experiment"]["done"]:
             continue
-        reply = await asyncio.to_thread(request, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
+        reply = await asyncio.to_thread(send_command, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
         assert reply == {"ok": True, "stopped": ""}
 
 
@@ -257,7 +257,7 @@ async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, t
             assert await asyncio.to_thread(os.read, reader, 1), "it runs, and says so"
             os.close(reader)
             for command in ("status", "tare", "stop"):
-                assert (await asyncio.to_thread(request, address, {"command": command}, DEADLINE_S))["ok"]
+                assert (await asyncio.to_thread(send_command, address, {"command": command}, DEADLINE_S))["ok"]
             assert await process.wait() == 0
     finally:
         if process.returncode is None:
@@ -283,7 +283,7 @@ async def test_a_terminal_that_was_stopped_keeps_no_estimate_waiting(
             # A line for each would be 30 kB, of which the terminal takes 4 unread.
             received = await asyncio.to_thread(lambda: [next_message(frames) for _ in range(300)])
         assert [message["frame"] for message in received] == list(range(300))
-        assert (await asyncio.to_thread(next_message, health))["tasks"]["shown"]["trouble"] == ""
+        assert (await asyncio.to_thread(next_message, health))["tasks"]["shown"]["error"] == ""
         await stop_and_time(process, signal.SIGTERM)
     finally:
         if process.returncode is None:
@@ -304,9 +304,11 @@ async def test_a_load_cell_is_read_without_a_robot_too(config: Write, tmp_path: 
         ):
             assert (await torques.get())["torque_nm"] == pytest.approx(0.08, abs=0.005)
             address = f"ipc://{tmp_path}/commands"
-            reply = await asyncio.to_thread(request, address, {"command": "tare", "source": "load_cell"}, DEADLINE_S)
+            reply = await asyncio.to_thread(
+                send_command, address, {"command": "tare", "source": "load_cell"}, DEADLINE_S
+            )
             assert reply == {"ok": True, "tared": ["load_cell"]}
             while abs((await torques.get())["torque_nm"]) > 0.005:
                 continue
-            status = await asyncio.to_thread(request, address, {"command": "status"}, DEADLINE_S)
+            status = await asyncio.to_thread(send_command, address, {"command": "status"}, DEADLINE_S)
             assert status["tasks"]["load_cell"]["alive"]

@@ -127,7 +127,7 @@ def test_any_slicing_gives_the_same_frames(cuts: list[int]) -> None:
     frames = feed_all(parser, slices(b"".join(LINES), cuts))
     assert [frame.line + b"\n" for frame in frames] == LINES
     assert not parser.refused
-    assert parser.first_partials == 0
+    assert parser.partial_lines == 0
 
 
 def test_one_byte_at_a_time_gives_the_same_frames() -> None:
@@ -214,14 +214,14 @@ def test_the_rest_of_a_line_that_was_under_way_is_no_error(start: int) -> None:
     parser = FrameParser(ZERO_SLOTS)
     assert len(parser.feed(GOOD[start:] + LINES[1], 0)) == 1
     assert not parser.refused
-    assert parser.first_partials == 1
+    assert parser.partial_lines == 1
 
 
 def test_a_whole_line_that_is_broken_is_refused_even_as_the_first() -> None:
     parser = FrameParser(ZERO_SLOTS)
     parser.feed(with_value(CHANNEL, b"nan"), 0)
     assert dict(parser.refused) == {FrameErrorKind.NAN: 1}
-    assert parser.first_partials == 0
+    assert parser.partial_lines == 0
 
 
 def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> None:

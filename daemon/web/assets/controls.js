@@ -52,14 +52,14 @@ export class Controls {
     this.tell("stopping …");
     const reply = await this.ask("stop", {}, STOP_LATE_MS);
     if (reply.ok) this.tell(reply.stopped ? `stopped: ${reply.stopped}` : "stop: nothing was moving");
-    else this.tell(`STOP NOT CONFIRMED: ${reply.why}. Use the emergency stop of the robot.`, "bad");
+    else this.tell(`STOP NOT CONFIRMED: ${reply.reason}. Use the emergency stop of the robot.`, "bad");
   }
 
   async command(name) {
     this.tell(`${name} …`);
     const reply = await this.ask(`commands/${name}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
     if (reply.ok) this.tell(`${name}: done`);
-    else this.tell(`${name} was refused: ${reply.why}`, "bad");
+    else this.tell(`${name} was refused: ${reply.reason}`, "bad");
     // A token that is not the right one is asked for anew.
     if (reply.status === 403) this.keep("");
   }
@@ -69,7 +69,7 @@ export class Controls {
       const response = await fetch(path, { method: "POST", headers, keepalive: true, signal: AbortSignal.timeout(lateMs) });
       return { status: response.status, ...(await response.json()) };
     } catch {
-      return { ok: false, why: "the viewer on the rig's computer does not answer" };
+      return { ok: false, reason: "the viewer on the rig's computer does not answer" };
     }
   }
 

@@ -26,7 +26,7 @@ export function markAge(panel, link, message) {
 
 // The sources of estimates, the one that drives the loop first, then the one of both fingertips.
 export function estimatesFirst(link) {
-  const driving = link.get("loop.state")?.content.driving;
+  const driving = link.get("loop.state")?.content.torque_source;
   const rank = (source) => (source === driving ? 0 : source === "both" ? 1 : 2);
   return link.sources("eit.estimate").sort((one, other) => rank(one) - rank(other));
 }
@@ -39,7 +39,7 @@ export function isFingertip(link, source) {
 // Torque, what is wanted, load cell and diameter. The estimate that drives the loop comes first.
 export function torquePanel(link) {
   const loop = link.get("loop.state");
-  const driving = loop?.content.driving;
+  const driving = loop?.content.torque_source;
   const estimate = link.get("eit.estimate", estimatesFirst(link)[0]);
   const skin = link.get("skin.shear");
   const shown = estimate ?? skin;
@@ -50,8 +50,8 @@ export function torquePanel(link) {
   put(byId("torque-now"), valid ? number(said.torque_nm, 4, "N·m", { signed: true }) : "–");
   put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? interval(said.torque_low_nm, said.torque_high_nm, 4) : "");
   const load = link.get("load.torque");
-  const silent = load && !load.content.valid && !link.isOld(load) ? `load cell: ${load.content.why}` : "";
-  warn(byId("torque-why"), [said && !valid ? `no estimate: ${said.why}` : "", silent].filter(Boolean).join("; "));
+  const silent = load && !load.content.valid && !link.isOld(load) ? `load cell: ${load.content.reason}` : "";
+  warn(byId("torque-why"), [said && !valid ? `no estimate: ${said.reason}` : "", silent].filter(Boolean).join("; "));
   const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop.content : {};
   put(byId("wanted"), number(wanted.ramp_nm, 4, "N·m", { signed: true }));
   put(byId("set-point"), wanted.set_point_nm == null ? "" : `set point ${number(wanted.set_point_nm, 3, "", { signed: true })}`);
@@ -103,7 +103,7 @@ export class FingertipPanel {
     put(this.part("sigma"), number(said.sigma, 3, "cm"));
     put(this.part("frame"), said.frame === undefined ? "–" : String(said.frame));
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
-    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.why}` : "");
+    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : "");
     if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
     if (this.drawn.map !== heatmap) this.drawMap(heatmap);
     if (heatmap) this.mapText(heatmap, said);
@@ -151,7 +151,7 @@ export function shearPanel(link) {
   put(byId("shear-response"), number(said.response, 5, "", { signed: true }));
   put(byId("shear-gauges"), `${number(said.r1_ohm, 3)} · ${number(said.r2_ohm, 3)} Ω`);
   put(byId("shear-state"), said.deadband ? "within the deadband" : said.direction);
-  warn(byId("shear-why"), said.valid ? "" : `no force: ${said.why}`);
+  warn(byId("shear-why"), said.valid ? "" : `no force: ${said.reason}`);
 }
 
 export function robotPanel(link) {
@@ -174,8 +174,8 @@ export function robotPanel(link) {
   const loop = link.get("loop.state");
   const sent = loop && !link.isOld(loop) ? loop.content : {};
   put(byId("speed-sent"), number(sent.speed_sent_rad_per_s, 3, "rad/s", { signed: true }));
-  const clipped = sent.speed_wanted_rad_per_s !== undefined && Math.abs(sent.speed_wanted_rad_per_s - sent.speed_sent_rad_per_s) > 0.0005;
-  put(byId("speed-wanted"), clipped ? `wanted ${number(sent.speed_wanted_rad_per_s, 3, "", { signed: true })}` : "");
+  const clipped = sent.speed_command_rad_per_s !== undefined && Math.abs(sent.speed_command_rad_per_s - sent.speed_sent_rad_per_s) > 0.0005;
+  put(byId("speed-wanted"), clipped ? `wanted ${number(sent.speed_command_rad_per_s, 3, "", { signed: true })}` : "");
 }
 
 export function gripperPanel(link) {
@@ -223,8 +223,8 @@ function fillRow(row, name, facts) {
   row.className = dead ? "dead" : "";
   const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`} Hz`;
   const errors = Object.entries(facts.errors ?? {}).map(([kind, count]) => `${count} ${kind}`).join(", ");
-  const trouble = facts.trouble || facts.last_error || "";
-  const texts = [name, alive, rate, errors || "0", String(facts.restarts ?? ""), trouble];
+  const error = facts.error || facts.last_error || "";
+  const texts = [name, alive, rate, errors || "0", String(facts.restarts ?? ""), error];
   texts.forEach((text, i) => put(row.cells[i], text));
 }
 
@@ -236,7 +236,7 @@ export function loopPanel(link) {
   put(byId("phase-name"), current ? `${current.phase}${current.experiment ? `: ${current.experiment}` : ""}${step}` : "–");
   const reasons = current?.reasons ?? "";
   // What stopped it stands below, with its cure.
-  put(byId("phase-doing"), current?.phase === "stopped" && reasons ? "" : current?.doing ?? "");
+  put(byId("phase-doing"), current?.phase === "stopped" && reasons ? "" : current?.activity ?? "");
   const underWay = Boolean(current?.steps) && (ACTIVE.has(current.phase) || current.phase === "done");
   const share = underWay ? current.progress : 0;
   if (byId("progress").value !== share) byId("progress").value = share;

@@ -35,7 +35,7 @@ class Told:
         if len(self.messages) == self._enough:
             self.enough.set()
 
-    def wanted(self, _topic: str) -> bool:
+    def has_subscriber(self, _topic: str) -> bool:
         return False
 
 

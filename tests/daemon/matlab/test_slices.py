@@ -23,7 +23,7 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
         "step_name": "twist",
         "hold": 0,
         "slices": "torque",
-        "driving": "load_cell",
+        "torque_source": "load_cell",
         **changes,
     }
 
@@ -257,7 +257,7 @@ def test_a_folder_that_cannot_be_written_kills_nobody_and_is_told(unwritable: Pa
     facts = sweep.recorder.facts()
     assert facts["slices"] == 0
     assert facts["errors"] == sweep.recorder.missed
-    assert "cannot be written" in str(facts["trouble"])
+    assert "cannot be written" in str(facts["error"])
     assert not list(unwritable.glob("torque_slices/*")), "nothing half written is left"
 
 

@@ -35,7 +35,7 @@ def recorded(content: dict[str, Any]) -> RecordedEvent:
         ({"torque_nm": 0.1}, {"torque_nm": 0.1 + 1e-16}, "torque_nm was 0.1, is 0.100000000000000"),
         ({"k": None}, {"k": 1.5}, "k was None, is 1.5"),
         ({"k": 1.5}, {"k": None}, "k was 1.5, is None"),
-        ({"why": ""}, {"why": "no grip"}, "why was"),
+        ({"reason": ""}, {"reason": "no grip"}, "reason was"),
     ],
 )
 def test_a_message_is_the_recorded_one_bit_for_bit_or_told_with_what_differs(

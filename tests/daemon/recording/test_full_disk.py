@@ -79,7 +79,7 @@ def test_when_there_is_room_again_nothing_is_missing(tmp_path: Path) -> None:
         recorder.write()
     assert "No space left on device" in recorder.failure
     facts = recorder.facts()
-    assert facts["trouble"] == recorder.failure
+    assert facts["error"] == recorder.failure
     assert facts["waiting_bytes"] > 0
     recorder.experiment("another")
     recorder.write()

@@ -57,7 +57,7 @@ def torque(clock: Clock, number: int, torque_nm: float = 0.1) -> dict:
         saturated=False,
         spike=False,
         valid=True,
-        why="",
+        reason="",
     )
     return wire_map(message, clock.unix_s(message.t_mono_ns), number)
 
@@ -110,7 +110,7 @@ def test_a_live_recording_is_read_as_an_imported_one(tmp_path: Path) -> None:
         recorder.record("load.torque", torque(clock, n))
     recorder.record("load.torque", {**torque(clock, 3, 9.0), "valid": False})
     recorded_before = torque(clock, 4, 9.0) | {"spike": True}
-    del recorded_before["valid"], recorded_before["why"]
+    del recorded_before["valid"], recorded_before["reason"]
     recorder.record("load.torque", recorded_before)
     recorder.close()
     found = read_recording(recorder.finished[0])
@@ -234,8 +234,8 @@ def test_a_message_without_a_json_form_is_left_out_and_counted_and_the_recorder_
     asyncio.run(asyncio.to_thread(recorder.write))
     facts = recorder.facts()
     assert facts["errors"] == {"unwritable": 1}
-    assert facts["trouble"].startswith("a message of load.torque is left out, for it has no JSON form: ")
-    assert why in facts["trouble"]
+    assert facts["error"].startswith("a message of load.torque is left out, for it has no JSON form: ")
+    assert why in facts["error"]
     assert facts["waiting_bytes"] == 0
     assert recorder.failure == "", "nothing is wrong with the disk"
     recorder.experiment("second")

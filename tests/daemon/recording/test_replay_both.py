@@ -119,7 +119,7 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
             await board.stdout.readline()
         with zmq.asyncio.Context() as context:
             daemon = Daemon(load_daemon_config(config), context)
-            daemon.publisher.listen(listen)
+            daemon.publisher.add_listener(listen)
             right = daemon._estimations["right"]
             right.held_tool = lambda _: Measured(OTHER_MM, 0.5) if right.count in OTHER_TOOL else None
             running = asyncio.create_task(daemon.run())
@@ -161,10 +161,10 @@ def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
     torques = [one["torque_nm"] for _, one in replays[math.inf] if one["source"] == "right" and one["valid"]]
     assert len(torques) > 30
     assert np.ptp(torques) > 0.05
-    says = [(one["source"], "the tool is of 14 mm" in one["why"]) for _, one in replays[math.inf]]
+    says = [(one["source"], "the tool is of 14 mm" in one["reason"]) for _, one in replays[math.inf]]
     assert not any(refused for source, refused in says if source != "right")
     right = [one for _, one in replays[math.inf] if one["source"] == "right"]
-    refused = [number for number, one in enumerate(right) if "the tool is of 14 mm" in one["why"]]
+    refused = [number for number, one in enumerate(right) if "the tool is of 14 mm" in one["reason"]]
     # On a busy computer frames come so unevenly that a few are refused as coming after lost ones.
     assert refused
     assert set(refused) <= set(OTHER_TOOL)

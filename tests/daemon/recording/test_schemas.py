@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from shearloop.daemon.messaging.messages import EitFrame, Message, wire_map
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.messages import TOPICS, EitFrame, Message, wire_map
 from shearloop.daemon.recording.content import input_json, message_json
 from shearloop.daemon.recording.schema import INPUT, completed, schemas
 from shearloop.drivers.raw_event import InputKind, RawEvent

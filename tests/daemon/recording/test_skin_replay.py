@@ -18,7 +18,7 @@ async def recorded(folder: Path, *, socket: bool) -> list[tuple[str, dict[str, A
     """Return what a daemon published while a skin was loaded, tared and ill-treated, all of it recorded."""
     published: list[tuple[str, dict[str, Any]]] = []
     async with played(folder, socket=socket, daemon={"recording": {"folder": "recordings"}}) as bench:
-        bench.daemon.publisher.listen(lambda topic, content: published.append((topic, content)))
+        bench.daemon.publisher.add_listener(lambda topic, content: published.append((topic, content)))
         await bench.valid()
         for number in range(20):
             bench.skin.push(0.8 * number / 19)
@@ -55,7 +55,7 @@ def test_the_skin_s_raw_inputs_give_the_same_forces_again(
     then, now = (measured([one for one in run if one[0] == "skin.shear"]) for run in (live, again))
     begin = next(i for i, (_, content) in enumerate(now) if content["sample"] == then[0][1]["sample"])
     assert now[begin : begin + len(then)] == then
-    reasons = {content["why"].split(",")[0] for _, content in now}
+    reasons = {content["reason"].split(",")[0] for _, content in now}
     assert {"", "taking the zero"} <= reasons
     assert any("gauge 1 is open" in why for why in reasons)
     assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.service.installation import (
+from shearloop.daemon.service import (
     EXAMPLE,
     PLACES,
     REAL_TIME,
@@ -126,8 +126,8 @@ def test_a_program_that_the_service_cannot_see_is_refused(
     assert "there is no program" in mistake(capsys, "install", "--dry-run")
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin/shearloop").touch()
-    monkeypatch.setattr("shearloop.daemon.service.installation._HIDDEN", (str(tmp_path),))
+    monkeypatch.setattr("shearloop.daemon.service._HIDDEN", (str(tmp_path),))
     said = mistake(capsys, "install", "--dry-run")
     assert f"lies in {tmp_path}, which the service is not allowed to see" in said
-    monkeypatch.setattr("shearloop.daemon.service.installation._HIDDEN", ("/nowhere",))
+    monkeypatch.setattr("shearloop.daemon.service._HIDDEN", ("/nowhere",))
     assert find_program() == tmp_path / "bin/shearloop"

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon.service import realtime
+from shearloop.daemon import realtime
 
 
 def test_the_session_gets_its_place_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,8 +13,8 @@ from shearloop.daemon import health
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sd_notify import notify
-from shearloop.daemon.service.realtime import lock_memory
+from shearloop.daemon.realtime import lock_memory
+from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import Supervisor, TaskRecord
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
@@ -85,7 +85,7 @@ async def test_the_watchdog_is_fed_only_while_every_task_is_alive(
         supervisor.records["right"].alive = False
         while said.startswith(b"WATCHDOG=1"):
             said = await asyncio.to_thread(manager.recv, 4096)
-        assert said == b"STATUS=dead, to be started again: right"
+        assert said == b"STATUS=dead, restarting: right"
         assert await asyncio.to_thread(manager.recv, 4096) == said, "and it stays hungry"
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)

@@ -75,7 +75,7 @@ def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> 
         "#wrist": f"{signed(robot['wrist_rad'], 3)} rad",
         "#wrist-speed": f"{signed(robot['wrist_speed_rad_per_s'], 3)} rad/s",
         "#speed-sent": f"{signed(said['loop']['speed_sent_rad_per_s'], 3)} rad/s",
-        "#speed-wanted": f"wanted {signed(said['loop']['speed_wanted_rad_per_s'], 3)}",
+        "#speed-wanted": f"wanted {signed(said['loop']['speed_command_rad_per_s'], 3)}",
         "#wrist-torque": f"{signed(robot['wrist_torque_nm'], 3)} N·m",
         "#robot-mode": "running (7)",
         "#safety-mode": "normal (1)",
@@ -146,7 +146,7 @@ def test_lines_break_where_nothing_is_known_and_go_on_past_what_others_say(brows
 
 def test_an_invalid_estimate_is_no_number(browsed: Browsed) -> None:
     nothing = {"torque_nm": None, "torque_low_nm": None, "torque_high_nm": None, "diameter_mm": None}
-    browsed.daemon.say(estimate={**nothing, "valid": False, "why": "no signal above the noise"})
+    browsed.daemon.say(estimate={**nothing, "valid": False, "reason": "no signal above the noise"})
     browsed.open()
     browsed.until_shown(
         {
@@ -181,7 +181,7 @@ def test_a_fault_of_robot_and_gripper_stands_in_its_panel(browsed: Browsed) -> N
     browsed.daemon.say(
         robot={"protective_stop": True, "safety_mode": 3, "blocked": "The robot is in a protective stop."},
         gripper={"fault": 11, "fault_text": "overheated"},
-        loop={"phase": "stopped", "response": "stop and keep grip", "reasons": REASONS, "doing": "a long sentence"},
+        loop={"phase": "stopped", "response": "stop and keep grip", "reasons": REASONS, "activity": "a long sentence"},
     )
     browsed.open()
     browsed.until_shown(
@@ -199,7 +199,7 @@ def test_a_fault_of_robot_and_gripper_stands_in_its_panel(browsed: Browsed) -> N
 
 def test_a_reading_of_the_load_cell_that_is_not_to_be_believed_is_no_figure(browsed: Browsed) -> None:
     browsed.open()
-    browsed.daemon.say(load={"valid": False, "why": "the reading is the same for two seconds"})
+    browsed.daemon.say(load={"valid": False, "reason": "the reading is the same for two seconds"})
     why = "load cell: the reading is the same for two seconds"
     browsed.until_shown({"#load-torque": "–", "#load-note": "not valid", "#torque-why": why})
     assert browsed.layout()["spilt"] == []
@@ -235,8 +235,8 @@ def test_the_page_is_redrawn_thirty_times_a_second(browsed: Browsed) -> None:
 def test_two_fingertips_and_the_estimate_of_both(browsed: Browsed) -> None:
     page = browsed.open()
     browsed.daemon.say(
-        loop={"driving": "both"},
-        left={"source": "left", "torque_nm": None, "valid": False, "why": "no calibration is configured"},
+        loop={"torque_source": "both"},
+        left={"source": "left", "torque_nm": None, "valid": False, "reason": "no calibration is configured"},
         both={"source": "both", "torque_nm": 0.0876, "k": None, "sigma": None, "score": None, "runner_up": None},
     )
     browsed.until("#torque-source", "estimate of both, drives the loop")

@@ -103,7 +103,10 @@ async def test_what_moves_something_needs_the_token_and_stop_does_not(tmp_path: 
         assert page.asked == []
         assert await post(page, "/stop") == (200, {"ok": True, "stopped": "test"})
         assert await post(page, "/commands/start", **BEARER) == (200, {"ok": True})
-        assert await post(page, "/commands/pause", **BEARER) == (409, {"ok": False, "why": "no experiment is running"})
+        assert await post(page, "/commands/pause", **BEARER) == (
+            409,
+            {"ok": False, "reason": "no experiment is running"},
+        )
         # Other commands of the daemon are not the page's.
         for name in ("stop", "set", "status"):
             assert (await post(page, f"/commands/{name}", **BEARER))[0] == 404
@@ -165,13 +168,13 @@ def test_the_page_names_nothing_outside_of_itself() -> None:
 
 async def test_messages_reach_an_open_page_and_heatmaps_are_asked_for_while_one_is_open(tmp_path: Path) -> None:
     async with served(tmp_path) as page:
-        await until(lambda: page.publisher.wanted("load.torque"))
-        assert not page.publisher.wanted(EitHeatmap.topic)
+        await until(lambda: page.publisher.has_subscriber("load.torque"))
+        assert not page.publisher.has_subscriber(EitHeatmap.topic)
         async with page.http.ws_connect(f"{page.base}/stream") as stream:
             first = await stream.receive_json()
             assert first["first"]
             assert (first["messages"], first["quiet_s"]) == ([], None)
-            await until(lambda: page.publisher.wanted(EitHeatmap.topic))
+            await until(lambda: page.publisher.has_subscriber(EitHeatmap.topic))
             page.publisher.publish(
                 LoadTorque(
                     source="load_cell",
@@ -181,7 +184,7 @@ async def test_messages_reach_an_open_page_and_heatmaps_are_asked_for_while_one_
                     saturated=False,
                     spike=False,
                     valid=True,
-                    why="",
+                    reason="",
                 )
             )
             while not (batch := await stream.receive_json())["messages"]:
@@ -192,7 +195,7 @@ async def test_messages_reach_an_open_page_and_heatmaps_are_asked_for_while_one_
             first = await again.receive_json()
             assert first["messages"][0]["content"]["torque_nm"] == 0.1, "a page that comes later gets what is known"
             assert first["history"][0]["content"]["torque_nm"] == 0.1
-        await until(lambda: not page.publisher.wanted(EitHeatmap.topic))
+        await until(lambda: not page.publisher.has_subscriber(EitHeatmap.topic))
 
 
 async def test_a_flood_of_stops_is_one_request_and_passes_commands_that_hang(
@@ -239,7 +242,7 @@ async def test_without_a_daemon_a_stop_says_that_it_was_not_heard(
         page.bridge._address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
         status, reply = await post(page, "/stop")
         assert (status, reply["ok"]) == (503, False)
-        assert "no daemon answered" in reply["why"]
+        assert "no daemon answered" in reply["reason"]
 
 
 async def test_no_more_pages_than_can_be_served_and_none_that_talks_at_length(
@@ -269,7 +272,7 @@ async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tm
         port = taken.getsockname()[1]
         with pytest.raises(UserError, match=f"cannot be served on 127.0.0.1:{port}"):
             await serve(DaemonAddress(PUBLISH_ADDRESS, f"ipc://{tmp_path}/c"), port, TOKEN, tip, ready)
-    for wrong, said in (("nonsense", "'nonsense' is not an address"), ("tcp://127.0.0.1:70000", "ends in no port")):
+    for wrong, said in (("nonsense", "'nonsense' is not an address"), ("tcp://127.0.0.1:70000", "has no valid port")):
         for publish, commands in ((wrong, PUBLISH_ADDRESS), (PUBLISH_ADDRESS, wrong)):
             with pytest.raises(UserError, match=said):
                 await serve(DaemonAddress(publish, commands), 0, TOKEN, tip, ready)

@@ -155,7 +155,7 @@ async def test_resistances_come_through_over_every_way_in(tmp_path: Path, serial
         facts = bench.skin.facts()
         assert facts["connected"]
         assert facts["samples"] == len(bench.samples)
-        assert facts.get("first_partials") == (facts["openings"] if adc else None)
+        assert facts.get("partial_lines") == (facts["openings"] if adc else None)
     assert not bench.circuit.output_on, "whoever stops measuring switches the current off"
 
 

@@ -1,4 +1,4 @@
-"""The serial ports of this computer: what is plugged in, under which serial number, and whether it may be opened."""
+"""The serial ports of this computer, their USB serial numbers, and whether the user may open them."""
 
 import os
 from dataclasses import dataclass
@@ -18,8 +18,8 @@ BY_SERIAL = Path("/dev/shearloop")
 
 
 @dataclass(frozen=True, slots=True)
-class PortThere:
-    """One port; empty texts where the system tells nothing."""
+class SerialPortInfo:
+    """One port. Unknown texts are empty; `error` says why the user may not open it."""
 
     path: str
     serial_number: str
@@ -27,55 +27,54 @@ class PortThere:
     description: str
     likely: str
     stable_name: str
-    trouble: str
+    error: str
 
     @property
     def named_by(self) -> str:
-        """What a configuration names it by."""
+        """The `device` that a configuration names it by."""
         if self.serial_number:
             return f'{{serial_number: "{self.serial_number}"}}'
         return f"{{path: {self.stable_name or self.path}}}"
 
 
-def ports_there() -> list[PortThere]:
-    """Return the ports that are there: those on USB, and others that a driver stands behind."""
+def list_serial_ports() -> list[SerialPortInfo]:
+    """Return all USB ports and other ports with a driver."""
     found = []
     for port in sorted(list_ports.comports()):
         usb = f"{port.vid:04x}:{port.pid:04x}" if port.vid is not None and port.pid is not None else ""
         if not usb and "ttyS" in port.device:
-            # Every computer lists a row of these, mostly without a plug.
+            # Every computer lists several of these, mostly without a plug.
             continue
         found.append(
-            PortThere(
+            SerialPortInfo(
                 path=port.device,
                 serial_number=port.serial_number or "",
                 usb=usb,
                 description=port.description if port.description != "n/a" else "",
                 likely=BOARDS.get(port.vid or 0, ""),
                 stable_name=_stable_name(port.device, port.serial_number),
-                trouble=access_trouble(port.device),
+                error=access_error(port.device),
             )
         )
     return found
 
 
-def access_trouble(path: str) -> str:
-    """Return why this user may not open a port, and the cure; empty where nothing stands against it."""
+def access_error(path: str) -> str:
+    """Return why this user may not open a port, and the cure; empty if the user may."""
     if os.access(path, os.R_OK | os.W_OK):
         return ""
     try:
         group = Path(path).group()
     except (OSError, KeyError):
         group = "dialout"
-    return f"you may not open it; `sudo usermod -aG {group} $USER`, then log in anew"
+    return f"you may not open it; `sudo usermod -aG {group} $USER`, then log in again"
 
 
 def _stable_name(device: str, serial_number: str | None) -> str:
-    """Return a name that stays when cables are swapped: udev's own, or ours by serial number."""
-    ours = BY_SERIAL / (serial_number or "-")
+    """Return a link that survives swapped cables: ours by serial number, or udev's; empty if there is none."""
     folders = (Path("/dev/serial/by-id"), Path("/dev/serial/by-path"))
-    candidates = [ours, *(link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir()))]
-    for link in candidates:
+    links = [link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir())]
+    for link in (BY_SERIAL / (serial_number or "-"), *links):
         if link.exists() and os.path.realpath(link) == os.path.realpath(device):
             return str(link)
     return ""

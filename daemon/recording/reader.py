@@ -32,7 +32,7 @@ from shearloop.daemon.recording.schema import (
     input_topic,
 )
 from shearloop.daemon.sensing.tool_diameter import from_text
-from shearloop.drivers.raw_event import InputKind
+from shearloop.drivers.serial_sensor import InputKind
 
 # Metadata of every recording; the other keys are notes of this one.
 _IDENTITY_KEYS = ("format_version", "channel_table_hash", "software", "code_sha256")

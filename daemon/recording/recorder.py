@@ -33,7 +33,7 @@ from shearloop.daemon.recording.schema import (
     recorded_topic,
 )
 from shearloop.daemon.recording.writer import McapFile
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap
+from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent
 
 # A kill loses the data since the last flush, less than a second even on a busy computer.
 FLUSH_S = 0.5
@@ -133,7 +133,7 @@ class Recorder:
         size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
         self._enqueue(_Message(topic, content, self._clock.offset_ns, self._clock.now_ns()), size)
 
-    def input_recorder(self, source: str) -> Tap:
+    def input_recorder(self, source: str) -> OnRaw:
         """Return a function that records the raw input of one source."""
 
         def record_input(event: RawEvent) -> None:

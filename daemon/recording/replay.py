@@ -48,12 +48,11 @@ from shearloop.daemon.sensing.estimation import estimate_message
 from shearloop.daemon.sensing.fingertip import frame_message
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
-from shearloop.daemon.sensing.skin_setup import RecordedSkin
-from shearloop.daemon.sensing.skin_task import SKIN
+from shearloop.daemon.sensing.skin_task import SKIN, RecordedSkin
 from shearloop.daemon.sensing.tool_diameter import from_text
-from shearloop.drivers.eit_line import Frame, FrameParser
-from shearloop.drivers.hx711 import LoadParser
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.eit_kit import Frame, FrameParser
+from shearloop.drivers.load_cell import LoadParser
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 # Topics that a replay computes. All others are sent as they were recorded.
 COMPUTED_TOPICS = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topic)
@@ -198,17 +197,17 @@ class ReplayPipeline:
     async def process(self, source: str, event: RawEvent) -> None:
         """Publish the messages that follow from a raw input; an input of another source is ignored."""
         if source in self._frame_parsers:
-            for frame in self._renumbered(source, self._frame_parsers[source].take(event)):
+            for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
                 pair = self._pairing.take(source, frame.t_mid_ns, frame) if self._pairing is not None else None
                 if pair is not None:
                     await self._estimate(BOTH, *pair[1])
         elif source == LOAD_CELL and self._load_parser is not None:
-            for sample in self._load_parser.take(event):
+            for sample in self._load_parser.handle(event):
                 self._publisher.publish(load_message(sample))
         elif self._skin is not None and source in self._skin.sources:
-            for message in self._skin.take(source, event):
+            for message in self._skin.handle(source, event):
                 self._publisher.publish(message)
 
     def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:

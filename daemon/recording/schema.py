@@ -23,7 +23,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame, EitHeatmap, LoadTorque
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 FORMAT_VERSION = "2"
 FRAME_TOPIC = EitFrame.topic

@@ -22,7 +22,7 @@ from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import repair, summarise
 from shearloop.daemon.recording.replay import RecordedRun
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.recording.test_recorder import frame, torque
 from tests.daemon.recording.test_replay import replayed
 

@@ -24,7 +24,7 @@ from shearloop.daemon.recording.identity import AttachedFile, Identity, basic_id
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import repair, summarise
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.conftest import deadline
 
 IDENTITY = Identity(basic_identity("a test"), (AttachedFile("configuration.json", "application/json", b"{}"),))

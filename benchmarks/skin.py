@@ -28,8 +28,8 @@ from shearloop.bank.skin.plane_strain import (
     MESH_1792,
     MeshSize,
     condense,
-    follow,
     gauge_strains,
+    states_along,
 )
 from shearloop.bank.skin.statistics import loading, loop, responses
 
@@ -40,7 +40,7 @@ Model = Callable[[FloatArray], FloatArray]
 def two_dimensional(mesh: MeshSize) -> Model:
     """Return the 2-D model on a mesh."""
     skin = condense(PAPER_SECTION, mesh)
-    return lambda path: response_of_strains(*gauge_strains(skin, follow(skin, NORMAL_N, path.tolist())).T)
+    return lambda path: response_of_strains(*gauge_strains(skin, states_along(skin, NORMAL_N, path.tolist())).T)
 
 
 def models() -> dict[str, Model]:

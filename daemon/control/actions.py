@@ -89,7 +89,7 @@ class ActionExecutor:
         if why := await self._rest():
             return why
         reply = await self._robot.send(ZeroForceTorque())
-        return reply.refused if not reply.accepted else await self._take_zero()
+        return reply.refusal if not reply.accepted else await self._take_zero()
 
     async def _move(self, action: MoveTo) -> str:
         pose = action.pose_m_rad
@@ -119,16 +119,16 @@ class ActionExecutor:
         """Begin a straight move and wait for its end; return why it was not one, or an empty text."""
         reply = await self._robot.send(command)
         if not reply.accepted:
-            return reply.refused
+            return reply.refusal
         for why in reply.clipped:
             structlog.get_logger().warning("the move was clipped", why=why)
         while True:
             state = await self._robot.next_state()
-            if state.motion_id != before and state.ended:
-                if state.ended not in (ARRIVED, STOPPED_ON_COMMAND):
+            if state.motion_id != before and state.end_reason:
+                if state.end_reason not in (ARRIVED, STOPPED_ON_COMMAND):
                     # It ended by itself, just before it was to be held back: what it met is not met again.
                     self._interrupted = False
-                return "" if state.ended == ARRIVED else f"the move ended early: {state.ended}"
+                return "" if state.end_reason == ARRIVED else f"the move ended early: {state.end_reason}"
 
 
 def along_tool(pose: tuple[float, ...], distance_m: float) -> tuple[float, ...]:

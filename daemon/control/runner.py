@@ -156,7 +156,7 @@ class ControlLoopRunner:
             return self._brain.start(file, self._clock.now_ns())
         reply = await self._robot.send(Enable())
         if not reply.accepted:
-            return reply.refused
+            return reply.refusal
         # The state that says so comes one cycle later.
         with suppress(TimeoutError):
             async with asyncio.timeout(ENABLED_WITHIN_S):
@@ -184,7 +184,7 @@ class ControlLoopRunner:
         """Let robot and gripper move again after a stop, on the operator's word; return why they would not."""
         reply = await self._robot.send(Unlock())
         if not reply.accepted:
-            return reply.refused
+            return reply.refusal
         if self._gripper is not None and (why := await self._gripper.unlock()):
             return why
         self._brain.acknowledge()
@@ -193,8 +193,8 @@ class ControlLoopRunner:
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the robot."""
         errors = dict(self._robot.losses)
-        if self._robot.stops_in_vain:
-            errors["paused program not stopped"] = self._robot.stops_in_vain
+        if self._robot.failed_program_stops:
+            errors["paused program not stopped"] = self._robot.failed_program_stops
         return {
             "connected": self._robot.state is not None,
             "states": self._robot.states,

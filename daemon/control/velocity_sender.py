@@ -48,7 +48,7 @@ class VelocityCommandSender:
     def _send(self, command: WristSpeed | Stop) -> None:
         self._unanswered += 1
         try:
-            self._robot.tell(command, self._answered)
+            self._robot.send_nowait(command, self._answered)
         except Exception as error:  # noqa: BLE001 - told by the next tick, which ends the experiment
             self._unanswered -= 1
             self._died_of(error)
@@ -59,7 +59,7 @@ class VelocityCommandSender:
             if not reply.accepted:
                 # Without a process there is nobody who could have refused it.
                 gone = self._robot.state is None
-                (self._brain.on_command_unanswered if gone else self._brain.on_command_refused)(reply.refused)
+                (self._brain.on_command_unanswered if gone else self._brain.on_command_refused)(reply.refusal)
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
             self._brain.on_speed_sent(self.sent_rad_per_s)
         except Exception as error:  # noqa: BLE001 - not the robot's process, which has answered, but the next tick's

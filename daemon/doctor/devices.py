@@ -26,7 +26,7 @@ from shearloop.drivers.hx711 import LoadCalibration
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
 from shearloop.drivers.serial_port import find_port
-from shearloop.drivers.ur.controller_query import look
+from shearloop.drivers.ur.controller import query_controller
 from shearloop.drivers.ur.settings import read_settings
 
 # A larger relative difference between measured and configured rate is reported.
@@ -203,7 +203,7 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
 def _check_robot(settings: Path) -> list[Finding]:
     try:
         host = read_settings(settings).host
-        seen = look(host, ROBOT_TIMEOUT_S)
+        seen = query_controller(host, ROBOT_TIMEOUT_S)
     except DriverError as error:
         return [from_error("robot", error, "the robot cannot be driven")]
     findings = [good("robot", f"{host} answers, PolyScope {seen.version}")]

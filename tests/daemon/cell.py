@@ -21,7 +21,7 @@ SPEED_M_PER_S = 0.1
 
 
 class Robot(UrRobot):
-    """The client with the pilot in the same process, and an arm that moves in straight lines too."""
+    """The client with the command handler in the same process, and an arm that moves in straight lines too."""
 
     def __init__(self) -> None:
         super().__init__(SETTINGS)
@@ -37,12 +37,12 @@ class Robot(UrRobot):
         # For how many cycles there is no process yet.
         self.gone_for = 0
 
-    def tell(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
+    def send_nowait(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
         if self.gone_for:
-            answered(CommandReply(refused="The robot is not connected."))
+            answered(CommandReply(refusal="The robot is not connected."))
             return
         asyncio.get_running_loop().call_soon(self._obey, command, answered)
 
@@ -60,9 +60,9 @@ class Robot(UrRobot):
         """End the process with all that it has not said; the next one is there after so many cycles."""
         self.gone_for = gone_for
         held, self._held, self._unread = self._held, [], []
-        self._disconnected()
+        self._disconnect()
         for answered, _ in held:
-            answered(CommandReply(refused="The robot's process ended before it answered."))
+            answered(CommandReply(refusal="The robot's process ended before it answered."))
 
     def cycle(self, *, read: bool = True) -> None:
         """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""
@@ -92,7 +92,7 @@ class Robot(UrRobot):
         held, self._held = self._held, []
         for answered, reply in held:
             answered(reply)
-        self.take_all(self._unread)
+        self.handle_messages(self._unread)
         self._unread.clear()
 
     @property

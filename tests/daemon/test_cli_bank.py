@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.build import RowJournal
 from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.journal import RowJournal
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.bank_config import load_bank_plans

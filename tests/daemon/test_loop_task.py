@@ -269,7 +269,7 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
         # The pause is said while the state that tells of the force is on its way.
         arm.be(wrench=(0.0, 0.0, SETTINGS.limits.force_n.inner + 5.0, 0.0, 0.0, 0.0))
         flight.fly(1)
-        assert "force" in flight.state.ended
+        assert "force" in flight.state.end_reason
         cell.loop._actions.hold_back()
         arm.be(wrench=(0.0,) * 6)
         await cell.cycles(1)

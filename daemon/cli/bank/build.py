@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tqdm import tqdm
 
     from shearloop.bank.eit.bank_file import BankDefinition
-    from shearloop.bank.eit.journal import BankRow
+    from shearloop.bank.eit.build import BankRow
     from shearloop.bank.eit.mesh import Mesh
     from shearloop.daemon.bank_config import BankPlan, GridConfig
 

@@ -106,7 +106,7 @@ async def twist(arm: UrRobot, by_rad: float) -> None:
         while abs(missing_rad := target_rad - (await arm.next_state()).wrist_rad) > 0.002:
             speed = float(np.clip(4.0 * missing_rad, -0.2, 0.2))
             reply = await arm.send(WristSpeed(speed, 2.0))
-            assert reply.accepted, reply.refused
+            assert reply.accepted, reply.refusal
     assert (await arm.send(Stop(4.0))).accepted
     await until(arm, lambda state: state.motion == "idle")
 

@@ -1,4 +1,4 @@
-"""Random experiments, faults and timings through brain and pilot: not one command to the arm is outside its limits."""
+"""Random experiments, faults and timings through loop and handler: no command to the arm exceeds its limits."""
 
 import dataclasses
 import math
@@ -90,12 +90,12 @@ class CheckedArm(FakeArm):
 
 
 class WholeRig:
-    """Brain and pilot with the twin between them, a control cycle at a time; what LoopTask does, without its ports."""
+    """Control loop and command handler with the twin between them, one cycle at a time."""
 
     def __init__(self) -> None:
         self.brain, self.arm, self.twin = brain(), CheckedArm(), Twin(TwinSettings())
         self.now_ns, self.number, self.force_n = 10**12, 0, 0.0
-        self.pilot = CommandHandler(SETTINGS, self.arm, self.now_ns)
+        self.handler = CommandHandler(SETTINGS, self.arm, self.now_ns)
         self.silent, self.absurd, self.fault = False, False, ""
         self.sent, self.stopped, self.late = 0.0, True, 0
         self.action: tuple[int, Action] | None = None
@@ -106,8 +106,8 @@ class WholeRig:
         self.number += 1
         torque_nm = self.twin.step(CYCLE_NS / 1e9, self.arm.reading.wrist_rad, self.force_n).torque_nm
         self.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, torque_nm))
-        self.pilot.heard(self.now_ns)
-        self.pilot.tick(self.arm.reading, self.now_ns)
+        self.handler.note_daemon_alive(self.now_ns)
+        self.handler.tick(self.arm.reading, self.now_ns)
         if self.late:
             self.late -= 1
             return
@@ -160,11 +160,11 @@ class WholeRig:
                 self.brain.acknowledge()
 
     def _ask(self, command: Any) -> Any:
-        reply = self.pilot.request(self.number, command, self.arm.reading, self.now_ns)
+        reply = self.handler.request(self.number, command, self.arm.reading, self.now_ns)
         return reply if reply is not None else dataclasses.make_dataclass("Later", [("sent", object, None)])()
 
     def _sense(self, torque_nm: float) -> None:
-        state = self.pilot.state(self.arm.reading, self.number)
+        state = self.handler.state(self.arm.reading, self.number)
         self.brain.inputs.arm = ArmStatus(
             state.wrist_rad, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked
         )

@@ -13,7 +13,7 @@ from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopI
 from shearloop.daemon.control.runner import PUBLISH_EVERY, wrench_source
 from shearloop.daemon.control.safety import TABLE, FaultCode, Response
 from shearloop.daemon.control.settings import LoopConfig
-from shearloop.drivers.ur.sample_age import SampleAge
+from shearloop.drivers.ur.controller import SampleAge
 
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)

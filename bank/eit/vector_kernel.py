@@ -1,37 +1,54 @@
-"""The arithmetic of `shearloop.bank.eit.elimination`, compiled: several matrices side by side, on small tiles of
-their entries.
+"""Partial Cholesky factorisation of several matrices at once, compiled by numba: the arithmetic of `elimination`.
 
-All that numba compiles is in this file, for what it keeps on the disk is made anew when this file changes.
+Several matrices stand side by side, one per lane of a vector register, and entries are processed in small tiles. numba
+has no vector type, and its loops over the last axis of an array do not stay in registers. So this module defines one:
+an array (n, LANES) of doubles holds n entries; `_load` and `_store` move one of them, `_load_column` and
+`_store_column` as many as a tile has rows. Vectors can be added, subtracted and multiplied, lane by lane.
 """
 
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
+import numpy as np
 from llvmlite import ir
-from numba import config, njit
+from numba import njit
 from numba.core import cgutils, types
-from numba.core.caching import FunctionCache
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
+from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.fronts import TILE, Plan
-from shearloop.bank.errors import BankError
 
-_F = TypeVar("_F", bound=Callable[..., Any])
-
-# One number of each of several matrices is a value of its own here, which a vector register holds. numba has no such
-# type, and what it makes of loops over the last axis of an array does not stay in registers. An array (n, LANES) of
-# doubles holds n entries: `_load` and `_store` move one of them, `_load_column` and `_store_column` as many as a tile
-# has rows. Such values can be added, subtracted and multiplied, each lane on its own.
-
-# Eight doubles are a register of AVX-512. Elsewhere a register holds four at most, and there are half as many of them.
-# What numba keeps on the disk is found by the processor it compiles for, which NUMBA_CPU_NAME may say. If that did not
-# decide alone, machines that share a folder would run each other's code on arrays of another width, unchecked.
+# Fronts are stored in tiles of this many rows and columns, on and below the diagonal, one row of tiles after the other.
+# A tile holds its columns one after the other: entry (i, j) is at row_start(i) + TILE · j.
+TILE = 4
+# Eight doubles fill a register of AVX-512; elsewhere a register holds four at most. The width follows from the
+# processor that numba compiles for, which also selects its cache: machines that share a folder must not run each
+# other's code on arrays of another width.
 _, _, _FEATURES = cpu_target.target_context.codegen().magic_tuple()
 LANES: Final = 8 if "+avx512f" in _FEATURES.split(",") else 4
+_F = TypeVar("_F", bound=Callable[..., Any])
 _DOUBLE, _INDEX = ir.DoubleType(), ir.IntType(32)
+
+
+class Plan(NamedTuple):
+    """The steps of an elimination, front by front; the last front holds the kept unknowns.
+
+    Places are entries of the memory that all fronts share.
+    fronts: each begins at `base` and has the rows from `first` to `size`; those before `end` are pivots. Rows before
+    `first` are empty, so that `end` is the start of a tile. `tile_row` is its first tile row among all.
+    tile_rows: where the terms and arrivals of each begin, with one more for their end.
+    terms: each adds value · factors[source] at `place`.
+    arrivals: each adds `length` entries of an earlier front, TILE apart from `source`, at the distances
+    columns[column], columns[column + 1], … from `target`.
+    """
+
+    fronts: NDArray[np.void]
+    tile_rows: NDArray[np.void]
+    terms: NDArray[np.void]
+    arrivals: NDArray[np.void]
+    columns: NDArray[np.int32]
 
 
 class _Lanes(types.Type):
@@ -78,7 +95,7 @@ def _storing(kind: _Lanes) -> Any:
     return intrinsic(typed)
 
 
-# What numpy promises of an array of doubles; whoever wants speed begins arrays where a cache line begins.
+# The alignment that numpy guarantees.
 _DOUBLE_BYTES = 8
 _load, _load_column = _loading(_ONE), _loading(_COLUMN)
 _store, _store_column = _storing(_ONE), _storing(_COLUMN)
@@ -99,13 +116,13 @@ _inverse_root = intrinsic(_rooting)
 
 
 def _repeated(builder: Any, value: Any, times: Sequence[int]) -> Any:
-    """Return a vector of those elements of another."""
+    """Return a vector of the elements at `times` of another."""
     pick = ir.Constant(ir.VectorType(_INDEX, len(times)), list(times))
     return builder.shuffle_vector(value, ir.Constant(value.type, ir.Undefined), pick)
 
 
 def _widened(builder: Any, value: Any, kind: _Lanes) -> Any:
-    """Return a number, or one entry, as often as a wider value has room for it."""
+    """Return a number, or one entry, repeated to the width of a wider value."""
     if value.type == _DOUBLE:
         one = builder.insert_element(ir.Constant(kind.vector, ir.Undefined), value, _INDEX(0))
         return _repeated(builder, one, [0] * kind.vector.count)
@@ -113,12 +130,12 @@ def _widened(builder: Any, value: Any, kind: _Lanes) -> Any:
 
 
 def _define(sign: Callable[[Any, Any], Any], instruction: str, *cases: tuple[Any, Any, Any]) -> None:
-    """Teach numba what left sign right is, for some (left, right, result)."""
+    """Define left `sign` right in numba, for some (left, right, result)."""
 
     def make(_: Any, builder: Any, signature: Any, given: Any) -> Any:
         kind = signature.return_type
         wide = [value if value.type == kind.vector else _widened(builder, value, kind) for value in given]
-        # A product and a difference may be one instruction, as everywhere in `shearloop.bank.eit.elimination`.
+        # A product and a difference may be fused.
         return getattr(builder, instruction)(*wide, flags=("contract",))
 
     def typed(_: Any) -> Any:
@@ -134,56 +151,30 @@ _define(operator.sub, "fsub", (_COLUMN, _COLUMN, _COLUMN))
 _define(operator.mul, "fmul", (_COLUMN, _ONE, _COLUMN), (types.float64, _ONE, _ONE))
 
 
-def require_compiler() -> None:
-    """Raise BankError where numba was told to compile nothing: Python itself cannot add such values."""
-    if config.DISABLE_JIT:
-        raise BankError(
-            "the environment variable NUMBA_DISABLE_JIT is set, and a bank's cells are solved by compiled code alone; "
-            "unset it"
-        )
-
-
-class _Cache(FunctionCache):  # type: ignore[misc]  # numba's types are not all known
-    """What numba keeps of a function; a file of it that was cut short, or is another's, counts as none."""
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Return what was kept for a signature; None where nothing was, or nothing that can be read."""
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception:  # noqa: BLE001 - a damaged pickle may raise anything, and everything is made anew
-            # The index may be what is damaged, and is read again before it is written.
-            self.flush()
-            return None
-
-
 def _compiled(function: _F) -> _F:
-    """Compile a function, and keep the result on the disk where there is a place for it."""
-    # Products and differences may be fused; nothing else may be reordered. Without the lock of the interpreter, several
-    # threads eliminate at once.
+    """Compile a function and cache the result on the disk where that is possible.
+
+    Products and sums may be fused, nothing reordered. The interpreter's lock is released: threads run in parallel.
+    """
     options: dict[str, Any] = {"nogil": True, "fastmath": {"contract"}}
     try:
-        cache = _Cache(function)
-    except RuntimeError:  # neither beside this file nor in the user's cache may anything be written
-        cache = None
-    compiled = njit(**options)(function)
-    if cache is not None:
-        # As `cache=True` does it, which has no place for another cache than its own.
-        compiled._cache = cache
-    kept: _F = compiled
-    return kept
+        compiled: _F = njit(cache=True, **options)(function)
+    except RuntimeError:  # no folder for the cache is writable
+        compiled = njit(**options)(function)
+    return compiled
 
 
 @_compiled
 def schur_complements(plan: Plan, factors: FloatArray, lanes: FloatArray, work: FloatArray, left: FloatArray) -> None:
-    """Put into `left` what is left of n matrices, (n, kept, kept), for (n, F) factors; factor F is 1.
+    """Write the Schur complements (n, kept, kept) of n matrices to `left`, for (n, F) factors; factor F is 1.
 
-    `lanes`, (F + 1, LANES), and `work`, (entries of the plan, LANES), are memory to work in.
+    `lanes` (F + 1, LANES) and `work` (entries of the plan, LANES) are scratch memory.
     """
     lanes[-1] = 1.0
     for begin in range(0, len(factors), LANES):
         for factor in range(factors.shape[1]):
             for lane in range(LANES):
-                # The last matrices may be fewer than there are lanes.
+                # The last group may have fewer matrices than lanes.
                 lanes[factor, lane] = factors[min(begin + lane, len(factors) - 1), factor]
         for front in plan.fronts:
             for row in range(0, front.size, TILE):
@@ -191,7 +182,7 @@ def schur_complements(plan: Plan, factors: FloatArray, lanes: FloatArray, work: 
                 work[at : at + TILE * (row + TILE)] = 0.0
                 _assemble(plan, front.tile_row + row // TILE, lanes, work)
                 _factor(work, front.base, row, front.first, front.end)
-        # Nothing of the last front was eliminated.
+        # The last front has no pivots.
         for matrix in range(begin, min(begin + LANES, len(factors))):
             for row in range(plan.fronts[-1].size):
                 at = plan.fronts[-1].base + _row_start(row)
@@ -207,7 +198,7 @@ def _row_start(row: int) -> int:
 
 @_compiled
 def _assemble(plan: Plan, tile_row: int, lanes: FloatArray, work: FloatArray) -> None:
-    """Add up what a row of tiles is made of: its own terms, and what fronts before leave."""
+    """Assemble a row of tiles: its own terms, and the remainders of earlier fronts."""
     begin, end = plan.tile_rows[tile_row], plan.tile_rows[tile_row + 1]
     for term in plan.terms[begin.term : end.term]:
         _store(work, term.place, _load(work, term.place) + term.value * _load(lanes, term.source))
@@ -219,9 +210,9 @@ def _assemble(plan: Plan, tile_row: int, lanes: FloatArray, work: FloatArray) ->
 
 @_compiled
 def _factor(work: FloatArray, base: int, row: int, first: int, end: int) -> None:
-    """Bring a row of tiles up to date: Cholesky's factor in the pivots' columns, and what these leave in the others.
+    """Factorise a row of tiles: the Cholesky factor in the pivots' columns, the remainder in the others.
 
-    By rows, so that a row is assembled, changed and done while it is in the nearest cache. All rows before are done.
+    Row by row, so that a row stays in the nearest cache. All earlier rows are finished.
     """
     left = base + _row_start(row)
     for column in range(0, row + 1, TILE):
@@ -256,9 +247,9 @@ def _subtract_products(work: FloatArray, left: int, right: int, at: int, first: 
 
 @_compiled
 def _divide(work: FloatArray, at: int, diagonal: int, first: int) -> None:
-    """Divide a tile's columns, from `first`, by Cholesky's factor on the diagonal of its column; make it if it is that.
+    """Divide a tile's columns, from `first`, by the Cholesky factor of the diagonal tile; compute it on the diagonal.
 
-    The factor has inverse numbers on its own diagonal.
+    The factor stores inverses on its own diagonal.
     """
     for column in range(first, TILE):
         found = _load_column(work, at + TILE * column)

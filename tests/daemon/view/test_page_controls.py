@@ -96,7 +96,8 @@ def test_a_daemon_that_dies_is_shown_as_dead_within_two_seconds_and_lives_again(
             """() => {
               window.toldDead = null;
               new MutationObserver((_, observer) => {
-                const said = document.querySelector('#link-reason').textContent.match(/nothing from it for ([0-9.]+) s/);
+                const shown = document.querySelector("#link-reason").textContent;
+                const said = shown.match(/nothing from it for ([0-9.]+) s/);
                 if (!said) return;
                 window.toldDead = Number(said[1]);
                 observer.disconnect();

@@ -34,7 +34,6 @@ from shearloop.daemon.sensing.estimation import EstimatorTask
 from shearloop.daemon.sensing.fingertip import FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
-from shearloop.daemon.sensing.skin_setup import make_skin
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
@@ -42,9 +41,9 @@ from shearloop.daemon.sensing.tracking import TrackedEstimator
 from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
+from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.eit_kit import EitKit
-from shearloop.drivers.raw_event import Tap, no_tap
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 
 
 class Daemon:
@@ -111,7 +110,7 @@ class Daemon:
             )
         self._skin: SkinTask | None = None
         if config.skin is not None:
-            self._skin = make_skin(config.skin, self.publisher, self._clock, hear, self._tap)
+            self._skin = SkinTask(config.skin, self.publisher, self._clock, hear, self._tap)
         diameters = FingertipDiameters(BOTH)
         if self._rig is not None and self._rig.gripper is not None:
             self._rig.gripper.fingertips_say = diameters.at
@@ -168,10 +167,10 @@ class Daemon:
         if self._both is not None:
             health.add(BOTH, self._both.facts)
         if self._skin is not None:
-            health.add(SKIN, self._skin.facts)
-            health.add(SKIN_SOURCE, self._skin.source_facts)
+            health.add(SKIN, self._skin.diagnostics)
+            health.add(SKIN_SOURCE, self._skin.source_diagnostics)
         if self._load_cell is not None:
-            health.add(LOAD_CELL, self._load_cell.facts)
+            health.add(LOAD_CELL, self._load_cell.diagnostics)
         if self._rig is not None:
             health.add("robot", self._rig.loop.facts)
             if self._rig.gripper is not None:
@@ -282,8 +281,8 @@ class Daemon:
         """Begin the configured experiment no more, and return it; None where it was not waited for."""
         return self._experiment.give_up() if self._experiment is not None else None
 
-    def _tap(self, source: str) -> Tap:
-        return no_tap if self._recorder is None else self._recorder.tap(source)
+    def _tap(self, source: str) -> OnRaw:
+        return ignore_raw if self._recorder is None else self._recorder.tap(source)
 
     def _busy(self) -> bool:
         """Return whether an experiment is running."""
@@ -339,7 +338,7 @@ def _board(
     config: FingertipConfig,
     name: str,
     on_event: Callable[[LinkEvent], None],
-    tap: Tap,
+    tap: OnRaw,
     both: CombinedFingertipTask | None,
 ) -> EitKit:
     return EitKit(
@@ -348,7 +347,7 @@ def _board(
         zero_slots=ZERO_SLOTS,
         frame_period_s=config.frame_period_s,
         on_event=on_event,
-        tap=tap,
+        on_raw=tap,
         **({"on_frame": partial(both.take, name)} if both is not None else {}),
     )
 

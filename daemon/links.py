@@ -2,7 +2,7 @@
 
 import structlog
 
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.connection import LinkEvent
 
 
 def log_link(device: str, event: LinkEvent) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic_core import to_json
 
 from shearloop.daemon.messaging.messages import EitFrame
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 # Of arrays, which are float32 on the wire: a microvolt, a microradian.
 _DECIMALS = 6

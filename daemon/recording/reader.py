@@ -26,7 +26,7 @@ from shearloop.daemon.recording.schema import (
     input_topic,
 )
 from shearloop.daemon.sensing.tool_diameter import from_text
-from shearloop.drivers.raw_event import InputKind
+from shearloop.drivers.serial_sensor import InputKind
 
 # What every recording says of itself, beside the notes of this one.
 _IDENTITIES = ("format_version", "channel_table_hash", "software", "code_sha256")

@@ -30,7 +30,7 @@ from shearloop.daemon.recording.schema import (
     schema_of,
 )
 from shearloop.daemon.sensing.tool_diameter import from_text
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 Model = TypeVar("Model", bound=ConfigModel)
 

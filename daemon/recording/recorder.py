@@ -30,7 +30,7 @@ from shearloop.daemon.recording.schema import (
     input_topic,
     recorded_topic,
 )
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap
+from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent
 
 # A kill costs what came since the last flush: below a second, and so even where the machine is busy.
 FLUSH_S = 0.5
@@ -131,7 +131,7 @@ class Recorder:
         size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
         self._add(_Message(topic, content, self._clock.offset_ns, self._clock.now_ns()), size)
 
-    def tap(self, source: str) -> Tap:
+    def tap(self, source: str) -> OnRaw:
         """Return what hears of all that a source's parser is told."""
 
         def hear(told: RawEvent) -> None:

@@ -15,11 +15,10 @@ from shearloop.daemon.sensing.estimation import estimate_message
 from shearloop.daemon.sensing.fingertip import frame_message
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
 from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
-from shearloop.daemon.sensing.skin_setup import RecordedSkin
-from shearloop.daemon.sensing.skin_task import SKIN
-from shearloop.drivers.eit_line import Frame, FrameParser
-from shearloop.drivers.hx711 import LoadParser
-from shearloop.drivers.raw_event import RawEvent
+from shearloop.daemon.sensing.skin_task import SKIN, RecordedSkin
+from shearloop.drivers.eit_kit import Frame, FrameParser
+from shearloop.drivers.load_cell import LoadParser
+from shearloop.drivers.serial_sensor import RawEvent
 
 # What is made anew; everything else of a recording is sent as it was recorded.
 MADE_ANEW = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topic)
@@ -66,17 +65,17 @@ class ReplayPipeline:
     async def take(self, source: str, told: RawEvent) -> None:
         """Publish all that an input leads to; an input of a source that is not configured leads to nothing."""
         if source in self._lines:
-            for frame in self._as_numbered(source, self._lines[source].take(told)):
+            for frame in self._as_numbered(source, self._lines[source].handle(told)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
                 pair = self._pairing.take(source, frame.t_mid_ns, frame) if self._pairing is not None else None
                 if pair is not None:
                     await self._estimate(BOTH, *pair[1])
         elif source == LOAD_CELL and self._load is not None:
-            for sample in self._load.take(told):
+            for sample in self._load.handle(told):
                 self._publisher.publish(load_message(sample))
         elif self._skin is not None and source in self._skin.sources:
-            for message in self._skin.take(source, told):
+            for message in self._skin.handle(source, told):
                 self._publisher.publish(message)
 
     def _as_numbered(self, source: str, frames: list[Frame]) -> list[Frame]:

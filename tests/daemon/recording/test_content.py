@@ -10,7 +10,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from shearloop.daemon.recording.content import as_json, input_json, input_of
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 texts = st.text()
 scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats() | texts

@@ -23,7 +23,7 @@ from shearloop.daemon.recording.recorded_run import RecordedRun
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import repair
 from shearloop.daemon.recording.summary import summarise
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.recording.test_recorder import frame, torque
 from tests.daemon.recording.test_replay import replayed
 

@@ -25,7 +25,7 @@ from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import repair
 from shearloop.daemon.recording.summary import summarise
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.conftest import deadline
 
 IDENTITY = Identity(basic_identity("a test"), (Attached("configuration.json", "application/json", b"{}"),))

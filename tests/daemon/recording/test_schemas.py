@@ -11,7 +11,7 @@ from jsonschema import Draft202012Validator
 from shearloop.daemon.messaging.messages import TOPICS, EitFrame, Message, wire_map
 from shearloop.daemon.recording.content import input_json, message_json
 from shearloop.daemon.recording.schema import INPUT, completed, schemas
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.sample_messages import sample
 
 PLAIN = {"boolean", "string", "number", "integer"}

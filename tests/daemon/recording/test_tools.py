@@ -17,7 +17,7 @@ from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.summary import summarise
 from shearloop.daemon.sensing.tool_diameter import as_text
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 PERIOD_NS = 540_000_000
 TEN, TWENTY = Measured(10.2, 1.2), Measured(20.1, 1.2)

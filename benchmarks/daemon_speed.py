@@ -34,8 +34,7 @@ from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.sensing.both import BOTH
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.eit_line import TRANSFER_NS
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S, TRANSFER_NS
 
 MEASUREMENTS = ("commands", "latency", "flood", "rated", "twisting")
 REPEATS = 5

@@ -20,12 +20,12 @@ from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, FrameSeries, fit
 from shearloop.daemon.analysis.evaluation import follow, judge
 from shearloop.daemon.analysis.series import series_of
-from shearloop.daemon.cli.emulated.frames import frame_maker
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
 from shearloop.daemon.recording.writer import RecordingWriter
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.emulators.hx711 import PERIOD_S
+from shearloop.daemon.synthetic import frame_maker
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.emulators.boards import LOAD_PERIOD_S
 from shearloop.drivers.emulators.rig import NOISE_NM, SIDES, FrameOf
 from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper
 from shearloop.drivers.emulators.scene import Scene
@@ -81,9 +81,9 @@ class Recorded:
         with RecordingWriter(path, "the emulated rig, by python -m benchmarks.rig_twists", notes) as writer:
             for t_s, pair in zip(self.frame_s, self.lines, strict=True):
                 for side, line in zip(SIDES, pair, strict=True):
-                    writer.frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
+                    writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
             for t_s, torque_nm in zip(self.torque_s, self.torque_nm, strict=True):
-                writer.torque(round(t_s * 1e9), torque_nm)
+                writer.add_torque(round(t_s * 1e9), torque_nm)
 
 
 class Play:
@@ -96,7 +96,7 @@ class Play:
         self._gripper = Gripper(between=lambda _: diameter_mm)
         self._scene = Scene(self._gripper)
         self._wrist_rad = 0.0
-        self._due_frame_s, self._due_torque_s = FRAME_PERIOD_S, PERIOD_S
+        self._due_frame_s, self._due_torque_s = FRAME_PERIOD_S, LOAD_PERIOD_S
 
     def run(self) -> None:
         """Idle, grip, twist, let go."""
@@ -139,10 +139,10 @@ class Play:
             self.recorded.frame_s.append(now_s - FRAME_PERIOD_S / 2)
             self.recorded.lines.append(lines_of(self._scene, self._frame_of))
         if now_s >= self._due_torque_s:
-            self._due_torque_s += PERIOD_S
-            self.recorded.torque_s.append(now_s - PERIOD_S / 2)
+            self._due_torque_s += LOAD_PERIOD_S
+            self.recorded.torque_s.append(now_s - LOAD_PERIOD_S / 2)
             noise_nm = self._random.normal(0.0, NOISE_NM)
-            self.recorded.torque_nm.append(self._scene.conversion_nm(PERIOD_S) + noise_nm)
+            self.recorded.torque_nm.append(self._scene.conversion_nm(LOAD_PERIOD_S) + noise_nm)
 
 
 def record(bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM) -> Iterator[tuple[float, Recorded]]:

@@ -25,7 +25,7 @@ from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
-from shearloop.daemon.recording.identity import Attached, identity_of, notes_of
+from shearloop.daemon.recording.identity import AttachedFile, daemon_identity, experiment_notes
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import Rig, check_experiment, make_load_cell
 from shearloop.daemon.sensing.both import BOTH, CombinedFingertipTask
@@ -33,7 +33,6 @@ from shearloop.daemon.sensing.estimation import EstimatorTask
 from shearloop.daemon.sensing.fingertip import FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
-from shearloop.daemon.sensing.skin_setup import make_skin
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
@@ -41,9 +40,9 @@ from shearloop.daemon.sensing.tracking import TrackedEstimator
 from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
+from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.eit_kit import EitKit
-from shearloop.drivers.raw_event import Tap, no_tap
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 
 
 class Daemon:
@@ -114,7 +113,7 @@ class Daemon:
             )
         self._skin: SkinTask | None = None
         if config.skin is not None:
-            self._skin = make_skin(config.skin, self.publisher, self._clock, on_torque, self._tap)
+            self._skin = SkinTask(config.skin, self.publisher, self._clock, on_torque, self._tap)
 
         def estimation(name: str, estimator: AnyEstimator, period_s: Callable[[], float]) -> EstimatorTask:
             made = EstimatorTask(
@@ -168,16 +167,16 @@ class Daemon:
         if self._both is not None:
             health.add(BOTH, self._both.facts)
         if self._skin is not None:
-            health.add(SKIN, self._skin.facts)
-            health.add(SKIN_SOURCE, self._skin.source_facts)
+            health.add(SKIN, self._skin.diagnostics)
+            health.add(SKIN_SOURCE, self._skin.source_diagnostics)
         if self._load_cell is not None:
-            health.add(LOAD_CELL, self._load_cell.facts)
+            health.add(LOAD_CELL, self._load_cell.diagnostics)
         if self._rig is not None:
             health.add("robot", self._rig.runner.diagnostics)
             if self._rig.gripper is not None:
                 health.add("gripper", self._rig.gripper.diagnostics)
         if self._recorder is not None:
-            health.add("recording", self._recorder.facts)
+            health.add("recording", self._recorder.diagnostics)
         health.add("commands", self._command_facts)
         return health
 
@@ -265,21 +264,21 @@ class Daemon:
     async def start_experiment(self, path: Path) -> str | None:
         """Start and record an experiment; return None, or why not. Raises UserError for an invalid file."""
         rig, recorder = needed(self._rig), self._recorder
-        attached = Attached.if_there(path) if recorder is not None else ()
+        attached = AttachedFile.read(path) if recorder is not None else ()
         reason = await rig.start(path)
         if reason is None and self._experiment is not None:
             self._experiment.on_begun(path)
         if reason is None and recorder is not None and rig.control_loop.experiment is not None:
             file = rig.control_loop.experiment.file
-            recorder.experiment(file.name, attached, notes_of(file))
+            recorder.record_experiment(file.name, attached, experiment_notes(file))
         return reason
 
     def _call_off_experiment(self) -> Path | None:
         """Cancel the automatic start of the configured experiment; return it, or None if it was not awaited."""
         return self._experiment.call_off() if self._experiment is not None else None
 
-    def _tap(self, source: str) -> Tap:
-        return no_tap if self._recorder is None else self._recorder.tap(source)
+    def _tap(self, source: str) -> OnRaw:
+        return ignore_raw if self._recorder is None else self._recorder.input_recorder(source)
 
     def _busy(self) -> bool:
         """Return whether an experiment is running."""
@@ -326,8 +325,8 @@ def _recorder(
     """Return the recorder, if one is configured; raises UserError if it cannot write."""
     if config.recording is None:
         return None
-    recorder = Recorder(config.recording.folder, identity_of(config), clock, busy=busy, on_failure=on_failure)
-    publisher.add_listener(recorder.record)
+    recorder = Recorder(config.recording.folder, daemon_identity(config), clock, is_busy=busy, on_failure=on_failure)
+    publisher.add_listener(recorder.record_message)
     return recorder
 
 
@@ -335,7 +334,7 @@ def _board(
     config: FingertipConfig,
     name: str,
     on_event: Callable[[LinkEvent], None],
-    tap: Tap,
+    tap: OnRaw,
     both: CombinedFingertipTask | None,
 ) -> EitKit:
     return EitKit(
@@ -344,7 +343,7 @@ def _board(
         zero_slots=ZERO_SLOTS,
         frame_period_s=config.frame_period_s,
         on_event=on_event,
-        tap=tap,
+        on_raw=tap,
         **({"on_frame": partial(both.take, name)} if both is not None else {}),
     )
 

@@ -84,7 +84,7 @@ class FingertipConfig(ConfigModel):
     creep: CreepConfig | None = Field(
         None, description="of the gel, where the calibration gives its shear; the loop is driven by what is left"
     )
-    # shearloop.drivers.eit_format.FRAME_PERIOD_S, which comes with NumPy: a configuration is read without.
+    # shearloop.drivers.eit_kit.FRAME_PERIOD_S, which comes with NumPy: a configuration is read without.
     frame_period_s: float = Field(0.5408, gt=0, le=60, description="the board's frame period before it is measured")
     heatmap: Literal["on_request", "always"] = Field(
         "on_request", description="whether eit.heatmap is computed only while somebody subscribes to it"

@@ -10,7 +10,7 @@ from pydantic_core import ErrorDetails
 
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.yaml_file import read_yaml
+from shearloop.drivers.yaml_files import read_yaml
 
 _LONGEST_VALUE = 60
 

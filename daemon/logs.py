@@ -15,7 +15,7 @@ from typing import TextIO, cast
 import structlog
 
 from shearloop.daemon.messaging.messages import Scalar
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.connection import LinkEvent
 
 # Texts beyond this number are dropped and counted.
 MOST_WAITING = 10_000

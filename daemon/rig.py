@@ -29,17 +29,16 @@ from shearloop.daemon.sensing.both import BOTH
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.sensing.tool_diameter import unknown
-from shearloop.drivers.calibration_file import load_calibration
-from shearloop.drivers.hx711 import LoadCalibration
-from shearloop.drivers.load_cell import LoadCell
-from shearloop.drivers.raw_event import Tap, no_tap
+from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
 from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.yaml_files import load_calibration
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
@@ -55,7 +54,7 @@ def make_load_cell(
     clock: Clock,
     on_torque: Callable[[TorqueSample], None],
     on_event: Callable[[LinkEvent], None],
-    tap: Tap = no_tap,
+    tap: OnRaw = ignore_raw,
 ) -> LoadCellTask:
     """Return the load cell's task; raises DriverError if its calibration cannot be used."""
     calibration = load_cell_calibration(config)
@@ -66,7 +65,7 @@ def make_load_cell(
         path=device.path,
         rate_hz=config.rate_hz,
         on_event=on_event,
-        tap=tap,
+        on_raw=tap,
     )
     return LoadCellTask(board, publisher, clock, on_torque, config.rate_hz)
 
@@ -102,7 +101,7 @@ class Rig:
         sources: Mapping[str, TorqueSource],
         tare_fingertips: Callable[[], Awaitable[str]],
         dead_tasks: Callable[[], Mapping[str, str]],
-        tap: Callable[[str], Tap] = lambda _: no_tap,
+        tap: Callable[[str], OnRaw] = lambda _: ignore_raw,
         fingertip_diameter: Callable[[int], Measured | None] = unknown,
     ) -> None:
         """Read the settings of every device; none is opened yet.

@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.model_scores import Setting, searched_settings
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import CalibrationError

@@ -93,8 +93,8 @@ def _skin(config: "SkinConfig") -> str:
     import math
 
     from shearloop.bank.skin.calibration import load_calibration
-    from shearloop.daemon.sensing.skin_setup import check_circuit
-    from shearloop.daemon.sensing.skin_zero import MOST_CHANGE
+    from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
+    from shearloop.daemon.sensing.skin_task import check_circuit
 
     calibration = load_calibration(config.calibration)
     check_circuit(config, calibration)
@@ -103,6 +103,6 @@ def _skin(config: "SkinConfig") -> str:
         f"calibration {config.calibration} to {calibration.tension_n[0]:+.1f} … {calibration.tension_n[-1]:+.1f} N, "
         f"± {calibration.prediction_half_width_n:.3f} N, {radius}"
     )
-    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MOST_CHANGE:
+    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MAX_CHANGE:
         text += "; its gauges are too similar at rest to detect swapped wires: check the sign of a push"
     return text

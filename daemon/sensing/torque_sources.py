@@ -6,7 +6,7 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.sensing.both import BOTH
 from shearloop.daemon.sensing.opening import AnyEstimator
-from shearloop.daemon.sensing.skin_setup import skin_source
+from shearloop.daemon.sensing.skin_task import skin_source
 from shearloop.daemon.sensing.tracking import TrackedEstimator
 
 

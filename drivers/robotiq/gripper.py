@@ -6,6 +6,7 @@ import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
 from typing import TypeVar
 
+from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.faults import GripperFaultError, GripperRefusedError, fault_of
 from shearloop.drivers.robotiq.messages import (
@@ -28,7 +29,6 @@ from shearloop.drivers.robotiq.messages import (
 )
 from shearloop.drivers.robotiq.sequences import ActivationSequence, MotionWatch, blocking_fault, object_status
 from shearloop.drivers.robotiq.width import COUNTS_MAX, WidthCalibration
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy
 
 T = TypeVar("T")
 

@@ -9,10 +9,10 @@ from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
+from shearloop.drivers.connection import find_port
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
 from shearloop.drivers.robotiq import registers
 from shearloop.drivers.robotiq.messages import GripperMove, Readout, Request
-from shearloop.drivers.serial_port import find_port
 
 T = TypeVar("T")
 

@@ -13,7 +13,8 @@ from typing import Self
 import numpy as np
 from pydantic import model_validator
 
-from shearloop.drivers.calibration_file import CalibrationError, CalibrationModel, Finite, Positive
+from shearloop.drivers.errors import DeviceCalibrationError
+from shearloop.drivers.yaml_files import CalibrationModel, Finite, Positive
 
 COUNTS_MAX = 255
 STROKE_MM = 140.0
@@ -52,19 +53,19 @@ class WidthCalibration(CalibrationModel):
         line goes through them.
         """
         if len({width for _, width in gauges}) < 2:
-            raise CalibrationError("A width calibration needs objects of at least two different diameters.")
+            raise DeviceCalibrationError("A width calibration needs objects of at least two different diameters.")
         counts, widths = (np.array(column, dtype=float) for column in zip(*gauges, strict=True))
         counts_per_mm, closed_counts = (float(value) for value in np.polyfit(widths, counts, 1))
         # A quarter of what the gripper has by design is no slope but an error in the order.
         if counts_per_mm > -0.25 * COUNTS_MAX / STROKE_MM:
-            raise CalibrationError(
+            raise DeviceCalibrationError(
                 "The fingers did not stop further closed on the smaller objects: were they measured in the order "
                 "given, and did the fingers hold each of them?"
             )
         residuals = (counts - (closed_counts + counts_per_mm * widths)) / counts_per_mm
         scatter_mm = math.sqrt(float(residuals @ residuals) / (len(gauges) - 2)) if len(gauges) > 2 else 0.0
         if scatter_mm > 0.02 * STROKE_MM:
-            raise CalibrationError(
+            raise DeviceCalibrationError(
                 f"The diameters scatter by {scatter_mm:.1f} mm about a straight line: check them, and that each object "
                 "was gripped at the same place of the fingertips."
             )

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.eit.design import ALLOWED, Choice, Scene, Step, _board_choices, designed
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.bank_config import FingertipGeometryConfig

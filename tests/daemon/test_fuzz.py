@@ -133,7 +133,7 @@ async def test_a_flood_of_malformed_frames_and_requests(
                     asyncio.to_thread(exchange, address, malformed_requests(REQUESTS)),
                     asyncio.to_thread(write_all, board, malformed_frames(FRAMES)),
                 )
-                while (refused := sum(daemon._fingertips["right"].facts()["errors"].values())) < FRAMES - 1:
+                while (refused := sum(daemon._fingertips["right"].diagnostics()["errors"].values())) < FRAMES - 1:
                     told.clear()
                     await told.wait()
             assert replies == {False: REQUESTS}, "each is answered, and none is carried out"

@@ -21,7 +21,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
@@ -211,7 +211,7 @@ async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_h
             for _ in range(25):
                 await frames.get()
             facts = (await health.get())["tasks"]["right"]
-            while facts["openings"] < 2 or facts["frames"] < 25:
+            while facts["connections"] < 2 or facts["frames"] < 25:
                 facts = (await health.get())["tasks"]["right"]
             assert facts["alive"]
             assert facts["errors"]["wrong_count"] >= 1

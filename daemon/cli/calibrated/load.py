@@ -12,8 +12,8 @@ from shearloop.daemon.cli.options import add_json
 from shearloop.daemon.cli.output import print_result
 
 if TYPE_CHECKING:
-    from shearloop.drivers.hx711_calibration import LoadCalibrator
-    from shearloop.drivers.serial_port import SerialPort
+    from shearloop.drivers.connection import SerialPort
+    from shearloop.drivers.load_calibration import LoadCalibrator
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -52,10 +52,10 @@ def run(args: argparse.Namespace) -> int:
     """Ask for each load, measure it, and write the calibration."""
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
-    from shearloop.drivers.calibration_file import save_calibration
-    from shearloop.drivers.hx711 import BAUD_RATE
-    from shearloop.drivers.hx711_calibration import LoadCalibrator
-    from shearloop.drivers.serial_port import SerialPort, find_port
+    from shearloop.drivers.connection import SerialPort, find_port
+    from shearloop.drivers.load_calibration import LoadCalibrator
+    from shearloop.drivers.load_cell import BAUD_RATE
+    from shearloop.drivers.yaml_files import save_calibration
 
     if not 0 < args.lever_arm_mm < 1000:
         raise UserError(f"--lever-arm-mm {args.lever_arm_mm:g} is no lever arm; give millimetres above 0")
@@ -101,18 +101,17 @@ class _Session:
         self._step: asyncio.Future[None] | None = None
 
     async def listen(self) -> None:
-        from shearloop.drivers.calibration_file import CalibrationError
-        from shearloop.drivers.errors import DeviceLostError
-        from shearloop.drivers.hx711 import LoadParser
-        from shearloop.drivers.hx711_calibration import UNCALIBRATED
-        from shearloop.drivers.streaming_sensor import BOOT_S
+        from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError
+        from shearloop.drivers.load_calibration import UNCALIBRATED
+        from shearloop.drivers.load_cell import LoadParser
+        from shearloop.drivers.serial_sensor import BOOT_S
 
         parser = LoadParser(UNCALIBRATED)
         while (received := await self._port.read(BOOT_S)) is not None:
             for sample in parser.feed(received.data, received.t_arrival_ns):
                 try:
                     complete = self._calibrator.feed(sample)
-                except CalibrationError as error:
+                except DeviceCalibrationError as error:
                     self._end_step(error)
                 else:
                     if complete:
@@ -131,15 +130,15 @@ class _Session:
             self._step.set_exception(error)
 
     async def lead(self) -> None:
-        from shearloop.drivers.calibration_file import CalibrationError
+        from shearloop.drivers.errors import DeviceCalibrationError
 
         while not self._calibrator.finished:
             await self._operator.ask(f"{self._calibrator.prompt} Then press Enter.")
             self._step = asyncio.get_running_loop().create_future()
-            self._calibrator.ready()
+            self._calibrator.start_step()
             try:
                 await self._step
-            except CalibrationError as error:
+            except DeviceCalibrationError as error:
                 print(f"Refused: {error}", file=sys.stderr, flush=True)
             else:
                 level = self._calibrator.levels[-1]

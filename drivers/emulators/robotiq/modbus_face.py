@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from shearloop.drivers.emulators.pty_server import PtyServer
+from shearloop.drivers.emulators.ports import PtyServer
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
 
 DEVICE_ID = 9

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from shearloop.drivers.emulators.ports import SocketServer
 from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper
-from shearloop.drivers.emulators.socket_server import SocketServer
 
 PORT = 63352
 LONGEST_LINE = 256

@@ -11,7 +11,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
-from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Twin, TwinSettings
 
 TICK_S = 0.008
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)

@@ -12,7 +12,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
 from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo, MoveTo
-from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
 from tests.daemon.loop.rig import EIT, new_loop

@@ -20,7 +20,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.sensing.both import LARGEST_BACKLOG, CombinedFingertipTask
 from shearloop.daemon.sensing.estimation import Taken
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import measured, replayed
 

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.calibration_file import CalibrationError
-from shearloop.drivers.errors import DeviceLostError, ProtocolError
+from shearloop.drivers.errors import DeviceCalibrationError, DeviceLostError, ProtocolError
 from shearloop.drivers.robotiq import registers
 from shearloop.drivers.robotiq.faults import fault_of
 from shearloop.drivers.robotiq.messages import (
@@ -180,7 +179,7 @@ def test_gauges_give_the_line_they_were_measured_on_and_its_scatter() -> None:
     ],
 )
 def test_gauges_that_make_no_line_are_refused(gauges: list[tuple[float, float]], said: str) -> None:
-    with pytest.raises(CalibrationError, match=said):
+    with pytest.raises(DeviceCalibrationError, match=said):
         WidthCalibration.of_gauges(gauges)
 
 

@@ -104,7 +104,7 @@ class GripperTask:
 
     def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the gripper's part of `health`."""
-        return self._gripper.facts()
+        return self._gripper.diagnostics()
 
     def _publish(self, state: GripperState) -> None:
         tool = tool_diameter(state, self._fingertip_diameter(state.t_ns))
@@ -118,7 +118,6 @@ class GripperTask:
                 tool_diameter_mm=tool.value if tool is not None else None,
                 tool_diameter_std_mm=tool.half_width / TWO_SIDED_95 if tool is not None else None,
                 current_ma=state.current_ma,
-                current_age_s=(state.t_ns - state.current_t_ns) / 1e9,
                 object=state.object.text,
                 fault=state.fault.code,
                 fault_text=state.fault.sentence if state.fault.code else "",

@@ -53,21 +53,21 @@ class Truth:
             self._folder.cleanup()
 
 
-class Happenings:
-    """Says to the emulators what the configuration wants to befall them, at a step of the experiment."""
+class EmulatorEvents:
+    """Sends the configured events to the emulators, each at its step of the experiment."""
 
     def __init__(self, emulators: "tuple[EmulatorConfig, ...]", processes: Sequence["Popen[bytes]"]) -> None:
         """Take the emulators and their processes, in the same order."""
         self._left = [
-            (happening, process)
+            (event, process)
             for emulator, process in zip(emulators, processes, strict=True)
-            for happening in emulator.happenings
+            for event in emulator.events
         ]
         self._since_ns: dict[int, int] = {}
         self.happened: list[tuple[int, str]] = []
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Look at `loop.state`, which comes once a second, whether it is time."""
+        """Send the events that are due at a `loop.state`."""
         if topic != "loop.state" or content["phase"] != "running" or not content["hold"]:
             return
         now_ns = content["t_mono_ns"]
@@ -77,14 +77,14 @@ class Happenings:
             for entry in self._left
             if entry[0].step == content["step"] and now_ns - since_ns >= entry[0].held_for_s * 1e9
         ]
-        for happening, process in due:
-            self._left.remove((happening, process))
-            # One that ends just now is told of as dead; here it must not take along whose message this is.
+        for event, process in due:
+            self._left.remove((event, process))
+            # An emulator may end at this moment; `Deaths` reports it.
             with contextlib.suppress(BrokenPipeError):
                 if process.stdin is not None and process.poll() is None:
-                    process.stdin.write(f"{happening.say}\n".encode())
+                    process.stdin.write(f"{event.command}\n".encode())
                     process.stdin.flush()
-                    self.happened.append((time.monotonic_ns(), happening.say))
+                    self.happened.append((time.monotonic_ns(), event.command))
 
 
 class Deaths:

@@ -69,7 +69,7 @@ def _run(
 
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
-    from shearloop.daemon.cli.demonstration import Deaths, Happenings, Truth
+    from shearloop.daemon.cli.demonstration import Deaths, EmulatorEvents, Truth
     from shearloop.daemon.cli.output import EstimatePrinter
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
     from shearloop.daemon.errors import UserError
@@ -108,8 +108,8 @@ def _run(
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
         processes = stack.enter_context(_run_emulators(emulators, args.config.parent, args.recording, truth))
-        happenings = Happenings(emulators, processes)
-        listeners += [Deaths(emulators, processes), happenings]
+        events = EmulatorEvents(emulators, processes)
+        listeners += [Deaths(emulators, processes), events]
         if processes:
             # The daemon does not know about emulation and will report missing devices.
             structlog.get_logger().info(
@@ -118,7 +118,7 @@ def _run(
             )
         if args.show:
             summary = RunSummary(
-                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: happenings.happened
+                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: events.happened
             )
             listeners += [EstimatePrinter(out), summary]
         finished = asyncio.run(run_daemon(config, tuple(listeners), diagnostics, on_ready))

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from shearloop.daemon.cli.demonstration import Deaths, Happenings, Truth
+from shearloop.daemon.cli.demonstration import Deaths, EmulatorEvents, Truth
 from shearloop.daemon.config import EmulatorConfig
 from shearloop.daemon.config_file import load_yaml_model
 
@@ -24,31 +24,31 @@ def held(t_s: float, step: int = 7, hold: int = 1, phase: str = "running") -> di
 
 
 def test_what_befalls_the_rig_is_said_once_when_the_step_has_been_held_for_its_time() -> None:
-    rig = emulator(happenings=[{"step": 7, "held_for_s": 12, "say": "kick -0.03"}])
+    rig = emulator(events=[{"step": 7, "held_for_s": 12, "command": "kick -0.03"}])
     process = subprocess.Popen([sys.executable, "-c", "print(input())"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    happenings = Happenings((rig,), [process])
+    events = EmulatorEvents((rig,), [process])
     for content in (held(0, step=6), held(50, hold=0), held(60), held(71.9), held(73, phase="held")):
-        happenings("loop.state", content)
-    assert happenings.happened == []
-    happenings("loop.state", held(73))
-    happenings("loop.state", held(74))
-    assert [words for _, words in happenings.happened] == ["kick -0.03"]
+        events("loop.state", content)
+    assert events.happened == []
+    events("loop.state", held(73))
+    events("loop.state", held(74))
+    assert [words for _, words in events.happened] == ["kick -0.03"]
     out, _ = process.communicate(timeout=30)
     assert out == b"kick -0.03\n"
 
 
 def test_a_rig_that_has_ended_is_told_nothing() -> None:
-    rig = emulator(happenings=[{"step": 1, "say": "slip"}])
+    rig = emulator(events=[{"step": 1, "command": "slip"}])
     process = subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE)
     process.wait(30)
-    happenings = Happenings((rig,), [process])
-    happenings("loop.state", held(1, step=1))
-    assert happenings.happened == []
+    events = EmulatorEvents((rig,), [process])
+    events("loop.state", held(1, step=1))
+    assert events.happened == []
     process.communicate()
 
 
 def test_a_rig_that_ends_in_this_moment_takes_nobody_along() -> None:
-    rig = emulator(happenings=[{"step": 1, "say": "slip"}])
+    rig = emulator(events=[{"step": 1, "command": "slip"}])
     process = subprocess.Popen(
         [sys.executable, "-c", "import os, signal; os.close(0); os.close(1); signal.pause()"],
         stdin=subprocess.PIPE,
@@ -56,9 +56,9 @@ def test_a_rig_that_ends_in_this_moment_takes_nobody_along() -> None:
     )
     assert process.stdout is not None
     assert process.stdout.read() == b"", "its input is closed, and it lives"
-    happenings = Happenings((rig,), [process])
-    happenings("loop.state", held(1, step=1))
-    assert happenings.happened == []
+    events = EmulatorEvents((rig,), [process])
+    events("loop.state", held(1, step=1))
+    assert events.happened == []
     process.kill()
     with contextlib.suppress(BrokenPipeError):
         process.communicate()
@@ -103,6 +103,6 @@ def test_without_an_emulated_rig_nobody_knows_the_truth() -> None:
 
 def test_a_happening_of_two_lines_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "emulator.yaml"
-    path.write_text('device: rig\nhappenings: [{step: 1, say: "slip\\nkick 3"}]\n')
-    with pytest.raises(Exception, match="say"):
+    path.write_text('device: rig\nevents: [{step: 1, command: "slip\\nkick 3"}]\n')
+    with pytest.raises(Exception, match="command"):
         load_yaml_model(path, EmulatorConfig)

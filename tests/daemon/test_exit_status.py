@@ -62,7 +62,7 @@ async def ended(path: Path, log: Log, *, once: str) -> Daemon:
 
 
 async def done_experiment() -> SimpleNamespace:
-    return SimpleNamespace(phase=ExperimentPhase.DONE, why="")
+    return SimpleNamespace(phase=ExperimentPhase.DONE, stop_reason="")
 
 
 async def test_after_a_crash_no_experiment_begins_by_itself(

@@ -72,7 +72,7 @@ class ConfiguredExperiment:
                 "the experiment has ended",
                 experiment=str(self.path),
                 phase=experiment.phase.value,
-                why=experiment.stop_reason,
+                reason=experiment.stop_reason,
             )
         finally:
             self._told.set()

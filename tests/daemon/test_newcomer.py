@@ -123,7 +123,7 @@ def tree(tmp_path: Path) -> Iterator[Tree]:
         content["gripper"]["socket"]["host"] = HOST
         (rig,) = content["emulators"]
         rig["arguments"] += ["--host", HOST, "--speed", str(SPEED), "--unlock-wait-s", "0.2", "--power-on-s", "0.1"]
-        (kick,) = rig["happenings"]
+        (kick,) = rig["events"]
         kick["held_for_s"] = HOLD_S / 2
 
     def experiment(content: Any) -> None:

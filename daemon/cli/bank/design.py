@@ -17,9 +17,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Design, and print or write what `bank build --config` takes."""
+    from shearloop.daemon.analysis.bank_design import design_yaml, designed_for, doubts
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.scene import design_yaml, designed_for, doubts
 
     if args.out is not None:
         check_overwrite(args.out, "a configuration")

@@ -25,7 +25,7 @@ from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
-from shearloop.daemon.recording.identity import Attached, identity_of, notes_of
+from shearloop.daemon.recording.identity import AttachedFile, daemon_identity, experiment_notes
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import Rig, make_load_cell
 from shearloop.daemon.rig_check import checked_experiment
@@ -176,7 +176,7 @@ class Daemon:
             if self._rig.gripper is not None:
                 health.add("gripper", self._rig.gripper.facts)
         if self._recorder is not None:
-            health.add("recording", self._recorder.facts)
+            health.add("recording", self._recorder.diagnostics)
         health.add("commands", self._command_facts)
         return health
 
@@ -268,13 +268,13 @@ class Daemon:
     async def _begin(self, path: Path) -> str | None:
         """Begin the experiment in a file, recorded, or return why not; raises UserError for a file that is none."""
         rig, recorder = needed(self._rig), self._recorder
-        attached = Attached.if_there(path) if recorder is not None else ()
+        attached = AttachedFile.read(path) if recorder is not None else ()
         why = await rig.start(path)
         if why is None and self._experiment is not None:
             self._experiment.has_begun(path)
         if why is None and recorder is not None and rig.brain.experiment is not None:
             file = rig.brain.experiment.file
-            recorder.experiment(file.name, attached, notes_of(file))
+            recorder.record_experiment(file.name, attached, experiment_notes(file))
         return why
 
     def _give_up_waiting(self) -> Path | None:
@@ -282,7 +282,7 @@ class Daemon:
         return self._experiment.give_up() if self._experiment is not None else None
 
     def _tap(self, source: str) -> OnRaw:
-        return ignore_raw if self._recorder is None else self._recorder.tap(source)
+        return ignore_raw if self._recorder is None else self._recorder.input_recorder(source)
 
     def _busy(self) -> bool:
         """Return whether an experiment is running."""
@@ -329,8 +329,8 @@ def _recorder(
     """Return what records all that is published, where that is configured; raises UserError where it cannot."""
     if config.recording is None:
         return None
-    recorder = Recorder(config.recording.folder, identity_of(config), clock, busy=busy, on_failure=on_failure)
-    publisher.add_listener(recorder.record)
+    recorder = Recorder(config.recording.folder, daemon_identity(config), clock, is_busy=busy, on_failure=on_failure)
+    publisher.add_listener(recorder.record_message)
     return recorder
 
 

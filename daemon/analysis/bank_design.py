@@ -95,7 +95,7 @@ def doubts(design: Design) -> list[str]:
         )
     if design.relative_noise > _MAX_NOISE:
         found.append(
-            f"the noise is {design.relative_noise:.1%} of a difference frame, against 16% for the paper's peak samples: "
+            f"the noise is {design.relative_noise:.1%} of a difference frame, against 16% of the paper's samples: "
             "it hides the signal; record a tool that is gripped and twisted"
         )
     return found

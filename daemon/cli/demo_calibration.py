@@ -78,9 +78,9 @@ class RecordedTwists:
         with RecordingWriter(path, "the emulated rig, by shearloop.daemon.cli.demo_calibration", notes) as writer:
             for t_s, pair in zip(self.frame_s, self.lines, strict=True):
                 for side, line in zip(SIDES, pair, strict=True):
-                    writer.frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
+                    writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
             for t_s, torque_nm in zip(self.torque_s, self.torque_nm, strict=True):
-                writer.torque(round(t_s * 1e9), torque_nm)
+                writer.add_torque(round(t_s * 1e9), torque_nm)
 
 
 class TwistPlayer:

@@ -87,7 +87,7 @@ def _run(
         lock_memory()
     options = check_emulators(emulators, args.config)
     if args.recording is not None:
-        from shearloop.daemon.recording.matlab_streams import read_stream
+        from shearloop.daemon.recording.matlab import read_stream
 
         for emulator, given in zip(emulators, options, strict=True):
             if emulator.device == "eit-kit":
@@ -104,7 +104,7 @@ def _run(
             slices = SliceRecorder(args.slices)
             stack.callback(slices.close)
             listeners.append(slices)
-            diagnostics["slices"] = slices.facts
+            diagnostics["slices"] = slices.diagnostics
         truth = stack.enter_context(closing(TruthFile(emulators)))
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())

@@ -110,11 +110,11 @@ def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
     with RecordingWriter(tmp_path / "one.mcap", "a test") as writer:
         for number in range(12):
             t_ns = number * period_ns
-            writer.frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
-            writer.torque(t_ns, 0.1)
+            writer.add_frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+            writer.add_torque(t_ns, 0.1)
         # A board that was lost soon, and whose frames lie beside the other's.
         for t_ns in (6 * period_ns, 20 * period_ns):
-            writer.frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+            writer.add_frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
     scenes: list[Scene] = []
     monkeypatch.setattr("shearloop.daemon.analysis.bank_design.designed", lambda scene, _: scenes.append(scene))
     designed_for(tmp_path / "one.mcap", None, "left")

@@ -191,7 +191,7 @@ def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree: Tree)
     for topic in ("eit.estimate.both", "eit.frame.left", "load.torque", "robot.state", "gripper.state", "loop.state"):
         assert topic in told
     told = tree.shell(f"{replay} --publish ipc://{tree.root}/replay").stderr
-    same = re.findall(r"(\S+): (\d+) of (\d+) are the same as recorded, bit for bit", told)
+    same = re.findall(r"(\S+): (\d+) of (\d+) equal the recorded ones, bit for bit", told)
     assert [topic for topic, *_ in same] == ["eit.estimate", "eit.frame", "load.torque"]
     assert all(made == recorded and int(made) > 100 for _, made, recorded in same)
     assert "estimator fused, torque from" in tree.shell(calibrate).stdout

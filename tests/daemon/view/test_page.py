@@ -75,7 +75,7 @@ def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> 
         "#wrist": f"{signed(robot['wrist_rad'], 3)} rad",
         "#wrist-speed": f"{signed(robot['wrist_speed_rad_per_s'], 3)} rad/s",
         "#speed-sent": f"{signed(said['loop']['speed_sent_rad_per_s'], 3)} rad/s",
-        "#speed-wanted": f"wanted {signed(said['loop']['speed_command_rad_per_s'], 3)}",
+        "#speed-command": f"wanted {signed(said['loop']['speed_command_rad_per_s'], 3)}",
         "#wrist-torque": f"{signed(robot['wrist_torque_nm'], 3)} N·m",
         "#robot-mode": "running (7)",
         "#safety-mode": "normal (1)",
@@ -86,7 +86,7 @@ def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> 
         "#gripper-diameter": "19.7 ± 3.0 mm",
         "#gripper-current": "270 mA",
         "#phase-name": "running: hold 0.10 N·m, step 6 of 7",
-        "#phase-doing": "holding",
+        "#phase-activity": "holding",
         "#progress-text": "62 %, about 38 s left",
         "#process": "142 MB, 6.0 % of a core, event loop 1.3 ms late",
     }
@@ -150,7 +150,7 @@ def test_an_invalid_estimate_is_no_number(browsed: Browsed) -> None:
     browsed.open()
     browsed.until_shown(
         {
-            "#torque-why": "no estimate: no signal above the noise",
+            "#torque-reason": "no estimate: no signal above the noise",
             ".fingertip .invalid": "not valid: no signal above the noise",
             "#torque-now": "–",
             "#torque-interval": "",
@@ -190,7 +190,7 @@ def test_a_fault_of_robot_and_gripper_stands_in_its_panel(browsed: Browsed) -> N
             "#safety-mode": "protective stop (3)",
             "#gripper-fault": "fault 11: overheated",
             "#holding-title": "Stopped: stop and keep grip",
-            "#phase-doing": "",
+            "#phase-activity": "",
             "#wanted": "–",
             "#progress-text": "",
         }
@@ -201,7 +201,7 @@ def test_a_reading_of_the_load_cell_that_is_not_to_be_believed_is_no_figure(brow
     browsed.open()
     browsed.daemon.say(load={"valid": False, "reason": "the reading is the same for two seconds"})
     why = "load cell: the reading is the same for two seconds"
-    browsed.until_shown({"#load-torque": "–", "#load-note": "not valid", "#torque-why": why})
+    browsed.until_shown({"#load-torque": "–", "#load-note": "not valid", "#torque-reason": why})
     assert browsed.layout()["spilt"] == []
 
 

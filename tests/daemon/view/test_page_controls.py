@@ -96,7 +96,8 @@ def test_a_daemon_that_dies_is_shown_as_dead_within_two_seconds_and_lives_again(
             """() => {
               window.toldDead = null;
               new MutationObserver((_, observer) => {
-                const said = document.querySelector('#link-why').textContent.match(/nothing from it for ([0-9.]+) s/);
+                const shown = document.querySelector("#link-reason").textContent;
+                const said = shown.match(/nothing from it for ([0-9.]+) s/);
                 if (!said) return;
                 window.toldDead = Number(said[1]);
                 observer.disconnect();
@@ -145,8 +146,8 @@ def test_no_daemon_is_told_with_what_to_do(browsed: Browsed) -> None:
     browsed.viewer.start()
     browsed.page.goto(browsed.viewer.url)
     browsed.until("#link-state", "✗ NO DAEMON")
-    assert "start one with `shearloop run CONFIG`" in browsed.text("#link-why")
-    assert "nothing heard" in browsed.text("#torque .age")
+    assert "start one with `shearloop run CONFIG`" in browsed.text("#link-reason")
+    assert "no message" in browsed.text("#torque .age")
     browsed.page.click("#stop")
     browsed.until("#answer", "STOP NOT CONFIRMED: no daemon answered")
     browsed.daemon.start()

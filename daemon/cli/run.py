@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from shearloop.daemon.cli.demonstration import TruthFile
     from shearloop.daemon.config import EmulatorConfig
+    from shearloop.daemon.logs import NonBlockingWriter
     from shearloop.daemon.messaging.publisher import Listener
-    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
 
 # An emulator needs some of it to remove its port's link; a clean stop takes less than a second in all.
 EMULATOR_STOP_S = 0.5
@@ -46,9 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal, `shearloop command stop`, or the end of the experiment (`stop_when_done`)."""
-    from shearloop.daemon.gc_control import kept_from_lasting_objects
-    from shearloop.daemon.logs import logging_to_stderr
-    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
+    from shearloop.daemon.gc_control import without_long_collections
+    from shearloop.daemon.logs import NonBlockingWriter, logging_to_stderr
     from shearloop.daemon.signals import ending_signals
 
     # Until the event loop handles the signals: stopping a service that is still starting is no failure.
@@ -56,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         if number != signal.SIGINT:
             signal.signal(number, lambda *_: sys.exit(0))
     with (
-        kept_from_lasting_objects() as on_ready,
+        without_long_collections() as on_ready,
         logging_to_stderr(json_lines=args.json_log) as log,
         closing(NonBlockingWriter(sys.stdout)) as out,
     ):
@@ -94,7 +93,7 @@ def _run(
                 # Without its frames the daemon would wait forever.
                 read_stream(args.recording, given.side)
     listeners: list[Listener] = []
-    diagnostics = {"log": log.facts, "shown": out.facts}
+    diagnostics = {"log": log.diagnostics, "shown": out.diagnostics}
     with ExitStack() as stack:
         slices = None
         if args.slices is not None:

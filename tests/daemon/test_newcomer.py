@@ -121,7 +121,7 @@ def tree(tmp_path: Path) -> Iterator[Tree]:
         content["gripper"]["socket"]["host"] = HOST
         (rig,) = content["emulators"]
         rig["arguments"] += ["--host", HOST, "--speed", str(SPEED), "--unlock-wait-s", "0.2", "--power-on-s", "0.1"]
-        (kick,) = rig["happenings"]
+        (kick,) = rig["events"]
         kick["held_for_s"] = HOLD_S / 2
 
     def experiment(content: Any) -> None:
@@ -189,7 +189,7 @@ def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree: Tree)
     for topic in ("eit.estimate.both", "eit.frame.left", "load.torque", "robot.state", "gripper.state", "loop.state"):
         assert topic in summary
     comparison = tree.shell(f"{replay} --publish ipc://{tree.root}/replay").stderr
-    same = re.findall(r"(\S+): (\d+) of (\d+) are the same as recorded, bit for bit", comparison)
+    same = re.findall(r"(\S+): (\d+) of (\d+) equal the recorded ones, bit for bit", comparison)
     assert [topic for topic, *_ in same] == ["eit.estimate", "eit.frame", "load.torque"]
     assert all(made == recorded and int(made) > 100 for _, made, recorded in same)
     assert "estimator fused, torque from" in tree.shell(calibrate).stdout

@@ -25,21 +25,21 @@ class Commands:
         fingertips: Mapping[str, FingertipTask],
         experiment: Path | None,
         begin: Callable[[Path], Awaitable[str | None]],
-        give_up_waiting: Callable[[], Path | None],
+        call_off_experiment: Callable[[], Path | None],
         tasks: Callable[[], Any],
         stop: Callable[[], None],
     ) -> None:
         """Take the rig, where there is one, and what takes the zero of each sensor.
 
-        `experiment` is the configured one; `begin` starts one or returns why not; `give_up_waiting` returns one that
-        was still to be started; `tasks` are what health knows of them; `stop` ends the daemon.
+        `experiment` is the configured one; `begin` starts one or returns why not; `call_off_experiment` cancels
+        its automatic start; `tasks` are what health knows of them; `stop` ends the daemon.
         """
         self._rig = rig
         self._tares = tares
         self._fingertips = fingertips
         self._experiment = experiment
         self._begin = begin
-        self._give_up_waiting = give_up_waiting
+        self._call_off_experiment = call_off_experiment
         self._tasks = tasks
         self._stop_daemon = stop
 
@@ -76,22 +76,22 @@ class Commands:
         return {"experiment": str(path)}
 
     async def _pause(self, _request: Request) -> Reply:
-        _refuse(needed(self._rig).brain.pause())
+        _refuse(needed(self._rig).control_loop.pause())
         return {}
 
     async def _resume(self, _request: Request) -> Reply:
-        _refuse(needed(self._rig).brain.resume())
+        _refuse(needed(self._rig).control_loop.resume())
         return {}
 
     async def _unlock(self, _request: Request) -> Reply:
-        _refuse(await needed(self._rig).loop.unlock())
+        _refuse(await needed(self._rig).runner.unlock())
         return {}
 
     async def _tare(self, request: Request) -> Reply:
         source = request.get("source")
         if source is not None and not (isinstance(source, str) and source in self._tares):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(self._tares)}")
-        experiment = self._rig.brain.experiment if self._rig is not None else None
+        experiment = self._rig.control_loop.experiment if self._rig is not None else None
         if experiment is not None and experiment.running:
             raise CommandRefusedError(
                 f"the experiment {experiment.file.name!r} is running, and a new zero would change what its torques "
@@ -119,7 +119,7 @@ class Commands:
 
     async def _stop(self, request: Request) -> Reply:
         stopped = self._rig.stop() if self._rig is not None else ""
-        awaited = self._give_up_waiting()
+        awaited = self._call_off_experiment()
         if stopped:
             return {"stopped": stopped}
         if request.get("spare_daemon"):

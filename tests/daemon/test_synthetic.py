@@ -146,7 +146,7 @@ def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared) 
     from shearloop.bank.eit.forward import ForwardModel
     from shearloop.bank.eit.mesh import load_mesh
     from shearloop.bank.eit.models import conductivity
-    from shearloop.daemon.recording.matlab_streams import read_torque_slices
+    from shearloop.daemon.recording.matlab import read_torque_slices
 
     mesh = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     forward = ForwardModel(mesh)

@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 
 from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank
 from shearloop.bank.eit.fingertip import Fingertip
+from shearloop.daemon.analysis.bank_design import choices_of, doubts, scene_of
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save
 from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
-from shearloop.daemon.scene import choices_of, doubts, scene_of
 from shearloop.daemon.workers import Executor, in_order
 
 _MESH_SIZE_CM = 0.07

@@ -9,8 +9,7 @@ import pytest
 from jsonschema import Draft202012Validator
 
 from shearloop.daemon.messaging.messages import TOPICS, EitFrame, Message, wire_map
-from shearloop.daemon.recording.content import input_json, message_json
-from shearloop.daemon.recording.schema import INPUT, completed, schemas
+from shearloop.daemon.recording.schema import INPUT, input_json, message_json, schemas, with_missing_keys
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.sample_messages import sample
 
@@ -66,7 +65,7 @@ def test_every_message_is_what_its_schema_says_with_and_without_values(topic: st
         written = json.loads(message_json(topic, on_wire, 0))
         Draft202012Validator(schemas()[topic]).validate(written)
         assert None not in written.values()
-        restored = completed(topic, written)
+        restored = with_missing_keys(topic, written)
         for item in dataclasses.fields(message):
             value = getattr(message, item.name)
             if isinstance(value, tuple):

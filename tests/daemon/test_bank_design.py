@@ -15,12 +15,12 @@ from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import NOT_TURNED, NearestCell
 from shearloop.bank.estimation.values import FrameSeries
+from shearloop.daemon.analysis.bank_design import design_yaml, designed_for, scene_of
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
 from shearloop.daemon.bank_config import FingertipGeometryConfig, load_bank_plan, load_geometry
 from shearloop.daemon.cli import main
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.recording.writer import RecordingWriter
-from shearloop.daemon.scene import design_yaml, designed_for, scene_of
 
 
 @pytest.fixture(scope="session")
@@ -112,13 +112,13 @@ def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
     with RecordingWriter(tmp_path / "one.mcap", "a test") as writer:
         for number in range(12):
             t_ns = number * period_ns
-            writer.frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
-            writer.torque(t_ns, 0.1)
+            writer.add_frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+            writer.add_torque(t_ns, 0.1)
         # A board that was lost soon, and whose frames lie beside the other's.
         for t_ns in (6 * period_ns, 20 * period_ns):
-            writer.frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+            writer.add_frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
     scenes: list[MeasuredFrames] = []
-    monkeypatch.setattr("shearloop.daemon.scene.designed", lambda scene, _: scenes.append(scene))
+    monkeypatch.setattr("shearloop.daemon.analysis.bank_design.design_bank", lambda scene, _: scenes.append(scene))
     designed_for(tmp_path / "one.mcap", None, "left")
     # Of the twelve the first stands in for the idle one.
     assert scenes[0].differences.shape == (11, N_CHANNELS)

@@ -242,9 +242,8 @@ def check_experiment(config: DaemonConfig, sources: Mapping[str, TorqueSource]) 
     measured = [name for name, source in sources.items() if source.measures_torque]
     driving = [*measured, *([LOAD_CELL] if config.load_cell is not None else []), WRENCH]
     if file.torque_source not in driving:
-        raise UserError(
-            f"{path}: `torque_source: {file.torque_source}` {_why_not_driving(file.torque_source, config)}; there are {', '.join(driving)}"
-        )
+        reason = _why_not_driving(file.torque_source, config)
+        raise UserError(f"{path}: `torque_source: {file.torque_source}` {reason}; there are {', '.join(driving)}")
     if config.gripper is None:
         for number, step in enumerate(file.steps, 1):
             if isinstance(step, GripStep | ReleaseStep):

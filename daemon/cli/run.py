@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from shearloop.daemon.cli.demonstration import Truth
+    from shearloop.daemon.cli.demonstration import TruthFile
     from shearloop.daemon.config import EmulatorConfig
     from shearloop.daemon.logs import NonBlockingWriter
     from shearloop.daemon.messaging.publisher import Listener
@@ -69,7 +69,7 @@ def _run(
 
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
-    from shearloop.daemon.cli.demonstration import Deaths, EmulatorEvents, Truth
+    from shearloop.daemon.cli.demonstration import EmulatorMonitor, EventInjector, TruthFile
     from shearloop.daemon.cli.output import EstimatePrinter
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
     from shearloop.daemon.errors import UserError
@@ -104,12 +104,12 @@ def _run(
             stack.callback(slices.close)
             listeners.append(slices)
             diagnostics["slices"] = slices.diagnostics
-        truth = stack.enter_context(closing(Truth(emulators)))
+        truth = stack.enter_context(closing(TruthFile(emulators)))
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
         processes = stack.enter_context(_run_emulators(emulators, args.config.parent, args.recording, truth))
-        events = EmulatorEvents(emulators, processes)
-        listeners += [Deaths(emulators, processes), events]
+        events = EventInjector(emulators, processes)
+        listeners += [EmulatorMonitor(emulators, processes), events]
         if processes:
             # The daemon does not know about emulation and will report missing devices.
             structlog.get_logger().info(
@@ -118,7 +118,7 @@ def _run(
             )
         if args.show:
             summary = RunSummary(
-                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: events.happened
+                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: events.sent
             )
             listeners += [EstimatePrinter(out), summary]
         finished = asyncio.run(run_daemon(config, tuple(listeners), diagnostics, on_ready))
@@ -149,7 +149,7 @@ def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> li
 
 @contextmanager
 def _run_emulators(
-    emulators: "tuple[EmulatorConfig, ...]", folder: Path, recording: Path | None, truth: "Truth"
+    emulators: "tuple[EmulatorConfig, ...]", folder: Path, recording: Path | None, truth: "TruthFile"
 ) -> Iterator[list["subprocess.Popen[bytes]"]]:
     """Run the configuration's emulated devices, each in a process."""
     processes: list[subprocess.Popen[bytes]] = []

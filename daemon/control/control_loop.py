@@ -111,7 +111,8 @@ class ControlLoop:
         if self.experiment is not None and self.experiment.running:
             return f"the experiment {self.experiment.file.name!r} is still running; stop it first"
         if file.torque_source not in self._wrists:
-            return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {', '.join(self._wrists)}"
+            known = ", ".join(self._wrists)
+            return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
         if self.safety.stopped:
             return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
         refusals = [

@@ -120,7 +120,7 @@ def test_no_content_whatever_does_anything_but_load_or_be_refused(tmp_path_facto
 @pytest.mark.parametrize(
     ("step", "said"),
     [
-        ("{do: gripp}", "`steps[0]` has the do 'gripp', which does not exist, did you mean 'grip'? (allowed: approach, "),
+        ("{do: gripp}", "`steps[0]` has the do 'gripp', which does not exist, did you mean 'grip'? (allowed: approach"),
         ("{do: 7}", "`steps[0]` has the do '7', which does not exist (allowed: approach, "),
         ("{width_mm: 5}", "`steps[0]` lacks `do`, its kind"),
     ],

@@ -15,7 +15,7 @@ import zmq.asyncio
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import Commands, needed
+from shearloop.daemon.commands import Commands, required_rig
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
@@ -154,8 +154,8 @@ class Daemon:
             tares=tares,
             fingertips=self._fingertips,
             experiment=self._config.experiment,
-            begin=self._begin,
-            give_up_waiting=self._give_up_waiting,
+            start=self._begin,
+            cancel_start=self._give_up_waiting,
             tasks=self.health.tasks,
             stop=self.stop,
         )
@@ -267,7 +267,7 @@ class Daemon:
 
     async def _begin(self, path: Path) -> str | None:
         """Begin the experiment in a file, recorded, or return why not; raises UserError for a file that is none."""
-        rig, recorder = needed(self._rig), self._recorder
+        rig, recorder = required_rig(self._rig), self._recorder
         attached = AttachedFile.read(path) if recorder is not None else ()
         why = await rig.start(path)
         if why is None and self._experiment is not None:

@@ -1,4 +1,4 @@
-"""Structured logs: readable lines on a console, JSON where a service manager collects them."""
+"""Structured logs: readable lines on a console, JSON for a service manager."""
 
 import logging
 import os
@@ -14,9 +14,9 @@ from shearloop.daemon.nonblocking_writer import NonBlockingWriter
 
 @contextmanager
 def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.INFO) -> Iterator[NonBlockingWriter]:
-    """Configure structlog for as long as the context lasts; nobody who logs waits for whoever reads it.
+    """Configure structlog for the context; logging never blocks on the reader of stderr.
 
-    JSON is chosen by itself when systemd has connected the log to its journal.
+    The default is JSON if stderr is systemd's journal, else readable lines.
     """
     if json_lines is None:
         json_lines = "JOURNAL_STREAM" in os.environ
@@ -44,5 +44,5 @@ def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.IN
         try:
             yield outlet
         finally:
-            # What is logged later is written by whoever logs.
+            # Later log lines are written directly.
             structlog.configure(logger_factory=structlog.WriteLoggerFactory(sys.stderr))

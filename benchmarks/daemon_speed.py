@@ -4,7 +4,7 @@
 
 Each figure is measured on a daemon in its own process, through a pseudo-terminal and a subscriber's socket. Latency
 counts from before the last byte is written until the subscriber has the estimate. `--rig` is the folder of
-`benchmarks.rig_twists`, with the default estimator's recording and calibrations, and the emulated rig's bank.
+`shearloop.daemon.cli.demo_calibration`, with the default estimator's recording and calibrations, and the rig's bank.
 """
 
 import argparse
@@ -279,7 +279,7 @@ def estimator_latency(rig: Path, sides: Sequence[str], n_frames: int, pause_s: f
                     else:
                         missed[source] += number >= FIRST_VALID_FRAME - FIRST_FRAME
     if not all(taken.values()):
-        raise RuntimeError("no estimate was valid: run benchmarks.rig_twists again")
+        raise RuntimeError("no estimate was valid: run shearloop.daemon.cli.demo_calibration again")
     return {source: {**_percentiles(found), "missed": missed[source]} for source, found in taken.items()}
 
 

@@ -25,21 +25,21 @@ class Commands:
         fingertips: Mapping[str, FingertipTask],
         experiment: Path | None,
         start: Callable[[Path], Awaitable[str | None]],
-        cancel_start: Callable[[], Path | None],
+        call_off_experiment: Callable[[], Path | None],
         tasks: Callable[[], Any],
         stop: Callable[[], None],
     ) -> None:
         """`tares` sets the zero of each sensor, `experiment` is the configured one, `tasks` returns their health.
 
-        `start` starts an experiment or returns the reason of its refusal. `cancel_start` cancels an experiment that
-        waits to start and returns it. `stop` stops the daemon.
+        `start` starts an experiment or returns the reason of its refusal. `call_off_experiment` cancels an
+        experiment that waits to start and returns it. `stop` stops the daemon.
         """
         self._rig = rig
         self._tares = tares
         self._fingertips = fingertips
         self._experiment = experiment
         self._start_experiment = start
-        self._cancel_start = cancel_start
+        self._call_off_experiment = call_off_experiment
         self._tasks = tasks
         self._stop_daemon = stop
 
@@ -78,22 +78,22 @@ class Commands:
         return {"experiment": str(path)}
 
     async def _pause(self, _request: Request) -> Reply:
-        _refuse_if(required_rig(self._rig).brain.pause())
+        _refuse_if(required_rig(self._rig).control_loop.pause())
         return {}
 
     async def _resume(self, _request: Request) -> Reply:
-        _refuse_if(required_rig(self._rig).brain.resume())
+        _refuse_if(required_rig(self._rig).control_loop.resume())
         return {}
 
     async def _unlock(self, _request: Request) -> Reply:
-        _refuse_if(await required_rig(self._rig).loop.unlock())
+        _refuse_if(await required_rig(self._rig).runner.unlock())
         return {}
 
     async def _tare(self, request: Request) -> Reply:
         source = request.get("source")
         if source is not None and not (isinstance(source, str) and source in self._tares):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(self._tares)}")
-        experiment = self._rig.brain.experiment if self._rig is not None else None
+        experiment = self._rig.control_loop.experiment if self._rig is not None else None
         if experiment is not None and experiment.running:
             raise CommandRefusedError(
                 f"the experiment {experiment.file.name!r} is running, and a new zero would change its "
@@ -121,7 +121,7 @@ class Commands:
 
     async def _stop(self, request: Request) -> Reply:
         stopped = self._rig.stop() if self._rig is not None else ""
-        waiting = self._cancel_start()
+        waiting = self._call_off_experiment()
         if stopped:
             return {"stopped": stopped}
         if request.get("spare_daemon"):

@@ -213,20 +213,22 @@ class RecordingConfig(ConfigModel):
 
 
 class EventConfig(ConfigModel):
-    """What befalls an emulated device in the course of an experiment."""
+    """A command to an emulated device during an experiment."""
 
     step: int = Field(ge=1, description="number of the experiment's step, from 1")
-    held_for_s: float = Field(0.0, ge=0, description="after its torque or angle has been held for so long")
-    say: str = Field(min_length=1, pattern=r"^[^\n]*$", description="a command of the emulator, see its --help")
+    held_for_s: float = Field(0.0, ge=0, description="delay after the step begins to hold its torque or angle")
+    command: str = Field(
+        min_length=1, pattern=r"^[^\n]*$", description="one of the emulator's commands, see its --help"
+    )
 
 
 class EmulatorConfig(ConfigModel):
-    """A device that is played by a process of its own, for demonstrations."""
+    """A device that is emulated by its own process, for demonstrations."""
 
     device: str
     arguments: tuple[str, ...] = ()
-    synthetic: tuple[str, ...] = Field((), description="further arguments where no recording is played")
-    happenings: tuple[EventConfig, ...] = ()
+    synthetic: tuple[str, ...] = Field((), description="further arguments, unless a recording is played")
+    events: tuple[EventConfig, ...] = ()
 
 
 class DaemonConfig(ConfigModel):

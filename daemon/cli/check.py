@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
 
     from shearloop.daemon.cli.run import check_emulators
     from shearloop.daemon.config import load_daemon_config
-    from shearloop.daemon.rig_check import checked_experiment
+    from shearloop.daemon.rig import check_experiment
     from shearloop.daemon.sensing.opening import open_both, open_estimator
     from shearloop.daemon.sensing.torque_sources import torque_sources
 
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     if config.skin is not None:
         parts["skin"] = _skin(config.skin)
     parts |= _rig(config)
-    experiment = checked_experiment(config, torque_sources(config, estimators, combined))
+    experiment = check_experiment(config, torque_sources(config, estimators, combined))
     if experiment is not None:
         parts["experiment"] = f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.drive}"
     if args.json:

@@ -10,7 +10,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.links import log_link
+from shearloop.daemon.logs import log_link
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading

@@ -277,7 +277,7 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
         await watcher.until("robot.state", lambda state: abs(state["wrist_speed_rad_per_s"]) > 0.1)
         daemon.stop()
         await daemon.stopped()
-    why = "the daemon was told to end: the wrist is stopped, a tool that is gripped stays gripped"
+    why = "the daemon ended: the wrist is stopped, a gripped tool stays gripped"
     assert not daemon.finished
     assert (watcher.seen["loop.state"][-1]["phase"], watcher.seen["loop.state"][-1]["activity"]) == ("stopped", why)
     assert any("STOPPED before its end" in line for line in told)

@@ -168,12 +168,12 @@ async def test_no_zero_is_taken_while_an_experiment_runs() -> None:
     tared: list[str] = []
     experiment = SimpleNamespace(running=True, file=SimpleNamespace(name="hold"))
     commands = Commands(
-        rig=cast("Rig", SimpleNamespace(brain=SimpleNamespace(experiment=experiment))),
+        rig=cast("Rig", SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment))),
         tares={name: partial(tared.append, name) for name in ("right", "load_cell")},
         fingertips={},
         experiment=None,
         start=AsyncMock(),
-        cancel_start=lambda: None,
+        call_off_experiment=lambda: None,
         tasks=dict,
         stop=lambda: None,
     )

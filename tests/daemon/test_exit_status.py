@@ -12,15 +12,14 @@ import zmq.asyncio
 
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.control.configured_experiment import ConfiguredExperiment, CrashMarker
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from shearloop.daemon.crash_marker import CrashMarker
 from shearloop.daemon.errors import UserError
 from tests.daemon.conftest import Log, deadline, shearloop
 from tests.emulator_process import own_address
 
 Write = Callable[..., Path]
-LEFT_TO_OPERATOR = "it begins by `shearloop command start` alone"
+LEFT_TO_OPERATOR = "it starts by `shearloop command start` only"
 
 
 @pytest.fixture
@@ -62,7 +61,7 @@ async def ended(path: Path, log: Log, *, once: str) -> Daemon:
 
 
 async def done_experiment() -> SimpleNamespace:
-    return SimpleNamespace(phase=ExperimentPhase.DONE, why="")
+    return SimpleNamespace(phase=ExperimentPhase.DONE, stop_reason="")
 
 
 async def test_after_a_crash_no_experiment_begins_by_itself(
@@ -73,7 +72,7 @@ async def test_after_a_crash_no_experiment_begins_by_itself(
     assert not crashed.left_behind
     crashed.set()
     assert not (await ended(waiting_config, log, once=LEFT_TO_OPERATOR)).finished
-    assert any("died after it had begun an experiment" in one for one in log.said)
+    assert any("crashed after it had started an experiment" in one for one in log.said)
     assert not CrashMarker().left_behind, "this one ended in good order"
 
 
@@ -121,18 +120,18 @@ async def test_an_experiment_that_is_begun_by_hand_after_all_is_seen_to_its_end(
     path = tmp_path / "experiment.yaml"
 
     async def not_yet(_path: Path) -> str | None:
-        experiment.give_up()
+        experiment.call_off()
         return "the gripper is not ready"
 
     experiment = ConfiguredExperiment(path, not_yet, done_experiment)  # type: ignore[arg-type]
     async with deadline("the experiment was not seen to its end"), asyncio.TaskGroup() as group:
         await experiment.run()
         assert experiment.left_to_operator
-        running = group.create_task(experiment.begun_and_ended())
-        experiment.has_begun(tmp_path / "another.yaml")
+        running = group.create_task(experiment.wait_for_end())
+        experiment.on_begun(tmp_path / "another.yaml")
         await asyncio.sleep(0)
         assert not running.done()
-        experiment.has_begun(path)
+        experiment.on_begun(path)
     assert experiment.done
 
 
@@ -143,7 +142,7 @@ async def test_what_was_called_off_stays_so_when_its_task_dies(by: str, tmp_path
 
     async def begin(path: Path) -> str | None:
         if begun:
-            experiment.has_begun(path)
+            experiment.on_begun(path)
             return None
         begun.append(path)
         raise UserError("the file is none")
@@ -152,9 +151,9 @@ async def test_what_was_called_off_stays_so_when_its_task_dies(by: str, tmp_path
     with pytest.raises(UserError):
         await experiment.run()
     if by == "stop":
-        assert experiment.give_up() == experiment.path
+        assert experiment.call_off() == experiment.path
     else:
-        experiment.has_begun(tmp_path / "another.yaml")
+        experiment.on_begun(tmp_path / "another.yaml")
     await experiment.run()
     assert experiment.left_to_operator
     assert not experiment.begun
@@ -170,4 +169,4 @@ def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyP
 
 def test_a_mark_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     CrashMarker({"RUNTIME_DIRECTORY": str(tmp_path / "nowhere")}).set()
-    assert "there is no mark of this one" in capsys.readouterr().out
+    assert "cannot write the crash marker" in capsys.readouterr().out

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon import gc_control as collector
+from shearloop.daemon import gc_control
 from shearloop.daemon.cli import main, run
 from shearloop.daemon.signals import ending_signals
 from tests.daemon.conftest import DEADLINE_S
@@ -60,7 +60,7 @@ def test_what_ends_a_daemon_does_nothing_more_when_it_comes_again(
 
     monkeypatch.setattr(run, "_run_emulators", emulators)
     monkeypatch.setattr(
-        collector, "kept_from_lasting_objects", lambda: nullcontext(partial(os.kill, os.getpid(), number))
+        gc_control, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number))
     )
     assert main(["run", str(config())]) == 0
     assert came == ["again"]
@@ -71,7 +71,7 @@ def test_a_command_runs_in_any_thread_and_hears_no_signals_there(
     config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ready = threading.Event()
-    monkeypatch.setattr(collector, "kept_from_lasting_objects", lambda: nullcontext(ready.set))
+    monkeypatch.setattr(gc_control, "without_long_collections", lambda: nullcontext(ready.set))
     with ThreadPoolExecutor() as pool:
         assert pool.submit(ending_signals).result() == ()
         daemon = pool.submit(main, ["run", str(config())])

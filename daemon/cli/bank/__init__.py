@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _design(args: argparse.Namespace) -> int:
-    from shearloop.daemon.scene import design_yaml, designed_for, doubts
+    from shearloop.daemon.analysis.bank_design import design_yaml, designed_for, doubts
 
     if args.out is not None:
         check_overwrite(args.out, "a configuration")

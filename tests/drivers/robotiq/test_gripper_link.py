@@ -78,7 +78,7 @@ async def test_it_comes_back_by_itself_and_says_so(way: str, tmp_path: Path) -> 
         second = await coming
         assert second.t_ns >= lost_ns
         assert second.seq > first.seq
-        openings = rig.driver.facts()["openings"]
+        openings = rig.driver.diagnostics()["openings"]
         assert openings == 2
         ups = [event.up for event in rig.events]
         assert ups[0]
@@ -103,7 +103,7 @@ async def test_a_loss_that_a_command_meets_is_told_as_well(way: str, tmp_path: P
             (False, True),
             (True, False),
         ]
-        assert rig.driver.facts()["last_loss"] == str(met.value)
+        assert rig.driver.diagnostics()["last_loss"] == str(met.value)
 
 
 @WAYS

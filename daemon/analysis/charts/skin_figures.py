@@ -21,7 +21,7 @@ PAPER_PREDICTION_N, PAPER_SENSITIVITY_PER_N, PAPER_LINEAR_N = 0.0802, 0.078, 1.2
 
 
 def draw(found: Characterisation, out: Path) -> list[Path]:
-    """Write the three figures as PNG and SVG into a folder, made if need be, and return their paths."""
+    """Write the three figures as PNG and SVG into a folder and return their paths."""
     figures = {"figure_5": _figure_5(found), "figure_6": _figure_6(found), "figure_7": _figure_7(found)}
     written = []
     try:
@@ -71,7 +71,7 @@ def _figure_5(found: Characterisation) -> Figure:
 
 
 def _both_sides(curve: ResponseCurve, response: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """A loading and its mirror image, each from zero: the skin is symmetrical."""
+    """Return a loading and its mirror image: the skin is symmetrical."""
     shear = np.concatenate([-curve.shear_n[::-1], [0.0], curve.shear_n])
     return shear, np.concatenate([-response[::-1], [0.0], response])
 

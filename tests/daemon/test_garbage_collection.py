@@ -12,7 +12,7 @@ from shearloop.daemon import app
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.gc_control import kept_from_lasting_objects
+from shearloop.daemon.gc_control import without_long_collections
 
 
 class Cycle:
@@ -36,7 +36,7 @@ def forgotten() -> weakref.ref[Cycle]:
 
 
 def test_nothing_is_collected_until_all_that_lasts_is_there_and_then_only_what_comes() -> None:
-    with kept_from_lasting_objects() as collect_what_comes:
+    with without_long_collections() as collect_what_comes:
         assert not gc.isenabled()
         before = forgotten()
         collect_what_comes()
@@ -52,14 +52,14 @@ def test_nothing_is_collected_until_all_that_lasts_is_there_and_then_only_what_c
 
 
 def test_what_ends_before_it_is_ready_leaves_the_collector_as_it_was() -> None:
-    with pytest.raises(SystemExit), kept_from_lasting_objects():
+    with pytest.raises(SystemExit), without_long_collections():
         raise SystemExit
     assert gc.isenabled()
 
 
 def test_collector_that_was_off_stays_off() -> None:
     gc.disable()
-    with kept_from_lasting_objects() as collect_what_comes:
+    with without_long_collections() as collect_what_comes:
         collect_what_comes()
         assert not gc.isenabled()
     assert not gc.isenabled()

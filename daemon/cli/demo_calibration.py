@@ -1,10 +1,8 @@
-"""Records the emulated rig and calibrates its fingertips: `python -m benchmarks.rig_twists --bank run/demo.bank
---out run`.
+"""Records the emulated rig and calibrates its fingertips: `python -m shearloop.daemon.cli.demo_calibration`.
 
-A real rig is calibrated on recordings: idle, a grip, twists with the load cell read beside, idle again, for a few
-cylinders. This plays the same on the emulated rig's own physics and frames, in the scene's time instead of the clock's
-so that the same seed gives the same files, writes the recordings, and calibrates on them: `rig-DDmm.mcap`, `rig.cal`
-for both fingertips together, and one calibration for each of them alone.
+As on a real rig, a recording holds idle frames, a grip, twists with the load cell's torque, and idle frames again, for
+several cylinders. It runs on the emulated rig's physics in simulated time, so that a seed always gives the same files:
+`rig-DDmm.mcap`, `rig.cal` for both fingertips together, and one calibration for each of them.
 """
 
 import argparse
@@ -30,16 +28,15 @@ from shearloop.drivers.emulators.rig import NOISE_NM, SIDES, FrameOf
 from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper
 from shearloop.drivers.emulators.scene import Scene
 
-# Three are enough to read others between them by; of five the interval is half as wide (python -m
-# benchmarks.cylinders).
+# Three diameters are enough to interpolate; five halve the interval.
 DIAMETERS_MM = (10.0, 17.5, 25.0, 32.5, 40.0)
-# Of the twin: an injection of a frame takes about as long.
+# The time step; about the duration of an injection.
 STEP_S = 0.02
 IDLE_S, SETTLE_S = 12.0, 10.0
 N_TWISTS = 12
-# What the wrist does in a grip: angles from here to there, so fast, and held so long.
+# Ranges of the wrist's angles, speeds and holds in a grip.
 ANGLES_RAD, SPEEDS_RAD_PER_S, HOLDS_S = (-0.12, 0.25), (0.05, 0.5), (1.0, 15.0)
-# Of a gripper that wakes up, holds a tool with about 60 N, and lets go.
+# Gripper commands: activate, grip a tool with about 60 N, open.
 ACTIVATE, GRIP = Command(act=True), Command(act=True, gto=True, pos=255, spe=128, force=110)
 _OPEN = replace(GRIP, pos=0)
 
@@ -47,14 +44,14 @@ Sides = tuple[str, ...]
 
 
 def lines_of(scene: Scene, frame_of: FrameOf) -> list[NDArray[np.float64]]:
-    """Return the lines of both boards' frames that end now, each (1024,) in volts."""
+    """Return the lines of both boards, (1024,) in volts, for frames that end now."""
     seen = scene.frame(FRAME_PERIOD_S)
     return [frame_of(seen.grip, sign * seen.shear_torque_nm, seen.diameter_mm) for sign in SIDES.values()]
 
 
 @dataclass(slots=True)
-class Recorded:
-    """Frames and torques as they fall due, in the scene's time."""
+class RecordedTwists:
+    """Frames and torques with their simulated times."""
 
     frame_s: list[float] = field(default_factory=list)
     lines: list[list[NDArray[np.float64]]] = field(default_factory=list)
@@ -62,7 +59,7 @@ class Recorded:
     torque_nm: list[float] = field(default_factory=list)
 
     def series(self, diameter_mm: float) -> FrameSeries:
-        """Return what a recording of this would be read as."""
+        """Return the series that a reader makes of the recording."""
         t_s = np.array(self.frame_s)
         channels = np.array([[channels_of_line(line) for line in pair] for pair in self.lines])
         return FrameSeries(
@@ -76,9 +73,9 @@ class Recorded:
         )
 
     def write(self, path: Path, diameter_mm: float) -> None:
-        """Write it as a recording that began at the Unix time 0."""
+        """Write a recording that begins at the Unix time 0."""
         notes = {DIAMETER_NOTE: f"{diameter_mm:g}"}
-        with RecordingWriter(path, "the emulated rig, by python -m benchmarks.rig_twists", notes) as writer:
+        with RecordingWriter(path, "the emulated rig, by shearloop.daemon.cli.demo_calibration", notes) as writer:
             for t_s, pair in zip(self.frame_s, self.lines, strict=True):
                 for side, line in zip(SIDES, pair, strict=True):
                     writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
@@ -86,11 +83,11 @@ class Recorded:
                 writer.add_torque(round(t_s * 1e9), torque_nm)
 
 
-class Play:
-    """One scene with a tool, and what is recorded of it."""
+class TwistPlayer:
+    """One scene with a tool, and its recording."""
 
     def __init__(self, frame_of: FrameOf, diameter_mm: float, seed: int) -> None:
-        self.recorded = Recorded()
+        self.recorded = RecordedTwists()
         self._random = np.random.default_rng(seed)
         self._frame_of = frame_of
         self._gripper = Gripper(between=lambda _: diameter_mm)
@@ -99,7 +96,7 @@ class Play:
         self._due_frame_s, self._due_torque_s = FRAME_PERIOD_S, LOAD_PERIOD_S
 
     def run(self) -> None:
-        """Idle, grip, twist, let go."""
+        """Idle, grip, twist, release."""
         self._gripper.command = ACTIVATE
         while self._gripper.sta != 3:
             self._step()
@@ -115,7 +112,7 @@ class Play:
         self._still(IDLE_S)
 
     def _angles(self) -> Iterator[float]:
-        """Yield angles all over the range, in an order without a trend, and now and then none."""
+        """Yield angles over the whole range in random order, with a zero after every third."""
         for number, share in enumerate(self._random.permutation(np.linspace(0.0, 1.0, N_TWISTS))):
             yield ANGLES_RAD[0] + float(share) * (ANGLES_RAD[1] - ANGLES_RAD[0])
             if number % 3 == 2:
@@ -145,11 +142,13 @@ class Play:
             self.recorded.torque_nm.append(self._scene.conversion_nm(LOAD_PERIOD_S) + noise_nm)
 
 
-def record(bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM) -> Iterator[tuple[float, Recorded]]:
-    """Yield what is recorded with each cylinder."""
+def record(
+    bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM
+) -> Iterator[tuple[float, RecordedTwists]]:
+    """Yield each cylinder's diameter and recording."""
     frame_of = frame_maker(bank, seed)
     for number, diameter_mm in enumerate(diameters_mm):
-        play = Play(frame_of, diameter_mm, seed + number)
+        play = TwistPlayer(frame_of, diameter_mm, seed + number)
         play.run()
         yield diameter_mm, play.recorded
 
@@ -157,11 +156,11 @@ def record(bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM
 def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
     """Return the default estimator's calibration for these fingertips."""
     chosen = [one.of_sides(sides) for one in recordings]
-    return fit("fused", chosen, "the emulated rig, by python -m benchmarks.rig_twists", timed_by=recordings)
+    return fit("fused", chosen, "the emulated rig, by shearloop.daemon.cli.demo_calibration", timed_by=recordings)
 
 
 def main() -> None:
-    """Record, calibrate, and print what the calibrations are worth on a recording apart."""
+    """Record, calibrate, and print the calibrations' accuracy on a separate recording."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bank", type=Path, required=True)
     parser.add_argument("--out", type=Path, required=True, help="folder for recordings and calibrations")

@@ -61,7 +61,7 @@ def test_a_calibration_of_diameters_alone_is_no_torque_to_drive_by(
     steps = {"name": "one", "drive": "right", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     said = mistake(capsys, command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
-    assert "`drive: right` has a calibration of diameters alone" in said
+    assert "`drive: right` has a calibration without torques" in said
 
 
 @pytest.mark.parametrize("command", ["run", "check"])

@@ -125,12 +125,6 @@ def gauge_factor(poisson_ratio: float = 0.5) -> float:
     return 1 + 2 * poisson_ratio
 
 
-def resistance_change(strain: FloatArray, poisson_ratio: float = 0.5) -> FloatArray:
-    """Return ΔR/R₀ of a channel stretched along itself, (1+ε)/(1−νε)² − 1; gauge_factor · ε to first order."""
-    change: FloatArray = (1 + strain) / (1 - poisson_ratio * strain) ** 2 - 1
-    return change
-
-
 def measured_response(
     r1_ohm: FloatArray, r2_ohm: FloatArray, r1_unloaded_ohm: float, r2_unloaded_ohm: float
 ) -> FloatArray:

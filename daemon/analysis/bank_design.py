@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.design import ALLOWED, Choice, Design, Scene, designed
+from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.bank.estimation.grip_segmentation import gripped_part
 from shearloop.bank.estimation.values import FrameSeries
@@ -34,15 +34,15 @@ def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> t
         raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
     # Peak samples have no side.
     one = series[0] if sides is None else series[0].of_sides(sides)
-    return path, designed(scene_of(one), load_yaml_model(path, FingertipGeometryConfig).fingertip())
+    return path, design_bank(scene_of(one), load_yaml_model(path, FingertipGeometryConfig).fingertip())
 
 
-def scene_of(series: FrameSeries) -> Scene:
+def scene_of(series: FrameSeries) -> MeasuredFrames:
     """Return the first side's gripped differences, their noise, and the torque."""
     torque = series.torque_at_frames()
     if series.kind == "difference":
         frames = series.channels[:, 0]
-        return Scene(frames, residual_noise(frames), torque if np.isfinite(torque).all() else None)
+        return MeasuredFrames(frames, residual_noise(frames), torque if np.isfinite(torque).all() else None)
     idle, gripped, _ = gripped_part(series)
     frames = series.channels[gripped, 0]
     # A recording that begins gripped has no idle frame: use its first one.
@@ -51,7 +51,7 @@ def scene_of(series: FrameSeries) -> Scene:
     differences = frames - np.median(before, axis=0)
     # The substitute for the idle frame has no difference.
     used = np.isfinite(torque[gripped]) & differences.any(axis=1)
-    return Scene(differences[used], float(np.median(noise[np.isfinite(noise)])), torque[gripped][used])
+    return MeasuredFrames(differences[used], float(np.median(noise[np.isfinite(noise)])), torque[gripped][used])
 
 
 def residual_noise(frames: NDArray[np.float64]) -> float:
@@ -110,7 +110,7 @@ def model_lines(design: Design) -> list[str]:
     ]
 
 
-def choices_of(design: Design) -> tuple[Choice, ...]:
+def choices_of(design: Design) -> tuple[DesignChoice, ...]:
     """Return all choices, in the table's order."""
     return (design.mesh, design.k_count, design.sigma_count, design.rank, design.channels, design.injections)
 

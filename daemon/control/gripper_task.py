@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.estimation import Measured, fused
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus

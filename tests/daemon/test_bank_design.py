@@ -9,7 +9,7 @@ from scipy.io import savemat
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.build import build_bank
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
-from shearloop.bank.eit.design import Scene, designed
+from shearloop.bank.eit.design import MeasuredFrames, design_bank
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import CalibrationError
@@ -52,7 +52,9 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Pat
     frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
     # A third of a frame's size: a coarse mesh and few cells, built in no time.
     frames += np.random.default_rng(0).normal(0.0, 8e-4, frames.shape)
-    design = designed(Scene(frames, 8e-4, None), load_yaml_model(OWN_FINGERTIP, FingertipGeometryConfig).fingertip())
+    design = design_bank(
+        MeasuredFrames(frames, 8e-4, None), load_yaml_model(OWN_FINGERTIP, FingertipGeometryConfig).fingertip()
+    )
     config = tmp_path / "step.yaml"
     config.write_text(design_yaml(design, OWN_FINGERTIP, tmp_path))
     plan = load_bank_plan(config)
@@ -115,8 +117,8 @@ def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
         # A board that was lost soon, and whose frames lie beside the other's.
         for t_ns in (6 * period_ns, 20 * period_ns):
             writer.add_frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
-    scenes: list[Scene] = []
-    monkeypatch.setattr("shearloop.daemon.analysis.bank_design.designed", lambda scene, _: scenes.append(scene))
+    scenes: list[MeasuredFrames] = []
+    monkeypatch.setattr("shearloop.daemon.analysis.bank_design.design_bank", lambda scene, _: scenes.append(scene))
     designed_for(tmp_path / "one.mcap", None, "left")
     # Of the twelve the first stands in for the idle one.
     assert scenes[0].differences.shape == (11, N_CHANNELS)

@@ -3,7 +3,8 @@
 The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
 the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
 resistances and forces: the membrane's two plays turn the forces into the tension at the gauges, friction included, and
-leave the coefficient of friction and the curve to be fitted.
+leave the coefficient of friction and the curve to be fitted. The daemon loads calibrations, so scipy.optimize is
+imported only to fit.
 """
 
 import csv
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from scipy.special import stdtrit
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
@@ -318,6 +320,8 @@ class _CurveFit:
         """Return the sum of squared residuals with the best curve for this friction."""
         from scipy.optimize import nnls
 
+        from scipy.optimize import nnls
+
         return float(nnls(self._design(self._tensions(friction)), self._response)[1] ** 2)
 
     def rises(self, friction: float) -> bool:
@@ -326,6 +330,8 @@ class _CurveFit:
 
     def calibration(self, friction: float, rows_beyond: int, rest_ohm: tuple[float, float]) -> SkinCalibration:
         """Return the calibration with the best curve for this friction."""
+        from scipy.optimize import nnls
+
         from scipy.optimize import nnls
 
         tension = self._tensions(friction)
@@ -376,6 +382,8 @@ def _knots(tension: FloatArray, linear_to_n: float) -> FloatArray:
 
 
 def _fit_friction(curve: _CurveFit) -> float:
+    from scipy.optimize import minimize_scalar
+
     # Imported here: the daemon loads calibrations and does not fit them.
     from scipy.optimize import minimize_scalar
 

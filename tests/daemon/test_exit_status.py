@@ -37,7 +37,7 @@ def waiting_config(config: Write, tmp_path: Path) -> Path:
     ("number", "status"),
     [(signal.SIGINT, 3), (signal.SIGTERM, 0), (signal.SIGHUP, 0)],
 )
-async def test_an_experiment_that_is_not_done_is_seen_in_the_exit_status(
+async def test_an_unfinished_experiment_sets_the_exit_status(
     number: signal.Signals, status: int, waiting_config: Path
 ) -> None:
     async with shearloop("run", str(waiting_config)) as daemon:
@@ -64,7 +64,7 @@ async def done_experiment() -> SimpleNamespace:
     return SimpleNamespace(phase=ExperimentPhase.DONE, stop_reason="")
 
 
-async def test_after_a_crash_no_experiment_begins_by_itself(
+async def test_no_experiment_starts_automatically_after_a_crash(
     waiting_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Log
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
@@ -77,7 +77,7 @@ async def test_after_a_crash_no_experiment_begins_by_itself(
 
 
 @pytest.mark.parametrize(("own", "finished"), [(True, True), (False, False)])
-async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment_that_waited(
+async def test_a_manual_start_cancels_the_waiting_experiment(
     own: bool, finished: bool, waiting_config: Path, tmp_path: Path, log: Log
 ) -> None:
     """Neither by the same one again, nor by the configured one after another."""
@@ -111,7 +111,7 @@ async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment
 
 
 @pytest.mark.parametrize("crashed", [False, True], ids=["called off", "after a crash"])
-async def test_an_experiment_that_is_begun_by_hand_after_all_is_seen_to_its_end(
+async def test_a_manually_started_experiment_is_followed_to_its_end(
     crashed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
@@ -136,7 +136,7 @@ async def test_an_experiment_that_is_begun_by_hand_after_all_is_seen_to_its_end(
 
 
 @pytest.mark.parametrize("by", ["stop", "another"])
-async def test_what_was_called_off_stays_so_when_its_task_dies(by: str, tmp_path: Path) -> None:
+async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(by: str, tmp_path: Path) -> None:
     """An experiment file may be spoilt when it is to begin, and mended after somebody has said stop."""
     begun = []
 
@@ -159,7 +159,7 @@ async def test_what_was_called_off_stays_so_when_its_task_dies(by: str, tmp_path
     assert not experiment.begun
 
 
-def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_crash_marker_without_a_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     mark = CrashMarker()
     mark.set()
@@ -167,6 +167,6 @@ def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyP
     assert not CrashMarker().left_behind
 
 
-def test_a_mark_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failing_crash_marker_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     CrashMarker({"RUNTIME_DIRECTORY": str(tmp_path / "nowhere")}).set()
     assert "cannot write the crash marker" in capsys.readouterr().out

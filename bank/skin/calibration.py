@@ -16,7 +16,6 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.special import stdtrit
-from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
@@ -320,8 +319,6 @@ class _CurveFit:
         """Return the sum of squared residuals with the best curve for this friction."""
         from scipy.optimize import nnls
 
-        from scipy.optimize import nnls
-
         return float(nnls(self._design(self._tensions(friction)), self._response)[1] ** 2)
 
     def rises(self, friction: float) -> bool:
@@ -330,8 +327,6 @@ class _CurveFit:
 
     def calibration(self, friction: float, rows_beyond: int, rest_ohm: tuple[float, float]) -> SkinCalibration:
         """Return the calibration with the best curve for this friction."""
-        from scipy.optimize import nnls
-
         from scipy.optimize import nnls
 
         tension = self._tensions(friction)
@@ -385,7 +380,6 @@ def _fit_friction(curve: _CurveFit) -> float:
     from scipy.optimize import minimize_scalar
 
     # Imported here: the daemon loads calibrations and does not fit them.
-    from scipy.optimize import minimize_scalar
 
     coarse = np.linspace(0.0, MAX_FRICTION, 26)
     best = coarse[int(np.argmin([curve.squares(mu) for mu in coarse]))]

@@ -91,11 +91,11 @@ class UrcapServer(SocketServer):
         port: int = PORT,
         on_port: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(host, port, on_port)
+        super().__init__(self._new_face, host, port, on_port)
         self._gripper = gripper
         self.no_data = False
 
-    def _answerer(self) -> Callable[[bytes], bytes]:
+    def _new_face(self) -> Callable[[bytes], bytes]:
         face = UrcapFace(self._gripper)
 
         def answer(data: bytes) -> bytes:

@@ -15,7 +15,7 @@ import zmq.asyncio
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import Commands, needed
+from shearloop.daemon.commands import Commands, required_rig
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
@@ -154,7 +154,7 @@ class Daemon:
             tares=tares,
             fingertips=self._fingertips,
             experiment=self._config.experiment,
-            begin=self.start_experiment,
+            start=self.start_experiment,
             call_off_experiment=self._call_off_experiment,
             tasks=self.health.tasks,
             stop=self.stop,
@@ -263,7 +263,7 @@ class Daemon:
 
     async def start_experiment(self, path: Path) -> str | None:
         """Start and record an experiment; return None, or why not. Raises UserError for an invalid file."""
-        rig, recorder = needed(self._rig), self._recorder
+        rig, recorder = required_rig(self._rig), self._recorder
         attached = AttachedFile.read(path) if recorder is not None else ()
         reason = await rig.start(path)
         if reason is None and self._experiment is not None:

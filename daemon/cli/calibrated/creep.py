@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.analysis.evaluation import follow
     from shearloop.daemon.analysis.grips import grips_of
     from shearloop.daemon.analysis.series import read_series
-    from shearloop.daemon.cli.recorded import check_kind
+    from shearloop.daemon.cli.options import check_kind
     from shearloop.daemon.control.creep import fit_creep
 
     check_paths_differ(args.recordings)

@@ -76,7 +76,7 @@ class RecordedEvent:
 class ReplayEvents:
     """Events that the frames do not contain: tares and tools by source and frame number.
 
-    `frame_numbers` are those of the frames by source and arrival: they continue from file to file.
+    `frame_numbers` holds the frames' numbers by source and arrival; they continue from file to file.
     """
 
     tares: dict[str, set[int]] = field(default_factory=dict)
@@ -141,7 +141,7 @@ class RecordedRun:
             yield map_paths(config, lambda _, path: files.get(path, path))
 
     def events(self) -> Iterator[RecordedEvent]:
-        """Yield the events in the order in which they were recorded."""
+        """Yield the events in recorded order."""
         with open_recording(self.path) as recording:
             # An imported recording has one side after the other, a live one is in order.
             messages = recording.messages(by_time=not self.has_inputs)

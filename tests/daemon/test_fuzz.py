@@ -144,7 +144,7 @@ async def test_a_flood_of_malformed_frames_and_requests(
             assert arm.told == [], "nothing was asked of the robot"
             assert daemon._rig is not None
             assert daemon._rig.control_loop.experiment is None
-            assert not daemon.supervisor.dead
+            assert not daemon.supervisor.dead_tasks()
             assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
             assert resident_memory_mb() - before_mb < MOST_GROWTH_MB
             assert len(asyncio.all_tasks()) <= tasks + MAX_CONCURRENT

@@ -1,4 +1,4 @@
-"""A bank compressed to a few numbers per cell, with bounds on what is left out.
+"""A bank compressed to a few numbers per cell, with bounds on the remainder.
 
 Every unit signal b of the bank is split as b = Φ c + d, with Φ (896 × r) an orthonormal basis fitted to the bank, d
 orthogonal to it and ‖d‖ = ρ. For a frame y with g = Φᵀ y and t = ‖y − Φ g‖, Cauchy and Schwarz give

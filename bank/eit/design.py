@@ -28,7 +28,7 @@ COUNTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 150)
 RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 CHANNEL_COUNTS = (8, 16, 32, 64, 112, 168, 224, 280, 336, 392, 448, 504, 560, 616, 672, 728, 784, 840, 896)
 _WITHOUT_SIGMA = tuple(name for name, model in MODELS.items() if model.sigma_unit == "not used")
-# Parameters of each model besides the amplitude.
+# Parameters of each model, without the amplitude.
 PARAMETERS = {name: 1 if name in _WITHOUT_SIGMA else 2 for name in MODELS}
 _FOLDS = 8
 # Errors of linear elements are proportional to the mesh size: two fine meshes extrapolate to the limit.

@@ -16,7 +16,6 @@ from skfem.helpers import dot, grad
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, STIMULATION_CURRENT
-from shearloop.bank.eit.elimination import Elimination, Pattern
 from shearloop.bank.eit.mesh import Mesh, require_fingertip
 from shearloop.bank.errors import ConductivityError
 
@@ -125,6 +124,9 @@ class BatchForwardModel:
 
     def __init__(self, mesh: Mesh) -> None:
         """Assemble, and plan the elimination (about a tenth of a second for 5000 triangles)."""
+        # The daemon imports this module, and numba takes 60 MB.
+        from shearloop.bank.eit.elimination import Elimination, Pattern
+
         self.mesh = mesh
         self.direct = ForwardModel(mesh)
         stiffness, contact = assemble(mesh)
@@ -209,7 +211,7 @@ def _load(v, w):  # type: ignore[no-untyped-def]  # as above
 
 
 def assemble(mesh: Mesh) -> tuple[Terms, Terms]:
-    """Return the terms ∫∇u·∇v of every triangle, and those of the contacts, with the electrodes after the nodes."""
+    """Return the terms ∫∇u·∇v of every triangle, and the contacts' terms, with the electrodes after the nodes."""
     domain = MeshTri(mesh.nodes.T.copy(), mesh.triangles.T.copy())
     inside = _stiffness.coo_data(Basis(domain, ElementTriP1(), intorder=0))
     stiffness = Terms(inside.indices[0], inside.indices[1], inside.data)

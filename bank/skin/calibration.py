@@ -3,7 +3,8 @@
 The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
 the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
 resistances and forces: the membrane's two plays turn the forces into the tension at the gauges, friction included, and
-leave the coefficient of friction and the curve to be fitted.
+leave the coefficient of friction and the curve to be fitted. The daemon loads calibrations, so scipy.optimize is
+imported only to fit.
 """
 
 import csv
@@ -376,8 +377,9 @@ def _knots(tension: FloatArray, linear_to_n: float) -> FloatArray:
 
 
 def _fit_friction(curve: _CurveFit) -> float:
-    # Imported here: the daemon loads calibrations and does not fit them.
     from scipy.optimize import minimize_scalar
+
+    # Imported here: the daemon loads calibrations and does not fit them.
 
     coarse = np.linspace(0.0, MAX_FRICTION, 26)
     best = coarse[int(np.argmin([curve.squares(mu) for mu in coarse]))]

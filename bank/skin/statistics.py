@@ -1,7 +1,7 @@
 """A skin's figures of merit by the paper's definitions, and synthetic recordings to test their estimators.
 
 Noise, dynamic range, precision, drift, crosstalk and temperature: each function takes recorded arrays and returns
-numbers. Responses are those of equation (1), forces are in N.
+numbers. Responses follow equation (1), forces are in N.
 """
 
 import math

@@ -23,11 +23,13 @@ from shearloop.drivers.shear_skin.instruments import (
     Daq,
     Keithley6430,
     PairParser,
-    RecordedScanner,
-    RecordedSource,
     ScpiScanner,
     SourceReading,
+    Voltages,
+    recorded_scanner,
+    recorded_source,
 )
+from shearloop.drivers.shear_skin.scpi import RecordedInstrument
 from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinSample
 
 SKIN = "skin"
@@ -91,7 +93,7 @@ class SkinTask:
         self._estimator.tare(now_ns)
 
     async def zero(self) -> str:
-        """Take a new zero and wait for it; return the reason if that fails, else an empty text."""
+        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
         try:
             # Earlier waiters get this zero too.
@@ -139,10 +141,10 @@ class RecordedSkin:
         daq_period_s = 1.0 / config.daq.rate_hz
         self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
         self._radius_m = _radius_m(config)
-        self._source = RecordedSource()
+        self._source = recorded_source()
         adc = config.daq.adc
-        self._daq: RecordedScanner | PairParser = (
-            RecordedScanner() if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
+        self._daq: RecordedInstrument[Voltages] | PairParser = (
+            recorded_scanner() if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
         )
         self._latest: SourceReading | None = None
 

@@ -5,13 +5,15 @@ import contextlib
 import os
 import select
 import tty
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
-from typing import Self
+from typing import Self, TypeAlias
+
+# Turns received bytes into a reply, empty for none.
+Answer: TypeAlias = Callable[[bytes], bytes]
 
 READ_BYTES = 4096
-# A reader that empties a full buffer in parts shows it as empty for a moment; so many empty looks in a row mean read.
+# A reader that empties a full buffer in parts shows it as empty for a moment: look several times.
 EMPTY_LOOKS = 3
 # How long a port that is about to hang up waits for its reader.
 UNREAD_S = 0.5
@@ -39,7 +41,7 @@ class PtyPort:
     """The device's end of a serial port; as a context it is plugged in, and unplugged at the end.
 
     `on_bytes` receives the other side's bytes. With `link`, a symbolic link of that name leads to the port while it is
-    plugged in, as udev's links do. The port belongs to the event loop in which it is plugged in.
+    plugged in, as udev's links do. Plug and unplug it in the same event loop.
     """
 
     def __init__(self, on_bytes: Callable[[bytes], None], link: Path | None = None) -> None:
@@ -55,7 +57,7 @@ class PtyPort:
 
     @property
     def path(self) -> str:
-        """The path at which the other side opens the port."""
+        """The path for the other side."""
         return self._terminal if self._link is None else str(self._link)
 
     def __enter__(self) -> Self:
@@ -143,23 +145,26 @@ class PtyPort:
         self._room.set()
 
 
-class PtyServer(ABC):
+class PtyServer:
     """A device on a pseudo-terminal that answers requests. `on_port` receives its path whenever it appears.
 
     While `silent` it answers nothing; with `breaks_off` the next answer stops half-way and the port reappears.
     """
 
-    def __init__(self, link: Path | None, on_port: Callable[[str], None], answer_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        answer: Answer,
+        link: Path | None = None,
+        on_port: Callable[[str], None] = lambda _: None,
+        answer_s: float = 0.0,
+    ) -> None:
+        self._answer = answer
         self._port = PtyPort(self._received, link)
         self._on_port = on_port
         self._answer_s = answer_s
         self._replies: asyncio.Queue[bytes] = asyncio.Queue()
         self.silent = False
         self.breaks_off = False
-
-    @abstractmethod
-    def _answer(self, data: bytes) -> bytes:
-        """Return the reply to received bytes; empty for none."""
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -193,13 +198,21 @@ class PtyServer(ABC):
             self._replies.put_nowait(reply)
 
 
-class SocketServer(ABC):
-    """A device on a socket, with any number of connections. `on_port` receives its address whenever it listens.
+class SocketServer:
+    """A device on a socket; `new_answer` returns a function for each connection. `on_port` receives its address.
 
     While `silent` it answers nothing; with `breaks_off` the next answer stops half-way and the connection closes.
     """
 
-    def __init__(self, host: str, port: int, on_port: Callable[[str], None], answer_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        new_answer: Callable[[], Answer],
+        host: str = "127.0.0.1",
+        port: int = 0,
+        on_port: Callable[[str], None] = lambda _: None,
+        answer_s: float = 0.0,
+    ) -> None:
+        self._new_answer = new_answer
         self._host = host
         self._answer_s = answer_s
         self._on_port = on_port
@@ -209,10 +222,6 @@ class SocketServer(ABC):
         self.port = port
         self.silent = False
         self.breaks_off = False
-
-    @abstractmethod
-    def _answerer(self) -> Callable[[bytes], bytes]:
-        """Return a function from one connection's bytes to replies."""
 
     async def run(self) -> None:
         """Serve until cancelled; OSError if the port is taken."""
@@ -242,7 +251,7 @@ class SocketServer(ABC):
             await asyncio.wait(self._connections)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        answer = self._answerer()
+        answer = self._new_answer()
         task = asyncio.current_task()
         if task is None:
             raise RuntimeError("a connection is served by a task")

@@ -5,13 +5,11 @@ import math
 import re
 from collections import deque
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
 # Returns the answer to a query, or None for a command; the argument is the text after the header.
 Handler = Callable[[str], str | None]
-Feed = Callable[[bytes], bytes]
 
 MAX_LINE_BYTES = 512
 MAX_ERRORS = 10
@@ -67,7 +65,7 @@ class ScpiInterpreter:
 
 
 def parse_number(text: str, low: float, high: float) -> float:
-    """Return a command's number; ScpiError if it is none or out of range."""
+    """Return a command's number; ScpiError for other text or out of range."""
     try:
         value = float(text)
     except ValueError:
@@ -87,7 +85,7 @@ def accept_number(low: float, high: float) -> Handler:
 
 
 def parse_boolean(text: str) -> bool:
-    """Return a command's truth value; ScpiError if it is none."""
+    """Return a command's truth value; ScpiError for other text."""
     values = {"ON": True, "1": True, "OFF": False, "0": False}
     if text.upper() not in values:
         raise ScpiError(ILLEGAL_VALUE)
@@ -106,45 +104,10 @@ def _pattern(header: str) -> re.Pattern[str]:
     return re.compile(":?" + words.replace("[", "(?:").replace("]", ")?"), re.IGNORECASE)
 
 
-class ScpiSocket(SocketServer):
-    """An instrument on a socket."""
-
-    def __init__(
-        self,
-        feed: Feed,
-        host: str = "127.0.0.1",
-        port: int = 0,
-        on_port: Callable[[str], None] = lambda _: None,
-        answer_s: float = 0.0,
-    ) -> None:
-        super().__init__(host, port, on_port, answer_s)
-        self._feed = feed
-
-    def _answerer(self) -> Feed:
-        return self._feed
-
-
-class ScpiSerial(PtyServer):
-    """An instrument on a serial port."""
-
-    def __init__(
-        self,
-        feed: Feed,
-        link: Path | None = None,
-        on_port: Callable[[str], None] = lambda _: None,
-        answer_s: float = 0.0,
-    ) -> None:
-        super().__init__(link, on_port, answer_s)
-        self._feed = feed
-
-    def _answer(self, data: bytes) -> bytes:
-        return self._feed(data)
-
-
 class FaultyServer:
     """A server that can fall silent or disappear, for a time or until `normal`, or break off once."""
 
-    def __init__(self, server: ScpiSocket | ScpiSerial) -> None:
+    def __init__(self, server: SocketServer | PtyServer) -> None:
         self._server = server
         self._connected = True
         self._changed = asyncio.Event()

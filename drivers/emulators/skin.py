@@ -9,14 +9,13 @@ from random import Random
 from typing import TypeAlias
 
 from shearloop.drivers.emulators.boards import EmulatedAdcBoard
+from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 from shearloop.drivers.emulators.scpi import (
     ILLEGAL_VALUE,
     SETTINGS_CONFLICT,
     FaultyServer,
     ScpiError,
     ScpiInterpreter,
-    ScpiSerial,
-    ScpiSocket,
     accept_number,
     parse_boolean,
     parse_number,
@@ -169,16 +168,12 @@ class EmulatedKeithley6430:
             {
                 "*RST": self._reset,
                 "SOURce:FUNCtion[:MODE]": self._set_function,
-                "SOURce:FUNCtion[:MODE]?": lambda _: self._function,
                 "SOURce:CURRent:MODE": self._set_mode,
                 "SOURce:CURRent:RANGe": accept_number(-MAX_A, MAX_A),
                 "SOURce:CURRent[:LEVel][:IMMediate][:AMPLitude]": self._set_level,
-                "SOURce:CURRent[:LEVel][:IMMediate][:AMPLitude]?": lambda _: _scientific(circuit.level_a),
                 "SENSe:FUNCtion:CONCurrent": self._set_concurrent,
                 "SENSe:FUNCtion[:ON]": self._set_measured,
                 "SENSe:VOLTage[:DC]:PROTection[:LEVel]": self._set_compliance,
-                "SENSe:VOLTage[:DC]:PROTection[:LEVel]?": lambda _: _scientific(circuit.compliance_v),
-                "SENSe:VOLTage[:DC]:PROTection:TRIPped?": self._tripped,
                 "SENSe:VOLTage[:DC]:RANGe[:UPPer]": accept_number(-MAX_V, MAX_V),
                 "SENSe:VOLTage[:DC]:NPLCycles": accept_number(0.01, 10.0),
                 "FORMat:ELEMents[:SENSe]": self._set_elements,
@@ -194,7 +189,6 @@ class EmulatedKeithley6430:
         return self.interpreter.feed(data)
 
     def _reset(self, _: str) -> None:
-        self._function = "VOLT"
         self._measured = {"CURR"}
         self._elements = set(ELEMENTS)
         self.circuit.output_on = False
@@ -205,7 +199,6 @@ class EmulatedKeithley6430:
         if text.upper() not in ("CURR", "CURRENT"):
             # Sourcing a voltage is not emulated.
             raise ScpiError(ILLEGAL_VALUE)
-        self._function = "CURR"
 
     def _set_mode(self, text: str) -> None:
         if text.upper() not in ("FIX", "FIXED"):
@@ -232,9 +225,6 @@ class EmulatedKeithley6430:
             raise ScpiError(ILLEGAL_VALUE)
         self._elements = names
 
-    def _tripped(self, _: str) -> str:
-        return str(int(self.circuit.state(time.monotonic()).compliance))
-
     def _switch(self, text: str) -> None:
         self.circuit.output_on = parse_boolean(text)
 
@@ -259,7 +249,7 @@ def _scientific(value: float) -> str:
 
 
 class EmulatedScanner:
-    """A scanning multimeter whose first two scanned channels are the gauges."""
+    """A scanning multimeter; the first two channels of a scan are the gauges."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
         """Switch the instrument on, with an empty scan list."""
@@ -312,8 +302,8 @@ def play_source(
     """Return the current source at an address; None for a new pseudo-terminal."""
     feed = EmulatedKeithley6430(circuit, seed).feed
     if isinstance(address, tuple):
-        return FaultyServer(ScpiSocket(feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
-    return FaultyServer(ScpiSerial(feed, address, on_port, answer_s=ANSWER_S / speed))
+        return FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
+    return FaultyServer(PtyServer(feed, address, on_port, answer_s=ANSWER_S / speed))
 
 
 def play_daq(
@@ -322,7 +312,7 @@ def play_daq(
     """Return a scanner on a socket, or a converter board on a pseudo-terminal."""
     if isinstance(address, tuple):
         feed = EmulatedScanner(circuit, seed).feed
-        return FaultyServer(ScpiSocket(feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
+        return FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
     period_s = DAQ_PERIOD_S / speed
     return EmulatedAdcBoard(
         circuit.voltages, period_s=period_s, noise_v=NOISE_V, link=address, on_port=on_port, seed=seed

@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import AsyncGenerator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TypeAlias
 
 from shearloop.drivers.connection import Diagnostics, Link
 from shearloop.drivers.errors import DeviceLostError, DeviceSilentError, DriverError, ProtocolError
@@ -23,7 +23,7 @@ from shearloop.drivers.shear_skin.scpi import (
     OVERLOAD,
     REPLY_TIMEOUT_S,
     PolledInstrument,
-    RecordedReplies,
+    RecordedInstrument,
     Reply,
     parse_numbers,
 )
@@ -78,43 +78,25 @@ class SourceReading:
     compliance: bool = False
 
 
-def read_elements(text: str, t_ns: int) -> SourceReading:
-    """Return the reading in a reply to :READ? with the elements VOLT, CURR, STAT; else ProtocolError."""
-    voltage_v, current_a, status = parse_numbers(text, 3, "The current source")
+def read_elements(reply: Reply) -> SourceReading:
+    """Return the reading in a reply to READ with the elements VOLT, CURR, STAT; ProtocolError for a bad reply."""
+    voltage_v, current_a, status = parse_numbers(reply.text, 3, "The current source")
     if not 0 <= status < 1 << 24 or max(abs(voltage_v), abs(current_a)) >= NOT_A_NUMBER:
-        raise ProtocolError(f"The current source sent {text[:60]!r}, which is not a reading; was it set by hand?")
+        raise ProtocolError(f"The current source sent {reply.text[:60]!r}, which is not a reading; was it set by hand?")
     bad = _OVERFLOW | _COMPLIANCE | _OVERVOLTAGE | _RANGE_COMPLIANCE
-    return SourceReading(t_ns, True, voltage_v, current_a, compliance=bool(int(status) & bad))
+    return SourceReading(reply.t_arrival_ns, True, voltage_v, current_a, compliance=bool(int(status) & bad))
 
 
-def read_source_reply(query: str, reply: Reply) -> SourceReading | None:
-    """Return the reading in a reply to OUTPUT or READ; None if the output is on; else ProtocolError."""
-    if query == READ:
-        return read_elements(reply.text, reply.t_arrival_ns)
-    if reply.text == "0":
-        return SourceReading(reply.t_arrival_ns, output_on=False)
-    if reply.text != "1":
+def read_output(reply: Reply) -> SourceReading | None:
+    """Return a reading if a reply to OUTPUT says off, None if on; ProtocolError for a bad reply."""
+    if reply.text not in ("0", "1"):
         raise ProtocolError(f"The current source sent {reply.text[:60]!r} instead of 0 or 1.")
-    return None
+    return SourceReading(reply.t_arrival_ns, output_on=False) if reply.text == "0" else None
 
 
-class RecordedSource:
-    """Parses the recorded replies of a source. No I/O."""
-
-    def __init__(self) -> None:
-        """Start without a reply."""
-        self._replies = RecordedReplies()
-
-    def handle(self, event: RawEvent) -> list[SourceReading]:
-        """Return the readings that an event completes; invalid replies give none, as they did live."""
-        answer = self._replies.handle(event)
-        if answer is None or answer[0] not in (OUTPUT, READ):
-            return []
-        try:
-            reading = read_source_reply(*answer)
-        except ProtocolError:
-            return []
-        return [] if reading is None else [reading]
+def recorded_source() -> RecordedInstrument[SourceReading]:
+    """Return a parser for the recorded replies of a source."""
+    return RecordedInstrument({OUTPUT: read_output, READ: read_elements})
 
 
 class Keithley6430(PolledInstrument[SourceReading]):
@@ -161,7 +143,7 @@ class Keithley6430(PolledInstrument[SourceReading]):
         return name
 
     async def _read(self) -> SourceReading:
-        off = read_source_reply(OUTPUT, await self._session.ask(OUTPUT))
+        off = read_output(await self._session.ask(OUTPUT))
         if off is not None:
             return off
         try:
@@ -169,11 +151,11 @@ class Keithley6430(PolledInstrument[SourceReading]):
         except DeviceSilentError:
             # The operator may have switched the output off in between: then READ has no reply. Reopening the
             # connection would switch it on again.
-            off = read_source_reply(OUTPUT, await self._session.ask(OUTPUT))
+            off = read_output(await self._session.ask(OUTPUT))
             if off is None:
                 raise
             return off
-        return read_elements(reply.text, reply.t_arrival_ns)
+        return read_elements(reply)
 
     async def _shut_down(self) -> None:
         """Switch the output off and wait for the confirmation."""
@@ -209,22 +191,8 @@ class Voltages:
     over_2: bool = False
 
 
-class Daq(Protocol):
-    """An instrument that reads two voltages."""
-
-    @property
-    def period_s(self) -> float:
-        """The time between readings."""
-
-    def readings(self) -> AsyncGenerator[Voltages]:
-        """Yield every reading, in order and without end; iterate within `contextlib.aclosing`."""
-
-    def diagnostics(self) -> Diagnostics:
-        """Return the instrument's values for `health`."""
-
-
 def read_scan(reply: Reply) -> Voltages:
-    """Return the voltages in the reply to a scan, stamped between query and answer; else ProtocolError."""
+    """Return the voltages in a reply to SCAN, stamped between query and answer; ProtocolError for a bad reply."""
     v1_v, v2_v = parse_numbers(reply.text, 2, "The scanner")
     return Voltages(
         v1_v,
@@ -234,24 +202,6 @@ def read_scan(reply: Reply) -> Voltages:
         over_1=abs(v1_v) >= OVERLOAD,
         over_2=abs(v2_v) >= OVERLOAD,
     )
-
-
-class RecordedScanner:
-    """Parses the recorded replies of a scanner. No I/O."""
-
-    def __init__(self) -> None:
-        """Start without a reply."""
-        self._replies = RecordedReplies()
-
-    def handle(self, event: RawEvent) -> list[Voltages]:
-        """Return the voltages that an event completes; invalid replies give none, as they did live."""
-        answer = self._replies.handle(event)
-        if answer is None or answer[0] != SCAN:
-            return []
-        try:
-            return [read_scan(answer[1])]
-        except ProtocolError:
-            return []
 
 
 class ScpiScanner(PolledInstrument[Voltages]):
@@ -285,6 +235,11 @@ class ScpiScanner(PolledInstrument[Voltages]):
 
     async def _read(self) -> Voltages:
         return read_scan(await self._session.ask(SCAN))
+
+
+def recorded_scanner() -> RecordedInstrument[Voltages]:
+    """Return a parser for the recorded replies of a scanner."""
+    return RecordedInstrument({SCAN: read_scan})
 
 
 class PairParser:
@@ -394,3 +349,6 @@ class AdcBoard(StreamingSensor[Voltages]):
         found = self._parser.handle(event)
         self._count += len(found)
         return found
+
+
+Daq: TypeAlias = ScpiScanner | AdcBoard

@@ -4,7 +4,8 @@ import asyncio
 import re
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from time import monotonic_ns
 from typing import Generic, TypeVar
@@ -78,21 +79,24 @@ class Reply:
     t_arrival_ns: int
 
 
-class RecordedReplies:
-    """Pairs queries and replies when a recording is replayed. No I/O."""
+class RecordedInstrument(Generic[ReadingT]):
+    """Parses an instrument's recorded replies. No I/O."""
 
-    def __init__(self) -> None:
-        """Start without a query."""
+    def __init__(self, parsers: Mapping[str, Callable[[Reply], ReadingT | None]]) -> None:
+        """Use a parser for the replies to each query."""
+        self._parsers = parsers
         self._query, self._asked_ns = "", 0
 
-    def handle(self, event: RawEvent) -> tuple[str, Reply] | None:
-        """Return a query and its reply once both are there."""
+    def handle(self, event: RawEvent) -> list[ReadingT]:
+        """Return the readings that an event completes; invalid replies give none, as they did live."""
         if event.kind is InputKind.ASKED:
             self._query, self._asked_ns = event.data.decode("latin-1"), event.t_ns
-        elif event.kind is InputKind.DATA and self._query:
-            query, self._query = self._query, ""
-            return query, Reply(event.data.decode("latin-1"), self._asked_ns, event.t_ns)
-        return None
+        elif event.kind is InputKind.DATA and self._query in self._parsers:
+            parse, self._query = self._parsers[self._query], ""
+            with suppress(ProtocolError):
+                reading = parse(Reply(event.data.decode("latin-1"), self._asked_ns, event.t_ns))
+                return [] if reading is None else [reading]
+        return []
 
 
 def parse_numbers(text: str, count: int, instrument: str) -> list[float]:

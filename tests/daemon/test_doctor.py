@@ -198,7 +198,7 @@ def test_ports_are_listed_with_their_configuration_entry(
     assert main(["ports", "--json"]) == 0
     first, second = json.loads(capsys.readouterr().out)
     assert first["named_by"] == '{serial_number: "12345670"}'
-    assert (first["likely"], first["usb"], first["trouble"]) == ("EIT-kit (Teensy)", "16c0:0483", "")
+    assert (first["likely"], first["usb"], first["error"]) == ("EIT-kit (Teensy)", "16c0:0483", "")
     assert second["named_by"] == "{path: /dev/null}"
     there[:] = [port(device="/dev/gone")]
     assert main(["ports"]) == 0

@@ -7,7 +7,7 @@ from itertools import count, cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.emulate.console import add_link, check_positive, checked_link, play, print_port
+from shearloop.daemon.cli.emulate.console import Device, add_link, check_positive, checked_link, play, print_port
 from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
@@ -198,4 +198,7 @@ def _finite(text: str) -> float:
     return value
 
 
-COMMANDS = {"eit-kit": (_configure_eit_kit, _run_eit_kit), "hx711": (_configure_hx711, _run_hx711)}
+DEVICES = {
+    "eit-kit": Device("the EIT board of a fingertip, on a pseudo-terminal", _configure_eit_kit, _run_eit_kit),
+    "hx711": Device("the load cell's board, on a pseudo-terminal", _configure_hx711, _run_hx711),
+}

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Coroutine, Iterator
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.signals import ending_signals
@@ -19,6 +20,14 @@ STDIN = 0
 READ_BYTES = 4096
 
 print_port = partial(print, flush=True)
+
+
+class Device(NamedTuple):
+    """The command of one emulated device."""
+
+    summary: str
+    configure: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
 
 
 def print_event(event: str, **fields: object) -> None:

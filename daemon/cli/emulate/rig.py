@@ -10,7 +10,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from shearloop.daemon.cli.emulate.console import check_positive, checked_link, play, print_event, report_busy_address
+from shearloop.daemon.cli.emulate.console import (
+    Device,
+    check_positive,
+    checked_link,
+    play,
+    print_event,
+    report_busy_address,
+)
 from shearloop.daemon.cli.emulate.robots import add_robot, print_robot_event, robot_make
 from shearloop.daemon.errors import UserError
 
@@ -182,4 +189,4 @@ def _fields(truth: "Truth") -> dict[str, object]:
     return {name: round(value, 9) if isinstance(value, float) else value for name, value in asdict(truth).items()}
 
 
-COMMANDS = {"rig": (_configure, _run)}
+DEVICES = {"rig": Device("all devices of the rig, tied by one physics", _configure, _run)}

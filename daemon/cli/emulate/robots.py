@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.emulate.console import (
+    Device,
     add_link,
     check_positive,
     check_range,
@@ -155,8 +156,10 @@ def _play_gripper(args: argparse.Namespace, make_server: Callable[["Gripper"], "
     return 0
 
 
-COMMANDS = {
-    "ur": (_configure_ur, _run_ur),
-    "gripper-socket": (_configure_gripper_socket, _run_gripper_socket),
-    "gripper-modbus": (_configure_gripper_modbus, _run_gripper_modbus),
+DEVICES = {
+    "ur": Device("a UR robot's controller, on an address of this machine", _configure_ur, _run_ur),
+    "gripper-socket": Device("a 2F-140 behind the URCap's socket", _configure_gripper_socket, _run_gripper_socket),
+    "gripper-modbus": Device(
+        "a 2F-140 on Modbus RTU, on a pseudo-terminal", _configure_gripper_modbus, _run_gripper_modbus
+    ),
 }

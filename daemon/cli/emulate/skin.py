@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.emulate.console import (
+    Device,
     check_positive,
     check_range,
     checked_link,
@@ -231,8 +232,8 @@ def _run_instrument(args: argparse.Namespace) -> int:
     return 0
 
 
-COMMANDS = {
-    "skin": (_configure_skin, _run_skin),
-    "skin-source": (_configure_source, _run_instrument),
-    "skin-daq": (_configure_daq, _run_instrument),
+DEVICES = {
+    "skin": Device("the shear skin with source and DAQ, and the robot that turns it", _configure_skin, _run_skin),
+    "skin-source": Device("the Keithley 6430 that feeds the shear skin", _configure_source, _run_instrument),
+    "skin-daq": Device("the scanner or converter board of the shear skin", _configure_daq, _run_instrument),
 }

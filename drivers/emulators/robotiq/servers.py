@@ -106,11 +106,11 @@ class UrcapServer(SocketServer):
         port: int = URCAP_PORT,
         on_port: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(host, port, on_port)
+        super().__init__(self._new_session, host, port, on_port)
         self._gripper = gripper
         self.no_data = False
 
-    def _answerer(self) -> Callable[[bytes], bytes]:
+    def _new_session(self) -> Callable[[bytes], bytes]:
         session = UrcapSession(self._gripper)
 
         def answer(data: bytes) -> bytes:
@@ -246,11 +246,11 @@ class ModbusServer(PtyServer):
     def __init__(
         self, gripper: Gripper, link: Path | None = None, on_port: Callable[[str], None] = lambda _: None
     ) -> None:
-        super().__init__(link, on_port)
+        super().__init__(self._reply_to, link, on_port)
         self._slave = ModbusSlave(gripper)
         self.damage_next = False
 
-    def _answer(self, data: bytes) -> bytes:
+    def _reply_to(self, data: bytes) -> bytes:
         reply = self._slave.feed(data, asyncio.get_running_loop().time())
         if reply and self.damage_next and not self.silent:
             self.damage_next = False

@@ -91,7 +91,7 @@ async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(
                     # It came to the daemon, which has nothing to start.
                     status, reply = await page.post("commands/start", token=True)
                     assert status == 409
-                    assert reply["reason"].startswith("which experiment?")
+                    assert reply["reason"].startswith("no experiment is given")
                     assert await page.post("stop") == (200, {"ok": True, "stopped": ""})
                 for who in ("eve", None):
                     async with page_of(places, tmp_path, who) as page:

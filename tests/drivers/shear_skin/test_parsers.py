@@ -101,7 +101,7 @@ def test_a_flood_without_an_end_is_counted_once_and_forgotten() -> None:
 
 @given(st.text(max_size=80))
 def test_what_is_no_reading_is_refused_by_name(text: str) -> None:
-    for read in (lambda: read_elements(text, 0), lambda: read_scan(Reply(text, 0, 2))):
+    for read in (lambda: read_elements(Reply(text, 0, 0)), lambda: read_scan(Reply(text, 0, 2))):
         if re.fullmatch(r"[0-9Ee.,+ -]+", text):
             with suppress(ProtocolError):
                 read()
@@ -112,7 +112,7 @@ def test_what_is_no_reading_is_refused_by_name(text: str) -> None:
 
 def test_the_manual_s_own_example_is_read() -> None:
     # Figure 17-1 of the 6430's manual, without the resistance and the time; 10 kΩ at 100 µA.
-    reading = read_elements("+1.000206E+00, +1.000000E-04, +4.813200E+04", 5)
+    reading = read_elements(Reply("+1.000206E+00, +1.000000E-04, +4.813200E+04", 0, 5))
     assert (reading.voltage_v, reading.current_a, reading.t_ns) == (1.000206, 1e-4, 5)
     assert reading.output_on
     assert not reading.compliance
@@ -120,13 +120,13 @@ def test_the_manual_s_own_example_is_read() -> None:
 
 @pytest.mark.parametrize("bit", [0, 3, 4, 16])
 def test_every_way_of_not_keeping_its_current_is_compliance(bit: int) -> None:
-    assert read_elements(f"+1.0E+00,+1.0E-09,{38916 | 1 << bit:+.6E}", 0).compliance
+    assert read_elements(Reply(f"+1.0E+00,+1.0E-09,{38916 | 1 << bit:+.6E}", 0, 0)).compliance
 
 
 @pytest.mark.parametrize("text", ["+9.91E37,+5.0E-03,+3.8E+04", "1,2", "1,2,-1", "1,2,3E+08", "inf,nan,1", "1_0,2,3"])
 def test_a_reading_that_was_not_made_is_refused(text: str) -> None:
     with pytest.raises(ProtocolError):
-        read_elements(text, 0)
+        read_elements(Reply(text, 0, 0))
 
 
 def test_an_overload_of_the_scanner_is_told_by_channel() -> None:

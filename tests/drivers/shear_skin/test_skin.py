@@ -12,7 +12,8 @@ import pytest
 
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, TcpLink
 from shearloop.drivers.emulators.boards import EmulatedAdcBoard
-from shearloop.drivers.emulators.scpi import FaultyServer, ScpiSerial, ScpiSocket
+from shearloop.drivers.emulators.ports import PtyServer, SocketServer
+from shearloop.drivers.emulators.scpi import FaultyServer
 from shearloop.drivers.emulators.skin import NOISE_V, Circuit, EmulatedKeithley6430, EmulatedScanner
 from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Daq, Keithley6430, ScpiScanner
 from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
@@ -70,14 +71,14 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         changed.set()
 
     played = EmulatedKeithley6430(circuit)
-    way_in: ScpiSerial | ScpiSocket
+    way_in: PtyServer | SocketServer
     if serial_source:
-        way_in = ScpiSerial(played.feed, folder / "source", lambda _: ready.release(), answer_s=0.0)
+        way_in = PtyServer(played.feed, folder / "source", lambda _: ready.release(), answer_s=0.0)
     else:
-        way_in = ScpiSocket(played.feed, on_port=lambda _: ready.release(), answer_s=0.0)
+        way_in = SocketServer(lambda: played.feed, on_port=lambda _: ready.release(), answer_s=0.0)
     outages = FaultyServer(way_in)
     players = [outages.run]
-    scanner = ScpiSocket(EmulatedScanner(circuit).feed, on_port=lambda _: ready.release(), answer_s=0.0)
+    scanner = SocketServer(lambda: EmulatedScanner(circuit).feed, on_port=lambda _: ready.release(), answer_s=0.0)
     scanner_outages = FaultyServer(scanner)
     board = EmulatedAdcBoard(
         circuit.voltages, period_s=1 / RATE_HZ, noise_v=NOISE_V, link=folder / "adc", on_port=lambda _: ready.release()
@@ -89,7 +90,7 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
 
     source_link = (
         SerialLink(path=str(folder / "source"), baud=SOURCE_BAUD, policy=policy, on_event=on_event)
-        if isinstance(way_in, ScpiSerial)
+        if isinstance(way_in, PtyServer)
         else TcpLink("127.0.0.1", way_in.port, policy=policy, on_event=on_event)
     )
     source = Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s)
@@ -326,7 +327,7 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
 
 
 async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
-    scanner = ScpiSocket(EmulatedScanner(Circuit(lambda: (R1, R2))).feed, answer_s=0.0)
+    scanner = SocketServer(lambda: EmulatedScanner(Circuit(lambda: (R1, R2))).feed, answer_s=0.0)
     sentences: asyncio.Queue[str] = asyncio.Queue()
 
     def on_event(event: LinkEvent) -> None:

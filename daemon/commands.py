@@ -133,7 +133,7 @@ class Commands:
 
 
 def required_rig(rig: Rig | None) -> Rig:
-    """Return the rig; raises CommandRefusedError if there is none."""
+    """Return the rig; raises CommandRefusedError without a rig."""
     if rig is None:
         raise CommandRefusedError("the configuration has no robot; add `robot: ur.yaml` to it")
     return rig

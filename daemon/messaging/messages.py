@@ -237,7 +237,7 @@ TOPICS: dict[str, type[Message]] = {
 
 
 def stale_after_s(topic: str) -> float:
-    """Return the age in seconds at which a topic's latest message is stale.
+    """Return the age in seconds that makes a topic's latest message stale.
 
     Raises KeyError for a topic that is unknown or sent on change only.
     """

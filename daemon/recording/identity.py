@@ -116,7 +116,7 @@ def code_digest() -> str:
 
 
 def map_paths(section: Model, change: Callable[[str, Path], Path]) -> Model:
-    """Return a copy of a configuration in which `change(key, path)` replaces each path."""
+    """Return a copy of a configuration with each path replaced by `change(key, path)`."""
     changed: dict[str, object] = {}
     for key in type(section).model_fields:
         value = getattr(section, key)

@@ -73,8 +73,8 @@ def frame_middles(arrivals_ns: Sequence[int]) -> list[int]:
     """Return the middle of each frame's acquisition from its arrival, in nanoseconds.
 
     A frame is read when it is complete or later. The board's clock is therefore the line below the stamps
-    (`drivers.frame_clock`). Its height is that of the earliest stamp among the neighbours, so that it follows a board
-    that paused.
+    (`drivers.frame_clock`). The earliest stamp among the neighbours gives its height, so that it follows a
+    board that paused.
     """
     numbered = list(enumerate(arrivals_ns))
     period = slope_below(numbered) if len(numbered) > 1 else float(NOMINAL_PERIOD_NS)

@@ -88,8 +88,8 @@ class Recorder:
     ) -> None:
         """Begin the first file; raises UserError if that is not possible.
 
-        `is_busy` returns whether an experiment is running. `on_failure` receives the error after each flush, empty if
-        there is none.
+        `is_busy` returns whether an experiment is running. `on_failure` receives the error after each flush, empty
+        without an error.
         """
         self._folder = folder
         self._identity = identity

@@ -3,7 +3,7 @@
 A recording is an MCAP file (mcap.dev) that any MCAP tool can show. Log times are Unix nanoseconds: for a message the
 time of its measurement (for a frame the middle of its acquisition), for a raw input its arrival.
 
-Topics are those of the live messages. Topics that each fingertip sends end in the source: `eit.frame.right`.
+Topics have the names of the live messages. Topics that each fingertip sends end in the source: `eit.frame.right`.
 `input.SOURCE` holds the raw input of a parser as Latin-1 text, so that each byte is one character. `input.clock` holds
 the offset between the monotonic clock and Unix time. Replay needs only these two.
 

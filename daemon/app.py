@@ -28,7 +28,7 @@ from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.recording.identity import AttachedFile, daemon_identity, experiment_notes
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import Rig, check_experiment, make_load_cell
-from shearloop.daemon.sensing.both import BOTH, CombinedFingertipTask
+from shearloop.daemon.sensing.both import COMBINED, CombinedFingertipTask
 from shearloop.daemon.sensing.estimation import EstimatorTask
 from shearloop.daemon.sensing.fingertip import FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
@@ -57,7 +57,7 @@ class Daemon:
         self._rig: Rig | None = None
         self._experiment: ConfiguredExperiment | None = None
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
-        both = open_both(config.both, config.fingertips) if config.both is not None else None
+        both = open_both(config.combined, config.fingertips) if config.combined is not None else None
         sources = torque_sources(config, estimators, both)
         check_experiment(config, sources)
         with contextlib.ExitStack() as opened:
@@ -88,7 +88,7 @@ class Daemon:
     ) -> None:
         """Create the tasks of devices and estimators; no device is opened yet."""
         config = self._config
-        diameters = FingertipDiameters(BOTH)
+        diameters = FingertipDiameters(COMBINED)
         if config.robot is not None:
             self._rig = Rig(
                 config,
@@ -126,7 +126,7 @@ class Daemon:
         self._both: CombinedFingertipTask | None = None
         if both is not None:
             period_s = config.fingertips[both.sides[0]].frame_period_s
-            self._both = CombinedFingertipTask(estimation(BOTH, both, lambda: period_s), both.sides, period_s)
+            self._both = CombinedFingertipTask(estimation(COMBINED, both, lambda: period_s), both.sides, period_s)
 
         def fingertip(name: str, estimator: AnyEstimator) -> FingertipTask:
             board = _board(config.fingertips[name], name, self._on_link(name), self._tap(name), self._both)
@@ -141,7 +141,7 @@ class Daemon:
         self._fingertips = {name: fingertip(name, estimator) for name, estimator in estimators.items()}
         self._estimations = {name: task.estimation for name, task in self._fingertips.items()}
         if self._both is not None:
-            self._estimations[BOTH] = self._both.estimation
+            self._estimations[COMBINED] = self._both.estimation
 
     def _make_commands(self) -> Commands:
         tares: dict[str, Callable[[], None]] = {name: one.tare for name, one in self._estimations.items()}
@@ -165,7 +165,7 @@ class Daemon:
         for name, task in self._fingertips.items():
             health.add(name, task.facts)
         if self._both is not None:
-            health.add(BOTH, self._both.facts)
+            health.add(COMBINED, self._both.facts)
         if self._skin is not None:
             health.add(SKIN, self._skin.diagnostics)
             health.add(SKIN_SOURCE, self._skin.source_diagnostics)
@@ -234,7 +234,7 @@ class Daemon:
             yield supervised(name, task.read)
             yield supervised(f"{name}.estimator", task.estimate)
         if self._both is not None:
-            yield supervised(BOTH, self._both.estimate)
+            yield supervised(COMBINED, self._both.estimate)
         if self._skin is not None:
             yield supervised(SKIN, self._skin.read)
             yield supervised(SKIN_SOURCE, self._skin.watch_source)

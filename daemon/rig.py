@@ -25,7 +25,7 @@ from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_so
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import log_event, log_link
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.both import COMBINED
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.daemon.sensing.tool_diameter import unknown
@@ -126,7 +126,7 @@ class Rig:
         required = ("robot", "gripper") if config.gripper is not None else ("robot",)
         gels = {
             name: Creep(fingertip.creep.share, fingertip.creep.time_s)
-            for name, fingertip in (*config.fingertips.items(), (BOTH, config.both))
+            for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
             if fingertip is not None and fingertip.creep is not None
         }
         self.control_loop = ControlLoop(config.loop, sources, required, gels)
@@ -241,10 +241,9 @@ def check_experiment(config: DaemonConfig, sources: Mapping[str, TorqueSource]) 
     file = read_experiment(path)
     measured = [name for name, source in sources.items() if source.measures_torque]
     driving = [*measured, *([LOAD_CELL] if config.load_cell is not None else []), WRENCH]
-    if file.drive not in driving:
-        raise UserError(
-            f"{path}: `drive: {file.drive}` {_why_not_driving(file.drive, config)}; there are {', '.join(driving)}"
-        )
+    if file.torque_source not in driving:
+        reason = _why_not_driving(file.torque_source, config)
+        raise UserError(f"{path}: `torque_source: {file.torque_source}` {reason}; there are {', '.join(driving)}")
     if config.gripper is None:
         for number, step in enumerate(file.steps, 1):
             if isinstance(step, GripStep | ReleaseStep):
@@ -280,7 +279,7 @@ def _holds_unidentified(file: ExperimentFile) -> int | None:
 def _why_not_driving(drive: str, config: DaemonConfig) -> str:
     if drive in config.fingertips and config.fingertips[drive].calibration is None:
         return "is a fingertip without a calibration, which has no torque: add `calibration`, or choose another"
-    if drive in config.fingertips or (drive == BOTH and config.both is not None):
+    if drive in config.fingertips or (drive == COMBINED and config.combined is not None):
         return "has a calibration without torques: calibrate with the load cell and one tool, or choose another"
     if drive == SKIN and config.skin is not None:
         return "has no torque without a radius: add `skin.tool_radius_mm`, or choose another"

@@ -14,7 +14,7 @@ from shearloop.bank.skin.calibration import CalibrationTable
 from shearloop.bank.skin.membrane import PAPER_SECTION, UNSTRETCHED, Membrane, paper_membrane
 from shearloop.bank.skin.statistics import loop
 
-# Two gauges are never quite alike, which tells them apart.
+# Real gauges differ, so swapped ones can be recognised.
 REST_OHM = (24.6, 25.3)
 # A fingertip of elastomer under the tool's edge.
 CONTACT_N_PER_MM = 1.0

@@ -21,7 +21,7 @@ from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, Devic
 DEFAULT_BAUD = 115_200
 # The kernel keeps 4 kB for a pseudo-terminal and up to 64 kB for a USB port.
 READ_BYTES = 65_536
-# After so many reads other tasks have their turn; the rest waits in the kernel.
+# Then other tasks have their turn; the rest waits in the kernel.
 READS_PER_TURN = 8
 # A read shorter than one kernel buffer has emptied the port.
 SHORT_READ_BYTES = 4_000

@@ -25,7 +25,7 @@ from shearloop.drivers.serial_sensor import InputKind, LineSplitter, OnRaw, RawE
 N_VALUES = 1024
 CELL_BYTES = len(b"0.1234, ")
 LINE_BYTES = N_VALUES * CELL_BYTES
-# Twice a valid line: enough to tell a wrong count from a stream without newlines.
+# Twice a valid line: a line with a wrong count is shorter, a stream without newlines is longer.
 MAX_LINE_BYTES = 2 * LINE_BYTES
 EXCERPT_BYTES = 60
 
@@ -43,11 +43,11 @@ FULL_SCALE_SINE_RMS_V = ADC_REFERENCE_V / 2 / 2**0.5
 DEAD_AFTER_FRAMES = 200
 
 START = b"y"
-# After so many silent periods the board is started again.
+# A silence of this many periods restarts the board.
 SILENT_PERIODS = 4
 # At fast frame rates a shorter silence may come from a busy computer.
 MIN_SILENCE_S = 0.5
-# After so many starts without a byte the port is reopened.
+# Unanswered starts before the port is reopened.
 STARTS_BEFORE_REOPENING = 5
 
 _SEPARATOR = b", "

@@ -35,8 +35,7 @@ def is_cancelled() -> bool:
     """Return whether someone asked the current task to end.
 
     Before Python 3.13 a task group that fails while it is cancelled raises only the failure, so a restart loop has to
-    ask here. A group whose body ended before its tasks leaves the same mark: the body of a supervised task must last
-    as long as its tasks.
+    ask here. A group leaves the same mark if its body ends before its tasks, so keep the body running.
     """
     task = asyncio.current_task()
     return task is not None and task.cancelling() > 0

@@ -14,7 +14,7 @@ from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.load_cell import LoadCalibration, LoadSample
 
 STANDARD_GRAVITY = 9.80665
-# Before the scale is known, size cannot tell a corrupted value from a load.
+# Before the scale is known, any value may be a load.
 UNCALIBRATED = LoadCalibration(tare_counts=0.0, scale_n_per_count=1e-9)
 SAMPLES_PER_STEP = 30
 # The converter settles within four conversions (HX711 data sheet); the mass needs as long to hang still.

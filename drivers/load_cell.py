@@ -40,7 +40,7 @@ STUCK_AFTER = 20
 CAPACITY_NM = 1.75
 # More than twice the fastest change in the paper's recordings (0.76 N·m/s, a 10 mm cylinder slipping free).
 SLEW_NM_PER_S = 2.0
-# So many values in a row that agree with each other are a new level.
+# Values in a row that agree with each other and become the new level.
 SETTLE_SAMPLES = 3
 
 _DECIMAL = re.compile(rb"[+-]?[0-9]{1,15}(\.[0-9]{1,15})?")
@@ -116,7 +116,7 @@ class LoadSample:
 
 
 class SpikeFilter:
-    """Tells corrupted values from loads, causally.
+    """Separates corrupted values from loads, causally.
 
     A spike lies beyond the cell's capacity, or further from the last good value than the rig can move in between. A
     real step looks alike, so SETTLE_SAMPLES values in a row that agree with each other become the new level.

@@ -177,7 +177,7 @@ class StreamingSensor(SerialSensor[ValueT]):
     def __init__(self, link: Link, *, period_s: float, silence_hint: str, on_raw: OnRaw = ignore_raw) -> None:
         """Use the link, not yet open, of a board with a line every `period_s`.
 
-        `silence_hint` tells the operator what to check when nothing comes.
+        `silence_hint` is the operator's checklist when nothing comes.
         """
         super().__init__(link, on_raw)
         self._silence_s = SILENT_PERIODS * period_s

@@ -116,7 +116,7 @@ def choices_of(design: Design) -> tuple[DesignChoice, ...]:
 
 
 def choice_lines(design: Design) -> list[str]:
-    """Return each choice with its error, and that of the next finer step."""
+    """Return each choice with its error and the next finer step's."""
     found = []
     for one in choices_of(design):
         step, after = one.chosen, one.next_step

@@ -37,15 +37,17 @@ def run(args: argparse.Namespace) -> int:
         torque = _torque(estimators[name], calibrated=fingertip.calibration is not None)
         bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
         parts[name] = f"{bank}, {torque}"
-    combined = open_both(config.both, config.fingertips) if config.both is not None else None
+    combined = open_both(config.combined, config.fingertips) if config.combined is not None else None
     if combined is not None:
-        parts["both"] = f"{' and '.join(combined.sides)} together, {_torque(combined, calibrated=True)}"
+        parts["combined"] = f"{' and '.join(combined.sides)} together, {_torque(combined, calibrated=True)}"
     if config.skin is not None:
         parts["skin"] = _skin(config.skin)
     parts |= _rig(config)
     experiment = check_experiment(config, torque_sources(config, estimators, combined))
     if experiment is not None:
-        parts["experiment"] = f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.drive}"
+        parts["experiment"] = (
+            f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.torque_source}"
+        )
     if args.json:
         print(json.dumps({"config": str(args.config), "parts": parts}, ensure_ascii=False))
         return 0

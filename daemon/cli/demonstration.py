@@ -82,7 +82,7 @@ class EventInjector:
 
 
 class EmulatorMonitor:
-    """A listener that reports each emulator whose process ended, once."""
+    """A listener that reports once when an emulator's process has ended."""
 
     def __init__(self, emulators: "tuple[EmulatorConfig, ...]", processes: Sequence["Popen[bytes]"]) -> None:
         """Use the emulators and their processes, in the same order."""

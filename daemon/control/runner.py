@@ -312,7 +312,7 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
     """Return the `loop.state` message at now_ns."""
     status, experiment = control_loop.status, control_loop.experiment
     progress = experiment.progress() if experiment is not None else None
-    driving = experiment.file.drive if experiment is not None else ""
+    driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
     controller = control_loop.controller
     estimates = controller.state if controller is not None else None

@@ -43,7 +43,7 @@ from shearloop.daemon.recording.schema import (
     with_missing_keys,
 )
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.both import COMBINED
 from shearloop.daemon.sensing.estimation import estimate_message
 from shearloop.daemon.sensing.fingertip import frame_message
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
@@ -176,8 +176,8 @@ class ReplayPipeline:
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
         self._pairing: Pairing[Frame] | None = None
-        if config.both is not None:
-            self._estimators[BOTH] = combined = open_both(config.both, config.fingertips)
+        if config.combined is not None:
+            self._estimators[COMBINED] = combined = open_both(config.combined, config.fingertips)
             self._pairing = Pairing(combined.sides, round(config.fingertips[combined.sides[0]].frame_period_s * 1e9))
         self._frame_parsers = {
             name: FrameParser(ZERO_SLOTS, nominal_period_ns=round(fingertip.frame_period_s * 1e9))
@@ -202,7 +202,7 @@ class ReplayPipeline:
                 await self._estimate(source, frame)
                 pair = self._pairing.take(source, frame.t_mid_ns, frame) if self._pairing is not None else None
                 if pair is not None:
-                    await self._estimate(BOTH, *pair[1])
+                    await self._estimate(COMBINED, *pair[1])
         elif source == LOAD_CELL and self._load_parser is not None:
             for sample in self._load_parser.handle(event):
                 self._publisher.publish(load_message(sample))

@@ -65,7 +65,7 @@ class LoadCellTask:
         self._zero_until_ns = now_ns + round(self._timeout_s * 1e9)
 
     async def zero(self) -> str:
-        """Take a new zero and wait for it; return the reason if that fails, else an empty text."""
+        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
         try:
             # Earlier waiters get this zero too.

@@ -92,7 +92,7 @@ class SkinZeroTaker:
         return None
 
     def _check_calibration(self, r1_ohm: float, r2_ohm: float) -> str | None:
-        """Compare the ratio of both, in which current and temperature cancel, with the calibration's."""
+        """Compare the ratio of both with the calibration's: current and temperature cancel."""
         known, found = _log_ratio(*self._rest_ohm), _log_ratio(r1_ohm, r2_ohm)
         if abs(found - known) <= MAX_CHANGE:
             return None
@@ -123,7 +123,7 @@ class SkinReading:
     """The estimate of one sample: both gauges' changes, the response, and the force with its interval.
 
     `band` is the force and the range that friction leaves open, without width if the direction is known. `interval`
-    holds the force with 95 %. Both are None if there are `reasons` against them.
+    holds the force with 95 %. With `reasons` both are None.
     """
 
     response_1: float | None = None

@@ -93,7 +93,7 @@ class SkinTask:
         self._estimator.tare(now_ns)
 
     async def zero(self) -> str:
-        """Take a new zero and wait for it; return the reason if that fails, else an empty text."""
+        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
         try:
             # Earlier waiters get this zero too.

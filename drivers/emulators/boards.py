@@ -45,12 +45,12 @@ class BoardFaultKind(Enum):
     FLOOD = "flood"
     # The next line comes twice.
     REPEAT = "repeat"
-    # For so many seconds.
+    # Lasts for a number of seconds.
     SILENCE = "silence"
     SATURATION = "saturation"
     STUCK = "stuck"
     UNPLUG = "unplug"
-    # From now on the torque is higher by so many N·m.
+    # Raises the torque by an offset in N·m.
     JUMP = "jump"
 
 
@@ -91,7 +91,7 @@ class PlayedBoard(ABC):
     """An emulated board on a pseudo-terminal.
 
     `on_port` receives the port's path whenever it appears. `inject` applies faults to the next lines, one each.
-    `sent` counts intact lines. While nobody reads, the terminal fills up and then the board waits.
+    `sent` counts intact lines. Without a reader the terminal fills up and then the board waits.
     """
 
     faults: Collection[BoardFaultKind]
@@ -135,7 +135,7 @@ class PlayedBoard(ABC):
         self._injected.append(fault)
 
     def command(self, text: str) -> None:
-        """Inject the fault in a command, or recover on `normal`; ValueError, with a sentence, if there is none."""
+        """Inject the fault in a command, or recover on `normal`; ValueError, with a sentence, for other text."""
         if text.strip() == "normal":
             self.recover()
         else:
@@ -366,7 +366,7 @@ class ConverterBoard(PlayedBoard):
 
 @dataclass(frozen=True, slots=True)
 class Sketch:
-    """The board's conversion: counts_per_nm × torque + tare_counts, plus noise, with so many decimals.
+    """The board's conversion: counts_per_nm × torque + tare_counts, plus noise, with `decimals` places.
 
     The default is our sketch with a 5 kg cell of 1 mV/V on a 35 mm lever arm: 420 counts a gram.
     """

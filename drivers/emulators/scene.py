@@ -19,7 +19,7 @@ from shearloop.drivers.emulators.robotiq.gripper import Gripper
 FloatArray = NDArray[np.float64]
 
 N_INJECTIONS = 32
-# Times at which the mean over a conversion is sampled.
+# Samples in the mean over a conversion.
 N_MOMENTS = 16
 # A little longer than a frame.
 HISTORY_S = 0.6
@@ -47,13 +47,13 @@ class Joint(Enum):
 
 @dataclass(frozen=True, slots=True)
 class TwinSettings:
-    """The rig's constants; those of the gel are of the size seen in the paper's recordings."""
+    """The rig's constants; the gel's are typical of the paper's recordings."""
 
     gel_stiffness_nm_per_rad: float = 0.8
     # The share of a held twist that relaxes in the end, and its time constant.
     relaxing_share: float = 0.08
     relaxation_s: float = 20.0
-    # Width of the band in which the gel's conductivity does not follow a reversal.
+    # After a reversal the gel's conductivity follows only beyond this angle.
     hysteresis_rad: float = 0.004
     # Torque that the grip bears, per newton of gripping force.
     slip_torque_nm_per_n: float = 0.012
@@ -91,7 +91,7 @@ class Twin:
     settings: TwinSettings = field(default_factory=TwinSettings)
     state: TwinState = TwinState()
     kick_nm: float = 0.0
-    _reference_rad: float = 0.0  # wrist angle at which the gel is free of torque
+    _reference_rad: float = 0.0  # wrist angle without torque in the gel
     _crept_rad: float = 0.0
     _turned_rad: float = 0.0  # plastic angle of the joint
     _broken_loose: bool = False
@@ -173,7 +173,7 @@ class Twin:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The true state at `time_s` of the scene's own time; diameter_mm is None without an object to grip."""
+    """The true state at `time_s` of the scene's own time; without an object diameter_mm is None."""
 
     time_s: float
     wrist_rad: float
@@ -221,7 +221,7 @@ class Scene:
         self._moments = deque([_Moment(0.0, 0.0, 0.0, 0.0)])
 
     def step(self, dt_s: float, wrist_rad: float) -> float:
-        """Advance by dt_s of real time; return the torque in N·m on the flange, with which the tool resists."""
+        """Advance by dt_s of real time; return the tool's resisting torque on the flange in N·m."""
         dt_s *= self._speed
         self.time_s += dt_s
         self._wrist_rad = wrist_rad

@@ -161,7 +161,7 @@ class SampleValidator:
             return [self._source_fault]
         gauges = self._gauge_faults(voltages)
         if source.compliance:
-            # Compliance is the cause; an open gauge tells where.
+            # Compliance is the cause; an open gauge is the place.
             opened = [fault for fault in gauges if fault in (SkinFault.OPEN_1, SkinFault.OPEN_2)]
             return [SkinFault.COMPLIANCE, *opened]
         if abs(source.current_a - self._current_a) > CURRENT_TOLERANCE * self._current_a:
@@ -199,7 +199,7 @@ class SampleValidator:
         return found
 
     def _is_spike(self, pair: tuple[float, float], missed: int) -> bool:
-        """Tell a disturbance from a load: after a few readings that agree, they are the new level."""
+        """Detect a disturbance; a few readings that agree with each other become the new level."""
         if self._good is not None and not _reachable(self._good, pair, missed):
             if self._candidates and not _reachable(self._candidates[-1], pair, missed):
                 self._candidates.clear()

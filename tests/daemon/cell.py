@@ -193,7 +193,7 @@ class Cell:
                 await asyncio.sleep(0)
 
     async def start(self, *steps: Mapping[str, Any]) -> None:
-        file = ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": list(steps)})
+        file = ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps)})
         starting = asyncio.create_task(self.runner.start(file))
         while not starting.done():
             await self.cycles(1)

@@ -28,7 +28,7 @@ from shearloop.daemon.cli.output import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.both import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 
 Write = Callable[..., Path]
@@ -58,10 +58,10 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(
     assert main(["check", str(config(fingertips=section))]) == 0
     assert "without torque: its calibration has diameters only" in capsys.readouterr().out
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
-    steps = {"name": "one", "drive": "right", "steps": [{"do": "wait", "wait_s": 1}]}
+    steps = {"name": "one", "torque_source": "right", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     said = mistake(capsys, command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
-    assert "`drive: right` has a calibration without torques" in said
+    assert "`torque_source: right` has a calibration without torques" in said
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
@@ -90,7 +90,7 @@ def test_a_configuration_mistake_names_file_key_and_cure(
 
 async def test_fingertip_names_do_not_collide_with_task_names(config: Write, tmp_path: Path) -> None:
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
-    (tmp_path / "wait.yaml").write_text("{name: one, drive: right, steps: [{do: wait, wait_s: 1}]}")
+    (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")
     whole = config(
         robot="ur.yaml",
         gripper={"socket": {"host": "127.0.0.1"}},
@@ -107,7 +107,7 @@ async def test_fingertip_names_do_not_collide_with_task_names(config: Write, tmp
         daemon.stop()
         await daemon.run()
     assert {"right", "right.estimator", "robot", "gripper", "loop", "load_cell", "recording", "health"} <= names
-    assert (names | {BOTH, SKIN, WRENCH}) - TAKEN_NAMES == {"right", "right.estimator"}
+    assert (names | {COMBINED, SKIN, WRENCH}) - TAKEN_NAMES == {"right", "right.estimator"}
 
 
 def fingertip(**changes: Any) -> dict[str, Any]:

@@ -27,7 +27,7 @@ def waiting_config(config: Write, tmp_path: Path) -> Path:
     """Write a configuration whose experiment waits for a robot that there is none of."""
     robot = yaml.safe_load(Path("config/ur.yaml").read_text())
     (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": own_address(6)}))
-    steps = {"name": "test", "drive": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}
+    steps = {"name": "test", "torque_source": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     return config(robot="ur.yaml", experiment="experiment.yaml", stop_when_done=True)
 

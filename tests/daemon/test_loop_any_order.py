@@ -65,7 +65,7 @@ class Story:
             await self.go(1)
 
     async def start(self, *steps: dict[str, Any]) -> None:
-        file = ExperimentFile.model_validate({"name": "any", "drive": WRENCH, "steps": list(steps)})
+        file = ExperimentFile.model_validate({"name": "any", "torque_source": WRENCH, "steps": list(steps)})
         await self.within(self.cell.runner.start(file), 100)
 
     async def mend(self) -> None:

@@ -101,7 +101,7 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() ->
 async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> None:
     async with driven() as cell:
         starting = asyncio.create_task(
-            cell.runner.start(ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": [MOVE]}))
+            cell.runner.start(ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": [MOVE]}))
         )
         while not starting.done():
             await cell.cycles(1)
@@ -122,7 +122,7 @@ async def test_who_waits_for_an_experiments_end_is_told_of_that_one() -> None:
         cell.control_loop.stop("the operator said stop")
         # The next one begins before whoever waits has had his turn.
         cell.control_loop.tick(cell.robot.flight.now_ns)
-        again = {"name": "again", "drive": WRENCH, "steps": [{"do": "wait", "wait_s": 60}]}
+        again = {"name": "again", "torque_source": WRENCH, "steps": [{"do": "wait", "wait_s": 60}]}
         assert cell.control_loop.start(ExperimentFile.model_validate(again), cell.robot.flight.now_ns) is None
         async with asyncio.timeout(20):
             while not waiting.done():
@@ -217,7 +217,7 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
         await cell.start(TWIST)
         await cell.cycles(10)
         before = len(cell.robot.commands)
-        file = ExperimentFile.model_validate({"name": "other", "drive": WRENCH, "steps": [MOVE]})
+        file = ExperimentFile.model_validate({"name": "other", "torque_source": WRENCH, "steps": [MOVE]})
         assert "is still running" in (await cell.runner.start(file) or "")
         assert all(isinstance(command, WristSpeed) for command in cell.robot.commands[before:])
 

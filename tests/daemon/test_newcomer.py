@@ -114,10 +114,10 @@ def tree(tmp_path: Path) -> Iterator[Tree]:
         content["publish"], content["commands"] = f"ipc://{tmp_path}/publish", f"ipc://{tmp_path}/commands"
         for fingertip in content["fingertips"].values():
             fingertip["frame_period_s"] = 0.5412 / SPEED
-        content["both"]["creep"]["time_s"] /= SPEED
+        content["combined"]["creep"]["time_s"] /= SPEED
         content["load_cell"]["rate_hz"] = 10.9 * SPEED
         # Two and a half periods of such a load cell are what a busy computer may be late.
-        content["loop"] = {"freshness_s": 0.3}
+        content["loop"] = {"stale_after_s": 0.3}
         content["gripper"]["socket"]["host"] = HOST
         (rig,) = content["emulators"]
         rig["arguments"] += ["--host", HOST, "--speed", str(SPEED), "--unlock-wait-s", "0.2", "--power-on-s", "0.1"]

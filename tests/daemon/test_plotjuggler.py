@@ -18,7 +18,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import TOPICS, Message
 from shearloop.daemon.messaging.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
-from tests.daemon.view.fake_daemon import MESSAGES, made
+from tests.daemon.web.fake_daemon import MESSAGES, made
 
 
 def messages() -> list[Message]:

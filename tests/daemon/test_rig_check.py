@@ -41,20 +41,22 @@ def refusal(folder: Path, experiment: dict[str, Any], **more: Any) -> str:
 
 def test_a_torque_that_is_measured_may_drive(tmp_path: Path) -> None:
     for drive in ("right", "load_cell", "wrench"):
-        file = check_experiment(config(tmp_path, {"drive": drive}, load_cell={"device": {"path": "load"}}), SOURCES)
+        file = check_experiment(
+            config(tmp_path, {"torque_source": drive}, load_cell={"device": {"path": "load"}}), SOURCES
+        )
         assert file is not None
-        assert file.drive == drive
+        assert file.torque_source == drive
 
 
 def test_a_torque_that_is_not_measured_may_not_drive(tmp_path: Path) -> None:
-    assert refusal(tmp_path, {"drive": "load_cell"}).endswith(
-        "experiment.yaml: `drive: load_cell` is not a measured torque: choose another, or configure its "
+    assert refusal(tmp_path, {"torque_source": "load_cell"}).endswith(
+        "experiment.yaml: `torque_source: load_cell` is not a measured torque: choose another, or configure its "
         "device; there are right, wrench"
     )
-    assert "`drive: left` is a fingertip without a calibration" in refusal(tmp_path, {"drive": "left"})
+    assert "`torque_source: left` is a fingertip without a calibration" in refusal(tmp_path, {"torque_source": "left"})
     tips = {name: {"device": {"path": name}, "calibration": f"{name}.cal"} for name in SOURCES}
-    told = refusal(tmp_path, {"drive": "left"}, fingertips=tips)
-    assert "`drive: left` has a calibration without torques" in told
+    told = refusal(tmp_path, {"torque_source": "left"}, fingertips=tips)
+    assert "`torque_source: left` has a calibration without torques" in told
     assert told.endswith("there are right, wrench")
 
 
@@ -92,7 +94,7 @@ LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
 def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(
     tmp_path: Path, step: dict[str, Any], told: str
 ) -> None:
-    said = refusal(tmp_path, {"drive": "wrench", "limits": LIMITS, "steps": [*STEPS, step]})
+    said = refusal(tmp_path, {"torque_source": "wrench", "limits": LIMITS, "steps": [*STEPS, step]})
     assert f"`steps[2]` ({step['do']}) {told}" in said
 
 

@@ -25,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank the calibration was made with, if any")
     add_json(parser)
-    parser.epilog = "Prints the line `creep:` for the fingertip, or for `both`, in the configuration."
+    parser.epilog = "Prints the line `creep:` for the fingertip, or for `combined`, in the configuration."
 
 
 def run(args: argparse.Namespace) -> int:

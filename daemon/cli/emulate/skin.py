@@ -139,9 +139,8 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
 def _run_skin(args: argparse.Namespace) -> int:
     from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
     from shearloop.drivers.emulators.skin import SkinInstruments
-    from shearloop.drivers.emulators.ur.faults import obey
     from shearloop.drivers.emulators.ur.robot import Robot
-    from shearloop.drivers.emulators.ur.server import Controller
+    from shearloop.drivers.emulators.ur.server import Controller, apply_fault
 
     check_positive(args, "speed")
     if not abs(args.sweep_n) <= 5.0:
@@ -169,7 +168,7 @@ def _run_skin(args: argparse.Namespace) -> int:
     def on_command(line: str) -> None:
         name, _, fault = line.partition(" ")
         if name == "robot" and controller is not None:
-            obey(controller, fault)
+            apply_fault(controller, fault)
         elif not pushed.command(line):
             instruments.command(line)
 

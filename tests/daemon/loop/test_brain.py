@@ -17,7 +17,7 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive: str) -> Non
         {"do": "identify"},
         {"do": "hold_torque", "torque_nm": 0.1, "hold_s": 20},
         {"do": "release"},
-        drive=drive,
+        torque_source=drive,
     )
     rig.run(200)
     assert rig.control_loop.experiment is not None

@@ -57,7 +57,7 @@ def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
         Rig(new_loop(), seed),
         GRIP,
         {"do": "twist", "angles_rad": [0.3, -0.3], "speed_rad_per_s": 0.05},
-        drive="load_cell",
+        torque_source="load_cell",
     )
     rig.run(2)
     held_s = 0.0

@@ -217,7 +217,7 @@ def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits
     for _ in range(70):
         rig.cycle()
     begin = [{"do": "grip", "width_mm": 5, "force_n": 60}]
-    content = {"name": "any", "drive": drive, "steps": begin + steps, "limits": {"torque_nm": torque_limit_nm}}
+    content = {"name": "any", "torque_source": drive, "steps": begin + steps, "limits": {"torque_nm": torque_limit_nm}}
     assert rig.control_loop.start(ExperimentFile.model_validate(content), rig.now_ns) is None
     for cycles, fault in [*story, (150, "resume")]:
         for _ in range(cycles):

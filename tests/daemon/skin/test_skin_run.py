@@ -252,7 +252,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section({"adc": {"device": {"path": "./skin-source"}}})},
-            "`skin.source.serial` and `skin.daq.adc.device` are both the port skin-source; each device has its own",
+            "`skin.source.serial` and `skin.daq.adc.device` are both the port skin-source; each device needs its own",
         ),
         (
             {"skin": section(SCANNER, source=SOCKET)},
@@ -264,7 +264,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section(ADC, tool_radius_mm=None), "robot": ROBOT, "experiment": HOLDS},
-            "`drive: skin` has no torque without a radius: add `skin.tool_radius_mm`, or choose another",
+            "`torque_source: skin` has no torque without a radius: add `skin.tool_radius_mm`, or choose another",
         ),
         ({"skin": section(ADC, calibration="none.yaml")}, "none.yaml: the calibration cannot be read: No such file"),
         ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),

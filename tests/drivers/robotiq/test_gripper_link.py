@@ -9,8 +9,7 @@ import pytest
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.pdu import ModbusPDU
 
-from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
-from shearloop.drivers.emulators.robotiq.urcap_face import UrcapServer
+from shearloop.drivers.emulators.robotiq.servers import ModbusServer, UrcapServer
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand
 from tests.drivers.robotiq.gripper_rig import WAYS, a_rig

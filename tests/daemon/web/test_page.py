@@ -5,8 +5,8 @@ import itertools
 import pytest
 
 from shearloop.daemon.web.latest import conductivity_profile
-from tests.daemon.view.conftest import Browsed
-from tests.daemon.view.fake_daemon import MESSAGES, REASONS
+from tests.daemon.web.conftest import Browsed
+from tests.daemon.web.fake_daemon import MESSAGES, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 
@@ -235,9 +235,9 @@ def test_the_page_is_redrawn_thirty_times_a_second(browsed: Browsed) -> None:
 def test_two_fingertips_and_their_combined_estimate(browsed: Browsed) -> None:
     page = browsed.open()
     browsed.daemon.say(
-        loop={"torque_source": "both"},
+        loop={"torque_source": "combined"},
         left={"source": "left", "torque_nm": None, "valid": False, "reason": "no calibration is configured"},
-        both={"source": "both", "torque_nm": 0.0876, "k": None, "sigma": None, "score": None, "runner_up": None},
+        both={"source": "combined", "torque_nm": 0.0876, "k": None, "sigma": None, "score": None, "runner_up": None},
     )
     browsed.until("#torque-source", "estimate of both, drives the loop")
     browsed.until("#torque-now", "+0.0876 N·m")

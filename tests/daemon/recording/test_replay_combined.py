@@ -84,7 +84,7 @@ async def test_pairs_follow_the_order_of_arrival() -> None:
         both.take("right", SimpleNamespace(t_mid_ns=number * 10**9))
         both.take("left", SimpleNamespace(t_mid_ns=number * 10**9 + 1))
         number += 1
-    assert both.facts()["backlog"] == LARGEST_BACKLOG
+    assert both.diagnostics()["backlog"] == LARGEST_BACKLOG
     reading_on = asyncio.create_task(both.room())
     go_on.set()
     async with asyncio.timeout(DEADLINE_S):

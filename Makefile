@@ -34,8 +34,8 @@ DEMO := $(if $(RECORDING),config/fingertip_demo.yaml --recording '$(RECORDING)',
 demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
 	$(BIN)/shearloop run $(DEMO) --show
 
-# Recordings of the emulated rig, and the calibrations of its fingertips that are made from them.
-run/rig.cal: run/demo.bank daemon/cli/demo_calibration.py | install
+# Recordings of the emulated rig, and the calibrations of its fingertips made from them.
+run/rig.cal: run/demo.bank src/shearloop/daemon/cli/demo_calibration.py | install
 	$(BIN)/python -m shearloop.daemon.cli.demo_calibration --bank $< --out run
 
 run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install

@@ -128,8 +128,7 @@ def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[n
     # Report a wrong sigma before a port appears.
     for torque_nm in (0.0, LARGEST_TORQUE_NM):
         synthesiser.signal(args.k, sigma_of_torque(torque_nm))
-    frames = twist_frames(synthesiser, TwistProgramme(), k=args.k, sigma_of_torque=sigma_of_torque, period_s=period_s)
-    return (frame.line for frame in frames)
+    return twist_frames(synthesiser, TwistProgramme(), k=args.k, sigma_of_torque=sigma_of_torque, period_s=period_s)
 
 
 def _demo_mesh() -> "Mesh":

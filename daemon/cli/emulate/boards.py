@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from shearloop.bank.eit.mesh import Mesh
     from shearloop.daemon.synthetic import Signals
-    from shearloop.drivers.emulators.boards import BoardFault, PlayedBoard
+    from shearloop.drivers.emulators.boards import BoardFault, EmulatedBoard
 
 DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
 # The paper's screwdriver: σ at rest and at the largest torque of its peak samples, in N·m.
@@ -89,7 +89,7 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
     return 0
 
 
-def _parse_fault(argument: str, name: str, board: "type[PlayedBoard]") -> "BoardFault":
+def _parse_fault(argument: str, name: str, board: "type[EmulatedBoard]") -> "BoardFault":
     from shearloop.drivers.emulators.boards import parse_fault
 
     try:

@@ -13,7 +13,7 @@ from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration, f
 from shearloop.bank.skin.membrane import Direction
 from shearloop.bank.skin.statistics import loop
 from shearloop.daemon.sensing.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
-from shearloop.daemon.synthetic_skin import REST_OHM, SyntheticSkin
+from shearloop.daemon.synthetic_skin import CONTACT_N_PER_MM, REST_OHM, SyntheticSkin
 from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 
 NOISE = 1e-4
@@ -279,8 +279,8 @@ def test_a_force_beyond_the_curve_is_not_a_force(calibration: SkinCalibration) -
 def test_turning_the_tool_stretches_contact_and_skin_in_series() -> None:
     skin = SyntheticSkin(normal_n=1.0)
     hold_n = skin.membrane.friction
-    contact = skin.settings.contact_n_per_mm * skin.settings.radius_mm
-    series = 1 / (1 / skin.settings.contact_n_per_mm + 1 / skin.stiffness_n_per_mm) * skin.settings.radius_mm
+    contact = CONTACT_N_PER_MM * skin.radius_mm
+    series = 1 / (1 / CONTACT_N_PER_MM + 1 / skin.stiffness_n_per_mm) * skin.radius_mm
     sticking_rad = hold_n / contact
     assert skin.turn(0.5 * sticking_rad) == pytest.approx(0.5 * hold_n)
     loaded_n = skin.turn(0.05)

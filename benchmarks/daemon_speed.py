@@ -228,7 +228,7 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
     lines = {side: recorded_lines(rig, side, FIRST_VALID_FRAME + n_frames) for side in sides}
     last_sources = {sides[-1], BOTH} if len(sides) > 1 else {sides[-1]}
     taken: dict[str, list[float]] = {source: [] for source in (*sides, *last_sources)}
-    missed = dict.fromkeys(taken, 0)
+    missed, latest = dict.fromkeys(taken, 0), dict.fromkeys(taken, -1)
     with played(config, period_s) as (boards, _, ready_s, estimates):
         estimates.setsockopt(zmq.RCVTIMEO, 1000)
         for number in range(FIRST_VALID_FRAME + n_frames):
@@ -246,8 +246,9 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
                             missed[source] += 1
                         break
                     source = estimate["source"]
-                    if estimate["frame"] == number and source in awaited:
+                    if source in awaited and estimate["frame"] > latest[source]:
                         awaited.remove(source)
+                        latest[source] = estimate["frame"]
                         if number >= FIRST_VALID_FRAME and (estimate["valid"] or estimate["k"] is not None):
                             taken[source].append((arrived_ns - sent_ns) / 1e6)
     return {
@@ -400,7 +401,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bank", type=Path, required=True, help="the fingertips' bank, of 100 × 100 cells")
     parser.add_argument("--rig", type=Path, required=True, help="folder with rig-25mm.mcap, rig*.cal and demo.bank")
-    parser.add_argument("--frames", type=int, default=300, help="number of timed frames")
+    parser.add_argument("--frames", type=int, default=240, help="number of timed frames")
     parser.add_argument("--rated-s", type=float, default=30.0, help="seconds at rated speeds")
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=MEASUREMENTS)
     parser.add_argument("--out", type=Path, required=True)

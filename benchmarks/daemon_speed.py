@@ -4,7 +4,7 @@
 
 Each figure is measured on a daemon in its own process, through a pseudo-terminal and a subscriber's socket. Latency
 counts from before the last byte is written until the subscriber has the estimate. `--rig` is the folder of
-`benchmarks.rig_twists`, with the default estimator's recording and calibrations, and the emulated rig's bank.
+`shearloop.daemon.cli.demo_calibration`, with the default estimator's recording and calibrations, and the emulated rig's bank.
 """
 
 import argparse
@@ -31,9 +31,8 @@ from numpy.typing import NDArray
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.sensing.both import BOTH
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.eit_line import TRANSFER_NS
+from shearloop.daemon.sensing.both import COMBINED
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S, TRANSFER_NS
 
 MEASUREMENTS = ("commands", "latency", "flood", "rated", "twisting")
 REPEATS = 5
@@ -49,7 +48,7 @@ RIG_RECORDING, RIG_BANK = "rig-25mm.mcap", "demo.bank"
 FIRST_FRAME, FIRST_VALID_FRAME = 12, 28
 TWISTS = {
     "name": "twists",
-    "drive": "load_cell",
+    "torque_source": "load_cell",
     "limits": {"torque_nm": 0.3, "angle_rad": 0.5},
     "steps": [
         {"do": "release", "timeout_s": 15},
@@ -197,7 +196,7 @@ def by_default(args: argparse.Namespace, sides: Sequence[str]) -> dict[str, Any]
     """Return the configuration of fingertips with the default estimator, and of the combined one for several."""
     rig = args.rig.resolve()
     fingertips = {side: {"calibration": str(rig / f"rig-{side}.cal"), "estimator": "fused"} for side in sides}
-    combined = {BOTH: {"calibration": str(rig / "rig.cal")}} if len(sides) > 1 else {}
+    combined = {COMBINED: {"calibration": str(rig / "rig.cal")}} if len(sides) > 1 else {}
     return {"fingertips": fingertips, **combined}
 
 
@@ -226,7 +225,7 @@ def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -
     """
     sides = list(config["fingertips"])
     lines = {side: recorded_lines(rig, side, FIRST_VALID_FRAME + n_frames) for side in sides}
-    last_sources = {sides[-1], BOTH} if len(sides) > 1 else {sides[-1]}
+    last_sources = {sides[-1], COMBINED} if len(sides) > 1 else {sides[-1]}
     taken: dict[str, list[float]] = {source: [] for source in (*sides, *last_sources)}
     missed, latest = dict.fromkeys(taken, 0), dict.fromkeys(taken, -1)
     with played(config, period_s) as (boards, _, ready_s, estimates):

@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.rig_twists import calibrate, record
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
@@ -23,6 +22,7 @@ from shearloop.bank.estimation.ranking import accuracy_over_channels
 from shearloop.daemon.analysis.evaluation import EstimateTrack, follow, judge
 from shearloop.daemon.analysis.figure import draw
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
+from shearloop.daemon.cli.demo_calibration import calibrate, record
 from shearloop.daemon.recording.importing import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.emulators.rig import SIDES

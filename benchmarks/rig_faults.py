@@ -6,7 +6,7 @@ The real daemon in its own process and the real drivers, with the rig emulated o
 the middle of a slow twist. Measured is the time until `loop.state` reports the response, in periods of the failed
 sensor's or device's topic, and whether the next experiment completes once the fault is gone. Finally the daemon is
 killed with SIGKILL in the middle of a fast twist, and the emulated robot reports when it stood still. `--rig` is the
-folder of `benchmarks.rig_twists`, with demo.bank and rig-right.cal.
+folder of `shearloop.daemon.cli.demo_calibration`, with demo.bank and rig-right.cal.
 """
 
 import argparse
@@ -100,7 +100,7 @@ class RunningRig:
             "robot": "ur.yaml",
             "gripper": {"socket": {"host": args.host}},
             # Estimates that disagree are no fault here.
-            "loop": {"disagreement_nm": 1.0, "jump_nm": 1.0},
+            "loop": {"disagreement_nm": 1.0, "max_innovation_nm": 1.0},
         }
         path = self.folder / "config.yaml"
         path.write_text(yaml.safe_dump(content))
@@ -182,7 +182,7 @@ def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
     # The estimator needs seven seconds of the grip.
     grip = [{"do": "grip", "width_mm": 5, "force_n": 60}, {"do": "wait", "wait_s": 8}]
     begin = [{"do": "release"}, {"do": "tare"}, *grip]
-    content = {"name": name, "drive": "load_cell", "limits": {"torque_nm": 0.3}, "steps": [*begin, *steps]}
+    content = {"name": name, "torque_source": "load_cell", "limits": {"torque_nm": 0.3}, "steps": [*begin, *steps]}
     path.write_text(yaml.safe_dump(content))
     return path
 
@@ -231,7 +231,7 @@ def measure_kill(rig: RunningRig) -> float:
     """Kill the daemon in the middle of a twist; return the seconds until the robot stood still."""
     fast = {"do": "twist", "angles_rad": [3.0], "speed_rad_per_s": 0.5, "hold_s": 1}
     path = rig.folder / "fast.yaml"
-    path.write_text(yaml.safe_dump({"name": "fast", "drive": "load_cell", "steps": [fast]}))
+    path.write_text(yaml.safe_dump({"name": "fast", "torque_source": "load_cell", "steps": [fast]}))
     rig.start(path)
     rig.wait_for("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.45)
     killed_ns = time.monotonic_ns()

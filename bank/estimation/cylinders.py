@@ -17,7 +17,7 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.estimation.interval_regressor import LEAST_HALF_WIDTH, Head, IntervalRegressor
 from shearloop.bank.estimation.intervals import Intervals
 from shearloop.bank.estimation.reciprocity import paired

@@ -7,7 +7,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.estimation.intervals import Intervals
 from shearloop.bank.estimation.regressors import InverseCalibration, Ridge, TobitRidge
 

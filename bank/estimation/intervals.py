@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 
 LEVEL = 0.95

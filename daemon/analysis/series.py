@@ -9,7 +9,7 @@ from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.analysis.tools import tool_of
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab_streams import read_diameter_slices, read_torque_slices
+from shearloop.daemon.recording.matlab import read_diameter_slices, read_torque_slices
 from shearloop.daemon.recording.reader import Recording, read_recording
 from shearloop.daemon.recording.schema import SIDES
 

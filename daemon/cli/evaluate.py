@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.analysis.copies import check_no_copies, check_paths_differ
     from shearloop.daemon.analysis.evaluation import followed, judge, reasons
     from shearloop.daemon.analysis.series import part_of, read_series
-    from shearloop.daemon.cli.recorded import check_kind, parsed_part
+    from shearloop.daemon.cli.options import check_kind, parse_part
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.workers import in_order, open_executor
 
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
-    start, stop = parsed_part(args.part)
+    start, stop = parse_part(args.part)
     named = [(path, one) for path in args.recordings for one in read_series(path)]
     check_kind(args.calibration, calibration, [one for _, one in named])
     parts = [part_of(one, start, stop) for _, one in named]

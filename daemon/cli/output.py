@@ -8,7 +8,7 @@ from datetime import datetime
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
-    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
+    from shearloop.daemon.logs import NonBlockingWriter
 
 _ENVELOPE = ("timestamp", "t_mono_ns", "seq", "source", "topic")
 

@@ -161,8 +161,8 @@ def check_files(config: DaemonConfig, geometry: Path | None) -> Iterator[Finding
     for name, fingertip in config.fingertips.items():
         yield check_bank(name, fingertip, geometry)
         yield check_calibration(name, fingertip)
-    if config.both is not None:
-        yield _check_combined(config.both, config.fingertips)
+    if config.combined is not None:
+        yield _check_combined(config.combined, config.fingertips)
     if config.skin is not None:
         yield _check_skin(config.skin.calibration)
     if config.robot is not None:
@@ -252,7 +252,9 @@ def _check_experiment(path: Path) -> Finding:
         experiment = load_yaml_model(path, ExperimentFile)
     except UserError as error:
         return from_file("experiment", str(error), "it cannot start")
-    return good("experiment", f"{path}: {experiment.name}, {len(experiment.steps)} steps, driven by {experiment.drive}")
+    return good(
+        "experiment", f"{path}: {experiment.name}, {len(experiment.steps)} steps, driven by {experiment.torque_source}"
+    )
 
 
 def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:

@@ -20,12 +20,11 @@ from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.rig import make_gripper_client
 from shearloop.daemon.serial_ports import access_error
+from shearloop.drivers.connection import find_port
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.hx711 import LoadCalibration
-from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
-from shearloop.drivers.serial_port import find_port
 from shearloop.drivers.ur.controller import query_controller
 from shearloop.drivers.ur.settings import read_settings
 
@@ -131,7 +130,7 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
         frame_period_s=config.frame_period_s,
     )
     frames = await _received(board.frames(), seconds)
-    facts = board.facts()
+    facts = board.diagnostics()
     if not frames and facts["last_loss"]:
         return [port, from_error(f"rate of {name}", str(facts["last_loss"]), "no frame came")]
     measured_hz = _rate_hz([frame.t_arrival_ns for frame in frames])
@@ -141,7 +140,7 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
         findings.append(
             note(
                 f"lines of {name}",
-                f"{sum(refused.values())} refused; {facts['last_refusal']}",
+                f"{sum(refused.values())} refused; {facts['last_frame_error']}",
                 "a bad cable, or another program on the same board",
                 "replace the USB cable",
             )

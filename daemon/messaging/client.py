@@ -23,7 +23,7 @@ def receive_messages(
     keys: ClientKeys | None = None,
     on_quiet: Callable[[], None] = lambda: None,
 ) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield (topic, content) of each message whose topic starts with one of `topics`, or of all messages if empty.
+    """Yield (topic, content) of each message with a topic that starts with one of `topics`, or of all messages.
 
     Calls `on_quiet` if no message arrives in the first QUIET_S. Raises UserError for a malformed address, and if no
     message arrives for `timeout_s`.

@@ -48,7 +48,7 @@ class TokenBucket:
         self._updated_ns: int | None = None
 
     def allow(self, t_ns: int) -> bool:
-        """Use one token at monotonic time t_ns; return False if there is none left."""
+        """Use one token at monotonic time t_ns; return False if no token is left."""
         if self._updated_ns is not None:
             self._tokens = min(self._burst, self._tokens + self._per_s * max(0, t_ns - self._updated_ns) / 1e9)
         self._updated_ns = t_ns

@@ -1,7 +1,7 @@
 """CURVE keys: the daemon's own pair, the clients' public keys, and the check of each new connection.
 
-Key files are those of `zmq.auth` (ZeroMQ RFC 26): `NAME.key` holds the public key, `NAME.key_secret` both. The folder
-of the allowed clients' `.key` files is read again for each new connection.
+Key files have the format of `zmq.auth` (ZeroMQ RFC 26): `NAME.key` holds the public key, `NAME.key_secret` both. The
+folder of the allowed clients' `.key` files is read again for each new connection.
 """
 
 import os
@@ -127,7 +127,7 @@ def allowed_clients(folder: Path) -> dict[bytes, str]:
 
 
 def check_allowed_clients(folder: Path) -> dict[bytes, str]:
-    """Return the allowed clients; raises UserError also if there are none."""
+    """Return the allowed clients; raises UserError also for an empty folder."""
     clients = allowed_clients(folder)
     if not clients:
         raise UserError(f"{folder} holds no key, so no client could connect; see `shearloop keys allow`")

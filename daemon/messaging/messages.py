@@ -168,9 +168,6 @@ class GripperStateMessage(Message):
     tool_diameter_mm: float | None = column("mm", "diameter from gripper and fingertips, weighted by their variances")
     tool_diameter_std_mm: float | None = column("mm", "its standard deviation")
     current_ma: float | None = column("mA", "motor current")
-    current_age_s: float = column(
-        "s", "how much older the current is than the rest: up to 0.5 while the gripper stands on the robot's controller"
-    )
     object: str = column("", "moving, contact opening, contact closing or at target")
     fault: int = column("", "fault code, 0 for none")
     fault_text: str = column("", "the fault in a sentence; empty for none")
@@ -240,7 +237,7 @@ TOPICS: dict[str, type[Message]] = {
 
 
 def stale_after_s(topic: str) -> float:
-    """Return the age in seconds at which a topic's latest message is stale.
+    """Return the age in seconds that makes a topic's latest message stale.
 
     Raises KeyError for a topic that is unknown or sent on change only.
     """

@@ -15,7 +15,7 @@ from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, i
 from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.messages import TOPICS, Message, encode, wire_map
 
-# Messages kept for a slow subscriber. It loses later ones; other subscribers do not wait for it.
+# Messages kept for a slow subscriber. It loses later ones; others are not delayed.
 HIGH_WATER_MARK = 1000
 # A subscription is a topic's beginning, after about 300 bytes of CURVE handshake. Longer ones end the connection.
 LARGEST_SUBSCRIPTION_BYTES = 1024

@@ -11,7 +11,7 @@ from shearloop.daemon.messaging.messages import Scalar
 from shearloop.daemon.sensing.estimation import Backlog, EstimatorTask, Taken
 from shearloop.drivers.eit_kit import Frame
 
-BOTH = "both"
+COMBINED = "combined"
 # Pairs that may wait for the estimator before the fingertips' boards are read no further.
 LARGEST_BACKLOG = 8
 

@@ -14,7 +14,7 @@ from shearloop.daemon.sensing.opening import AnyEstimator
 from shearloop.daemon.sensing.tool_diameter import HearDiameter, as_text, unheard, unknown
 from shearloop.daemon.waiting import Waiting
 from shearloop.drivers.eit_kit import Frame
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
+from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
 
 
 @dataclass(slots=True)
@@ -58,7 +58,7 @@ class EstimatorTask:
         period_s: Callable[[], float],
         hear: Callable[[TorqueSample], None],
         hear_diameter: HearDiameter = unheard,
-        tap: Tap = no_tap,
+        tap: OnRaw = ignore_raw,
     ) -> None:
         """Take what is tied together; `period_s` says how long the acquisition of a frame takes."""
         self._period_s = period_s

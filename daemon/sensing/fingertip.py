@@ -70,11 +70,11 @@ class FingertipTask:
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board and the estimates."""
-        facts = self._board.facts()
+        facts = self._board.diagnostics()
         return {
             **facts,
             "rate_hz": facts["measured_hz"],
-            "error": facts["last_refusal"] if facts["connected"] else facts["last_loss"],
+            "error": facts["last_frame_error"] if facts["connected"] else facts["last_loss"],
             "estimates": self.estimation.count,
             "backlog": self._backlog.qsize(),
         }

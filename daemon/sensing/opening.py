@@ -36,7 +36,7 @@ def open_estimator(config: FingertipConfig, name: str) -> AnyEstimator:
         if fitted.sides != (name,):
             raise UserError(
                 f"{config.calibration} is of the {' and '.join(fitted.sides)} fingertip, and not of {name}; "
-                f"calibrate with `--sides {name}`, or name a calibration of both under `both`"
+                f"calibrate with `--sides {name}`, or name a calibration of both under `combined`"
             )
         return _tracked(fitted, config)
     if config.estimator not in (None, "paper"):

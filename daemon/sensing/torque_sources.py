@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.both import COMBINED
 from shearloop.daemon.sensing.opening import AnyEstimator
-from shearloop.daemon.sensing.skin_setup import skin_source
+from shearloop.daemon.sensing.skin_task import skin_source
 from shearloop.daemon.sensing.tracking import TrackedEstimator
 
 
@@ -25,8 +25,8 @@ def torque_sources(
     }
     if both is not None:
         period_s = max(own.frame_period_s for own in config.fingertips.values())
-        sources[BOTH] = TorqueSource(
-            name=BOTH, period_s=period_s, window_s=period_s, measures_torque=both.measures_torque
+        sources[COMBINED] = TorqueSource(
+            name=COMBINED, period_s=period_s, window_s=period_s, measures_torque=both.measures_torque
         )
     skin = skin_source(config.skin) if config.skin is not None else None
     return sources if skin is None else {**sources, skin.name: skin}

@@ -13,8 +13,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from shearloop.drivers.cancelled import is_cancelled
-from shearloop.drivers.errors import DriverError
+from shearloop.drivers.errors import DriverError, is_cancelled
 from shearloop.drivers.ur import error_messages
 from shearloop.drivers.ur.messages import Command, CommandReply, Failed, Message, RobotState
 from shearloop.drivers.ur.settings import UrSettings

@@ -165,7 +165,7 @@ def read_settings(path: Path) -> UrSettings:
     """
     from pydantic import TypeAdapter, ValidationError
 
-    from shearloop.drivers.yaml_file import read_yaml
+    from shearloop.drivers.yaml_files import read_yaml
 
     content = read_yaml(path)
     try:

@@ -48,7 +48,7 @@ __all__ = [
     "subscribe",
 ]
 
-# Imported on first use: the command line answers at once.
+# ImportResult on first use: the command line answers at once.
 _HOMES = {
     "Bank": "shearloop.bank.eit.bank_file:Bank",
     "Calibration": "shearloop.bank.estimation:Calibration",

@@ -163,37 +163,38 @@ class Cell:
     def __init__(self) -> None:
         self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
         source = wrench_source(SETTINGS.rate_hz)
-        self.brain = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
+        self.control_loop = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
         self.died: Mapping[str, str] = {}
 
         async def no_zero() -> str:
             return ""
 
-        self.loop = ControlLoopRunner(
-            self.brain,
+        self.runner = ControlLoopRunner(
+            self.control_loop,
             self.robot,
             self.gripper,  # type: ignore[arg-type]
             no_zero,
             self.published,  # type: ignore[arg-type]
             StepClock(self.robot.flight),
             lambda: self.died,
+            4.0,
         )
         self.task: asyncio.Task[None] | None = None
 
     def drive(self) -> None:
-        self.task = asyncio.create_task(self.loop.drive())
+        self.task = asyncio.create_task(self.runner.run())
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):
-            self.brain.inputs.gripper = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
+            self.control_loop.inputs.gripper = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
             self.robot.cycle()
             # A state is sensed, decided upon and answered within a few turns of the event loop.
             for _ in range(8):
                 await asyncio.sleep(0)
 
     async def start(self, *steps: Mapping[str, Any]) -> None:
-        file = ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": list(steps)})
-        starting = asyncio.create_task(self.loop.start(file))
+        file = ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps)})
+        starting = asyncio.create_task(self.runner.start(file))
         while not starting.done():
             await self.cycles(1)
         assert starting.result() is None
@@ -207,13 +208,13 @@ class Cell:
 
     @property
     def phase(self) -> ExperimentPhase:
-        assert self.brain.experiment is not None
-        return self.brain.experiment.phase
+        assert self.control_loop.experiment is not None
+        return self.control_loop.experiment.phase
 
     @property
     def why(self) -> str:
-        assert self.brain.experiment is not None
-        return self.brain.experiment.stop_reason
+        assert self.control_loop.experiment is not None
+        return self.control_loop.experiment.stop_reason
 
     @property
     def state(self) -> RobotState:

@@ -58,14 +58,14 @@ def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
         load_cell={"device": {"path": "load-cell"}, "rate_hz": 10.9 * SPEED},
         robot="ur.yaml",
         gripper={"socket": {"host": HOST}},
-        loop={"disagreement_nm": 0.2, "jump_nm": 0.3},
+        loop={"disagreement_nm": 0.2, "max_innovation_nm": 0.3},
     )
 
 
 def experiment(folder: Path, *steps: Mapping[str, Any]) -> str:
     path = folder / "experiment.yaml"
     begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
-    content = {"name": "test", "drive": "load_cell", "tool_mm": 20, "steps": [*begin, *map(dict, steps)]}
+    content = {"name": "test", "torque_source": "load_cell", "tool_mm": 20, "steps": [*begin, *map(dict, steps)]}
     path.write_text(yaml.safe_dump(content))
     return str(path)
 
@@ -73,7 +73,9 @@ def experiment(folder: Path, *steps: Mapping[str, Any]) -> str:
 def ending_with(rig_config: Path, *steps: Mapping[str, Any]) -> Path:
     """Return a configuration whose experiment, of these steps, begins by itself and ends the daemon."""
     path, folder = rig_config.with_name("ending.yaml"), rig_config.parent
-    (folder / "own.yaml").write_text(yaml.safe_dump({"name": "own", "drive": "wrench", "steps": [*map(dict, steps)]}))
+    (folder / "own.yaml").write_text(
+        yaml.safe_dump({"name": "own", "torque_source": "wrench", "steps": [*map(dict, steps)]})
+    )
     content = yaml.safe_load(rig_config.read_text())
     path.write_text(yaml.safe_dump({**content, "experiment": "own.yaml", "stop_when_done": True}))
     return path
@@ -237,7 +239,7 @@ async def test_a_straight_move_brakes_while_it_is_paused_and_ends_where_it_was_t
 
     move = {"do": "approach", "along_tool_m": -0.05, "speed_m_per_s": 0.05}
     path = tmp_path / "move.yaml"
-    path.write_text(yaml.safe_dump({"name": "move", "drive": "wrench", "steps": [move]}))
+    path.write_text(yaml.safe_dump({"name": "move", "torque_source": "wrench", "steps": [move]}))
     async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
         first = pose(watcher.seen["robot.state"][-1])
         await started(command, str(path))
@@ -277,7 +279,7 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
         await watcher.until("robot.state", lambda state: abs(state["wrist_speed_rad_per_s"]) > 0.1)
         daemon.stop()
         await daemon.stopped()
-    why = "the daemon was told to end: the wrist is stopped, a tool that is gripped stays gripped"
+    why = "the daemon ended: the wrist is stopped, a gripped tool stays gripped"
     assert not daemon.finished
     assert (watcher.seen["loop.state"][-1]["phase"], watcher.seen["loop.state"][-1]["activity"]) == ("stopped", why)
     assert any("STOPPED before its end" in line for line in told)

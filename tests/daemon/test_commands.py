@@ -168,18 +168,20 @@ async def test_no_zero_is_taken_while_an_experiment_runs() -> None:
     tared: list[str] = []
     experiment = SimpleNamespace(running=True, file=SimpleNamespace(name="hold"))
     commands = Commands(
-        rig=cast("Rig", SimpleNamespace(brain=SimpleNamespace(experiment=experiment))),
+        rig=cast("Rig", SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment))),
         tares={name: partial(tared.append, name) for name in ("right", "load_cell")},
         fingertips={},
         experiment=None,
-        begin=AsyncMock(),
-        give_up_waiting=lambda: None,
+        start=AsyncMock(),
+        call_off_experiment=lambda: None,
         tasks=dict,
         stop=lambda: None,
     )
     tare = commands.handlers()["tare"]
     for request_ in ({}, {"source": "load_cell"}):
-        with pytest.raises(CommandRefusedError, match="the experiment 'hold' is running, and a new zero would change"):
+        with pytest.raises(
+            CommandRefusedError, match="the experiment 'hold' is running, and a new zero would change its"
+        ):
             await tare(request_)
     assert tared == []
     experiment.running = False

@@ -74,7 +74,7 @@ async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
-def test_a_subscriber_asks_for_topics_and_keys_that_there_are(name: str) -> None:
+def test_subscribers_use_existing_topics_and_keys(name: str) -> None:
     """MATLAB is on no machine of ours, so what its subscriber reads is held to the schema of the messages."""
     program = (ROOT / "docs/examples" / name).read_text()
     topics = set(re.findall(r'"((?:eit|load|skin|robot|gripper|loop)\.[a-z]*)"', program))
@@ -89,7 +89,7 @@ def test_a_subscriber_asks_for_topics_and_keys_that_there_are(name: str) -> None
 
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
-def test_a_subscriber_is_about_a_dozen_lines(name: str) -> None:
+def test_subscribers_are_short(name: str) -> None:
     lines = (ROOT / "docs/examples" / name).read_text().splitlines()
     code = [line for line in lines if line.strip() and not line.lstrip().startswith(("//", "%", '"""', "#", "import"))]
     assert len(code) <= 15

@@ -56,7 +56,7 @@ async def examined(path: Path, seconds: float) -> dict[str, Finding]:
 
 
 @pytest.mark.real_time
-async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, tiny_bank: Path) -> None:
+async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config: Path, tiny_bank: Path) -> None:
     found = await examined(rig_config, 0.1)
     assert "There is no serial port" in found["port of right"].found
     assert "switched on" in found["robot"].next_step
@@ -97,7 +97,7 @@ async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, t
             assert found["rate of load.torque load_cell"].state == "note"
 
 
-def test_a_configuration_that_is_wrong_ends_the_examination(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_stops_at_an_invalid_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", str(tmp_path / "no.yaml")]) == 1
     said = capsys.readouterr().out
     assert "WRONG configuration" in said
@@ -130,7 +130,7 @@ def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ({"alive": True, "connected": True, "errors": {"nan": 2}}, "note", "2 × nan"),
     ],
 )
-def test_a_task_is_judged_by_what_it_counts(facts: dict[str, Any], state: str, part: str) -> None:
+def test_tasks_are_judged_by_their_counters(facts: dict[str, Any], state: str, part: str) -> None:
     finding = check_task("right", facts)
     assert finding.state == state
     assert part in finding.found
@@ -186,7 +186,7 @@ def port(**changes: Any) -> Any:
     return SimpleNamespace(**{**fields, **changes})
 
 
-def test_ports_are_listed_with_what_a_configuration_names_them_by(
+def test_ports_are_listed_with_their_configuration_entry(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there: list[Any] = []

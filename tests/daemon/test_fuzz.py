@@ -133,7 +133,7 @@ async def test_a_flood_of_malformed_frames_and_requests(
                     asyncio.to_thread(exchange, address, malformed_requests(REQUESTS)),
                     asyncio.to_thread(write_all, board, malformed_frames(FRAMES)),
                 )
-                while (refused := sum(daemon._fingertips["right"].facts()["errors"].values())) < FRAMES - 1:
+                while (refused := sum(daemon._fingertips["right"].diagnostics()["errors"].values())) < FRAMES - 1:
                     told.clear()
                     await told.wait()
             assert replies == {False: REQUESTS}, "each is answered, and none is carried out"
@@ -143,7 +143,7 @@ async def test_a_flood_of_malformed_frames_and_requests(
             assert published["eit.estimate"] == published["eit.frame"] == 0
             assert arm.told == [], "nothing was asked of the robot"
             assert daemon._rig is not None
-            assert daemon._rig.brain.experiment is None
+            assert daemon._rig.control_loop.experiment is None
             assert not daemon.supervisor.dead
             assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
             assert resident_memory_mb() - before_mb < MOST_GROWTH_MB

@@ -21,7 +21,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
@@ -45,7 +45,7 @@ def recording(folder: Path, n_frames: int) -> Path:
     return path
 
 
-async def test_every_frame_of_a_recording_at_a_hundred_times_its_pace_becomes_an_estimate_in_order(
+async def test_every_frame_at_100_times_speed_becomes_an_estimate_in_order(
     shared: Path, config: Write, tmp_path: Path, subscriber: Connect
 ) -> None:
     play = shared / "recordings" / "streams" / "2024-12-03_16-09" / "device1.mat"
@@ -118,7 +118,7 @@ def collector(daemon: Daemon, topic: str) -> "asyncio.Queue[dict[str, Any]]":
     return queue
 
 
-async def test_commands_tare_tell_the_status_and_stop(config: Write, tmp_path: Path) -> None:
+async def test_tare_status_and_stop_commands(config: Write, tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/commands"
     play = recording(tmp_path, 60)
     link = str(tmp_path / "eit-right")
@@ -143,9 +143,7 @@ async def test_commands_tare_tell_the_status_and_stop(config: Write, tmp_path: P
         await daemon.stopped()
 
 
-async def test_a_heatmap_is_computed_only_while_somebody_subscribes(
-    config: Write, tmp_path: Path, subscriber: Connect
-) -> None:
+async def test_a_heatmap_is_computed_only_with_a_subscriber(config: Write, tmp_path: Path, subscriber: Connect) -> None:
     play, link = recording(tmp_path, 60), str(tmp_path / "eit-right")
     async with running(config()) as daemon:
         estimates, heatmaps = collector(daemon, "eit.estimate"), collector(daemon, "eit.heatmap")
@@ -180,9 +178,7 @@ def robotless(config: Write, tmp_path: Path) -> Path:
     return config(**rig, experiment=str(Path("config/experiments/loosen.yaml").resolve()))
 
 
-async def test_a_stop_calls_off_an_experiment_that_waits_for_its_devices_and_spares_the_daemon(
-    robotless: Path, tmp_path: Path
-) -> None:
+async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless: Path, tmp_path: Path) -> None:
     async with running(robotless) as daemon:
         health = collector(daemon, "health")
         while not (await health.get())["tasks"]["experiment"]["alive"]:
@@ -196,9 +192,7 @@ async def test_a_stop_calls_off_an_experiment_that_waits_for_its_devices_and_spa
         assert reply == {"ok": True, "stopped": ""}
 
 
-async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_health(
-    config: Write, tmp_path: Path
-) -> None:
+async def test_a_lost_board_reconnects_and_health_counts_refused_lines(config: Write, tmp_path: Path) -> None:
     link = str(tmp_path / "eit-right")
     faults = ["--fault", "wrong-count@5", "--fault", "garbage@7", "--fault", "unplug:0.3@12"]
     async with running(config()) as daemon:
@@ -211,14 +205,14 @@ async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_h
             for _ in range(25):
                 await frames.get()
             facts = (await health.get())["tasks"]["right"]
-            while facts["openings"] < 2 or facts["frames"] < 25:
+            while facts["connections"] < 2 or facts["frames"] < 25:
                 facts = (await health.get())["tasks"]["right"]
             assert facts["alive"]
             assert facts["errors"]["wrong_count"] >= 1
             assert sum(facts["errors"].values()) >= 2
 
 
-async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
+async def test_a_crashed_estimator_restarts_and_is_reported(
     config: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from shearloop.daemon.sensing.estimator import Estimator
@@ -245,7 +239,7 @@ async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
     assert (record.restarts, record.last_error) == (1, "RuntimeError: a bug")
 
 
-async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, tmp_path: Path) -> None:
+async def test_the_daemon_survives_a_closed_log(config: Write, tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/commands"
     reader, writer = os.pipe()
     process = await asyncio.create_subprocess_exec(
@@ -265,9 +259,7 @@ async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, t
             await process.wait()
 
 
-async def test_a_terminal_that_was_stopped_keeps_no_estimate_waiting(
-    config: Write, tmp_path: Path, subscriber: Connect
-) -> None:
+async def test_a_stopped_terminal_delays_no_estimate(config: Write, tmp_path: Path, subscriber: Connect) -> None:
     terminal, its_end = pty.openpty()
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "shearloop", "run", str(config()), "--show", stdout=its_end, stderr=its_end
@@ -293,7 +285,7 @@ async def test_a_terminal_that_was_stopped_keeps_no_estimate_waiting(
         os.close(its_end)
 
 
-async def test_a_load_cell_is_read_without_a_robot_too(config: Write, tmp_path: Path) -> None:
+async def test_a_load_cell_works_without_a_robot(config: Write, tmp_path: Path) -> None:
     link = str(tmp_path / "load-cell")
     # Lines of torques, of which no calibration is needed.
     async with running(config(load_cell={"device": {"path": "load-cell"}})) as daemon:

@@ -89,7 +89,9 @@ def test_a_last_moment_in_the_band_is_no_way_back() -> None:
     assert "not back by the end" in told(truth_that_falls_at(26.0, 17.5), [(26 * S, "kick")])
 
 
-@pytest.mark.parametrize(("others", "judge"), [(("left", "load_cell"), "load_cell"), (("left", "both"), "both")])
+@pytest.mark.parametrize(
+    ("others", "judge"), [(("left", "load_cell"), "load_cell"), (("left", "combined"), "combined")]
+)
 def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[str, ...], judge: str) -> None:
     lines: list[str] = []
     summary = RunSummary(lines.extend)

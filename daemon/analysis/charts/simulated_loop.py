@@ -20,7 +20,7 @@ from shearloop.daemon.control.controller import TwistController, WristCommand
 from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.margins import gain_for_noise, integral_gain
 from shearloop.daemon.control.settings import ControllerSettings
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 PERIOD_S = 0.008
 # The standard deviation of torque that noise may cause; it sets the gain.

@@ -26,7 +26,7 @@ from shearloop.bank.eit.models import MODELS
 from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError, MatchingError
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab_streams import (
+from shearloop.daemon.recording.matlab import (
     DiameterSlices,
     TorqueSlices,
     read_diameter_slices,

@@ -25,7 +25,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank the calibration was made with, if any")
     add_json(parser)
-    parser.epilog = "Prints the line `creep:` for the fingertip, or for `both`, in the configuration."
+    parser.epilog = "Prints the line `creep:` for the fingertip, or for `combined`, in the configuration."
 
 
 def run(args: argparse.Namespace) -> int:
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.analysis.evaluation import follow
     from shearloop.daemon.analysis.grips import grips_of
     from shearloop.daemon.analysis.series import read_series
-    from shearloop.daemon.cli.recorded import check_kind
+    from shearloop.daemon.cli.options import check_kind
     from shearloop.daemon.control.creep import fit_creep
 
     check_paths_differ(args.recordings)

@@ -69,20 +69,19 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation.archive import ARCHIVE_MAGIC
     from shearloop.daemon.analysis.copies import check_no_copies, check_paths_differ
     from shearloop.daemon.analysis.series import part_of, read_series, series_of
-    from shearloop.daemon.cli.options import check_overwrite
-    from shearloop.daemon.cli.recorded import parsed_part, parsed_sides
+    from shearloop.daemon.cli.options import check_overwrite, parse_part, parse_sides
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.reader import read_recording
     from shearloop.daemon.recording.schema import LARGEST_DIAMETER_MM
 
-    start, stop = parsed_part(args.part)
+    start, stop = parse_part(args.part)
     late_s = args.load_late
     if late_s is not None and not abs(late_s) <= _LARGEST_LATE_S:
         raise UserError(f"--load-late must be seconds from -{_LARGEST_LATE_S:g} to {_LARGEST_LATE_S:g}, not {late_s:g}")
     tool_mm = args.tool_mm
     if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
         raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
-    sides = parsed_sides(args.sides)
+    sides = parse_sides(args.sides)
     check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     check_paths_differ(args.recordings)
     series = [(path, one) for path in args.recordings for one in read_series(path, sides, tool_mm)]

@@ -7,7 +7,7 @@ import pytest
 import yaml
 from scipy.stats import chi2
 
-from shearloop.bank.eit.batch_forward import BatchForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame, fit
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.reciprocity import _FIRST, _SECOND, ReciprocityCheck

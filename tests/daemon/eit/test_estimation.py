@@ -10,8 +10,8 @@ from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimation import EstimatorTask
 from shearloop.daemon.sensing.estimator import Reading
-from shearloop.drivers.eit_line import Frame
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
+from shearloop.drivers.eit_kit import Frame
+from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
 
 MS = 1_000_000
 PERIOD_NS = 540 * MS
@@ -62,7 +62,7 @@ class Unheard:
         pass
 
 
-def estimating(estimator: Tared, clock: Clock, tap: Tap = no_tap) -> EstimatorTask:
+def estimating(estimator: Tared, clock: Clock, tap: OnRaw = ignore_raw) -> EstimatorTask:
     publisher = cast(Publisher, Unheard())
     return EstimatorTask(
         "right", cast(Any, estimator), publisher, clock, lambda: PERIOD_NS / 1e9, lambda _: None, tap=tap

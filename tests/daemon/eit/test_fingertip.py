@@ -15,8 +15,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimation import EstimatorTask
 from shearloop.daemon.sensing.estimator import Reading
 from shearloop.daemon.sensing.fingertip import FingertipTask
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S, EitKit, Frame
 
 
 class Told:

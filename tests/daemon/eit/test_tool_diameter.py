@@ -8,7 +8,7 @@ from shearloop.daemon.sensing.tool_diameter import STALE_AFTER_NS, FingertipDiam
 
 
 def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> None:
-    diameters = FingertipDiameters("both")
+    diameters = FingertipDiameters("combined")
     assert diameters.at(0) is None
     diameters.hear("right", Interval(20.0, 18.0, 22.0), 0)
     diameters.hear("left", Interval(22.0, 18.0, 26.0), 0)
@@ -23,14 +23,14 @@ def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> N
     assert apart is not None
     deviations = 6.0 / ((2.0**2 + 4.0**2) ** 0.5 / 1.96)
     assert apart.half_width == pytest.approx(deviations * said.half_width)
-    diameters.hear("both", Interval(21.0, 20.0, 22.0), 0)
+    diameters.hear("combined", Interval(21.0, 20.0, 22.0), 0)
     both = diameters.at(0)
     assert both is not None
     assert (both.value, both.half_width) == (21.0, 1.0)
 
 
 def test_what_is_old_or_taken_back_is_no_diameter() -> None:
-    diameters = FingertipDiameters("both")
+    diameters = FingertipDiameters("combined")
     diameters.hear("right", Interval(20.0, 18.0, 22.0), 0)
     assert diameters.at(STALE_AFTER_NS) is not None
     assert diameters.at(STALE_AFTER_NS + 1) is None

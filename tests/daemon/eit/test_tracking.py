@@ -171,7 +171,7 @@ def test_doctor_and_check_show_what_was_taken_on_somebodys_word(
     ("open_it", "sentence"),
     [
         (lambda f: open_estimator(fingertip(calibration=f["right"]), "left"), "fingertip, and not of left"),
-        (lambda f: open_estimator(fingertip(calibration=f["both"]), "right"), "a calibration of both under `both`"),
+        (lambda f: open_estimator(fingertip(calibration=f["both"]), "right"), "a calibration of both under `combined`"),
         (lambda f: open_estimator(fingertip(calibration=f["right"], estimator="bank"), "right"), "the estimator fused"),
         (lambda _: open_estimator(fingertip(estimator="fused"), "right"), "needs a calibration that was fitted"),
         (lambda _: open_estimator(fingertip(estimator="fused", calibration="no.cal"), "right"), "no.cal does not"),

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.calibration import Calibration
-from shearloop.drivers.hx711 import LoadCalibration
-from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import ObjectStatus
 from shearloop.drivers.robotiq.modbus_client import ModbusClient

@@ -7,10 +7,10 @@ from typing import cast
 import pytest
 
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.device_commands import VelocityCommandSender
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.control.step_runner import MoveToAngle
-from shearloop.daemon.control.velocity_sender import VelocityCommandSender
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply

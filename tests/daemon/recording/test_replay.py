@@ -19,9 +19,7 @@ from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.importing import import_mat
-from shearloop.daemon.recording.recorded_run import RecordedRun
-from shearloop.daemon.recording.replay import Comparison, Replay, ReplayClock
-from shearloop.daemon.recording.replay_pipeline import ReplayPipeline
+from shearloop.daemon.recording.replay import RecordedRun, Replay, ReplayClock, ReplayComparison, ReplayPipeline
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.test_run import recording
 
@@ -33,7 +31,7 @@ RELATIVE = 1e-9
 
 async def replayed(
     path: Path, speed: float, address: str, config: DaemonConfig | None = None
-) -> tuple[list[tuple[str, dict[str, Any]]], Comparison]:
+) -> tuple[list[tuple[str, dict[str, Any]]], ReplayComparison]:
     """Return all that a replay publishes, and how it compares."""
     run, clock, seen = RecordedRun(path), ReplayClock(), []
     with contextlib.ExitStack() as opened:
@@ -41,7 +39,7 @@ async def replayed(
         publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), address, clock)
         opened.callback(publisher.close)
         publisher.add_listener(lambda topic, content: seen.append((topic, content)))
-        replay = Replay(run, ReplayPipeline(config, run.asides(), publisher), publisher, clock)
+        replay = Replay(run, ReplayPipeline(config, run.replay_events(), publisher), publisher, clock)
         await replay.play(speed)
     return seen, replay.comparison
 
@@ -171,8 +169,8 @@ def test_a_real_recording_gives_the_estimates_that_it_gave(shared: Path, config:
     ("arguments", "message"),
     [
         (["nowhere.mcap"], "nowhere.mcap: the recording cannot be read: No such file"),
-        (["{imported}"], "has no configuration; give one with --config"),
-        (["{imported}", "{imported}", "a.mcap"], "one recording is replayed at a time, and 3 were named; name one"),
+        (["{imported}"], "has no configuration because"),
+        (["{imported}", "{imported}", "a.mcap"], "one recording can be replayed at a time, not 3; name one"),
         (["{imported}", "--speed", "0"], "--speed must be a number above 0, or max, not '0'"),
         (["{imported}", "--speed", "fast"], "--speed must be a number above 0, or max, not 'fast'"),
     ],
@@ -186,9 +184,9 @@ def test_mistakes_end_in_one_sentence(
 
 
 def test_what_is_not_a_number_goes_on_the_wire_as_it_went() -> None:
-    from shearloop.daemon.recording.replay import wire_map_of
+    from shearloop.daemon.recording.replay import restored_wire_map
 
-    on_wire = wire_map_of({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})
+    on_wire = restored_wire_map({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})
     assert on_wire["joints_rad_shape"] == [3]
     np.testing.assert_array_equal(np.frombuffer(on_wire["joints_rad"], "<f4"), np.float32([1.5, np.nan, 2.5]))
     assert on_wire["seq"] == 3

@@ -12,7 +12,7 @@ import zmq.asyncio
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.recording.recorded_run import RecordedRun
+from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.sensing.estimator import Estimator
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import replayed
@@ -48,9 +48,9 @@ async def record(config: Path, stream: Path) -> list[dict[str, Any]]:
             group.create_task(daemon.run())
             play = ("--recording", str(stream), "--once", "--speed", "20", "--link", str(config.parent / "eit-right"))
             async with shearloop("emulate", "eit-kit", *play, stdin=asyncio.subprocess.PIPE):
-                recorder.experiment("first")
+                recorder.record_experiment("first")
                 await until(BEGUN)
-                recorder.experiment("second")
+                recorder.record_experiment("second")
                 await until(ZEROED)
                 right.tare()
                 await until(ENOUGH)
@@ -63,7 +63,7 @@ def test_numbers_zeros_and_tools_of_a_later_file_are_replayed_as_they_were(
 ) -> None:
     live = asyncio.run(record(config(recording={"folder": "recordings"}), recording(tmp_path, 60)))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
-    ((zeroed,),) = RecordedRun(later).asides().tares.values()
+    ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
     assert zeroed >= ZEROED
     held: list[object] = []
     monkeypatch.setattr(Estimator, "hold", lambda _self, tool: held.append(tool))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.recording.export import topics_of
+from shearloop.daemon.recording.export import count_messages
 from tests.daemon.recording.test_replay import measured, replayed
 from tests.daemon.skin.test_skin_run import played
 
@@ -47,7 +47,7 @@ def test_the_skin_s_raw_inputs_give_the_same_forces_again(
 ) -> None:
     live = asyncio.run(recorded(tmp_path, socket=socket))
     (path,) = (tmp_path / "recordings").iterdir()
-    assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(topics_of(path))
+    assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(count_messages(path))
     address = f"ipc://{tmp_path}/replay"
     again, comparison = asyncio.run(replayed(path, math.inf, address))
     assert comparison.different == Counter(), comparison.examples
@@ -60,4 +60,4 @@ def test_the_skin_s_raw_inputs_give_the_same_forces_again(
     assert any("gauge 1 is open" in why for why in reasons)
     assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
     count = comparison.compared["skin.shear"]
-    assert f"skin.shear: {count} of {count} are the same as recorded" in capsys.readouterr().err
+    assert f"skin.shear: {count} of {count} equal the recorded ones" in capsys.readouterr().err

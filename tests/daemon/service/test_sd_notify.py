@@ -29,14 +29,14 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
         yield listening
 
 
-def test_nobody_is_told_where_nobody_listens(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_no_notification_without_a_service_manager(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     assert not notify("READY=1")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
     assert not notify("READY=1")
 
 
-def test_states_arrive_at_a_path_and_at_an_abstract_address(
+def test_states_arrive_at_a_path_and_an_abstract_address(
     manager: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert notify("READY=1", "STATUS=well")
@@ -50,13 +50,13 @@ def test_states_arrive_at_a_path_and_at_an_abstract_address(
         assert abstract.recv(4096) == b"WATCHDOG=1"
 
 
-def test_a_manager_that_does_not_read_keeps_nobody_waiting(manager: socket.socket) -> None:
+def test_a_blocked_manager_does_not_block_the_daemon(manager: socket.socket) -> None:
     # The kernel queues a few datagrams; the daemon must not wait for room.
     assert not all(notify("WATCHDOG=1") for _ in range(2000))
     assert manager.recv(4096) == b"WATCHDOG=1"
 
 
-async def test_the_daemon_says_when_it_is_ready_that_it_lives_and_that_it_ends(
+async def test_the_daemon_notifies_ready_alive_and_stopping(
     manager: socket.socket, config: Callable[..., Path]
 ) -> None:
     async with shearloop("run", str(config())) as daemon:
@@ -69,7 +69,7 @@ async def test_the_daemon_says_when_it_is_ready_that_it_lives_and_that_it_ends(
         said = manager.recv(4096)
 
 
-async def test_the_watchdog_is_fed_only_while_every_task_is_alive(
+async def test_the_watchdog_is_fed_only_while_all_tasks_are_alive(
     manager: socket.socket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(health, "HEALTH_PERIOD_S", 0.0)
@@ -92,7 +92,7 @@ async def test_the_watchdog_is_fed_only_while_every_task_is_alive(
         publisher.close()
 
 
-async def test_a_task_that_ends_by_itself_is_not_dead() -> None:
+async def test_a_finished_task_is_not_dead() -> None:
     supervisor = Supervisor()
 
     async def ends() -> None:
@@ -104,7 +104,7 @@ async def test_a_task_that_ends_by_itself_is_not_dead() -> None:
     assert supervisor.dead == ("other",)
 
 
-def test_memory_that_may_not_be_locked_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_to_lock_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 1000)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (8 << 20, 8 << 20))
     with pytest.raises(UserError, match="needs an unlimited RLIMIT_MEMLOCK, and it is 8192 kB: run `sudo shearloop"):

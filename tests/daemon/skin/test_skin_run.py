@@ -16,7 +16,7 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.synthetic_skin import SyntheticSkin
-from shearloop.drivers.emulators.skin.instruments import SkinInstruments
+from shearloop.drivers.emulators.skin import SkinInstruments
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.test_run import collector, running
 
@@ -35,7 +35,7 @@ class Played:
     def refused_lines(self) -> int:
         skin = self.daemon._skin
         assert skin is not None
-        errors = skin.facts()["errors"]
+        errors = skin.diagnostics()["errors"]
         assert isinstance(errors, Mapping)
         return int(errors.get("not two decimals", 0))
 
@@ -190,7 +190,7 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path)
 
 
 async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shearloop.daemon.sensing.skin_task.ZERO_DEADLINE_S", 0.3)
+    monkeypatch.setattr("shearloop.daemon.sensing.skin_task.ZERO_TIMEOUT_S", 0.3)
     async with played(tmp_path) as bench:
         await bench.valid()
         bench.instruments.command("open 2")
@@ -252,7 +252,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section({"adc": {"device": {"path": "./skin-source"}}})},
-            "`skin.source.serial` and `skin.daq.adc.device` are both the port skin-source; each device has its own",
+            "`skin.source.serial` and `skin.daq.adc.device` are both the port skin-source; each device needs its own",
         ),
         (
             {"skin": section(SCANNER, source=SOCKET)},
@@ -264,7 +264,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section(ADC, tool_radius_mm=None), "robot": ROBOT, "experiment": HOLDS},
-            "`drive: skin` has no torque without a radius: add `skin.tool_radius_mm`, or take another",
+            "`torque_source: skin` has no torque without a radius: add `skin.tool_radius_mm`, or choose another",
         ),
         ({"skin": section(ADC, calibration="none.yaml")}, "none.yaml: the calibration cannot be read: No such file"),
         ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),

@@ -135,7 +135,6 @@ MESSAGES: Mapping[str, Mapping[str, Any]] = {
         "diameter_mm": 19.68,
         "diameter_std_mm": 3.04,
         "current_ma": 270.0,
-        "current_age_s": 0.0,
         "object": "contact closing",
         "fault": 0,
         "fault_text": "",

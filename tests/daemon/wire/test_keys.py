@@ -144,7 +144,7 @@ async def _stop_without_a_key(daemon: Daemon, connect: Callable[..., Any]) -> No
     anyone = connect(zmq.DEALER, address_of(daemon._open_stop._socket), None)
     for name in ("start", "resume", "unlock", "tare", "pause"):
         await anyone.send(encode({"command": name}))
-        assert "this needs a key" in decode(await anyone.recv())["reason"]
+        assert "this command needs a key" in decode(await anyone.recv())["reason"]
     await anyone.send(encode({"command": "stop"}))
     assert decode(await anyone.recv())["ok"]
     await daemon.stopped()
@@ -184,10 +184,10 @@ def test_keys_are_made_once_shown_and_taken_back(keys: Path, capsys: pytest.Capt
     assert main(["keys", "allow", str(folder / "server.key"), "--name", "../eve", "--dir", str(folder)]) == 2
     assert "is not a client's name" in capsys.readouterr().err
     assert main(["keys", "revoke", "eve", "--dir", str(folder)]) == 2
-    assert "there is no client 'eve'; allowed is ada" in capsys.readouterr().err
+    assert "there is no client 'eve'; the allowed clients are ada" in capsys.readouterr().err
     assert main(["keys", "revoke", "ada", "--dir", str(folder)]) == 0
     assert main(["keys", "list", "--dir", str(folder)]) == 0
-    assert "nobody may connect yet" in capsys.readouterr().out
+    assert "no client may connect yet" in capsys.readouterr().out
 
 
 def test_a_damaged_key_is_a_sentence(keys: Path) -> None:

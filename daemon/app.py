@@ -19,7 +19,7 @@ from shearloop.daemon.commands import Commands, required_rig
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.health import Diagnostics, HealthReporter
+from shearloop.daemon.health import TaskFacts, HealthReporter
 from shearloop.daemon.logs import log_link
 from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
@@ -96,7 +96,7 @@ class Daemon:
                 self._clock,
                 sources,
                 self._tare_to_the_end,
-                self.supervisor.dead_tasks,
+                self.supervisor.deaths,
                 self._tap,
                 diameters.at,
             )
@@ -163,9 +163,9 @@ class Daemon:
     def _make_health(self) -> HealthReporter:
         health = HealthReporter(self.publisher, self.supervisor, self._clock)
         for name, task in self._fingertips.items():
-            health.add(name, task.facts)
+            health.add(name, task.diagnostics)
         if self._both is not None:
-            health.add(COMBINED, self._both.facts)
+            health.add(COMBINED, self._both.diagnostics)
         if self._skin is not None:
             health.add(SKIN, self._skin.diagnostics)
             health.add(SKIN_SOURCE, self._skin.source_diagnostics)
@@ -300,7 +300,7 @@ class Daemon:
     def _on_link(self, device: str) -> Callable[[LinkEvent], None]:
         return self._rig.on_link(device) if self._rig is not None else partial(log_link, device)
 
-    def _command_facts(self) -> Diagnostics:
+    def _command_facts(self) -> TaskFacts:
         """Return the numbers of refused commands and clients, by kind."""
         refused = self._commands.refused.copy()
         for other in (self._gate, self._open_stop):
@@ -351,7 +351,7 @@ def _board(
 async def run_daemon(
     config: DaemonConfig,
     listeners: tuple[Listener, ...] = (),
-    facts: Mapping[str, Callable[[], Diagnostics]] = MappingProxyType({}),
+    facts: Mapping[str, Callable[[], TaskFacts]] = MappingProxyType({}),
     on_ready: Callable[[], None] = lambda: None,
 ) -> bool:
     """Run a daemon until SIGINT, SIGTERM, SIGHUP or the command `stop`; return whether it ended as planned.

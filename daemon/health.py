@@ -1,10 +1,11 @@
-"""Publishes `health` once a second: the state of the process and of each task."""
+"""Publishes the health of the process and of each task once a second."""
 
 import asyncio
 import os
 import resource
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from shearloop.daemon.clock import Clock
@@ -14,40 +15,53 @@ from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import Supervisor
 
 HEALTH_PERIOD_S = 1.0
-Diagnostics = Mapping[str, Scalar | Mapping[str, int]]
+TaskFacts = Mapping[str, Scalar | Mapping[str, int]]
+
+
+@dataclass(slots=True)
+class _Usage:
+    """Measures the CPU use since the last message."""
+
+    cpu_s: float
+    at_s: float
+
+    def percent_since(self) -> float:
+        cpu_s, at_s = time.process_time(), time.monotonic()
+        percent = 100.0 * (cpu_s - self.cpu_s) / max(at_s - self.at_s, 1e-9)
+        self.cpu_s, self.at_s = cpu_s, at_s
+        return percent
 
 
 class HealthReporter:
-    """Collects the diagnostics of all tasks and publishes them."""
+    """Collects the supervisor's records and the tasks' own counters, and publishes them."""
 
     def __init__(self, publisher: Publisher, supervisor: Supervisor, clock: Clock) -> None:
         self._publisher = publisher
         self._supervisor = supervisor
         self._clock = clock
-        self._diagnostics: dict[str, Callable[[], Diagnostics]] = {}
+        self._facts: dict[str, Callable[[], TaskFacts]] = {}
 
-    def add(self, name: str, diagnostics: Callable[[], Diagnostics]) -> None:
-        """Add the diagnostics of a task (frames, errors by kind, rates) to every message."""
-        self._diagnostics[name] = diagnostics
+    def add(self, name: str, facts: Callable[[], TaskFacts]) -> None:
+        """Add a function that returns a task's counters (frames, errors by kind, rate); called for every message."""
+        self._facts[name] = facts
 
-    def tasks(self) -> dict[str, Diagnostics]:
-        """Return the present diagnostics of each task."""
-        gathered: dict[str, Diagnostics] = {
-            name: {
+    def tasks(self) -> dict[str, TaskFacts]:
+        """Return the present state of each task."""
+        gathered: dict[str, TaskFacts] = {}
+        for name, record in self._supervisor.records.items():
+            gathered[name] = {
                 "alive": record.alive,
                 "done": record.done,
                 "restarts": record.restarts,
                 "last_error": record.last_error,
             }
-            for name, record in self._supervisor.records.items()
-        }
-        for name, diagnostics in self._diagnostics.items():
-            gathered[name] = {**gathered.get(name, {}), **diagnostics()}
+        for name, facts in self._facts.items():
+            gathered[name] = {**gathered.get(name, {}), **facts()}
         return gathered
 
     async def run(self) -> None:
         """Publish once a second until cancelled."""
-        cpu_s, at_s = time.process_time(), time.monotonic()
+        usage = _Usage(time.process_time(), time.monotonic())
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         while True:
@@ -55,11 +69,10 @@ class HealthReporter:
             await asyncio.sleep(max(0.0, due_s - loop.time()))
             lag_s = loop.time() - due_s
             if lag_s > HEALTH_PERIOD_S:
-                # One late message after a long stall, not a burst.
+                # After a long stall, send one late message instead of a burst.
                 due_s = loop.time()
             self._clock.synchronise()
             self._notify_systemd()
-            (cpu_before_s, before_s), (cpu_s, at_s) = (cpu_s, at_s), (time.process_time(), time.monotonic())
             self._publisher.publish(
                 Health(
                     source="daemon",
@@ -67,20 +80,21 @@ class HealthReporter:
                     tasks=self.tasks(),
                     loop_lag_s=lag_s,
                     memory_mb=resident_memory_mb(),
-                    cpu_percent=100.0 * (cpu_s - cpu_before_s) / max(at_s - before_s, 1e-9),
+                    cpu_percent=usage.percent_since(),
                 )
             )
 
     def _notify_systemd(self) -> None:
-        """Feed systemd's watchdog unless a task is dead."""
-        if dead := self._supervisor.dead_tasks():
+        """Feed systemd's watchdog unless a task is dead; a task that stays dead ends the service."""
+        dead = self._supervisor.dead
+        if dead:
             notify(f"STATUS=dead, restarting: {', '.join(dead)}")
         else:
             notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
 
 
 def resident_memory_mb() -> float:
-    """Return the resident memory of this process in megabytes (the peak on systems without /proc)."""
+    """Return the resident memory of this process in megabytes (the peak, if the system reports no more)."""
     statistics = Path("/proc/self/statm")
     if statistics.exists():
         return int(statistics.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

@@ -1,6 +1,6 @@
-"""Summarises an experiment from the daemon's messages, as lines of text for its end.
+"""The summary of an experiment, printed at its end and made from the daemon's own messages.
 
-On an emulated rig the summary includes the true torque and the injected disturbances.
+An emulated rig adds the true torque and the disturbances.
 """
 
 from collections import Counter
@@ -15,22 +15,22 @@ from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 
 # A torque within this share of the set point counts as held.
 BAND = 0.10
-# A torque is back after a disturbance once it stays in the band for this time.
+# A torque has recovered from a disturbance when it stays in the band for this time.
 STAYS_S = 1.0
-# Topics whose messages carry a torque.
+# Topics with a torque.
 TORQUES = ("eit.estimate", "load.torque", "skin.shear")
-_ENDS = ("done", "stopped")
+_MOVING, _ENDS = "running", ("done", "stopped")
 
 
 @dataclass(frozen=True, slots=True)
 class TorqueSeries:
-    """Torques over time: stamps in ns (CLOCK_MONOTONIC) and N·m, both (n,)."""
+    """A torque over time: ns of CLOCK_MONOTONIC and N·m, both (n,)."""
 
     t_ns: FloatArray
     torque_nm: FloatArray
 
     def between(self, from_ns: float, to_ns: float) -> "TorqueSeries":
-        """Return the part between two times."""
+        """Return the part within a time interval."""
         inside = (self.t_ns >= from_ns) & (self.t_ns <= to_ns)
         return TorqueSeries(self.t_ns[inside], self.torque_nm[inside])
 
@@ -43,9 +43,8 @@ class _Step:
     to_ns: int
     holds: int = 0
     set_point_nm: float | None = None
-    # The beginning of the hold in closed loop.
+    # The first message of the closed loop that holds.
     held_from_ns: int | None = None
-    # The wrist's angle at the step's beginning and end.
     wrist_from_rad: float | None = None
     wrist_to_rad: float | None = None
 
@@ -53,7 +52,7 @@ class _Step:
 @dataclass(slots=True)
 class _Run:
     name: str
-    torque_source: str
+    driving: str
     steps_planned: int
     from_ns: int
     tool_mm: float | None
@@ -69,26 +68,26 @@ class _Run:
 
 
 class RunSummary:
-    """A listener that calls `output` with the lines of a summary at the end of each experiment."""
+    """Collects every message of a daemon and passes the summary's lines to `on_summary` when an experiment ends."""
 
     def __init__(
         self,
-        output: Callable[[Sequence[str]], object],
-        truth: Callable[[], TorqueSeries | None] = lambda: None,
-        events: Callable[[], Sequence[tuple[int, str]]] = tuple,
+        on_summary: Callable[[Sequence[str]], object],
+        true_torque: Callable[[], TorqueSeries | None] = lambda: None,
+        disturbances: Callable[[], Sequence[tuple[int, str]]] = tuple,
     ) -> None:
-        """`truth` returns an emulated rig's true torque, `events` its disturbances (time in ns, command)."""
-        self._output = output
-        self._truth = truth
-        self._events = events
+        """Take sources of the true torque and of disturbances (time in ns, description), for an emulated rig."""
+        self._on_summary = on_summary
+        self._true_torque = true_torque
+        self._disturbances = disturbances
         self._run: _Run | None = None
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Take one message."""
+        """Handle one message."""
         if topic == "loop.state":
             self._on_loop_state(content)
         elif self._run is not None:
-            _add_measurement(self._run, topic, content)
+            self._on_sample(self._run, topic, content)
 
     def _on_loop_state(self, content: Mapping[str, Any]) -> None:
         run, phase = self._run, content["phase"]
@@ -97,32 +96,31 @@ class RunSummary:
         if run is None:
             named = content["experiment"], content["torque_source"], content["steps"]
             run = self._run = _Run(*named, content["t_mono_ns"], content["tool_mm"])
-        _add_status(run, content)
+        _update(run, content)
         if phase in _ENDS:
             self._run = None
-            self._output(tuple(_lines(run, phase, self._truth(), self._events())))
+            self._on_summary(tuple(_lines(run, phase, self._true_torque(), self._disturbances())))
+
+    def _on_sample(self, run: _Run, topic: str, content: Mapping[str, Any]) -> None:
+        source, gripped = content["source"], run.steps and run.steps[-1].holds
+        if topic == "robot.state" and run.steps:
+            step = run.steps[-1]
+            step.wrist_to_rad = content["wrist_rad"]
+            step.wrist_from_rad = step.wrist_to_rad if step.wrist_from_rad is None else step.wrist_from_rad
+        if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
+            run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
+        elif topic in TORQUES and not content.get("valid", True):
+            run.invalid[source] += 1
+        if topic in ("eit.estimate", "gripper.state") and gripped and content.get("diameter_mm") is not None:
+            run.diameters.setdefault(source, []).append(content["diameter_mm"])
 
 
-def _add_measurement(run: _Run, topic: str, content: Mapping[str, Any]) -> None:
-    source, gripped = content["source"], run.steps and run.steps[-1].holds
-    if topic == "robot.state" and run.steps:
-        step = run.steps[-1]
-        step.wrist_to_rad = content["wrist_rad"]
-        step.wrist_from_rad = step.wrist_to_rad if step.wrist_from_rad is None else step.wrist_from_rad
-    if topic in TORQUES and content.get("torque_nm") is not None and content.get("valid", True):
-        run.torques.setdefault(source, []).append((content["t_mono_ns"], content["torque_nm"]))
-    elif topic in TORQUES and not content.get("valid", True):
-        run.invalid[source] += 1
-    if topic in ("eit.estimate", "gripper.state") and gripped and content.get("diameter_mm") is not None:
-        run.diameters.setdefault(source, []).append(content["diameter_mm"])
-
-
-def _add_status(run: _Run, content: Mapping[str, Any]) -> None:
+def _update(run: _Run, content: Mapping[str, Any]) -> None:
     now_ns = content["t_mono_ns"]
     if run.last is not None and run.last["phase"] == "held":
         run.held_s += (now_ns - run.last["t_mono_ns"]) / 1e9
     if content["response"] == "hold" and (run.last is None or run.last["response"] != "hold"):
-        # The fault without its numbers.
+        # The reason without its numbers.
         run.hold_reasons[content["reasons"].split(":")[0].rstrip(".")] += 1
     if "a command was refused" in content["reasons"]:
         run.refused[content["reasons"]] += 1
@@ -145,24 +143,24 @@ def _add_status(run: _Run, content: Mapping[str, Any]) -> None:
         run.identified = (content["stiffness_nm_per_rad"], content["delay_s"], content["noise_nm"])
 
 
-def _lines(run: _Run, phase: str, truth: TorqueSeries | None, events: Sequence[tuple[int, str]]) -> Iterator[str]:
+def _lines(run: _Run, phase: str, truth: TorqueSeries | None, disturbances: Sequence[tuple[int, str]]) -> Iterator[str]:
     end_ns = run.last["t_mono_ns"] if run.last is not None else run.from_ns
     ended = "done" if phase == "done" else "STOPPED before its end"
-    yield f"Summary: {run.name!r} was {ended}, after {(end_ns - run.from_ns) / 1e9:.0f} s."
+    yield f"What happened: {run.name!r} was {ended}, after {(end_ns - run.from_ns) / 1e9:.0f} s."
     if run.last is not None and phase != "done":
         yield f"  {run.last['activity']}"
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
-        yield f"  step {step.number} of {run.steps_planned}  {step.name:<12} {took_s:6.1f} s{_note(step, run)}"
+        yield f"  step {step.number} of {run.steps_planned}  {step.name:<12} {took_s:6.1f} s{_details(step, run)}"
         if step.set_point_nm is not None and step.held_from_ns is not None:
-            disturbances = [event for event in events if step.from_ns <= event[0] <= step.to_ns]
-            yield from _hold_lines(step, step.set_point_nm, step.held_from_ns, run, truth, disturbances)
+            here = [event for event in disturbances if step.from_ns <= event[0] <= step.to_ns]
+            yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here)
         if step.name == "tighten":
-            yield from _turn_lines(step, run, truth)
-    yield from _total_lines(run)
+            yield from _turned(step, run, truth)
+    yield from _counted(run)
 
 
-def _note(step: _Step, run: _Run) -> str:
+def _details(step: _Step, run: _Run) -> str:
     if step.name == "identify" and run.identified is not None:
         stiffness, delay_s, noise_nm = run.identified
         return f"   stiffness {stiffness:.3f} N·m/rad, delay {delay_s:.2f} s, noise of one torque {noise_nm:.4f} N·m"
@@ -171,27 +169,27 @@ def _note(step: _Step, run: _Run) -> str:
     return ""
 
 
-def _turn_lines(step: _Step, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
+def _turned(step: _Step, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
     if step.wrist_from_rad is not None and step.wrist_to_rad is not None:
-        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {run.torque_source}"
-    for name, series in _series(run, truth).items():
+        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {run.driving}"
+    for name, series in _all_torques(run, truth).items():
         turning = series.between(step.from_ns, step.to_ns).torque_nm
-        if turning.size and name in ("the truth", run.torque_source):
+        if turning.size and name in ("true", run.driving):
             largest_nm = turning[np.abs(turning).argmax()]
             yield f"    {name:<10} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at most"
 
 
-def _series(run: _Run, truth: TorqueSeries | None) -> dict[str, TorqueSeries]:
+def _all_torques(run: _Run, truth: TorqueSeries | None) -> dict[str, TorqueSeries]:
     sources = {name: TorqueSeries(*map(np.array, zip(*values, strict=True))) for name, values in run.torques.items()}
-    return sources if truth is None else {"the truth": truth, **sources}
+    return sources if truth is None else {"true": truth, **sources}
 
 
-def _hold_lines(
+def _held(
     step: _Step, set_nm: float, from_ns: int, run: _Run, truth: TorqueSeries | None, disturbances: list[tuple[int, str]]
 ) -> Iterator[str]:
     held_s = (step.to_ns - from_ns) / 1e9
-    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {run.torque_source}"
-    sources = _series(run, truth)
+    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {run.driving}"
+    sources = _all_torques(run, truth)
     for name, series in sources.items():
         held = series.between(from_ns, step.to_ns).torque_nm
         if held.size:
@@ -200,23 +198,27 @@ def _hold_lines(
                 f"    {name:<10} {held.mean():+.4f} N·m on average, ± {held.std():.4f}, "
                 f"within ± {BAND:.0%} for {share:.0%} of the time"
             )
-    # Judged by another source than the driving one: the truth, else the load cell.
-    names = sorted(set(sources) - {run.torque_source}, key=lambda name: (name != "the truth", name != LOAD_CELL, name))
+    # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
+    names = sorted(set(sources) - {run.driving}, key=lambda name: (name != "true", name != LOAD_CELL, name))
     if not names:
         return
     judge = sources[names[0]]
-    if (reached_s := _settled_s(judge.between(step.from_ns, step.to_ns), step.from_ns, set_nm)) is not None:
-        yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point was given, by {names[0]}"
-    for t_ns, command in disturbances:
+    if (reached_s := _recovery_s(judge.between(step.from_ns, step.to_ns), step.from_ns, set_nm)) is not None:
+        yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {names[0]}"
+    for t_ns, description in disturbances:
         after = judge.between(t_ns, step.to_ns)
         if after.torque_nm.size:
-            back_s, worst_nm = _settled_s(after, t_ns, set_nm), float(np.abs(after.torque_nm - set_nm).max())
-            back = f"back within ± {BAND:.0%} after {back_s:.1f} s" if back_s is not None else "not back by the end"
-            yield f"    disturbed after {(t_ns - from_ns) / 1e9:.1f} s ({command}): {worst_nm:.3f} N·m off, {back}"
+            recovery_s, worst_nm = _recovery_s(after, t_ns, set_nm), float(np.abs(after.torque_nm - set_nm).max())
+            back = (
+                f"back within ± {BAND:.0%} after {recovery_s:.1f} s"
+                if recovery_s is not None
+                else "not back by the end"
+            )
+            yield f"    disturbed after {(t_ns - from_ns) / 1e9:.1f} s ({description}): {worst_nm:.3f} N·m off, {back}"
 
 
-def _settled_s(series: TorqueSeries, since_ns: float, set_nm: float) -> float | None:
-    """Return the time after which the torque stays in the band, or None."""
+def _recovery_s(series: TorqueSeries, since_ns: float, set_nm: float) -> float | None:
+    """Return the time until the torque enters the band and stays there; None if it does not."""
     inside = np.abs(series.torque_nm - set_nm) <= BAND * abs(set_nm)
     seen = series.t_ns <= series.t_ns[-1:] - STAYS_S * 1e9
     for at in np.flatnonzero(inside & seen):
@@ -226,9 +228,9 @@ def _settled_s(series: TorqueSeries, since_ns: float, set_nm: float) -> float | 
     return None
 
 
-def _total_lines(run: _Run) -> Iterator[str]:
+def _counted(run: _Run) -> Iterator[str]:
     if run.tool_mm is not None:
-        yield f"  the tool has {run.tool_mm:g} mm, according to the experiment"
+        yield f"  tool diameter {run.tool_mm:g} mm, from the experiment"
     for source, values in run.diameters.items():
         yield f"  diameter by {source}: {np.mean(values):.1f} mm ± {np.std(values):.1f} of one reading"
     total = sum(run.hold_reasons.values())
@@ -240,8 +242,8 @@ def _total_lines(run: _Run) -> Iterator[str]:
     for source, count in run.invalid.items():
         # A source without any torque has another purpose.
         if source in run.torques:
-            of = count + len(run.torques[source])
-            yield f"  {count} of {of} torques of {source} were not valid and not used, as during a tare"
+            total = count + len(run.torques[source])
+            yield f"  {count} of {total} torques of {source} were not valid and not used"
     if run.refused:
         for reason, count in run.refused.most_common():
             yield f"  {count} times {reason}"

@@ -60,8 +60,8 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
     assert "stiffness 0.750 N·m/rad, delay 0.80 s" in text
     assert "right      +0.0980 N·m on average" in text
     # 5.5 of 30 s were out of the band.
-    assert "the truth  +0.0945 N·m on average, ± 0.0116, within ± 10% for 82% of the time" in text
-    assert "within ± 10% 3.0 s after the set point was given, by the truth" in text
+    assert "true       +0.0945 N·m on average, ± 0.0116, within ± 10% for 82% of the time" in text
+    assert "within ± 10% 3.0 s after the set point changed, by true" in text
     assert "disturbed after 12.0 s (kick -0.03): 0.030 N·m off, back within ± 10% after 5.5 s" in text
     assert "1 of 61 torques of right were not valid" in text
     assert "the wrist was never held" in text
@@ -69,7 +69,7 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
 
 
 def test_without_a_truth_nothing_is_said_of_it() -> None:
-    assert "truth" not in told(None, [])
+    assert "true" not in told(None, [])
 
 
 def test_a_tool_that_the_experiment_names_is_told() -> None:
@@ -77,8 +77,8 @@ def test_a_tool_that_the_experiment_names_is_told() -> None:
     summary = RunSummary(lines.extend)
     for phase in ("running", "done"):
         summary("loop.state", loop_state(0, tool_mm=20.0, phase=phase))
-    assert "  the tool has 20 mm, according to the experiment" in lines
-    assert "the tool has" not in told(None, [])
+    assert "  tool diameter 20 mm, from the experiment" in lines
+    assert "tool diameter" not in told(None, [])
 
 
 def test_a_disturbance_that_is_not_overcome_is_said_to_be_none() -> None:
@@ -103,7 +103,7 @@ def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[
             reading = {"source": source, "t_mono_ns": round(t_s * S), "torque_nm": torque_nm, "valid": True}
             summary("eit.estimate", reading)
     summary("loop.state", loop_state(20, phase="done"))
-    assert f"    within ± 10% 3.0 s after the set point was given, by {judge}" in lines
+    assert f"    within ± 10% 3.0 s after the set point changed, by {judge}" in lines
 
 
 def test_holds_and_refusals_are_counted_by_their_kind() -> None:
@@ -125,7 +125,7 @@ def test_an_experiment_that_was_stopped_says_why() -> None:
     summary = RunSummary(lines.extend)
     summary("loop.state", loop_state(0))
     summary("loop.state", loop_state(5, phase="stopped", activity="the operator said stop"))
-    assert lines[:2] == ["Summary: 'hold' was STOPPED before its end, after 5 s.", "  the operator said stop"]
+    assert lines[:2] == ["What happened: 'hold' was STOPPED before its end, after 5 s.", "  the operator said stop"]
 
 
 @pytest.mark.parametrize("phase", ["done", "stopped", "idle"])
@@ -147,5 +147,5 @@ def test_where_a_screw_ended_and_what_it_took_is_told() -> None:
     summary("loop.state", loop_state(12.1, phase="done", **turning))
     told = "\n".join(lines)
     assert "    turned by -0.500 rad; torque source: load_cell" in told
-    assert "    the truth  -0.1190 N·m at the end, -0.1800 at most" in told
+    assert "    true       -0.1190 N·m at the end, -0.1800 at most" in told
     assert "    load_cell  -0.1210 N·m at the end, -0.1760 at most" in told

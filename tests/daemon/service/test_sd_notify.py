@@ -96,12 +96,12 @@ async def test_a_finished_task_is_not_dead() -> None:
     supervisor = Supervisor()
 
     async def ends() -> None:
-        assert supervisor.dead_tasks() == {}
+        assert supervisor.dead == ()
 
     await supervisor.keep_running("experiment", ends)
-    assert supervisor.dead_tasks() == {}
+    assert supervisor.dead == ()
     supervisor.records["other"] = TaskRecord("other")
-    assert list(supervisor.dead_tasks()) == ["other"]
+    assert supervisor.dead == ("other",)
 
 
 def test_failing_to_lock_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -65,8 +65,9 @@ class Command:
 class Gripper:
     """One gripper. Servers write `command` and read the status; `step` moves the fingers.
 
-    `between` returns the width in mm of an object that stops closing fingers with a given force in N, or None; `around` does so for opening fingers. The next step takes up commands: until then the status
-    belongs to the motion before, as on the real gripper.
+    `between` returns the width in mm of an object that stops closing fingers with a given force in N, or None; `around`
+    does so for opening fingers. The next step takes up commands: until then the status belongs to the motion before, as
+    on the real gripper.
     """
 
     def __init__(

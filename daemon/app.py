@@ -163,9 +163,9 @@ class Daemon:
     def _make_health(self) -> HealthReporter:
         health = HealthReporter(self.publisher, self.supervisor, self._clock)
         for name, task in self._fingertips.items():
-            health.add(name, task.facts)
+            health.add(name, task.diagnostics)
         if self._both is not None:
-            health.add(COMBINED, self._both.facts)
+            health.add(COMBINED, self._both.diagnostics)
         if self._skin is not None:
             health.add(SKIN, self._skin.diagnostics)
             health.add(SKIN_SOURCE, self._skin.source_diagnostics)

@@ -58,7 +58,7 @@ class CombinedFingertipTask:
                 self._room.set()
             await self.estimation.finish(taken)
 
-    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the estimates."""
         return {
             "expected_hz": 1.0 / self._period_s,

@@ -68,7 +68,7 @@ class FingertipTask:
             taken = await self._backlog.get()
             await self._publish_heatmap(taken.frames[0], await self.estimation.finish(taken))
 
-    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return what health tells of the board and the estimates."""
         facts = self._board.diagnostics()
         return {

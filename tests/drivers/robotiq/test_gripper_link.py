@@ -77,7 +77,7 @@ async def test_it_comes_back_by_itself_and_says_so(way: str, tmp_path: Path) -> 
         second = await coming
         assert second.t_ns >= lost_ns
         assert second.seq > first.seq
-        openings = rig.driver.diagnostics()["openings"]
+        openings = rig.driver.diagnostics()["connections"]
         assert openings == 2
         ups = [event.up for event in rig.events]
         assert ups[0]

@@ -55,7 +55,7 @@ def check_recordings(disk: Path, torques: int) -> None:
     assert sum(found) >= torques
 
 
-async def test_a_full_disk_refuses_the_next_experiment_and_the_running_one_goes_on(
+async def test_a_full_disk_refuses_only_the_next_experiment(
     recorded_rig: Path, tiny_bank: Path, tmp_path: Path, small_disk: Path
 ) -> None:
     async with running_rig(recorded_rig, tiny_bank) as (_, watcher, _fault, command):

@@ -68,7 +68,7 @@ def twists(tmp_path_factory: pytest.TempPathFactory) -> Twists:
     return Twists(boards, calibrations)
 
 
-async def test_pairs_follow_from_the_order_of_arrival_and_boards_wait_while_too_many_are_left() -> None:
+async def test_pairs_follow_the_order_of_arrival() -> None:
     """What the estimator has not caught up with changes no pair: so a replay, which never waits, finds the same."""
     go_on, all_estimated, estimated, number = asyncio.Event(), asyncio.Event(), [], 0
 
@@ -84,7 +84,7 @@ async def test_pairs_follow_from_the_order_of_arrival_and_boards_wait_while_too_
         both.take("right", SimpleNamespace(t_mid_ns=number * 10**9))
         both.take("left", SimpleNamespace(t_mid_ns=number * 10**9 + 1))
         number += 1
-    assert both.facts()["backlog"] == LARGEST_BACKLOG
+    assert both.diagnostics()["backlog"] == LARGEST_BACKLOG
     reading_on = asyncio.create_task(both.room())
     go_on.set()
     async with asyncio.timeout(DEADLINE_S):
@@ -132,7 +132,7 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
 
 
 @pytest.mark.real_time
-def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
+def test_combined_fingertips_are_replayed_at_any_speed(
     config: Callable[..., Path], tiny_bank: Path, twists: Twists, tmp_path: Path
 ) -> None:
     fingertips = {

@@ -4,8 +4,6 @@ import asyncio
 import errno
 import io
 import os
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -152,19 +150,7 @@ def test_drops_are_counted_in_their_own_file(tmp_path: Path) -> None:
     assert [summarise(path).dropped for path in recorder.finished] == [dropped, later, 0]
 
 
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=64k", "tmpfs", folder], check=False, capture_output=True
-    )
-    if mounted.returncode:
-        pytest.skip("a small file system can be mounted by root alone, and not in every container")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
-
-
+@pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
 async def test_a_real_full_disk_is_reported_and_the_file_can_be_repaired(small_disk: Path, tmp_path: Path) -> None:
     clock = Clock()
     why: list[str] = []

@@ -19,7 +19,7 @@ from shearloop.daemon.commands import Commands, required_rig
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.health import TaskFacts, HealthReporter
+from shearloop.daemon.health import HealthReporter, TaskFacts
 from shearloop.daemon.logs import log_link
 from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer

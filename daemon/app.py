@@ -74,7 +74,7 @@ class Daemon:
             if self._recorder is not None:
                 opened.callback(self._recorder.close)
             self._connect(estimators, combined, sources)
-            commands = Commands(
+            self.commands = Commands(
                 rig=self._rig,
                 tares=self._tares,
                 fingertips=self._fingertips,
@@ -84,12 +84,12 @@ class Daemon:
                 tasks=self.health.tasks,
                 stop=self.stop,
             )
-            self._commands = CommandServer(context, config.commands, commands.handlers(), keys)
+            self._commands = CommandServer(context, config.commands, self.commands.handlers(), keys)
             opened.callback(self._commands.close)
             self._open_stop: CommandServer | None = None
             if "commands" in config.network_addresses:
                 address = local_stop_address(config.commands)
-                self._open_stop = CommandServer(context, address, commands.open_handlers())
+                self._open_stop = CommandServer(context, address, self.commands.open_handlers())
                 opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
         self._add_service_tasks()

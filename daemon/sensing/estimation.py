@@ -12,7 +12,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimator import Reading
 from shearloop.daemon.sensing.opening import AnyEstimator
 from shearloop.daemon.sensing.tool_diameter import HearDiameter, as_text, unheard, unknown
-from shearloop.daemon.waiting import Waiting
+from shearloop.daemon.waiters import Waiters
 from shearloop.drivers.eit_kit import Frame
 from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
 
@@ -75,7 +75,7 @@ class EstimatorTask:
         self._tool: Measured | None = None
         # Since when a new homogeneous frame is wanted, until it is begun.
         self._tare_since_ns: int | None = None
-        self._waiting = Waiting()
+        self._waiting = Waiters()
 
     def tare(self) -> None:
         """Take a new homogeneous frame, beginning with the first frame that is measured from now on.
@@ -148,7 +148,7 @@ class EstimatorTask:
         self._publish(frames, reading)
         self.count += 1
         if self._waiting and self._tare_since_ns is None and self.estimator.baseline_complete:
-            self._waiting.tell("")
+            self._waiting.notify("")
 
     def _publish(self, frames: tuple[Frame, ...], reading: Reading) -> None:
         torque, now_ns = reading.torque_nm, self._clock.now_ns()

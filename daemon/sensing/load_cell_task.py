@@ -9,7 +9,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.waiting import Waiting
+from shearloop.daemon.waiters import Waiters
 from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 LOAD_CELL = "load_cell"
@@ -42,7 +42,7 @@ class LoadCellTask:
         self._zeroing: list[float] | None = None
         self._zero_from_ns = self._zero_until_ns = 0
         self._zero_error = ""
-        self._zero_waiters = Waiting()
+        self._zero_waiters = Waiters()
         self._reason = ""
 
     async def read(self) -> None:
@@ -100,7 +100,7 @@ class LoadCellTask:
         if len(self._zeroing) == ZERO_SAMPLES:
             self._board.tare(sum(self._zeroing) / ZERO_SAMPLES)
             self._zeroing = None
-            self._zero_waiters.tell("")
+            self._zero_waiters.notify("")
 
 
 def load_message(sample: LoadSample) -> LoadTorque:

@@ -2,8 +2,7 @@
 
 from dataclasses import dataclass
 
-from shearloop.daemon.control.controller import WristCommand
-from shearloop.daemon.control.history import AngleHistory
+from shearloop.daemon.control.controller import AngleHistory, WristCommand
 
 
 @dataclass(slots=True, kw_only=True)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.plant import Plant, Sample
 from shearloop.daemon.control.controller import WristCommand
-from shearloop.daemon.control.excitation import ExciteSettings, StiffnessExcitation
+from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation
 
 
 class Loop(Protocol):
@@ -51,7 +51,6 @@ def run(
 ) -> Trace:
     """Close the loop for a time, or until the torque leaves the bound; `keep` drops measurements by their number."""
     rows = []
-    command: WristCommand | None = None
     end_s, count = plant.t_s + duration_s, 0
     while plant.t_s < end_s and abs(plant.torque_nm) <= bound_nm:
         now_ns = nanoseconds(plant.t_s)
@@ -59,9 +58,7 @@ def run(
             if keep(sample, count):
                 loop.measure(sample.torque_nm, nanoseconds(sample.t_mid_s), now_ns)
             count += 1
-        # What is not told changes nothing: the robot's process goes on as it was commanded.
-        if plant.tells() or command is None:
-            command = loop.command(now_ns, plant.angle_rad)
+        command = loop.command(now_ns, plant.angle_rad)
         plant.step(command.speed_rad_per_s)
         rows.append((plant.t_s, plant.torque_nm, plant.angle_rad, command.holds))
     table = np.array(rows, dtype=float)
@@ -70,12 +67,10 @@ def run(
 
 def identify_on(plant: Plant, settings: ExciteSettings) -> StiffnessExcitation:
     """Run the identification step on a plant to its end."""
-    step, speed_rad_per_s = StiffnessExcitation(settings), 0.0
+    step = StiffnessExcitation(settings)
     while not step.done:
         now_ns = nanoseconds(plant.t_s)
         for sample in plant.collect():
             step.measure(sample.torque_nm, nanoseconds(sample.t_mid_s), now_ns)
-        if plant.tells():
-            speed_rad_per_s = step.command(now_ns, plant.angle_rad)
-        plant.step(speed_rad_per_s)
+        plant.step(step.command(now_ns, plant.angle_rad))
     return step

@@ -9,15 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from numpy.typing import NDArray
 
 from benchmarks.closed_loop import Trace
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS
 
 mpl.use("Agg")
 mpl.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "savefig.dpi": 130})
 
-FloatArray = NDArray[np.float64]
 _PERIOD_S = 0.008
 _TOP = 2.4
 _INK, _MIDDLE, _PALE = "0.05", "0.55", "0.85"

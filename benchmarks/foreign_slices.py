@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation import EstimatorSession, FrameSeries, Name, Physics, fit
@@ -23,7 +24,7 @@ from shearloop.bank.estimation.grip_segmentation import gripped_part
 from shearloop.daemon.analysis.charts.detectability import ORIGINS
 from shearloop.daemon.analysis.charts.faults import Spoilt
 from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of
-from shearloop.daemon.analysis.charts.stability import BROKEN_SHARE, Floats, estimates_of
+from shearloop.daemon.analysis.charts.stability import BROKEN_SHARE, estimates_of
 from shearloop.daemon.analysis.series import read_series, series_of
 from shearloop.daemon.recording.importing import import_mat
 from shearloop.daemon.recording.reader import read_recording
@@ -69,8 +70,8 @@ class Counted:
 
 
 def foreign_frames(
-    later: Floats, fingertips: Mapping[str, Floats], cylinders: FrameSeries
-) -> Iterator[tuple[str, str, Floats]]:
+    later: FloatArray, fingertips: Mapping[str, FloatArray], cylinders: FrameSeries
+) -> Iterator[tuple[str, str, FloatArray]]:
     """Yield kind, name and the (n, 896) frames that are mixed into (n, 896) later slices, one for each of them."""
     mean = later.mean(axis=0)
     for seed in _SEEDS:
@@ -86,15 +87,15 @@ def foreign_frames(
         yield CYLINDERS, f"{diameter_mm:g} mm", _each(later, held.mean(axis=0))
 
 
-def _each(later: Floats, frame: Floats) -> Floats:
+def _each(later: FloatArray, frame: FloatArray) -> FloatArray:
     return np.broadcast_to(frame, later.shape)
 
 
-def _size(frames: Floats) -> Floats:
+def _size(frames: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt((frames**2).mean(axis=-1)))
 
 
-def gripped_frames(stream: FrameSeries) -> dict[str, Floats]:
+def gripped_frames(stream: FrameSeries) -> dict[str, FloatArray]:
     """Return differences (896,) in volts of frames in the grip to the idle one, of each side, every so often."""
     found = {}
     for layer, side in enumerate(stream.sides):
@@ -109,7 +110,7 @@ def counted(
     name: Name,
     slices: FrameSeries,
     n: int,
-    fingertips: Mapping[str, Floats],
+    fingertips: Mapping[str, FloatArray],
     cylinders: FrameSeries,
     bank: Bank,
     *,

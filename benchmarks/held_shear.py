@@ -11,22 +11,20 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.calibration import SkinCalibration
-from shearloop.daemon.config import LoopConfig
+from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
-from shearloop.daemon.control.step_commands import Action, Tare
-from shearloop.daemon.control.step_runner import ExperimentPhase
-from shearloop.daemon.rig import make_brain
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import Action, ExperimentPhase, Tare
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
 from shearloop.drivers.emulators.skin.daq import NOISE_V
 from shearloop.drivers.shear_skin.judge import SkinSample
 
-Floats = NDArray[np.float64]
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
 # What a reading takes from the middle of its conversion to the controller, and a speed until the wrist has it.
 AGE_S, ACTUATION_TICKS = 0.06, 2
@@ -34,7 +32,7 @@ AGE_S, ACTUATION_TICKS = 0.06, 2
 AGES_S = (0.02, 0.06, 0.1, 0.15, 0.2)
 RADIUS_MM, SET_POINTS_N = 15.0, (1.0, 0.6, 1.0)
 CALIBRATION = Path(__file__).parents[1] / "config" / "calibrations" / "skin_demo.yaml"
-SOURCE = TorqueSource(name=SKIN, period_s=SAMPLE_TICKS * TICK_S, sticks=True)
+SOURCE = TorqueSource(name=SKIN, period_s=SAMPLE_TICKS * TICK_S, has_friction_band=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,7 +84,7 @@ class SkinLoop:
             }
         )
         self._band, self._hold_s, self._age_s = case.band, case.hold_s, case.age_s
-        self.brain = make_brain(config, {SKIN: replace(SOURCE, sticks=case.band)}, ())
+        self.brain = ControlLoop(config, {SKIN: replace(SOURCE, has_friction_band=case.band)}, ())
         self._speeds = deque([0.0] * ACTUATION_TICKS)
         self._angle_rad = 0.0
         self._tick = self._samples = 0
@@ -116,7 +114,7 @@ class SkinLoop:
         return (
             experiment.phase.value
             if experiment.phase is ExperimentPhase.DONE
-            else f"{experiment.phase.value}: {experiment.why}"
+            else f"{experiment.phase.value}: {experiment.stop_reason}"
         )
 
     def _step(self) -> None:
@@ -128,16 +126,16 @@ class SkinLoop:
             self._measure()
         while self._due and self._due[0][0] <= self.t_ns:
             torque = self._due.pop(0)[1]
-            self.brain.hear(torque)
+            self.brain.on_torque(torque)
             if self._zero_begun and self.estimator.zero is not None:
                 self._zero_begun = False
-                self.brain.action_ended()
-        self.brain.senses.arm = ArmStatus(self._angle_rad, self.t_ns)
+                self.brain.on_action_ended()
+        self.brain.inputs.arm = ArmStatus(self._angle_rad, self.t_ns)
         orders = self.brain.tick(self.t_ns)
         speed = 0.0 if orders.stop else orders.wrist_rad_per_s
-        self.brain.sent(speed)
+        self.brain.on_speed_sent(speed)
         self._speeds.append(speed)
-        self._begin(orders.begin)
+        self._begin(orders.action)
         controller = self.brain.controller
         wanted_nm = controller.state.set_point_nm if controller is not None else None
         self.truth_n.append(self.skin.shear_n)
@@ -172,7 +170,7 @@ def _experiment(hold_s: float) -> ExperimentFile:
     return ExperimentFile.model_validate({"name": "bench", "drive": "skin", "steps": steps, "limits": {"angle_rad": 1}})
 
 
-def holds_of(loop: SkinLoop, settled_s: float) -> list[Floats]:
+def holds_of(loop: SkinLoop, settled_s: float) -> list[FloatArray]:
     """Return the true force over the settled end of each hold, in the order of the set points."""
     set_points, truth = np.array(loop.set_point_n), np.array(loop.truth_n)
     set_points = np.round(set_points, 6)

@@ -13,7 +13,6 @@ import statistics
 import time
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,13 +20,13 @@ from numpy.typing import NDArray
 from benchmarks.peers import MATCHERS, OTHERS_BYTES
 from benchmarks.same_maxima import recorded
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
 N_HOT, N_COLD = 5, 3
 SHARES = (50, 90, 99, 100)
 
 
-def seconds(matcher: FastMatcher | FastZeroLagMatcher, frame: NDArray[np.float64]) -> float:
+def seconds(matcher: PrunedMatcher | PrunedZeroLagMatcher, frame: NDArray[np.float64]) -> float:
     """Return what a match with runner-up takes of the processor."""
     begun = time.thread_time_ns()
     matcher.match(frame)
@@ -40,7 +39,7 @@ def percentiles(times: list[float]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Time both kinds, and count the frames that the compiled search leaves to numpy."""
+    """Time both kinds."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--bank", type=Path, required=True)
     parser.add_argument("--recordings", type=Path, required=True)
@@ -52,18 +51,15 @@ def main() -> None:
     found: dict[str, Any] = {"frames": len(frames)}
     for name, kind in MATCHERS.items():
         matcher = kind.from_bank(bank)
-        hot, cold, left = [], [], 0
+        hot, cold = [], []
         for frame in frames:
-            # Of numpy's own search, where the compiled one leaves a frame to it.
-            with mock.patch.object(matcher, "_search", wraps=matcher._search) as by_numpy:
-                hot.append(min(seconds(matcher, frame) for _ in range(N_HOT)))
-                middle = []
-                for _ in range(N_COLD):
-                    others += 1.0
-                    middle.append(seconds(matcher, frame))
-            left += by_numpy.called
+            hot.append(min(seconds(matcher, frame) for _ in range(N_HOT)))
+            middle = []
+            for _ in range(N_COLD):
+                others += 1.0
+                middle.append(seconds(matcher, frame))
             cold.append(statistics.median(middle))
-        found[name] = {"hot": percentiles(hot), "cold": percentiles(cold), "left_to_numpy": left}
+        found[name] = {"hot": percentiles(hot), "cold": percentiles(cold)}
         print(name, found[name])
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps(found, indent=2) + "\n")

@@ -18,21 +18,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
 from benchmarks.daemon_parts import spread
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank
 from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Match, ReferenceMatcher, unit_magnitudes
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import Conductivities
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.daemon.bank_config import load_geometry
-from shearloop.daemon.workers import Processes
+from shearloop.daemon.workers import ProcessExecutor
 
-Floats = NDArray[np.float64]
 Run = Callable[[], object]
 # Seconds per cell with warm caches, on the paper's mesh of 4882 triangles.
 EIDORS_CELL_S = 0.034
@@ -44,7 +43,10 @@ N_CHECKED = 10
 BATCH = 20_000
 # Written between two frames that are to be matched cold: more than what a processor's core has of its own.
 OTHERS_BYTES = 64 << 20
-MATCHERS: dict[str, type[FastMatcher | FastZeroLagMatcher]] = {"all lags": FastMatcher, "zero lag": FastZeroLagMatcher}
+MATCHERS: dict[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
+    "all lags": PrunedMatcher,
+    "zero lag": PrunedZeroLagMatcher,
+}
 
 
 def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], dict[str, float]]:
@@ -58,10 +60,10 @@ def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], dict[str, floa
             settings.append((k, sigma))
     model = BatchForwardModel(mesh)
 
-    def fast(some: list[tuple[float, float]]) -> Floats:
+    def fast(some: list[tuple[float, float]]) -> FloatArray:
         return model.voltages(np.array([of.of(MODEL, *each) for each in some]))
 
-    def threaded() -> list[Floats]:
+    def threaded() -> list[FloatArray]:
         with ThreadPoolExecutor(2) as pool:
             return list(pool.map(fast, [settings[i : i + 32] for i in range(0, N_CELLS, 32)]))
 
@@ -84,7 +86,7 @@ def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], dict[str, floa
     return methods, {"largest": float(np.max(errors)), "cells": len(errors)}
 
 
-def pyeit_solver(mesh: Mesh) -> Callable[[Floats], object] | None:
+def pyeit_solver(mesh: Mesh) -> Callable[[FloatArray], object] | None:
     """Return pyEIT's forward solve of the same patterns on the same mesh, with its point electrodes."""
     try:
         from pyeit.eit.fem import EITForward
@@ -102,27 +104,13 @@ def pyeit_solver(mesh: Mesh) -> Callable[[Floats], object] | None:
     )
     solver = EITForward(body, protocol)
 
-    def solve(conductivity: Floats) -> object:
+    def solve(conductivity: FloatArray) -> object:
         return solver.solve_eit(perm=conductivity)
 
     return solve
 
 
-class _ZeroLagByNumpy(FastZeroLagMatcher):
-    """As where there was no C compiler."""
-
-    def _compiled_search(self, *_: object) -> None:
-        return None
-
-
-class _AllLagsByNumpy(FastMatcher):
-    """As where there was no C compiler."""
-
-    def _compiled_search(self, *_: object) -> None:
-        return None
-
-
-def match_methods(bank: Bank, frames: Floats) -> tuple[dict[str, tuple[Run, int]], int]:
+def match_methods(bank: Bank, frames: FloatArray) -> tuple[dict[str, tuple[Run, int]], int]:
     """Return what finds the best cell of every frame, and in how many frames the fast ones find the reference's."""
     units = unit_magnitudes(frames)
     single = units.astype(np.float32)
@@ -130,8 +118,7 @@ def match_methods(bank: Bank, frames: Floats) -> tuple[dict[str, tuple[Run, int]
     signals /= np.linalg.norm(signals, axis=1, keepdims=True)
     length = fft.next_fast_len(2 * N_CHANNELS - 1, real=True)
     spectra = np.conj(fft.rfft(signals, length)).astype(np.complex64)
-    zero, every = FastZeroLagMatcher.from_bank(bank), FastMatcher.from_bank(bank)
-    plain_zero, plain_every = _ZeroLagByNumpy.from_bank(bank), _AllLagsByNumpy.from_bank(bank)
+    zero, every = PrunedZeroLagMatcher.from_bank(bank), PrunedMatcher.from_bank(bank)
     reference = ReferenceMatcher.from_bank(bank)
     n = len(frames)
 
@@ -143,11 +130,9 @@ def match_methods(bank: Bank, frames: Floats) -> tuple[dict[str, tuple[Run, int]
     methods: dict[str, tuple[Run, int]] = {
         "zero lag, fast": (lambda: [zero.match(frame, runner_up=False) for frame in frames], n),
         "zero lag, fast, with runner-up": (lambda: [zero.match(frame) for frame in frames], n),
-        "zero lag, fast, with runner-up, not compiled": (lambda: [plain_zero.match(frame) for frame in frames], n),
         "zero lag, numpy float32": (lambda: [int(np.argmax(signals @ frame)) for frame in single], n),
         "all lags, fast": (lambda: [every.match(frame, runner_up=False) for frame in frames], n),
         "all lags, fast, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
-        "all lags, fast, with runner-up, not compiled": (lambda: [plain_every.match(frame) for frame in frames], n),
         "all lags, numpy float32 FFT": (by_fft, 4),
     }
     try:
@@ -166,7 +151,7 @@ def match_methods(bank: Bank, frames: Floats) -> tuple[dict[str, tuple[Run, int]
     return methods, same
 
 
-def frames_of(bank: Bank, recordings: Path | None) -> Floats:
+def frames_of(bank: Bank, recordings: Path | None) -> FloatArray:
     """Return (n, 896) differences: recorded slices where there are any, else the bank's signals with noise."""
     if recordings is not None:
         from scipy.io import loadmat
@@ -181,7 +166,7 @@ def frames_of(bank: Bank, recordings: Path | None) -> Floats:
     return chosen + random.normal(0, 0.3 / np.sqrt(N_CHANNELS), chosen.shape)
 
 
-def batches_a_minute(bank: Path, frames: Floats, turns: int) -> dict[str, Any]:
+def batches_a_minute(bank: Path, frames: FloatArray, turns: int) -> dict[str, Any]:
     """Return how many frames a minute are matched in batches, in one process, and in two with the start of those."""
     many = np.tile(frames, (-(-BATCH // len(frames)), 1))[:BATCH]
     found: dict[str, Any] = {}
@@ -189,9 +174,9 @@ def batches_a_minute(bank: Path, frames: Floats, turns: int) -> dict[str, Any]:
         matcher = kind.from_bank(Bank.open(bank))
         seconds = take_turns(
             {
-                f"{name}, one process": (lambda: matcher.matches(many), BATCH),  # noqa: B023 - runs in its turn
+                f"{name}, one process": (lambda: [matcher.match(one, runner_up=False) for one in many], BATCH),  # noqa: B023 - runs in its turn
                 f"{name}, two processes": (
-                    lambda: list(Processes(2).map(matched, (name, bank), np.array_split(many, 2))),  # noqa: B023
+                    lambda: list(ProcessExecutor(2).map(matched, (name, bank), np.array_split(many, 2))),  # noqa: B023
                     BATCH,
                 ),
             },
@@ -201,10 +186,11 @@ def batches_a_minute(bank: Path, frames: Floats, turns: int) -> dict[str, Any]:
     return found
 
 
-def matched(shared: tuple[str, Path], frames: Floats) -> list[Match]:
+def matched(shared: tuple[str, Path], frames: FloatArray) -> list[Match]:
     """Return the matches of (n, 896) differences, wherever this runs."""
     name, bank = shared
-    return MATCHERS[name].from_bank(Bank.open(bank)).matches(frames)
+    matcher = MATCHERS[name].from_bank(Bank.open(bank))
+    return [matcher.match(frame, runner_up=False) for frame in frames]
 
 
 def take_turns(methods: Mapping[str, tuple[Run, int]], turns: int) -> dict[str, list[float]]:
@@ -220,18 +206,12 @@ def take_turns(methods: Mapping[str, tuple[Run, int]], turns: int) -> dict[str, 
     return found
 
 
-def cold_seconds(bank: Bank, frames: Floats, turns: int) -> dict[str, list[float]]:
+def cold_seconds(bank: Bank, frames: FloatArray, turns: int) -> dict[str, list[float]]:
     """Return the median seconds of a match with runner-up in every turn, each after others have had the caches.
 
     So frames come in a daemon, half a second apart.
     """
-    kinds = {
-        "zero lag": FastZeroLagMatcher,
-        "zero lag, not compiled": _ZeroLagByNumpy,
-        "all lags": FastMatcher,
-        "all lags, not compiled": _AllLagsByNumpy,
-    }
-    matchers = {name: kind.from_bank(bank) for name, kind in kinds.items()}
+    matchers = {name: kind.from_bank(bank) for name, kind in MATCHERS.items()}
     others = np.zeros(OTHERS_BYTES // 8)
     found: dict[str, list[float]] = {name: [] for name in matchers}
     for _ in range(turns):

@@ -12,8 +12,6 @@ import numpy as np
 from shearloop.daemon.control.creep import Creep
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
 from shearloop.drivers.emulators.twin import Twin
-from shearloop.drivers.ur.news import ANGLE_NEWS_RAD
-from shearloop.drivers.ur.pace import quiet_is_due
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,7 +75,6 @@ class Plant:
     period_s: float = 0.008
     disturbance_nm: float = 0.0
     blocked: bool = False  # the robot does not turn, whatever it is sent
-    as_told: bool = False  # the loop hears only of the periods in which the robot's process would tell of something new
     t_s: float = 0.0
     angle_rad: float = 0.0
     torque_nm: float = 0.0
@@ -89,9 +86,6 @@ class Plant:
     _window_integral: float = 0.0
     _next_end_s: float = 0.0
     _samples: list[Sample] = field(default_factory=list)
-    _cycle: int = -1
-    _told: int = -1
-    _told_rad: float = 0.0
 
     def __post_init__(self) -> None:
         """Set the sensor and the actuation delay going."""
@@ -107,15 +101,6 @@ class Plant:
         self.angle_rad += self.period_s * ((1.0 - part) * self._under_way[0] + part * earlier)
         self._load()
         self._measure()
-
-    def tells(self) -> bool:
-        """Return, once in each period, whether the loop hears of it."""
-        self._cycle += 1
-        due = quiet_is_due(self._cycle, self._told)
-        if self.as_told and not due and abs(self.angle_rad - self._told_rad) <= ANGLE_NEWS_RAD:
-            return False
-        self._told, self._told_rad = self._cycle, self.angle_rad
-        return True
 
     def collect(self) -> list[Sample]:
         """Return the measurements that have become known by now, each once."""

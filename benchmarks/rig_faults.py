@@ -35,7 +35,7 @@ from benchmarks.rig_configuration import write_configuration
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.messaging.request import request
 from shearloop.daemon.messaging.topics import TOPICS
-from shearloop.daemon.service.priority import first_in_line
+from shearloop.daemon.service.realtime import high_priority
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.settings import UrSettings, read_settings
 
@@ -305,7 +305,7 @@ def main() -> None:
             "computer as it was": measure_jitter(settings, 0),
             "a busy process for each processor": measure_jitter(settings, processors),
         }
-        with first_in_line() as allowed:
+        with high_priority() as allowed:
             if allowed:
                 jitter["the same, run first (as `shearloop run` asks)"] = measure_jitter(settings, processors)
     quantiles = {

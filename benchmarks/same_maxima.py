@@ -17,13 +17,13 @@ from scipy.io import loadmat
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_LINE_VALUES, channels_of_line
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher, best_match
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
 AT_ONCE = 32
-KINDS: dict[str, tuple[type[Matcher], type[FastMatcher | FastZeroLagMatcher]]] = {
-    "all lags": (ReferenceMatcher, FastMatcher),
-    "zero lag": (ZeroLagMatcher, FastZeroLagMatcher),
+KINDS: dict[str, tuple[type[Matcher], type[PrunedMatcher | PrunedZeroLagMatcher]]] = {
+    "all lags": (ReferenceMatcher, PrunedMatcher),
+    "zero lag": (ZeroLagMatcher, PrunedZeroLagMatcher),
 }
 
 
@@ -56,20 +56,15 @@ def main() -> None:
     for kind in args.kinds:
         slow_kind, fast_kind = KINDS[kind]
         reference, fast = slow_kind.from_bank(bank), fast_kind.from_bank(bank)
-        frames = same = batches = in_batches = 0
+        frames = same = 0
         furthest = 0.0
         for part in recorded(args.recordings, args.every):
-            batched: list[tuple[int, int]] = []
             for frame, heatmap in zip(part, reference.heatmaps(part), strict=True):
                 slow, quick = best_match(heatmap, bank.k_grid, bank.sigma_grid), fast.match(frame)
                 frames += 1
-                batched.append(quick.cell)
                 same += (slow.cell, slow.runner_up_cell) == (quick.cell, quick.runner_up_cell)
                 furthest = max(furthest, abs(slow.score - quick.score))
-            in_batches += [match.cell for match in fast.matches(part)] == batched
-            batches += 1
-        found[kind] = {"frames": frames, "same": same, "largest_difference_of_scores": furthest,
-            "batches": batches, "same_batches": in_batches}  # fmt: skip
+        found[kind] = {"frames": frames, "same": same, "largest_difference_of_scores": furthest}
         print(kind, found[kind])
     args.out.parent.mkdir(parents=True, exist_ok=True)
     args.out.write_text(json.dumps({"every": args.every, **found}, indent=2) + "\n")

@@ -18,8 +18,8 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin import closed_form
 from shearloop.bank.skin.annulus import MESH_56, MESH_112, MESH_448, MESH_1792, CondensedSkin, MeshSize, condense
 from shearloop.bank.skin.contact import follow, gauge_strains
@@ -28,7 +28,6 @@ from shearloop.bank.skin.membrane import paper_membrane, section_membrane
 from shearloop.bank.skin.section import PAPER_SECTION
 from shearloop.bank.skin.synthetic import loading, loop, responses
 
-Floats = NDArray[np.float64]
 NORMAL_N, AMPLITUDE_N = 1.0, 1.0
 UP, LOOP = loading(AMPLITUDE_N), loop(AMPLITUDE_N)
 
@@ -53,11 +52,11 @@ def _best_s(action: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
-def _two_d(skin: CondensedSkin, path: Floats) -> Floats:
+def _two_d(skin: CondensedSkin, path: FloatArray) -> FloatArray:
     return response_of_strains(*gauge_strains(skin, follow(skin, NORMAL_N, path.tolist())).T)
 
 
-def _closed(path: Floats) -> Floats:
+def _closed(path: FloatArray) -> FloatArray:
     return np.array([closed_form.loading_response(PAPER_SECTION, NORMAL_N, shear) for shear in path.tolist()])
 
 
@@ -69,7 +68,7 @@ def measure(
     truth_up, truth_loop = _two_d(reference_skin, UP), _two_d(reference_skin, LOOP)
     scale = abs(truth_loop).max()
 
-    def against_truth(name: str, model: Callable[[Floats], Floats], prepare_s: float, repeats: int) -> Measured:
+    def against_truth(name: str, model: Callable[[FloatArray], FloatArray], prepare_s: float, repeats: int) -> Measured:
         return Measured(
             model=name,
             step_s=_best_s(lambda: model(LOOP), repeats) / len(LOOP),

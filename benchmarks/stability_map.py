@@ -17,18 +17,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.alternatives import HeldSpeed, LateCorrection
 from benchmarks.closed_loop import Loop, run
 from benchmarks.control_charts import draw_stability
 from benchmarks.plant import Plant, Sample, Sensor, Tool
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.controller import TwistController
-from shearloop.daemon.control.margins import LoopModel, gain_limit, pulse_response, seen_through_window
+from shearloop.daemon.control.margins import LoopModel, gain_limit, pulse_response, window_response
 from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
-
-FloatArray = NDArray[np.float64]
 
 COMMAND_S = 0.016
 ACTUATION_S = 0.02
@@ -197,7 +195,7 @@ def _response(case: Case, model: LoopModel) -> FloatArray:
     # A held speed brings the wrist evenly to its correction, over one frame period.
     times = np.arange(0.0, FRAME_PERIOD_S + ACTUATION_S + 4 * COMMAND_S, COMMAND_S)
     ramp = np.clip((times - ACTUATION_S) / FRAME_PERIOD_S, 0.0, 1.0)
-    return seen_through_window(ramp, model)
+    return window_response(ramp, model)
 
 
 def boundaries() -> dict[str, dict[str, list[list[float]]]]:

@@ -23,10 +23,9 @@ from benchmarks.closed_loop import Loop, Trace, identify_on, nanoseconds, run
 from benchmarks.control_charts import draw_steps
 from benchmarks.plant import EIT, LOAD_CELL, Plant, Sensor, Tool
 from shearloop.daemon.control.controller import TwistController
-from shearloop.daemon.control.excitation import ExciteSettings
-from shearloop.daemon.control.identify import ToolModel
-from shearloop.daemon.control.settings import ControllerSettings
-from shearloop.daemon.control.tuning import RequiredMargins, gain_for_noise, integral_gain, refusal
+from shearloop.daemon.control.identification import ExciteSettings, ToolModel
+from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
+from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
 
 TARGET_NM = 0.10
 PERIOD_S = 0.008
@@ -57,6 +56,9 @@ def _excite(sensor: Sensor, dwell_s: float, share: float) -> ExciteSettings:
         window_s=sensor.window_s,
         torque_limit_nm=0.17,
         stiffness_share=share,
+        speed_rad_per_s=0.5,
+        acceleration_rad_per_s2=2.0,
+        bandwidth_per_s=5.0,
         dwell_s=dwell_s,
     )
 
@@ -151,7 +153,7 @@ def steps(source: Source, seeds: int, plant_of: PlantOf = small_plant) -> tuple[
         plant = plant_of(source.sensor, rng)
         found = identified(plant, source)
         settings = settings_for(found, source)
-        refused.append(refusal(settings, found, RequiredMargins()))
+        refused.append(margin_refusal(settings, found, LoopConfig()))
         controller = started(plant, found, settings)
         torques.append(run(plant, controller, source.hold_s).torque_nm)
         found_all.append(

@@ -28,7 +28,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.programme import expected_s
+from shearloop.daemon.control.step_runner import expected_s
 from shearloop.daemon.recording.matlab_slices import SliceRecorder
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
 

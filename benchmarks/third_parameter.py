@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.daemon.analysis.series import read_series
 from shearloop.daemon.scene import scene_of
 
@@ -35,7 +35,7 @@ def main() -> None:
     scores = {}
     for path in paths:
         bank = Bank.open(path)
-        matchers = FastZeroLagMatcher.from_bank(bank), FastMatcher.from_bank(bank)
+        matchers = PrunedZeroLagMatcher.from_bank(bank), PrunedMatcher.from_bank(bank)
         scores[path.stem] = [[matcher.match(frame, runner_up=False).score for frame in frames] for matcher in matchers]
     found = np.array(list(scores.values()))
     print(f"{len(frames)} frames of {args.recording.name}: mean score of the best cell, at lag 0 and over all lags")

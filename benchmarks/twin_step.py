@@ -15,14 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.plant import EIT, LOAD_CELL, Plant, Sensor, Tool, TwinPlant
 from benchmarks.step_response import BAND, PERIOD_S, SOURCES, TARGET_NM, steps
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
 from shearloop.drivers.emulators.twin import Joint, Twin, TwinSettings
-
-FloatArray = NDArray[np.float64]
 
 # What a gel can have; 0.8 is the emulated rig's.
 GEL_NM_PER_RAD = (0.5, 1.1)
@@ -60,7 +58,7 @@ def rig_twin(sensor: Sensor, rng: np.random.Generator) -> Plant:
     creep = Creep(calibrated_creep().share, calibrated_creep().time_s) if eit and CREEP_IS_CORRECTED else None
     twin = Twin(TwinSettings(gel_stiffness_nm_per_rad=float(rng.uniform(*GEL_NM_PER_RAD))))
     plain = replace(sensor, relaxing_share=0.0, play_nm=0.0)
-    return TwinPlant(Tool(), plain, rng, as_told=True, twin=twin, sees_gel=eit, creep=creep)
+    return TwinPlant(Tool(), plain, rng, twin=twin, sees_gel=eit, creep=creep)
 
 
 def tightened(seed: int) -> tuple[float, float]:

@@ -102,7 +102,7 @@ class Daemon:
             )
             if config.experiment is not None:
                 self._experiment = ConfiguredExperiment(config.experiment, self._begin, self._rig.loop.ended)
-        hear = self._rig.brain.hear if self._rig is not None else lambda _: None
+        hear = self._rig.brain.on_torque if self._rig is not None else lambda _: None
         self._load_cell = self._rig.load_cell if self._rig is not None else None
         if self._rig is None and config.load_cell is not None:
             # Measured and recorded beside the fingertips, while something else twists.
@@ -184,8 +184,7 @@ class Daemon:
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Run until `stop` is called, then end every task and close the sockets; `on_ready` when all is made."""
         try:
-            with self.publisher.told():
-                await self._run_tasks(on_ready)
+            await self._run_tasks(on_ready)
             if self._experiment is not None:
                 self._experiment.end()
         finally:
@@ -293,7 +292,7 @@ class Daemon:
 
     def _recording_failed(self, why: str) -> None:
         if self._rig is not None:
-            self._rig.brain.senses.recording_failed = why
+            self._rig.brain.inputs.recording_error = why
 
     def _tell_of_recordings(self) -> None:
         if self._recorder is None:

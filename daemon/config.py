@@ -8,6 +8,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import AfterValidator, Field, model_validator
 
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model
+from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.messaging.addresses import (
     COMMAND_ADDRESS,
     LARGEST_PORT,
@@ -205,26 +206,6 @@ class GripperConfig(ConfigModel):
         return self
 
 
-class LoopConfig(ConfigModel):
-    """What is asked of the closed loop; see docs/safety.md for what each event leads to."""
-
-    allowed_noise_nm: float = Field(0.0025, gt=0, le=1, description="true torque's std that noise may cause")
-    kp: float | None = Field(None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
-    deadband_nm: float = Field(0.001, ge=0, le=1, description="the wrist rests while it is this near to the set point")
-    disagreement_nm: float = Field(0.05, gt=0, le=5)
-    jump_nm: float = Field(0.08, gt=0, le=5)
-    slip_nm: float = Field(
-        0.06, gt=0, le=5, description="the torque at a fixed angle moved by more: it slips or drifts"
-    )
-    wrist_speed_rad_per_s: float = Field(0.5, gt=0, le=3.14)
-    freshness_s: float = Field(0.1, ge=0, le=10, description="no torque that is younger counts as stale")
-    wrist_acceleration_rad_per_s2: float = Field(4.0, gt=0, le=1000, description="asked of the robot at each change")
-    angle_bandwidth_per_s: float = Field(5.0, gt=0, le=30, description="how fast the wrist closes in on an angle")
-    actuation_s: float = Field(0.02, ge=0, le=0.2, description="from sending a speed until the wrist's angle shows it")
-    gain_margin: float = Field(2.0, ge=1, le=100)
-    phase_margin_deg: float = Field(45.0, ge=0, le=90)
-
-
 class RecordingConfig(ConfigModel):
     """What is kept of every run: all messages and all raw inputs, a file for each experiment."""
 
@@ -264,7 +245,7 @@ class DaemonConfig(ConfigModel):
     load_cell: LoadCellConfig | None = None
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
     gripper: GripperConfig | None = None
-    loop: LoopConfig = Field(default_factory=lambda: LoopConfig.model_validate({}))
+    loop: LoopConfig = LoopConfig()
     experiment: Path | None = Field(None, description="started as soon as all devices are there")
     stop_when_done: bool = Field(
         False, description="whether the daemon ends with that experiment: status 0 when done, else 3"

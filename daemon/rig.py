@@ -2,21 +2,15 @@
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Mapping
-from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig, LoopConfig
+from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
-from shearloop.daemon.control.fault_detection import MonitorSettings
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
-from shearloop.daemon.control.tune import TuneSettings, tuned
-from shearloop.daemon.control.tuning import RequiredMargins
-from shearloop.daemon.control.wrist_controller import WristController, WristSettings
 from shearloop.daemon.links import log_event, log_link
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.rig_check import read_experiment
@@ -96,34 +90,6 @@ def make_gripper(
     return GripperTask(gripper, publisher, feel, measures_diameters=config.calibration is not None)
 
 
-def make_brain(
-    config: LoopConfig,
-    sources: Mapping[str, TorqueSource],
-    required: tuple[str, ...],
-    creep: Mapping[str, Creep] = MappingProxyType({}),
-) -> ControlLoop:
-    """Return the brain for these torques; every one of them may drive that is measured at all."""
-    tune = TuneSettings(
-        allowed_noise_nm=config.allowed_noise_nm,
-        kp=config.kp,
-        deadband_nm=config.deadband_nm,
-        slip_nm=config.slip_nm,
-        speed_limit_rad_per_s=config.wrist_speed_rad_per_s,
-    )
-    settings = WristSettings(
-        speed_limit_rad_per_s=config.wrist_speed_rad_per_s,
-        angle_bandwidth_per_s=config.angle_bandwidth_per_s,
-        actuation_s=config.actuation_s,
-        required=RequiredMargins(gain=config.gain_margin, phase_deg=config.phase_margin_deg),
-    )
-    measured = {name: source for name, source in sources.items() if source.measures_torque}
-    wrists = {name: WristController(source, settings, partial(tuned, tune)) for name, source in measured.items()}
-    watch = MonitorSettings(
-        disagreement_nm=config.disagreement_nm, jump_nm=config.jump_nm, freshness_s=config.freshness_s
-    )
-    return ControlLoop(wrists, watch, dict(sources), required, creep)
-
-
 class Rig:
     """Everything that acts, and what belongs to it."""
 
@@ -157,7 +123,7 @@ class Rig:
         required = ("robot", "gripper") if config.gripper is not None else ("robot",)
         creep = {name: tip.creep for name, tip in (*config.fingertips.items(), (BOTH, config.both)) if tip is not None}
         gels = {name: Creep(own.share, own.time_s) for name, own in creep.items() if own is not None}
-        self.brain = make_brain(config.loop, sources, required, gels)
+        self.brain = ControlLoop(config.loop, sources, required, gels)
         self.gripper = None
         if config.gripper is not None:
             self.gripper = make_gripper(config.gripper, publisher, self._feel, self.link_of("gripper"))
@@ -229,15 +195,15 @@ class Rig:
 
     def _come_or_gone(self, device: str, up: bool, sentence: str) -> None:
         if up:
-            self.brain.senses.lost.pop(device, None)
+            self.brain.inputs.lost.pop(device, None)
         else:
-            self.brain.senses.lost[device] = sentence
+            self.brain.inputs.lost[device] = sentence
             self.loop.decide_now()
 
     def _hear(self, torque: TorqueSample) -> None:
-        self.brain.hear(torque)
+        self.brain.on_torque(torque)
 
     def _feel(self, hand: GripperStatus) -> None:
-        known = self.brain.senses.hand
+        known = self.brain.inputs.gripper
         if known is None or hand.t_ns >= known.t_ns:
-            self.brain.senses.hand = hand
+            self.brain.inputs.gripper = hand

@@ -12,7 +12,7 @@ from shearloop.daemon.control.experiment_schema import (
     IdentifyStep,
     ReleaseStep,
     TareStep,
-    beyond_limits,
+    check_limits,
 )
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.runner import WRENCH
@@ -25,7 +25,7 @@ from shearloop.daemon.sensing.skin_task import SKIN
 def read_experiment(path: Path) -> ExperimentFile:
     """Return the experiment in a file; UserError where it is none, or asks for more than its own limits."""
     file = load_yaml_model(path, ExperimentFile)
-    if why := beyond_limits(file):
+    if why := check_limits(file):
         raise UserError(f"{path}: {why}")
     return file
 
@@ -85,4 +85,4 @@ def _why_not(drive: str, config: DaemonConfig) -> str:
         )
     if drive == SKIN and config.skin is not None:
         return "has no torque without a radius: add `skin.tool_radius_mm`, or take another"
-    return "is none of the torques that are measured: take another, or configure its device"
+    return "is not a measured torque: choose another, or configure its device"

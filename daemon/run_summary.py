@@ -9,11 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
-
-FloatArray = NDArray[np.float64]
 
 # The share of the set point within which a torque counts as held.
 BAND = 0.10

@@ -13,8 +13,6 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.compiled import cells
-
 N_VALUES = 1024
 CELL_BYTES = len(b"0.1234, ")
 LINE_BYTES = N_VALUES * CELL_BYTES
@@ -74,14 +72,6 @@ def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64]
 
     `zero_slots` (1024,) is true where the board writes 0. A value is read only in the board's own form, `d.dddd`.
     """
-    if cells is not None:
-        read = np.empty(N_VALUES)
-        if cells.read(line, zero_slots, ADC_REFERENCE_V, read):
-            return read
-    return _read_by_numpy(line, zero_slots)
-
-
-def _read_by_numpy(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64] | FrameError:
     values = _cells(line)
     if values is None:
         return _what_is_wrong(line)

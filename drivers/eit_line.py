@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.compiled import cells
 from shearloop.drivers.eit_format import (
     EXCERPT_BYTES,
     FULL_SCALE_SINE_RMS_V,
@@ -79,8 +78,7 @@ class FrameParser:
         self.last_refusal: FrameError | None = None
         self.first_partials = 0
         self.unfinished = 0
-        # As compiled code takes it.
-        self._zero_slots = np.ascontiguousarray(zero_slots)
+        self._zero_slots = zero_slots
         self._slots = np.flatnonzero(~zero_slots)
         self._transfer_ns = transfer_ns
         self._full_scale_v = full_scale_v
@@ -179,7 +177,8 @@ class FrameParser:
         channels = values[self._slots]
         repeated = line == self._last_line
         self._fresh += not repeated
-        saturates = look(channels, self._last_channels, self._changed_in, self._fresh, self._full_scale_v)
+        self._changed_in[channels != self._last_channels] = self._fresh
+        saturates = bool((channels > self._full_scale_v).any())
         self._last_line, self._last_channels = line, channels
         t_mid_ns = sent_ns - self._transfer_ns - self.clock.period_ns // 2
         # Every call of numpy that is spared is: most frames have no such channel.
@@ -217,18 +216,3 @@ class FrameParser:
         self.refused[refusal.kind] += 1
         self.last_refusal = refusal
         self._missed = True
-
-
-def _look_by_numpy(
-    channels: NDArray[np.float64],
-    before: NDArray[np.float64],
-    changed_in: NDArray[np.int64],
-    number: int,
-    full_scale: float,
-) -> bool:
-    """Note the number in `changed_in` of each channel that is not what it was; whether one exceeds full scale."""
-    changed_in[channels != before] = number
-    return bool((channels > full_scale).any())
-
-
-look = _look_by_numpy if cells is None else cells.look

@@ -7,15 +7,13 @@ zero: what they add up to in truth is what rounding has done. A cell where that 
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS, N_ELECTRODES
 from shearloop.bank.eit.elimination import Elimination
 from shearloop.bank.eit.forward import ForwardModel, assemble, elimination_order, require_positive
 from shearloop.bank.eit.fronts import Pattern
 from shearloop.bank.eit.mesh import Mesh
-
-FloatArray = NDArray[np.float64]
 
 # The largest sum of a row, as a share of its diagonal: rounding in 896 differences of voltages is of that size, and
 # the smallest signal that a bank holds is 5e-5 of the voltages.

@@ -9,16 +9,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
 from shearloop.bank.eit.polynomial import Interval, Polynomial
 from shearloop.bank.eit.stored import check_made_with, check_version, replaced
 from shearloop.bank.errors import CalibrationError
-
-FloatArray = NDArray[np.float64]
 
 FORMAT_VERSION = 1
 TORQUE_DEGREE, DIAMETER_DEGREE = 2, 1

@@ -1,14 +1,14 @@
-"""A bank compressed into a few numbers per cell, with bounds on what was left out.
+"""A bank compressed to a few numbers per cell, with bounds on what is left out.
 
-Every unit signal b of the bank is split as b = Φ c + d: Φ (896 × r) an orthonormal basis fitted to the bank, d
-orthogonal to it, ‖d‖ = ρ. With a frame y, g = Φᵀ y and t = ‖y − Φ g‖, the inequality of Cauchy and Schwarz gives
+Every unit signal b of the bank is split as b = Φ c + d, with Φ (896 × r) an orthonormal basis fitted to the bank, d
+orthogonal to it and ‖d‖ = ρ. For a frame y with g = Φᵀ y and t = ‖y − Φ g‖, Cauchy and Schwarz give
 
     b·y = c·g + d·(y − Φ g) ≤ c·g + ρ t,
 
-and for all cells whose c lie within a radius e of a centre m, b·y ≤ m·g + e ‖g‖ + ρ t. The first direction of Φ is the
-mean of the signals, which is negative nowhere, as these and the frames are: so g₁ ≥ 0, and with the largest c₁ of the
-cells in place of m₁, e and ‖g‖ need only be of the other directions, in which a frame is far shorter. So a bound is the
-product of a row (m, e, ρ) with a column (g, ‖g‖, t), and many bounds are one matrix product, in float32.
+and for all cells with c within a radius e of a centre m, b·y ≤ m·g + e ‖g‖ + ρ t. The first direction of Φ is the mean
+signal. It is nowhere negative, and neither are the frames, so g₁ ≥ 0. With the largest c₁ of the cells in place of m₁,
+e and ‖g‖ need only cover the other directions, where a frame is far shorter. A bound is the product of a row (m, e, ρ)
+and a column (g, ‖g‖, t), so many bounds are one matrix product in float32.
 """
 
 import heapq
@@ -22,96 +22,90 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
+from shearloop.bank.arrays import Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS
 
-FloatArray = NDArray[np.float64]
-Single = NDArray[np.float32]
-Indices = NDArray[np.int64]
-
-# A basis is fitted to about so many cells, from all over the bank: a cell is much like its neighbours.
+# Number of cells, spread over the bank, that the basis is fitted to: neighbouring cells are alike.
 _FITTED_CELLS = 1024
-# Cells whose signals are in memory at once: a process keeps most of the memory that it has once taken, which a daemon
-# does not need.
+# Cells in memory at a time.
 COMPRESSED_CELLS = 128
-# Numbers per cell: few to find the neighbourhood, more to tell its cells apart.
+# Numbers per cell: few to find the neighbourhood, more to separate its cells.
 COARSE_RANK = 24
 FINE_RANK = 96
-# Cells are bounded in groups first, those in groups of theirs, of at least so many cells on average.
+# Number of groups in each level of the hierarchy, and the mean number of cells in a group at least.
 _N_GROUPS = (128, 512, 2048)
-# The level whose groups are small enough to look for a high score in.
+_MIN_GROUP_CELLS = 4
+# Level with groups small enough to search for a high score.
 SEED_LEVEL = 1
-_LEAST_CELLS = 4
-# What a group is split for: its radius, and its ρ times a usual t.
+# Groups are split by their radius plus ρ times a usual t.
 _USUAL_T = 0.5
-# Frames fall where the bank's cells stand close: groups of many cells are split a little sooner.
+# Frames fall where cells are dense, so groups of many cells are split slightly sooner.
 _CROWDING = 0.1
-# What float32 may take from a bound, and from the square that t is the root of. Sums of 98 products and a Fourier
-# transform of 1792 values, of norm 1, lose 5e-6 by the usual estimates; what is seen is 3e-7.
+# Rounding of float32 in a bound, and in the square of t. Sums of 98 products and a transform of 1792 values of norm 1
+# lose 5e-6 by the usual estimates; 3e-7 is observed.
 ROUNDING = 2e-5
 SQUARE_ROUNDING = 4e-6
-# The same for ρ, whose square is summed in float64.
+# Rounding of float64 in the square of ρ.
 _SQUARE_ROUNDING_64 = 1e-12
 
 
 class Level(NamedTuple):
-    """Groups of cells: their rows (m, r + 2), and the group of the level before, (m,), that each is a part of."""
+    """Groups of cells: their rows (m, r + 2), and (m,) the group of the previous level that contains each."""
 
-    rows: Single
-    part_of: Indices
+    rows: Float32Array
+    part_of: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CompressedBank:
     """Rows of bounds, from coarse to fine; a bound is a row times a column of `columns`.
 
-    basis (R, 896), its first directions the most important; fine (n, R + 2) and coarse (n, r + 2) rows of the n cells;
-    levels of groups from few to many. overlaps (1792,) bound what of a signal's norm overlaps with a frame at the lags
-    from −896 up. Cell i belongs to group group_of[i] of the last level; members[j] are the cells of group j of
-    SEED_LEVEL, and centres[j] is the one nearest to its centre. estimators (r, n) and left_out (n,) are coarse again,
-    its c and ρ, in the order of memory that suits products with all cells.
+    basis (R, 896), most important directions first; fine (n, R + 2) and coarse (n, r + 2) rows of the n cells; levels
+    of groups from few to many. overlaps (1792,) bound the norm of a signal's overlap with a frame at the lags from
+    −896 up. Cell i belongs to group group_of[i] of the last level. members[j] are the cells of group j of SEED_LEVEL,
+    and centres[j] is the cell nearest to its centre. estimators (r, n) and left_out (n,) are the columns of coarse.
     """
 
-    basis: Single
-    fine: Single
-    coarse: Single
+    basis: Float32Array
+    fine: Float32Array
+    coarse: Float32Array
     levels: tuple[Level, ...]
     overlaps: FloatArray
-    group_of: Indices
-    members: tuple[Indices, ...]
-    centres: Indices
-    estimators: Single
-    left_out: Single
+    group_of: IntArray
+    members: tuple[IntArray, ...]
+    centres: IntArray
+    estimators: Float32Array
+    left_out: Float32Array
 
 
-def compress(unit_signals: Callable[[Indices], FloatArray], cells: Indices) -> CompressedBank:
-    """Compress the unit signals of n cells; `unit_signals` gives those, (m, 896), of m of these cells."""
+def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) -> CompressedBank:
+    """Compress the unit signals of n cells; `unit_signals` returns the (m, 896) signals of some of them."""
     gram, total = np.zeros((N_CHANNELS, N_CHANNELS)), np.zeros(N_CHANNELS)
-    n, fitted = len(cells), cells[:: max(len(cells) // _FITTED_CELLS, 1)]
-    for some in _parts(fitted):
+    fitted = cells[:: max(len(cells) // _FITTED_CELLS, 1)]
+    for some in _chunks(fitted):
         part = unit_signals(some)
         gram += part.T @ part
         total += part.sum(axis=0)
     rank = min(FINE_RANK, len(fitted), N_CHANNELS)
     mean = total / np.linalg.norm(total)
     at_mean = gram @ mean
-    # The gram of what is across the mean, and on the mean more than all of it: so the mean comes first.
+    # Remove the mean from the Gram matrix and put it back with the largest weight, so that it comes first.
     above = mean @ at_mean + 2 * len(fitted)
     gram -= np.outer(mean, at_mean) + np.outer(at_mean, mean) - above * np.outer(mean, mean)
     _, ascending = linalg.eigh(gram, subset_by_index=[N_CHANNELS - rank, N_CHANNELS - 1])
     basis = np.column_stack([mean, ascending[:, -2::-1]])
     found = []
     least, most = np.ones(N_CHANNELS), np.zeros(N_CHANNELS)
-    for some in _parts(cells):
+    for some in _chunks(cells):
         part = unit_signals(some)
         found.append(part @ basis)
-        up_to = np.square(part)
-        np.cumsum(up_to, axis=1, out=up_to)
-        least, most = np.minimum(least, up_to.min(axis=0)), np.maximum(most, up_to.max(axis=0))
+        energy = np.cumsum(np.square(part), axis=1)
+        least, most = np.minimum(least, energy.min(axis=0)), np.maximum(most, energy.max(axis=0))
     numbers = np.vstack(found)
-    coarse = _rows_of_cells(numbers[:, :COARSE_RANK])
-    group_of = np.zeros(n, dtype=np.int64)
+    coarse = _cell_rows(numbers[:, :COARSE_RANK])
+    group_of = np.zeros(len(cells), dtype=np.int64)
     levels = []
-    partitions = _partitions(coarse, [min(size, n // _LEAST_CELLS) for size in _N_GROUPS])
+    partitions = _partitions(coarse, [min(size, len(cells) // _MIN_GROUP_CELLS) for size in _N_GROUPS])
     for groups in partitions:
         part_of = np.array([group_of[chosen[0]] for chosen, _ in groups])
         levels.append(Level(np.array([row for _, row in groups]), part_of))
@@ -120,32 +114,19 @@ def compress(unit_signals: Callable[[Indices], FloatArray], cells: Indices) -> C
     members = tuple(chosen for chosen, _ in partitions[SEED_LEVEL])
     return CompressedBank(
         basis=np.ascontiguousarray(basis.T, dtype=np.float32),
-        fine=_rows_of_cells(numbers),
+        fine=_cell_rows(numbers),
         coarse=coarse,
         levels=tuple(levels),
         overlaps=np.sqrt(np.maximum(np.concatenate([1 - least[::-1], most[::-1]]), 0.0)),
         group_of=group_of,
         members=members,
-        centres=np.array([_central(coarse, chosen) for chosen in members]),
+        centres=np.array([_central_cell(coarse, chosen) for chosen in members]),
         estimators=np.ascontiguousarray(coarse[:, :-2].T),
         left_out=np.ascontiguousarray(coarse[:, -1]),
     )
 
 
-def column(parts: Single, rank: int) -> tuple[Single, np.float32]:
-    """Return the (r + 2,) column of a frame y of norm 1, and its t at a lower rank; parts (r,) are Φᵀ y."""
-    along, coarse, rest = float(parts[0]) ** 2, parts[1:rank], parts[rank:]
-    across = float(coarse @ coarse)
-    t = np.float32(math.sqrt(max(1.0 - along - across, 0.0) + SQUARE_ROUNDING))
-    across += float(rest @ rest)
-    found = np.empty(len(parts) + 2, dtype=np.float32)
-    found[:-2] = parts
-    found[-2] = math.sqrt(across)
-    found[-1] = math.sqrt(max(1.0 - along - across, 0.0) + SQUARE_ROUNDING)
-    return found, t
-
-
-def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Single:
+def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Float32Array:
     """Return the (r + 2, n) columns of n frames y: parts (r, n) are Φᵀ y, squared_norms (n,) are ‖y‖²."""
     across = np.einsum("ij,ij->j", parts[1:], parts[1:])
     found = np.empty((len(parts) + 2, parts.shape[1]), dtype=np.float32)
@@ -155,39 +136,38 @@ def columns(parts: NDArray[np.floating[Any]], squared_norms: FloatArray) -> Sing
     return found
 
 
-def _parts(cells: Indices) -> Iterable[Indices]:
+def _chunks(cells: IntArray) -> Iterable[IntArray]:
     return (cells[start : start + COMPRESSED_CELLS] for start in range(0, len(cells), COMPRESSED_CELLS))
 
 
-def _rows_of_cells(numbers: FloatArray) -> Single:
+def _cell_rows(numbers: FloatArray) -> Float32Array:
     rows = np.zeros((len(numbers), numbers.shape[1] + 2), dtype=np.float32)
     rows[:, :-2] = numbers
     rows[:, -1] = np.sqrt(np.maximum(1 - np.einsum("ij,ij->i", numbers, numbers), 0.0) + _SQUARE_ROUNDING_64)
     return rows
 
 
-def _bounding(cells: Single) -> Single:
-    """Return the row that bounds all of some cells."""
+def _group_row(cells: Float32Array) -> Float32Array:
+    """Return the row that bounds all of some cells' rows."""
     centre = cells[:, :-2].mean(axis=0)
-    # Of the first direction and of what is left out the largest.
-    row: Single = cells.max(axis=0)
+    # The largest along the first direction and of ρ.
+    row: Float32Array = cells.max(axis=0)
     row[1:-2] = centre[1:]
     row[-2] = math.sqrt(_squared_distances(cells[:, 1:-2], centre[1:]).max())
     return row
 
 
-def _partitions(cells: Single, sizes: Sequence[int]) -> list[list[tuple[Indices, Single]]]:
-    """Split the cells into groups, as many as each of the rising sizes says, or fewer where cells are alike.
+def _partitions(cells: Float32Array, sizes: Sequence[int]) -> list[list[tuple[IntArray, Float32Array]]]:
+    """Split the cells into groups, as many as each ascending size, or fewer where cells are alike.
 
-    Returns of each size the groups' cells, and the row that bounds those.
-
-    The group of the widest bound is split in two, between the cell farthest from its centre and the one farthest from
-    that; so every group is a part of one of the partition before.
+    Returns, for each size, every group's cells and the row that bounds them. The group with the widest bound is split
+    in two, between the cell farthest from its centre and the cell farthest from that one. Every group is therefore part
+    of one group of the previous partition.
     """
     order = count()
 
-    def entry(chosen: Indices) -> tuple[float, int, Indices, Single]:
-        row = _bounding(cells[chosen])
+    def entry(chosen: IntArray) -> tuple[float, int, IntArray, Float32Array]:
+        row = _group_row(cells[chosen])
         radius, left_out = row[-2:].tolist()
         width = (radius + _USUAL_T * left_out) * len(chosen) ** _CROWDING if radius > ROUNDING else 0.0
         return -width, next(order), chosen, row
@@ -207,12 +187,12 @@ def _partitions(cells: Single, sizes: Sequence[int]) -> list[list[tuple[Indices,
     return found
 
 
-def _central(cells: Single, chosen: Indices) -> int:
+def _central_cell(cells: Float32Array, chosen: IntArray) -> int:
     points = cells[chosen, :-2]
     return int(chosen[np.argmin(_squared_distances(points, points.mean(axis=0)))])
 
 
-def _squared_distances(points: Single, place: Single) -> Single:
+def _squared_distances(points: Float32Array, place: Float32Array) -> Float32Array:
     apart = points - place
-    squares: Single = np.einsum("ij,ij->i", apart, apart)
+    squares: Float32Array = np.einsum("ij,ij->i", apart, apart)
     return squares

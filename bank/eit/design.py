@@ -11,8 +11,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.eit.fingertip import Fingertip
@@ -20,8 +20,6 @@ from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.model_scores import Setting, searched_settings
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import CalibrationError
-
-Floats = NDArray[np.float64]
 
 # The share of the noise that each choice may add.
 ALLOWED = 1.0 / 3.0
@@ -50,9 +48,9 @@ _LEAST_NOISE = 1e-6
 class Scene:
     """What was measured: (n, 896) differences in volts, the noise of one frame in volts, torque (n,) or None."""
 
-    differences: Floats
+    differences: FloatArray
     noise_v: float
-    torque_nm: Floats | None
+    torque_nm: FloatArray | None
 
     def __post_init__(self) -> None:
         """Refuse too little, and what no board makes."""
@@ -175,7 +173,7 @@ def designed(scene: Scene, fingertip: Fingertip) -> Design:
     )  # fmt: skip
 
 
-def _signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> tuple[list[Setting], Floats]:
+def _signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> tuple[list[Setting], FloatArray]:
     """Return those settings that are positive everywhere, and their (m, 896) magnitudes."""
     cells = [conductivity(forward.mesh, model, *setting) for setting in settings]
     kept = [i for i, cell in enumerate(cells) if cell.min() > 0]
@@ -183,14 +181,14 @@ def _signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]
     return [settings[i] for i in kept], np.abs(voltages[1:] - voltages[0])
 
 
-def _fit(frames: Floats, signals: Floats) -> tuple[Floats, Floats]:
+def _fit(frames: FloatArray, signals: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return (n, m) amplitudes of the best multiples of (m, d) signals for (n, d) frames, and the squares left."""
     energy = (signals**2).sum(axis=1)
     amplitude = frames @ signals.T / energy
     return amplitude, (frames**2).sum(axis=1)[:, None] - amplitude**2 * energy
 
 
-def _supported(scene: Scene, model: str, signals: Floats) -> Supported:
+def _supported(scene: Scene, model: str, signals: FloatArray) -> Supported:
     """Judge a model on injections that its parameters were not fitted to."""
     frames, injection = np.abs(scene.differences), CHANNELS[:, 0]
     left = np.zeros(len(frames))
@@ -212,7 +210,7 @@ def _supported(scene: Scene, model: str, signals: Floats) -> Supported:
 
 
 def _ranges(
-    scene: Scene, settings: Sequence[Setting], signals: Floats
+    scene: Scene, settings: Sequence[Setting], signals: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return where the frames lie, with the distance to the next searched setting as margin."""
     best = _fit(np.abs(scene.differences), signals)[1].argmin(axis=1)
@@ -226,14 +224,14 @@ def _ranges(
     return found[0], found[1]
 
 
-def _off(one: Floats, other: Floats) -> float:
+def _off(one: FloatArray, other: FloatArray) -> float:
     """Return how far two magnitudes are apart in shape, relative L2: the amplitude is free."""
     amplitude = float(one @ other / (other @ other))
     return float(np.linalg.norm(one - amplitude * other) / np.linalg.norm(one))
 
 
 def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float) -> Choice:
-    def solved(size: float) -> tuple[Floats, int]:
+    def solved(size: float) -> tuple[FloatArray, int]:
         forward = ForwardModel(mesh := replace(fingertip, mesh_size_cm=size).mesh())
         signal = forward.voltages(conductivity(mesh, model, *place)) - forward.homogeneous()
         return np.abs(signal), len(mesh.triangles)
@@ -307,7 +305,7 @@ def _board_choices(scene: Scene) -> tuple[Choice, Choice]:
     _, s, vt = np.linalg.svd(residual, full_matrices=False)
     drift = vt[:_N_DRIFT].T * (s[:_N_DRIFT] / np.sqrt(max(len(frames) - 2, 1)))
 
-    def spread(channels: NDArray[np.int64]) -> float:
+    def spread(channels: IntArray) -> float:
         """Return the standard deviation of a torque read from these channels."""
         b, v = slope[channels] / scene.noise_v, drift[channels] / scene.noise_v
         inner = np.linalg.inv(np.eye(_N_DRIFT) + v.T @ v)
@@ -317,7 +315,7 @@ def _board_choices(scene: Scene) -> tuple[Choice, Choice]:
     everything = np.arange(N_CHANNELS)
     least = spread(everything)
 
-    def added(channels: NDArray[np.int64]) -> float:
+    def added(channels: IntArray) -> float:
         return float(np.sqrt(max((spread(channels) / least) ** 2 - 1.0, 0.0)))
 
     # By how much each counts in that reading, where drift is taken out: not by how far the torque moves it alone.

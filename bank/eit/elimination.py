@@ -7,12 +7,11 @@ it is one of whole vector registers (`shearloop.bank.eit.tiles`).
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.fronts import Pattern, plan_of
 from shearloop.bank.eit.tiles import LANES, require_compiler, schur_complements
 
-FloatArray = NDArray[np.float64]
 _CACHE_LINE = 64
 
 

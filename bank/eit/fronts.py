@@ -12,8 +12,8 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-Indices = NDArray[np.int64]
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+
 Records = NDArray[np.void]
 
 # Fronts are kept in tiles of so many rows and columns, on and below the diagonal, one row of tiles after the other.
@@ -27,12 +27,12 @@ class Pattern(NamedTuple):
     All are (P,); several p of one place add up. Of symmetric pairs both or the lower one are given.
     """
 
-    rows: Indices
-    columns: Indices
+    rows: IntArray
+    columns: IntArray
     values: FloatArray
-    source: Indices
+    source: IntArray
 
-    def where(self, keep: NDArray[np.bool_]) -> "Pattern":
+    def where(self, keep: BoolArray) -> "Pattern":
         """Return some of it."""
         return Pattern(self.rows[keep], self.columns[keep], self.values[keep], self.source[keep])
 
@@ -69,17 +69,17 @@ def plan_of(pattern: Pattern, n: int, kept: int) -> tuple[Plan, int]:
     return Plan(fronts, tile_rows, terms, arrivals, columns), layout.entries
 
 
-def row_start(row: Indices) -> Indices:
+def row_start(row: IntArray) -> IntArray:
     """Return where a row of a front begins."""
     tiles = row // TILE
-    found: Indices = TILE * TILE // 2 * tiles * (tiles + 1) + row % TILE
+    found: IntArray = TILE * TILE // 2 * tiles * (tiles + 1) + row % TILE
     return found
 
 
 class _Front:
     """Pivots and the unknowns below them, by number, and the fronts whose remains it takes."""
 
-    def __init__(self, pivots: list[int], below: Indices, children: list["_Front"]) -> None:
+    def __init__(self, pivots: list[int], below: IntArray, children: list["_Front"]) -> None:
         self.pivots = pivots
         self.below = below
         self.children = children
@@ -100,12 +100,12 @@ class _Front:
         return int(row_start(np.array(self.rows)))
 
 
-def _structures(lower: Pattern, n: int, eliminated: int) -> list[Indices]:
+def _structures(lower: Pattern, n: int, eliminated: int) -> list[IntArray]:
     """Return the rows below every unknown in its column when it is eliminated (George and Liu 1981, chapter 5)."""
     matrix = sp.csc_array((np.ones(len(lower.rows)), (lower.rows, lower.columns)), shape=(n, n))
     matrix.sum_duplicates()
-    found: list[Indices] = []
-    children: list[list[Indices]] = [[] for _ in range(n)]
+    found: list[IntArray] = []
+    children: list[list[IntArray]] = [[] for _ in range(n)]
     for column in range(eliminated):
         own = matrix.indices[matrix.indptr[column] : matrix.indptr[column + 1]].astype(np.int64)
         below = np.unique(np.concatenate([own, *children[column]]))
@@ -117,7 +117,7 @@ def _structures(lower: Pattern, n: int, eliminated: int) -> list[Indices]:
     return found
 
 
-def _tree(below: list[Indices], eliminated: int, n: int) -> _Front:
+def _tree(below: list[IntArray], eliminated: int, n: int) -> _Front:
     """Return the last front, which has no pivots. A front takes its children in where that costs nothing."""
     waiting: list[list[_Front]] = [[] for _ in range(eliminated + 1)]
     for column, rows in enumerate(below):
@@ -180,12 +180,12 @@ class _Layout:
             [self.apart[s] + row_start(np.arange(0, front.rows, TILE)) for s, front in enumerate(fronts)]
         )
 
-    def row(self, front: Indices, unknown: Indices) -> Indices:
+    def row(self, front: IntArray, unknown: IntArray) -> IntArray:
         """Return the rows of unknowns in fronts."""
-        found: Indices = np.searchsorted(self._keys, front * len(self.number) + unknown) + self._shift[front]
+        found: IntArray = np.searchsorted(self._keys, front * len(self.number) + unknown) + self._shift[front]
         return found
 
-    def terms(self, lower: Pattern) -> tuple[Records, Indices]:
+    def terms(self, lower: Pattern) -> tuple[Records, IntArray]:
         """Return what the matrices' own entries are made of, and where each row of tiles begins in it."""
         upper, under = np.sort([self.number[lower.rows], self.number[lower.columns]], axis=0)
         front = self.owner[upper]
@@ -199,7 +199,7 @@ class _Layout:
         terms = _records(place=place, source=source, value=np.bincount(which, lower.values))
         return terms, np.append(np.searchsorted(at, self.tile_rows), len(at))
 
-    def arrivals(self) -> tuple[Records, Indices, NDArray[np.int32]]:
+    def arrivals(self) -> tuple[Records, IntArray, NDArray[np.int32]]:
         """Return which rows of fronts go where in their parents, where each row of tiles begins in it, and columns."""
         position = {id(front): s for s, front in enumerate(self.fronts)}
         parents = np.empty(len(self.fronts) - 1, dtype=np.int64)
@@ -222,7 +222,7 @@ class _Layout:
         return arrivals[order], starts, (TILE * row).astype(np.int32)
 
 
-def _places(fronts: list[_Front]) -> tuple[Indices, int]:
+def _places(fronts: list[_Front]) -> tuple[IntArray, int]:
     """Return where fronts begin, and how many entries all of them take.
 
     There are two stacks. A front lies on the one and its children, which it takes the place of, on top of the other.
@@ -246,7 +246,7 @@ def _whole(rows: int) -> int:
     return -(-rows // TILE) * TILE
 
 
-def _records(**fields: Indices | FloatArray) -> Records:
+def _records(**fields: IntArray | FloatArray) -> Records:
     """Return one array of what belongs together, with small integers."""
     kinds = [(name, np.float64 if values.dtype.kind == "f" else np.int32) for name, values in fields.items()]
     found = np.empty(len(next(iter(fields.values()))), dtype=kinds)

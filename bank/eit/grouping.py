@@ -3,13 +3,10 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-
-FloatArray = NDArray[np.float64]
-Labels = NDArray[np.int64]
 
 # A fall by more than this share of the whole range begins a new series.
 _RESTART_SHARE = 0.5
@@ -26,8 +23,8 @@ class Series:
     repeat and level are (n,), from 0; a repeat may lack levels.
     """
 
-    repeat: Labels
-    level: Labels
+    repeat: IntArray
+    level: IntArray
 
 
 def place_in_series(values: FloatArray) -> Series | None:
@@ -53,7 +50,7 @@ def place_in_series(values: FloatArray) -> Series | None:
     return Series(repeat, level)
 
 
-def _rising_levels(cost: FloatArray) -> Labels:
+def _rising_levels(cost: FloatArray) -> IntArray:
     """Return the rising levels (n,) of n values that cost least in all, (n, m) being what each level costs each."""
     n, m = cost.shape
     # The least cost of the first i values on the first j levels: the last level is the last value's, or nobody's.
@@ -71,7 +68,7 @@ def _rising_levels(cost: FloatArray) -> Labels:
     return levels
 
 
-def kmeans_groups(points: FloatArray, n_groups: int, seed: int = 0) -> Labels:
+def kmeans_groups(points: FloatArray, n_groups: int, seed: int = 0) -> IntArray:
     """Return the group of each of (n, d) points, numbered from 0 by the mean of the first coordinate.
 
     Coordinates are scaled to the same spread. The same points and seed give the same groups. Raises CalibrationError
@@ -96,7 +93,7 @@ def kmeans_groups(points: FloatArray, n_groups: int, seed: int = 0) -> Labels:
     return renumbered[best]
 
 
-def group_means(values: FloatArray, groups: Labels) -> FloatArray:
+def group_means(values: FloatArray, groups: IntArray) -> FloatArray:
     """Return the mean of (n,) values in each group, by rising number of the groups that have members."""
     _, member = np.unique(groups, return_inverse=True)
     means: FloatArray = np.bincount(member, values) / np.bincount(member)

@@ -1,47 +1,43 @@
-"""Matching a measured difference against a bank: the paper's heatmap, and the place of its maximum.
+"""Matching a measured difference against a bank: the paper's heatmap and its maximum.
 
 Trehan et al. 2025, section 2: the heatmap holds, for every k and σ, the largest normalised cross-correlation between
-|frame − homogeneous frame| and |simulated signal|, over all lags along the channels; its global maximum gives the
-characteristic k and σ. What is written here is the method itself, in float64 and without shortcuts: anything faster is
-tested against it.
+|frame − homogeneous frame| and |simulated signal| over all lags along the channels. Its maximum gives k and σ. This
+module is the reference in float64; `pruned_matching` is faster and is tested against it.
 """
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import fft
 from scipy.special import chdtri
 
+from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.compiled_search import energy as compiled_energy
 from shearloop.bank.errors import MatchingError
 
-FloatArray = NDArray[np.float64]
-
-# Scores that differ by less are the same to rounding: of those the first cell in (k, σ) order is taken.
+# Scores closer than this are equal up to rounding: the first cell in (k, σ) order wins.
 TIE = 1e-12
 # Cells this near to the maximum, in k or in σ, belong to its peak and are no runner-up.
 RUNNER_UP_RADIUS = 5
-# Frames of pure noise that pass for a signal: one in a million, at 1.85 frames a second about one in six days.
+# Share of pure noise frames that pass as a signal: at 1.85 frames/s, one in about six days.
 FALSE_ALARM = 1e-6
-_LEAST_ENERGY = float(chdtri(N_CHANNELS, FALSE_ALARM))
-# Cells whose spectra are in memory at once: 1024 × 897 complex numbers and as many correlations are 30 MB.
+_MIN_ENERGY = float(chdtri(N_CHANNELS, FALSE_ALARM))
+# Cells scored at a time: 1024 × 897 complex numbers and their correlations take 30 MB.
 CHUNK_CELLS = 1024
-# All 2 · 896 − 1 lags of the linear cross-correlation, none of them wrapped around.
 _N_LAGS = 2 * N_CHANNELS - 1
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """A heatmap's maximum, and the best score outside its neighbourhood, None where the bank ends before that.
+    """A heatmap's maximum, and the best score outside its neighbourhood (None where no cell lies outside).
 
-    cell is (row of k, column of σ); a runner_up as good as score says that the frame fits two places of the bank.
+    cell is (row of k, column of σ). A runner_up as good as score means that the frame fits two places of the bank.
     """
 
     k: float
@@ -54,7 +50,7 @@ class Match:
 
 @dataclass(frozen=True, slots=True)
 class NoSignal:
-    """The difference is what noise alone makes: its shape means nothing, and it must not be matched."""
+    """A difference that noise alone explains; do not match it."""
 
     why: str
 
@@ -62,13 +58,11 @@ class NoSignal:
 class Matcher(ABC):
     """Scores differences against all valid cells of a bank; keeps no state between calls."""
 
-    def __init__(
-        self, signals: NDArray[np.float32], valid: NDArray[np.bool_], k_grid: FloatArray, sigma_grid: FloatArray
-    ) -> None:
+    def __init__(self, signals: Float32Array, valid: BoolArray, k_grid: FloatArray, sigma_grid: FloatArray) -> None:
         """Take (K, S, 896) difference signals, (K, S) validity, and the (K,) and (S,) grids.
 
-        The signals are not copied; those of cells that are not valid are never read. Raises MatchingError when the
-        shapes do not fit, no cell is valid, or a valid cell has no signal.
+        Signals are not copied; those of invalid cells are never read. Raises MatchingError when shapes differ, no cell
+        is valid, or a valid cell has no signal.
         """
         shape = (len(k_grid), len(sigma_grid))
         if signals.shape != (*shape, N_CHANNELS) or valid.shape != shape:
@@ -81,14 +75,9 @@ class Matcher(ABC):
         self.k_grid = k_grid
         self.sigma_grid = sigma_grid
         self.valid = valid
-        # Not as a memory map, whose indexing is slow.
+        # A plain array: indexing a memory map is slow.
         self._signals = np.asarray(signals).reshape(-1, N_CHANNELS)
         self._cells = np.flatnonzero(valid)
-
-    def __reduce__(self) -> tuple[type[Self], tuple[NDArray[Any], ...]]:
-        """Copy or send it as what it is made of: what is compiled for it cannot be copied, and is made anew."""
-        signals = self._signals.reshape(*self.valid.shape, N_CHANNELS)
-        return type(self), (signals, self.valid, self.k_grid, self.sigma_grid)
 
     @classmethod
     def from_bank(cls, bank: Bank) -> Self:
@@ -96,18 +85,15 @@ class Matcher(ABC):
         return cls(bank.signals, bank.valid, bank.k_grid, bank.sigma_grid)
 
     def heatmap(self, difference: ArrayLike) -> FloatArray:
-        """Return the (K, S) scores of one (896,) difference, from 0 to 1, NaN in cells that are not valid.
-
-        Raises MatchingError as `heatmaps` does.
-        """
+        """Return the (K, S) scores, 0 to 1, of one (896,) difference; NaN in invalid cells. Errors as `heatmaps`."""
         found: FloatArray = self.heatmaps(np.asarray(difference)[None])[0]
         return found
 
     def heatmaps(self, differences: ArrayLike) -> FloatArray:
-        """Return the (n, K, S) scores of (n, 896) differences, whose sign and scale do not matter.
+        """Return the (n, K, S) scores of (n, 896) differences; their sign and scale do not matter.
 
-        Beside the result about 30 MB are in use, however large the bank. Raises MatchingError for a wrong shape, a
-        value that is not finite, and a difference that is zero everywhere (0/0: ask `signal_above_noise` beforehand).
+        Raises MatchingError for a wrong shape, a value that is not finite, and a difference of zeros (ask
+        `signal_above_noise` first).
         """
         frames = unit_magnitudes(differences)
         maps = np.full((len(frames), self.valid.size), np.nan)
@@ -116,35 +102,24 @@ class Matcher(ABC):
         # Rounding may carry a perfect fit past 1 by one bit.
         return np.clip(maps, 0.0, 1.0, out=maps).reshape(-1, *self.valid.shape)
 
-    def mean_heatmap(self, differences: ArrayLike) -> FloatArray:
-        """Return the (K, S) mean of the heatmaps of (n, 896) differences: several frames of one contact, accumulated.
-
-        Raises MatchingError as `heatmaps` does.
-        """
-        mean: FloatArray = self.heatmaps(differences).mean(axis=0)
-        return mean
-
     def match(self, difference: ArrayLike) -> Match:
-        """Return the maximum of one (896,) difference's heatmap and its runner-up; see `best_match`.
-
-        Raises MatchingError as `heatmaps` does.
-        """
+        """Return the maximum of one (896,) difference's heatmap and its runner-up. Errors as `heatmaps`."""
         return best_match(self.heatmap(difference), self.k_grid, self.sigma_grid)
 
-    def _chunks(self, size: int = CHUNK_CELLS) -> Iterator[NDArray[np.int64]]:
-        """Yield the numbers of all valid cells, as many at a time as are in memory at once."""
+    def _chunks(self, size: int = CHUNK_CELLS) -> Iterator[IntArray]:
+        """Yield the numbers of all valid cells, `size` at a time."""
         for start in range(0, len(self._cells), size):
             yield self._cells[start : start + size]
 
-    def _unit_signals(self, cells: NDArray[np.int64]) -> FloatArray:
+    def _unit_signals(self, cells: IntArray) -> FloatArray:
         magnitudes = self._magnitudes(cells)
         norms = np.linalg.norm(magnitudes, axis=1, keepdims=True)
-        # Below the least normal number float32 has lost the digits.
+        # Below the smallest normal number float32 has lost its digits.
         if not (np.isfinite(norms) & (norms > np.finfo(np.float32).tiny)).all():
-            raise MatchingError("a cell that the bank calls valid has no finite signal; build the bank anew")
+            raise MatchingError("a valid cell of the bank has no finite signal; build the bank again")
         return np.asarray(magnitudes / norms)
 
-    def _magnitudes(self, cells: NDArray[np.int64]) -> FloatArray:
+    def _magnitudes(self, cells: IntArray) -> FloatArray:
         return np.abs(self._signals.take(cells, axis=0), dtype=np.float64)
 
     @abstractmethod
@@ -153,11 +128,10 @@ class Matcher(ABC):
 
 
 class ReferenceMatcher(Matcher):
-    """The paper's score: the largest over all 1791 lags of the cross-correlation of two magnitudes of norm 1."""
+    """The paper's score: the largest cross-correlation, over all 1791 lags, of two magnitudes of norm 1."""
 
     def _scores(self, frames: FloatArray, signals: FloatArray) -> FloatArray:
-        # Correlation is a product of spectra; padded to all lags, nothing wraps around. The padding may add a lag
-        # without overlap: zero there, and never above the others, since all values are magnitudes.
+        # Padded to all lags, nothing wraps around. Padding may add a lag without overlap, where the product is 0.
         n = fft.next_fast_len(_N_LAGS, real=True)
         spectra = fft.rfft(signals, n)
         scores = np.empty((len(frames), len(signals)))
@@ -167,9 +141,9 @@ class ReferenceMatcher(Matcher):
 
 
 class ZeroLagMatcher(Matcher):
-    """The cosine of the angle between the two magnitudes: the cross-correlation at lag 0 alone.
+    """The cosine of the angle between two magnitudes: the cross-correlation at lag 0 alone.
 
-    Bank and board number the channels alike, so that a lag other than 0 compares voltages of different electrodes.
+    Bank and board number the channels alike; any other lag compares voltages of different electrodes.
     """
 
     def _scores(self, frames: FloatArray, signals: FloatArray) -> FloatArray:
@@ -185,7 +159,7 @@ def unit_magnitudes(differences: ArrayLike) -> FloatArray:
     if values.ndim != 2 or values.shape[1] != N_CHANNELS:
         raise MatchingError(f"a difference has {N_CHANNELS} channels; the array has shape {values.shape}")
     magnitudes = np.abs(values)
-    # Scaled by the largest first, so that the squares of no finite input overflow or vanish.
+    # Scaled by the largest first, so that squares neither overflow nor vanish.
     largest = magnitudes.max(axis=1, keepdims=True, initial=0.0)
     if not np.isfinite(largest).all():
         raise MatchingError(f"{int((~np.isfinite(values)).sum())} channels of the difference are not finite")
@@ -196,7 +170,7 @@ def unit_magnitudes(differences: ArrayLike) -> FloatArray:
 
 
 def unit_magnitude(difference: ArrayLike) -> FloatArray:
-    """Return the magnitudes of one (896,) difference, of norm 1, without the price of many; errors as of many."""
+    """Return the magnitudes of one (896,) difference, of norm 1; errors as `unit_magnitudes`."""
     magnitudes = np.abs(np.asarray(difference, dtype=np.float64))
     if magnitudes.shape == (N_CHANNELS,):
         largest = float(magnitudes.max())
@@ -209,40 +183,36 @@ def unit_magnitude(difference: ArrayLike) -> FloatArray:
 
 
 def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal | None:
-    """Return why an (896,) difference is no signal, or None where it stands out of the noise.
+    """Return why an (896,) difference is no signal, or None where it exceeds the noise.
 
-    noise_std is the standard deviation of the difference from noise alone, (896,) or one number for all channels.
-    Of independent Gaussian noise, Σ (difference/noise_std)² is distributed as χ² with 896 degrees of freedom; a signal
-    is what exceeds its quantile at 1 − FALSE_ALARM. Raises MatchingError for input that is not finite, and for a noise
-    that is not above zero: a frame is never free of noise, if only that of the converter's rounding.
+    noise_std is the difference's standard deviation from noise alone, (896,) or one number. For independent Gaussian
+    noise Σ (difference/noise_std)² is χ² distributed with 896 degrees of freedom; a signal exceeds its quantile at
+    1 − FALSE_ALARM. Raises MatchingError for values that are not finite and for a noise that is not above zero.
     """
     values, noise = np.asarray(difference, dtype=np.float64), np.asarray(noise_std, dtype=np.float64)
     if values.shape != (N_CHANNELS,) or noise.shape not in ((), (N_CHANNELS,)):
         raise MatchingError(
             f"a difference has {N_CHANNELS} channels; the arrays have shapes {values.shape}, {noise.shape}"
         )
-    energy = compiled_energy(values, noise) if noise.shape == values.shape else None
-    if energy is None:
-        if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
-            raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
-        with np.errstate(over="ignore"):  # far above the noise is all that matters
-            energy = float(np.sum((values / noise) ** 2))
-    least = _LEAST_ENERGY
-    if energy > least:
+    if not (np.isfinite(values).all() and np.isfinite(noise).all() and (noise > 0).all()):
+        raise MatchingError("the difference must be finite, and its noise finite and above zero, in all channels")
+    with np.errstate(over="ignore"):  # infinite energy is still a signal
+        energy = float(np.sum((values / noise) ** 2))
+    if energy > _MIN_ENERGY:
         return None
     return NoSignal(
         f"no signal above the noise: the difference is {np.sqrt(energy / N_CHANNELS):.2f} times the noise, "
-        f"and a signal needs {np.sqrt(least / N_CHANNELS):.2f} times"
+        f"and a signal needs {np.sqrt(_MIN_ENERGY / N_CHANNELS):.2f} times"
     )
 
 
 def best_match(
     heatmap: FloatArray, k_grid: FloatArray, sigma_grid: FloatArray, radius: int = RUNNER_UP_RADIUS
 ) -> Match:
-    """Return the maximum of a (K, S) heatmap and its runner-up.
+    """Return the maximum of a (K, S) heatmap and its runner-up; NaN cells are never returned.
 
     Of scores that tie (within TIE) the lowest flat index wins. The runner-up is the best cell more than `radius` cells
-    away in k or in σ. Cells with NaN are never returned; raises MatchingError when there is no other cell.
+    away in k or in σ. Raises MatchingError where no cell is valid.
     """
     if heatmap.shape != (len(k_grid), len(sigma_grid)):
         raise MatchingError(f"the heatmap has shape {heatmap.shape}, the grids {len(k_grid)} k × {len(sigma_grid)} σ")

@@ -10,18 +10,16 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.signal import find_peaks
 from scipy.stats import rankdata
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.matching import ReferenceMatcher
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import MatchingError
-
-FloatArray = NDArray[np.float64]
 
 # Peaks that carry an envelope are at least this many channels apart, and both it and the difference are smoothed by a
 # moving average: as in the paper's analysis.

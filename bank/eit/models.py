@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import ModelError
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh
 
-Values = NDArray[np.float64]
 
 _SUBDIVISIONS = 5
 # Triangles whose points are computed in one go.
@@ -32,7 +31,7 @@ class BasisModel:
     title: str
     k_unit: str
     sigma_unit: str
-    function: Callable[[Values, float, float, float], Values]
+    function: Callable[[FloatArray, float, float, float], FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,19 +58,19 @@ class Variation:
 PLAIN = Variation()
 
 
-def _step(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - all five have one signature
+def _step(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:  # noqa: ARG001 - all five have one signature
     return np.where(y > k, 0.5, -0.5)
 
 
-def _linear(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - as above
+def _linear(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:  # noqa: ARG001 - as above
     return (y - k) / sigma
 
 
-def _cut_linear(y: Values, k: float, sigma: float, c: float) -> Values:
+def _cut_linear(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:
     return np.where((c - k / 2 <= y) & (y <= c + k / 2), (y - c) / sigma, 0.0)
 
 
-def _gaussian_derivative(y: Values, k: float, sigma: float, c: float) -> Values:  # noqa: ARG001 - as above
+def _gaussian_derivative(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:  # noqa: ARG001 - as above
     # In place: memory that is new at each step takes longer than the arithmetic.
     d = y - k
     f = d * d
@@ -82,7 +81,7 @@ def _gaussian_derivative(y: Values, k: float, sigma: float, c: float) -> Values:
     return f
 
 
-def _modulated_gaussian(y: Values, k: float, sigma: float, c: float) -> Values:
+def _modulated_gaussian(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:
     return np.exp(-((y - c) ** 2) / (2 * sigma**2)) * np.cos(k * (y - c))
 
 
@@ -106,7 +105,7 @@ def model_named(name: str) -> BasisModel:
         raise ModelError(f"there is no basis model {name!r}; choose one of {', '.join(MODELS)}") from None
 
 
-def averaging_points() -> NDArray[np.float64]:
+def averaging_points() -> FloatArray:
     """Return the (15, 3) barycentric coordinates that f is averaged over in a triangle.
 
     Each edge is cut into five and lines parallel to the edges are drawn through the cuts: 25 equal triangles. The
@@ -118,13 +117,13 @@ def averaging_points() -> NDArray[np.float64]:
     return (3.0 * np.array(steps) + 1.0) / (3 * n)
 
 
-def conductivity(mesh: "Mesh", model: str, k: float, sigma: float, variation: Variation = PLAIN) -> NDArray[np.float64]:
+def conductivity(mesh: "Mesh", model: str, k: float, sigma: float, variation: Variation = PLAIN) -> FloatArray:
     """Return the (T,) conductivity of a mesh's triangles: 1 + the mean of f over the triangle's averaging points.
 
     It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
     """
     heights = _heights(mesh, variation)[mesh.triangles] @ averaging_points().T
-    values: NDArray[np.float64] = _mean(_pieces(heights), _centre(mesh), model, k, sigma, variation)
+    values: FloatArray = _mean(_pieces(heights), _centre(mesh), model, k, sigma, variation)
     return values
 
 
@@ -140,13 +139,13 @@ class Conductivities:
         self._centre = _centre(mesh)
         self._variation = variation
 
-    def of(self, model: str, k: float, sigma: float) -> NDArray[np.float64]:
+    def of(self, model: str, k: float, sigma: float) -> FloatArray:
         """Return the (T,) conductivity; errors as of `conductivity`."""
-        values: NDArray[np.float64] = _mean(self._heights, self._centre, model, k, sigma, self._variation)[self._alike]
+        values: FloatArray = _mean(self._heights, self._centre, model, k, sigma, self._variation)[self._alike]
         return values
 
 
-def _heights(mesh: "Mesh", variation: Variation) -> Values:
+def _heights(mesh: "Mesh", variation: Variation) -> FloatArray:
     """Return the (N,) heights of the nodes along the axis, in cm."""
     x, y = mesh.nodes.T
     if variation.tilt_deg == 0:
@@ -160,12 +159,14 @@ def _centre(mesh: "Mesh") -> float:
     return float((mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2)
 
 
-def _pieces(heights: Values) -> list[Values]:
+def _pieces(heights: FloatArray) -> list[FloatArray]:
     """Cut (T, 15) heights into (15, ≤ _AT_ONCE) of some triangles each: small enough for the processor's caches."""
     return [np.ascontiguousarray(piece.T) for piece in np.array_split(heights, -(-len(heights) // _AT_ONCE))]
 
 
-def _mean(pieces: list[Values], centre: float, model: str, k: float, sigma: float, variation: Variation) -> Values:
+def _mean(
+    pieces: list[FloatArray], centre: float, model: str, k: float, sigma: float, variation: Variation
+) -> FloatArray:
     basis = model_named(model)
     if not (np.isfinite(k) and np.isfinite(sigma)):
         raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
@@ -173,5 +174,5 @@ def _mean(pieces: list[Values], centre: float, model: str, k: float, sigma: floa
         raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
     shape = np.concatenate([basis.function(heights, k, sigma, centre).sum(axis=0) for heights in pieces])
     shape /= len(pieces[0])
-    values: Values = 1.0 + variation.offset + variation.amplitude * shape
+    values: FloatArray = 1.0 + variation.offset + variation.amplitude * shape
     return values

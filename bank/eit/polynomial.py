@@ -4,12 +4,10 @@ from dataclasses import dataclass
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import stdtrit
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
-
-FloatArray = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 

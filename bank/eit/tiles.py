@@ -8,19 +8,17 @@ import operator
 from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeVar
 
-import numpy as np
 from llvmlite import ir
 from numba import config, njit
 from numba.core import cgutils, types
 from numba.core.caching import FunctionCache
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic, lower_builtin, models, register_model, type_callable
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.fronts import TILE, Plan
 from shearloop.bank.errors import BankError
 
-FloatArray = NDArray[np.float64]
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 # One number of each of several matrices is a value of its own here, which a vector register holds. numba has no such

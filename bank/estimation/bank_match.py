@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, smoothed_along_channels
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
-from shearloop.bank.estimation.values import FloatArray
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh
@@ -59,9 +59,9 @@ class BankMatcher(Protocol):
 class PaperMatcher:
     """The paper's method: the heatmap's maximum, by default over all lags, found without the rest of the heatmap."""
 
-    def __init__(self, bank: Bank | FastMatcher | FastZeroLagMatcher) -> None:
+    def __init__(self, bank: Bank | PrunedMatcher | PrunedZeroLagMatcher) -> None:
         """Take the bank, or a matcher on it that several fingertips share."""
-        self._matcher = FastMatcher.from_bank(bank) if isinstance(bank, Bank) else bank
+        self._matcher = PrunedMatcher.from_bank(bank) if isinstance(bank, Bank) else bank
 
     def match(self, difference: FloatArray) -> BankMatch:
         """Return the position of the heatmap's maximum."""
@@ -83,12 +83,12 @@ class ElectrodeNumbering:
     score: float
     runner_up: float
 
-    def model_channels(self) -> "np.ndarray[tuple[int], np.dtype[np.int64]]":
+    def model_channels(self) -> IntArray:
         """Return (896,) the number of the model's channel for each of the board's channels."""
         sink, _, positive, negative = CHANNELS.T
         turn = -1 if self.reflected else 1
 
-        def electrode(number: "np.ndarray[tuple[int], np.dtype[np.int64]]") -> FloatArray:
+        def electrode(number: IntArray) -> FloatArray:
             return np.asarray((self.rotation + turn * number) % N_ELECTRODES)
 
         # A reflected pair is measured the other way round.

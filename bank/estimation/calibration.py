@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.eit.polynomial import Polynomial
@@ -34,7 +35,7 @@ from shearloop.bank.estimation.interval_regressor import IntervalRegressor, Poly
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import ChannelImputer
 from shearloop.bank.estimation.session_state import TemporalFeatures
-from shearloop.bank.estimation.values import FloatArray, Kind
+from shearloop.bank.estimation.values import Kind
 
 FORMAT_VERSION = 4
 # First bytes of a zip that is not empty.

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
@@ -28,7 +29,7 @@ from shearloop.bank.estimation.load_delay import torque_bounds
 from shearloop.bank.estimation.novelty import reciprocal_means
 from shearloop.bank.estimation.regressors import ChannelImputer, Regressor, Ridge, TobitRidge, later_origins
 from shearloop.bank.estimation.session_state import BASELINE_FRAMES, SessionState, TemporalFeatures
-from shearloop.bank.estimation.values import BoolArray, FloatArray, FrameSeries, Measured, TactileFrame, distinct
+from shearloop.bank.estimation.values import FrameSeries, Measured, TactileFrame, distinct
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.mesh import Mesh

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS, N_ELECTRODES
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher, ElectrodeNumbering
@@ -13,7 +14,7 @@ from shearloop.bank.estimation.fitting_raw import Physics, k_range, ridge_fit, s
 from shearloop.bank.estimation.interval_regressor import Mixtures, fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector, fitted_parts
 from shearloop.bank.estimation.regressors import InverseCalibration, Regressor, later_origins
-from shearloop.bank.estimation.values import FloatArray, FrameSeries, Rows
+from shearloop.bank.estimation.values import FrameSeries
 
 # Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
 # mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
@@ -128,12 +129,12 @@ class ContaminationTest:
         self._detectors: dict[bytes, NoveltyDetector] = {}
         self._features: dict[tuple[int, int, float], FloatArray] = {}
 
-    def growth(self, past: Rows, future: Rows) -> FloatArray:
+    def growth(self, past: IntArray, future: IntArray) -> FloatArray:
         """Return the growth of the intervals of (q,) later slices, by a detector fitted to the earlier ones."""
         detector = self._detector(past)
         return np.array([detector.widening(one, _ALL) for one in self._differences[future]])
 
-    def accepted(self, past: Rows, future: Rows) -> Mixtures:
+    def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
         """Return the mixtures of later slices that a detector fitted to the earlier ones accepts."""
         detector = self._detector(past)
         chosen = future[np.unique(np.linspace(0, len(future) - 1, min(len(future), _MOST_LATER)).astype(int))]
@@ -153,7 +154,7 @@ class ContaminationTest:
                     features.append(self._features[key])
         return Mixtures(np.array(rows, dtype=np.int64), np.array(features), np.array(limit_shares))
 
-    def _detector(self, past: Rows) -> NoveltyDetector:
+    def _detector(self, past: IntArray) -> NoveltyDetector:
         key = past.tobytes()
         if key not in self._detectors:
             self._detectors[key] = NoveltyDetector.fit(self._differences[past])

@@ -2,9 +2,10 @@
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import STEP_FRAMES, channel_noise, frame_steps
-from shearloop.bank.estimation.values import BoolArray, FloatArray, FrameSeries
+from shearloop.bank.estimation.values import FrameSeries
 
 # A large step exceeds the steps of twisting under load by this factor.
 _LARGE_STEP = 1.4

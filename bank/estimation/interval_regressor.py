@@ -14,6 +14,7 @@ from typing import Self, TypeAlias
 import numpy as np
 from scipy.special import stdtrit
 
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
 from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
@@ -25,7 +26,6 @@ from shearloop.bank.estimation.regressors import (
     later_splits,
     left_out_blocks,
 )
-from shearloop.bank.estimation.values import BoolArray, FloatArray, Rows
 
 LEVEL = 0.95
 LEAST_IN_STRATUM = 20
@@ -59,16 +59,16 @@ _LOADED_SHARE, _LEAST_COVERED = 0.1, 0.75
 class Mixtures:
     """Accepted mixtures of later frames with foreign ones: their rows, features (q, d) and shares of the limit (q,)."""
 
-    rows: Rows
+    rows: IntArray
     features: FloatArray
     limit_shares: FloatArray
 
 
 RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
 # From (earlier, later) rows to the growth of each later row's interval, by a detector fitted to the earlier ones.
-Growth: TypeAlias = Callable[[Rows, Rows], FloatArray]
+Growth: TypeAlias = Callable[[IntArray, IntArray], FloatArray]
 # From the same rows to accepted mixtures of the later ones.
-MixtureTest: TypeAlias = Callable[[Rows, Rows], Mixtures]
+MixtureTest: TypeAlias = Callable[[IntArray, IntArray], Mixtures]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -234,7 +234,7 @@ def fit_interval_regressor(
     *,
     strengths: tuple[float, ...] = STRENGTHS,
     limit_features: bool = False,
-    left_out: Sequence[tuple[Rows, Rows]] = (),
+    left_out: Sequence[tuple[IntArray, IntArray]] = (),
     growth: Growth | None = None,
     mixtures: MixtureTest | None = None,
     bounds: tuple[FloatArray, FloatArray] | None = None,
@@ -328,7 +328,7 @@ def _contamination(
 
 
 def _range_end(
-    point: Regressor, features: FloatArray, values: FloatArray, refit: Callable[[Rows], Regressor], sign: int
+    point: Regressor, features: FloatArray, values: FloatArray, refit: Callable[[IntArray], Regressor], sign: int
 ) -> float:
     """Return the prediction at or below which (sign −1: above which) the truth may lie anywhere further out.
 
@@ -342,7 +342,7 @@ def _range_end(
     n_out = int((outward <= outward[order[round(_AT_END * len(values)) - 1]]).sum())
     out, kept = order[:n_out], np.sort(order[n_out:])
 
-    def median(by: Regressor, rows: Rows) -> float:
+    def median(by: Regressor, rows: IntArray) -> float:
         return float(np.median([sign * reported_value(by, one) for one in by.predict(features[rows])]))
 
     end, outermost = float(outward.min()), median(point, order[: max(n_out // 2, 1)])
@@ -380,19 +380,19 @@ def _error(features: FloatArray, values: FloatArray, fit: RegressorFit, strength
     return float(np.mean(found))
 
 
-def _time_splits(values: FloatArray) -> list[tuple[Rows, Rows]]:
+def _time_splits(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
     return [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
 
 
 def _best_strength(features: FloatArray, values: FloatArray, fit: RegressorFit, strengths: tuple[float, ...]) -> float:
-    def error(strength: float, past: Rows, future: Rows) -> float:
+    def error(strength: float, past: IntArray, future: IntArray) -> float:
         return float((_validate(features, values, fit, strength, past, future)[1] ** 2).mean())
 
     return best_strength(strengths, error, _time_splits(values))
 
 
 def _validate(
-    features: FloatArray, values: FloatArray, fit: RegressorFit, strength: float, past: Rows, future: Rows
+    features: FloatArray, values: FloatArray, fit: RegressorFit, strength: float, past: IntArray, future: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the raw predictions of the future by a fit to the past, and their errors."""
     point = fit(features[past], values[past], strength)

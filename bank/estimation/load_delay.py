@@ -14,12 +14,13 @@ from typing import TypeAlias
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.bank.estimation.grip_segmentation import segment_grip
 from shearloop.bank.estimation.regressors import left_out_blocks
-from shearloop.bank.estimation.values import FloatArray, FrameSeries
+from shearloop.bank.estimation.values import FrameSeries
 
 _STEP_S = 0.06
 _SHIFTS_S = np.round(np.arange(-6.0, 6.01, _STEP_S), 2)

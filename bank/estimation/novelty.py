@@ -12,12 +12,12 @@ from typing import Self
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import LARGEST_UNUSABLE_SHARE
 from shearloop.bank.estimation.interval_regressor import LEVEL
 from shearloop.bank.estimation.regressors import later_origins, left_out_blocks
-from shearloop.bank.estimation.values import BoolArray, FloatArray, Rows
 
 # Margins beyond the largest Q and T² of blocks left out. Later recorded slices stay within 1.37 and 1.5 times of them
 # after two repeats, and within once after four.
@@ -270,7 +270,7 @@ def _check_slices(differences: FloatArray) -> None:
             )
 
 
-def fitted_parts(n: int) -> Iterator[Rows]:
+def fitted_parts(n: int) -> Iterator[IntArray]:
     """Yield the rows of all slices, then of each part that is fitted separately."""
     yield np.arange(n)
     for rest, _ in left_out_blocks(n):

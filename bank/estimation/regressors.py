@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import FingertipValidator
-from shearloop.bank.estimation.values import BoolArray, FloatArray, Rows
 
 # Readings below this share of the largest torque mean that the lever does not touch.
 CENSORED_SHARE = 0.02
@@ -128,7 +127,7 @@ class InverseCalibration:
     The value of a frame minimises (x − curve)ᵀ Σ⁻¹ (x − curve), Σ = driftᵀ diag(drift_variance) drift + noise² I.
     """
 
-    channels: NDArray[np.int64]
+    channels: IntArray
     spread: FloatArray
     coefficients: FloatArray
     trend: FloatArray
@@ -299,14 +298,14 @@ class ChannelImputer:
         return np.where(usable, difference, self.mean + moved), np.where(usable, 0.0, errors)
 
 
-def left_out_blocks(n: int) -> Iterator[tuple[Rows, Rows]]:
+def left_out_blocks(n: int) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield (rest, block) for N_BLOCKS blocks of n rows, each one stretch of time."""
     block = np.arange(n) * N_BLOCKS // n
     for one in range(N_BLOCKS):
         yield np.flatnonzero(block != one), np.flatnonzero(block == one)
 
 
-def later_origins(n: int) -> list[tuple[Rows, Rows]]:
+def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:
     """Return (earlier, all later) parts of n rows, from six tenths of the time on: rolling forecasts.
 
     The list is empty where the first part has too few rows to represent this calibration.
@@ -317,7 +316,7 @@ def later_origins(n: int) -> list[tuple[Rows, Rows]]:
     return [(np.arange(cut), np.arange(cut, n)) for cut in range(first, n - 1, max(1, n // N_ORIGINS))]
 
 
-def later_splits(n: int) -> Iterator[tuple[Rows, Rows]]:
+def later_splits(n: int) -> Iterator[tuple[IntArray, IntArray]]:
     """Yield (earlier, later) parts of n rows in time order: fit on the one, validate on the other."""
     for share in (0.4, 0.6, 0.8):
         cut, end = round(n * share), round(n * min(share + 0.2, 1.0))
@@ -325,7 +324,7 @@ def later_splits(n: int) -> Iterator[tuple[Rows, Rows]]:
             yield np.arange(cut), np.arange(cut, end)
 
 
-def ranked_channels(frames: FloatArray, values: FloatArray) -> NDArray[np.int64]:
+def ranked_channels(frames: FloatArray, values: FloatArray) -> IntArray:
     """Return the numbers of the (n, d) frames' channels by falling |correlation| with the (n,) values."""
     spread = frames.std(axis=0)
     covariance = np.abs((frames - frames.mean(axis=0)).T @ (values - values.mean()))
@@ -334,8 +333,8 @@ def ranked_channels(frames: FloatArray, values: FloatArray) -> NDArray[np.int64]
 
 def best_strength(
     strengths: Sequence[float],
-    error_of: Callable[[float, Rows, Rows], float],
-    splits: Sequence[tuple[Rows, Rows]],
+    error_of: Callable[[float, IntArray, IntArray], float],
+    splits: Sequence[tuple[IntArray, IntArray]],
 ) -> float:
     """Return the strength with the least mean squared error on the later parts; of equals, the strongest."""
     if not splits:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
@@ -17,7 +18,7 @@ from shearloop.bank.estimation.interval_regressor import IntervalRegressor
 from shearloop.bank.estimation.novelty import FAMILIAR, Novelty, NoveltyDetector
 from shearloop.bank.estimation.regressors import Ridge
 from shearloop.bank.estimation.session_state import BASELINE_FRAMES, PaperState, SessionState
-from shearloop.bank.estimation.values import BoolArray, Estimate, FloatArray, Measured, TactileFrame
+from shearloop.bank.estimation.values import Estimate, Measured, TactileFrame
 
 REPEATED_FRAME = ("the board sent the same frame again",)
 _UNITS: dict[Quantity, str] = {"torque": "N·m", "diameter": "mm"}

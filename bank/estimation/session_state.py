@@ -15,6 +15,7 @@ from typing import Self
 
 import numpy as np
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import signal_above_noise
 from shearloop.bank.estimation.fingertip_validator import (
@@ -26,7 +27,7 @@ from shearloop.bank.estimation.fingertip_validator import (
     GripDetector,
     mask_saturated,
 )
-from shearloop.bank.estimation.values import BoolArray, FloatArray, TactileFrame
+from shearloop.bank.estimation.values import TactileFrame
 
 # Frames in the mean of the idle baseline.
 BASELINE_FRAMES = 10

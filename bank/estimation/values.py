@@ -3,19 +3,15 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.gaussian import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 
-FloatArray: TypeAlias = NDArray[np.float64]
-BoolArray: TypeAlias = NDArray[np.bool_]
-# Numbers of frames in a series.
-Rows: TypeAlias = NDArray[np.int64]
 # "raw": volts as the board sends them. "difference": |frame − homogeneous frame|, smoothed over time.
 Kind = Literal["raw", "difference"]
 

@@ -9,16 +9,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import skfem
-from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 from skfem.helpers import grad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.errors import GeometryError
 from shearloop.bank.skin.section import Section
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,23 +89,23 @@ class CondensedSkin:
     """
 
     section: Section
-    contact_deg: Floats
-    compliance: Floats
-    load_displacement: Floats
-    load_compliance: Floats
-    midline_deg: Floats
-    strain_of_contact: Floats
-    load_strain: Floats
-    gauge_weights: Floats
+    contact_deg: FloatArray
+    compliance: FloatArray
+    load_displacement: FloatArray
+    load_compliance: FloatArray
+    midline_deg: FloatArray
+    strain_of_contact: FloatArray
+    load_strain: FloatArray
+    gauge_weights: FloatArray
 
-    def load_movement_mm(self, contact_force_n: Floats, normal_n: float, shear_n: float) -> Floats:
+    def load_movement_mm(self, contact_force_n: FloatArray, normal_n: float, shear_n: float) -> FloatArray:
         """Return how far the loaded arc has moved on average, (2,): towards the core and along the shear force."""
-        moved: Floats = self.load_displacement.T @ contact_force_n + self.load_compliance @ (normal_n, shear_n)
+        moved: FloatArray = self.load_displacement.T @ contact_force_n + self.load_compliance @ (normal_n, shear_n)
         return moved
 
-    def midline_strain(self, contact_force_n: Floats, normal_n: float, shear_n: float) -> Floats:
+    def midline_strain(self, contact_force_n: FloatArray, normal_n: float, shear_n: float) -> FloatArray:
         """Return the (m,) mean circumferential strain of each mid-line facet."""
-        strain: Floats = self.strain_of_contact @ contact_force_n + self.load_strain @ (normal_n, shear_n)
+        strain: FloatArray = self.strain_of_contact @ contact_force_n + self.load_strain @ (normal_n, shear_n)
         return strain
 
 
@@ -146,18 +144,18 @@ class _Assembly:
             gauge_weights=weights,
         )
 
-    def _facets_at(self, radius_mm: float) -> NDArray[np.int64]:
+    def _facets_at(self, radius_mm: float) -> IntArray:
         """Facets along a circle; with curved elements all three nodes of such a facet lie on it."""
         r = np.hypot(*self.mesh.p[:, self.mesh.facets])
         on_circle = (abs(r - radius_mm) < 1e-9 * radius_mm).all(axis=0)
         return np.flatnonzero(on_circle)
 
-    def _clamped(self) -> NDArray[np.int64]:
+    def _clamped(self) -> IntArray:
         facets = self.mesh.facets_satisfying(lambda x: abs(x[1]) < 1e-9, boundaries_only=True)
-        clamped: NDArray[np.int64] = self.basis.get_dofs(facets).flatten()
+        clamped: IntArray = self.basis.get_dofs(facets).flatten()
         return clamped
 
-    def _contact_rotation(self) -> tuple[csc_matrix, Floats]:
+    def _contact_rotation(self) -> tuple[csc_matrix, FloatArray]:
         """The (2n, dofs) matrix that takes radial and circumferential displacement of the contact nodes; their θ."""
         facets = self._facets_at(self.section.inner_radius_mm)
         nodes = np.unique(self.mesh.facets[:, facets])
@@ -173,7 +171,7 @@ class _Assembly:
         values = np.concatenate([*radial, *along])
         return csc_matrix((values, (rows, columns)), shape=(2 * n, self.basis.N)), np.degrees(theta)
 
-    def _midline_strain(self) -> tuple[csc_matrix, Floats, Floats]:
+    def _midline_strain(self) -> tuple[csc_matrix, FloatArray, FloatArray]:
         """The (m, dofs) matrix of facet means of ε_θθ, the facets' angles, and the two gauges' weights on them."""
         facets = self._facets_at(self.section.mid_radius_mm)
         theta = _angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
@@ -195,7 +193,7 @@ class _Assembly:
         weights = np.array([in_gauge * lengths, in_gauge[::-1] * lengths])
         return matrix, degrees, weights / weights.sum(axis=1, keepdims=True)
 
-    def _load(self) -> Floats:
+    def _load(self) -> FloatArray:
         """The (dofs, 2) nodal forces of 1 N towards the core and of 1 N of shear, even over the loaded arc."""
         facets = self._facets_at(self.section.outer_radius_mm)
         theta = _angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
@@ -207,14 +205,14 @@ class _Assembly:
         return np.column_stack([normal, shear])
 
 
-def _angle(points: Floats) -> Floats:
-    theta: Floats = np.arctan2(-points[1], -points[0])
+def _angle(points: FloatArray) -> FloatArray:
+    theta: FloatArray = np.arctan2(-points[1], -points[0])
     return theta
 
 
-def _radial(theta: Floats) -> Floats:
+def _radial(theta: FloatArray) -> FloatArray:
     return np.array([-np.cos(theta), -np.sin(theta)])
 
 
-def _along(theta: Floats) -> Floats:
+def _along(theta: FloatArray) -> FloatArray:
     return np.array([np.sin(theta), -np.cos(theta)])

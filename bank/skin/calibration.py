@@ -8,22 +8,20 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.skin.membrane import Direction, Membrane, ShearInterval
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationTable:
     """Recorded rows in the order in which they were recorded: resistances in Ω, forces in N, each (rows,)."""
 
-    r1_ohm: Floats
-    r2_ohm: Floats
-    shear_n: Floats
-    normal_n: Floats
+    r1_ohm: FloatArray
+    r2_ohm: FloatArray
+    shear_n: FloatArray
+    normal_n: FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,10 @@ load went; what is left to learn is the coefficient of friction and one rising c
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar, nnls
 from scipy.stats import t as student
 
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.skin import gauge
 from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration
@@ -18,7 +18,6 @@ from shearloop.bank.skin.closed_form import gauge_angle_rad
 from shearloop.bank.skin.membrane import UNSTRETCHED, Membrane
 from shearloop.bank.skin.section import PAPER_SECTION
 
-Floats = NDArray[np.float64]
 # The paper's response is straight up to here and rises faster beyond.
 LINEAR_TO_N = 1.2
 UNLOADED_BELOW_N = 0.02
@@ -34,7 +33,7 @@ FEWEST_PER_PIECE, MOST_PIECES = 8, 6
 
 def responses_of_table(
     table: CalibrationTable, unloaded_below_n: float = UNLOADED_BELOW_N
-) -> tuple[Floats, NDArray[np.int64]]:
+) -> tuple[FloatArray, IntArray]:
     """Return the (rows,) responses and, per row, the number of its loading, counted from 1; 0 for rows without load.
 
     Each loading begins with rows without load, whose mean resistances normalise it, as in the paper.
@@ -93,7 +92,7 @@ class _Rows:
     """The rows under load, and the tension that the membrane gives each of them."""
 
     def __init__(
-        self, table: CalibrationTable, response: Floats, loading: NDArray[np.int64], gauge_angle_rad: float
+        self, table: CalibrationTable, response: FloatArray, loading: IntArray, gauge_angle_rad: float
     ) -> None:
         used = loading > 0
         self.response = response[used]
@@ -102,7 +101,7 @@ class _Rows:
             zip(loading[used].tolist(), table.shear_n[used].tolist(), table.normal_n[used].tolist(), strict=True)
         )
 
-    def tensions(self, friction: float) -> Floats:
+    def tensions(self, friction: float) -> FloatArray:
         """Net tension (rows,) at the gauges, in N; each loading starts from the unstretched skin."""
         membrane = Membrane(1.0, friction, self.gauge_angle_rad, 1.0)
         state, current, found = UNSTRETCHED, 0, []
@@ -117,7 +116,7 @@ class _Rows:
 class _Curve:
     """Response against tension in straight pieces: one through the origin, others beyond its ends."""
 
-    def __init__(self, rows: _Rows, kept: NDArray[np.bool_], linear_to_n: float, upper: Floats, lower: Floats) -> None:
+    def __init__(self, rows: _Rows, kept: BoolArray, linear_to_n: float, upper: FloatArray, lower: FloatArray) -> None:
         self._rows, self._kept = rows, kept
         self._linear_to_n, self._upper, self._lower = linear_to_n, upper, lower
         self.rows = int(kept.sum())
@@ -159,25 +158,25 @@ class _Curve:
         )
 
     @property
-    def _response(self) -> Floats:
+    def _response(self) -> FloatArray:
         return self._rows.response[self._kept]
 
-    def _tensions(self, friction: float) -> Floats:
+    def _tensions(self, friction: float) -> FloatArray:
         return self._rows.tensions(friction)[self._kept]
 
-    def _design(self, tension: Floats) -> Floats:
+    def _design(self, tension: FloatArray) -> FloatArray:
         columns = [np.clip(tension, -self._linear_to_n, self._linear_to_n)]
         columns += _hinges(tension, self._upper) + [-column for column in _hinges(-tension, self._lower)]
         return np.column_stack(columns)
 
 
-def _hinges(tension: Floats, knots: Floats) -> list[Floats]:
+def _hinges(tension: FloatArray, knots: FloatArray) -> list[FloatArray]:
     """What of the tension lies within each piece; the last one is open."""
     widths = np.append(np.diff(knots), math.inf)
     return [np.clip(tension - knot, 0.0, width) for knot, width in zip(knots, widths, strict=False)]
 
 
-def _knots(tension: Floats, linear_to_n: float) -> Floats:
+def _knots(tension: FloatArray, linear_to_n: float) -> FloatArray:
     """Where the pieces beyond the straight one begin: as many as the rows there can carry, each with equal shares."""
     beyond = np.sort(tension[tension > linear_to_n])
     pieces = min(MOST_PIECES, len(beyond) // FEWEST_PER_PIECE)

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin import closed_form, statistics
 from shearloop.bank.skin.annulus import CondensedSkin, condense
 from shearloop.bank.skin.contact import ContactState, follow, gauge_strains, load, midline_strain, unloaded
@@ -18,7 +18,6 @@ from shearloop.bank.skin.membrane import Membrane, paper_membrane
 from shearloop.bank.skin.section import PAPER_SECTION, Section
 from shearloop.bank.skin.synthetic import Figures, loading, loop, recover, responses
 
-Floats = NDArray[np.float64]
 NORMAL_FORCES_N = (0.5, 1.0, 1.5, 2.0)
 FULL_RANGE_N = 5.0
 PAPER_MEASURED_SENSITIVITY = {0.5: "0.078", 1.0: "0.076", 1.5: "0.080", 2.0: "0.080"}
@@ -42,10 +41,10 @@ class Row:
 class Curve:
     """Responses (n,) of both models along shear forces (n,) in N, and of the two-dimensional one without friction."""
 
-    shear_n: Floats
-    membrane: Floats
-    two_d: Floats
-    two_d_slippery: Floats
+    shear_n: FloatArray
+    membrane: FloatArray
+    two_d: FloatArray
+    two_d_slippery: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,8 +56,8 @@ class Characterisation:
     """
 
     rows: tuple[Row, ...]
-    midline_deg: Floats
-    strain_profiles: Floats
+    midline_deg: FloatArray
+    strain_profiles: FloatArray
     near_zero: Curve
     wide: Curve
     wide_by_normal: dict[float, Curve]
@@ -87,27 +86,27 @@ class _Models:
         self.membrane: Membrane = paper_membrane(section)
         self.skin: CondensedSkin = condense(section)
 
-    def in_closed_form(self, shear_n: Floats, normal_n: float) -> Floats:
+    def in_closed_form(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
         return np.array([closed_form.loading_response(self.section, normal_n, float(s)) for s in shear_n])
 
-    def in_1d(self, shear_n: Floats, normal_n: float) -> Floats:
+    def in_1d(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
         return responses(self.membrane, shear_n.tolist(), normal_n)
 
-    def in_2d(self, shear_n: Floats, normal_n: float) -> Floats:
+    def in_2d(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
         return self._response(follow(self.skin, normal_n, shear_n.tolist()))
 
-    def in_2d_slippery(self, shear_n: Floats, normal_n: float) -> Floats:
+    def in_2d_slippery(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
         state, states = unloaded(self.skin), []
         for shear in (0.0, *shear_n.tolist()):
             state = load(self.skin, state, normal_n, shear, friction=0.0)
             states.append(state)
         return self._response(states[1:])
 
-    def curve(self, shear_n: Floats, normal_n: float) -> Curve:
+    def curve(self, shear_n: FloatArray, normal_n: float) -> Curve:
         models = (self.in_1d, self.in_2d, self.in_2d_slippery)
         return Curve(shear_n, *(model(shear_n, normal_n) for model in models))
 
-    def _response(self, states: list[ContactState]) -> Floats:
+    def _response(self, states: list[ContactState]) -> FloatArray:
         return response_of_strains(*gauge_strains(self.skin, states).T)
 
 
@@ -115,7 +114,7 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[Row]:
     section, skin = models.section, models.skin
     all_three = (models.in_closed_form, models.in_1d, models.in_2d)
 
-    def each(estimate: Callable[[Floats, Floats], float], normal_n: float) -> list[float]:
+    def each(estimate: Callable[[FloatArray, FloatArray], float], normal_n: float) -> list[float]:
         shear_n = loading(normal_n)
         return [estimate(shear_n, model(shear_n, normal_n)) for model in all_three]
 
@@ -148,11 +147,11 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[Row]:
     ]
 
 
-def _slope(shear_n: Floats, response: Floats) -> float:
+def _slope(shear_n: FloatArray, response: FloatArray) -> float:
     return statistics.fit_line(shear_n, response).slope_per_n
 
 
-def _kink(shear_n: Floats, response: Floats) -> float:
+def _kink(shear_n: FloatArray, response: FloatArray) -> float:
     line = statistics.fit_line(shear_n, response)
     return -line.offset / line.slope_per_n
 
@@ -171,7 +170,7 @@ def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[Row]:
     bits = statistics.dynamic_range_bits(FULL_RANGE_N, found.noise_floor_n)
     up, around = loading(1.0), loop(1.0)
 
-    def half_width(shear_n: Floats, response: Floats) -> float:
+    def half_width(shear_n: FloatArray, response: FloatArray) -> float:
         return statistics.fit_line(shear_n, response).prediction_half_width_n(0.0)
 
     both_ways = np.concatenate([-up, up])

@@ -15,12 +15,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.errors import BankError
 from shearloop.bank.skin.annulus import CondensedSkin
-
-Floats = NDArray[np.float64]
 
 # Random starts at a friction of 1 take up to about 45 steps, a step of loading 3 to 25.
 MAX_STEPS = 200
@@ -46,14 +44,14 @@ class ContactState:
 
     normal_n: float
     shear_n: float
-    contact_force_n: Floats
-    along_mm: Floats
+    contact_force_n: FloatArray
+    along_mm: FloatArray
     newton_steps: int = 0
 
     @property
-    def touching(self) -> NDArray[np.bool_]:
+    def touching(self) -> BoolArray:
         """The (n,) nodes that press on the core; the others have lifted off."""
-        pressing: NDArray[np.bool_] = self.contact_force_n[: len(self.along_mm)] > 0
+        pressing: BoolArray = self.contact_force_n[: len(self.along_mm)] > 0
         return pressing
 
 
@@ -70,7 +68,7 @@ def load(
     shear_n: float,
     *,
     friction: float | None = None,
-    start_force_n: Floats | None = None,
+    start_force_n: FloatArray | None = None,
 ) -> ContactState:
     """Return the state after one increment of load (N) from `before`; friction is the section's unless given.
 
@@ -98,19 +96,19 @@ def follow(skin: CondensedSkin, normal_n: float, shear_n: Iterable[float]) -> li
     return states
 
 
-def midline_strain(skin: CondensedSkin, state: ContactState) -> Floats:
+def midline_strain(skin: CondensedSkin, state: ContactState) -> FloatArray:
     """Return the (m,) circumferential strain at mid-thickness, at the angles `skin.midline_deg`."""
     return skin.midline_strain(state.contact_force_n, state.normal_n, state.shear_n)
 
 
-def gauge_strains(skin: CondensedSkin, states: Iterable[ContactState]) -> Floats:
+def gauge_strains(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatArray:
     """Return the (states, 2) mean circumferential strains of the two gauges."""
     return np.array([skin.gauge_weights @ midline_strain(skin, state) for state in states])
 
 
 def solve_contact(
-    compliance: Floats, displacement: Floats, along_before: Floats, friction: float, start: Floats
-) -> tuple[Floats, int]:
+    compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float, start: FloatArray
+) -> tuple[FloatArray, int]:
     """Return the contact forces (2n,) in N of one increment, and the Newton steps they took.
 
     `compliance` (2n, 2n) mm/N, `displacement` (2n,) mm without contact, `along_before` (n,) mm at the last
@@ -136,7 +134,7 @@ def solve_contact(
     return force, steps
 
 
-def _newton(problem: "_Problem", force: Floats) -> tuple[Floats, int, bool]:
+def _newton(problem: "_Problem", force: FloatArray) -> tuple[FloatArray, int, bool]:
     """Return the forces that one start leads to, the steps taken, and whether they meet the conditions."""
     weight = 0
     residual, guess = problem.residual(force, WEIGHTS[weight])
@@ -160,13 +158,15 @@ def _newton(problem: "_Problem", force: Floats) -> tuple[Floats, int, bool]:
 
 
 class _Guess(NamedTuple):
-    touching: NDArray[np.bool_]
+    touching: BoolArray
     # Sign of λ_t where a node slips, 0 where it sticks; means nothing at a node that does not touch.
-    slipping: NDArray[np.float64]
+    slipping: FloatArray
 
 
 class _Problem:
-    def __init__(self, compliance: Floats, displacement: Floats, along_before: Floats, friction: float) -> None:
+    def __init__(
+        self, compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float
+    ) -> None:
         self.n = len(along_before)
         self.compliance = compliance
         self.displacement = displacement
@@ -175,7 +175,7 @@ class _Problem:
         # Turns displacements into forces of their size; any positive number gives the same solution.
         self.stiffness = 1 / np.diag(compliance)
 
-    def residual(self, force: Floats, weight: float) -> tuple[Floats, _Guess]:
+    def residual(self, force: FloatArray, weight: float) -> tuple[FloatArray, _Guess]:
         """Return Φ (2n,) in N, and the piece of it in which the forces lie."""
         n = self.n
         moved = self.compliance @ force + self.displacement
@@ -187,7 +187,7 @@ class _Problem:
         slipping = np.sign(trial[n:]) * (abs(trial[n:]) >= bound)
         return force - wanted, _Guess(trial[:n] > 0, slipping)
 
-    def relaxed(self, force: Floats) -> Floats:
+    def relaxed(self, force: FloatArray) -> FloatArray:
         """Return the forces after some rounds in which each node in turn meets its own conditions (Gauss-Seidel)."""
         n, force = self.n, force.copy()
         for _ in range(SWEEPS):
@@ -197,12 +197,12 @@ class _Problem:
                 force[n + node] = min(max(self._alone(force, n + node, self.along_before[node]), -bound), bound)
         return force
 
-    def _alone(self, force: Floats, row: int, before_mm: float) -> float:
+    def _alone(self, force: FloatArray, row: int, before_mm: float) -> float:
         """Return the component of the forces that, all others given, moves its node back to where it was."""
         moved_mm = self.compliance[row] @ force + self.displacement[row] - before_mm
         return float(force[row] - self.stiffness[row] * moved_mm)
 
-    def solve(self, guess: _Guess) -> Floats:
+    def solve(self, guess: _Guess) -> FloatArray:
         """Return the forces of a guess: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n."""
         n, nodes = self.n, np.flatnonzero(guess.touching)
         sticking = n + nodes[guess.slipping[nodes] == 0]

@@ -6,11 +6,10 @@ Yin, Santos, Posner 2017, section 2 and equation (1).
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 
-Floats = NDArray[np.float64]
 EXCITATION_A = 5e-3
 # Eutectic gallium indium at room temperature.
 EGAIN_RESISTIVITY_OHM_M = 29.4e-8
@@ -62,13 +61,13 @@ def gauge_factor(poisson_ratio: float = 0.5) -> float:
     return 1 + 2 * poisson_ratio
 
 
-def resistance_change(strain: Floats, poisson_ratio: float = 0.5) -> Floats:
+def resistance_change(strain: FloatArray, poisson_ratio: float = 0.5) -> FloatArray:
     """Return ΔR/R₀ of a channel stretched along itself, (1+ε)/(1−νε)² − 1; gauge_factor · ε is its first term."""
-    change: Floats = (1 + strain) / (1 - poisson_ratio * strain) ** 2 - 1
+    change: FloatArray = (1 + strain) / (1 - poisson_ratio * strain) ** 2 - 1
     return change
 
 
-def response(r1_ohm: Floats, r2_ohm: Floats, r1_unloaded_ohm: float, r2_unloaded_ohm: float) -> Floats:
+def response(r1_ohm: FloatArray, r2_ohm: FloatArray, r1_unloaded_ohm: float, r2_unloaded_ohm: float) -> FloatArray:
     """Return the normalised response ΔR₁/R₁₀ − ΔR₂/R₂₀ = F (ε₁ − ε₂), the measured side of equation (1).
 
     Raises CalibrationError where an unloaded resistance is not a positive number.
@@ -78,11 +77,11 @@ def response(r1_ohm: Floats, r2_ohm: Floats, r1_unloaded_ohm: float, r2_unloaded
             raise CalibrationError(
                 f"The unloaded resistance of {name} is {unloaded} Ω; measure it again with the skin at rest."
             )
-    ratio: Floats = r1_ohm / r1_unloaded_ohm - r2_ohm / r2_unloaded_ohm
+    ratio: FloatArray = r1_ohm / r1_unloaded_ohm - r2_ohm / r2_unloaded_ohm
     return ratio
 
 
-def response_of_strains(strain_1: Floats, strain_2: Floats, factor: float = 2.0) -> Floats:
+def response_of_strains(strain_1: FloatArray, strain_2: FloatArray, factor: float = 2.0) -> FloatArray:
     """Return F (ε₁ − ε₂), the modelled side of equation (1)."""
-    modelled: Floats = factor * (strain_1 - strain_2)
+    modelled: FloatArray = factor * (strain_1 - strain_2)
     return modelled

@@ -7,15 +7,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 
-Floats = NDArray[np.float64]
 
-
-def origin_slope(shear_n: Floats, response: Floats) -> float:
+def origin_slope(shear_n: FloatArray, response: FloatArray) -> float:
     """Return Σxy/Σx², the slope in 1/N of the straight line through the origin.
 
     This is the sensitivity of the paper's table 1 as read here: over one loading from zero, in equal steps from the
@@ -28,7 +26,7 @@ def origin_slope(shear_n: Floats, response: Floats) -> float:
     return float(shear_n @ response) / squares
 
 
-def noise_floor_n(time_s: Floats, response: Floats, sensitivity_per_n: float, window_s: float = 1.0) -> float:
+def noise_floor_n(time_s: FloatArray, response: FloatArray, sensitivity_per_n: float, window_s: float = 1.0) -> float:
     """Return the standard deviation within windows of 1 s at constant load, in N; variances are pooled over windows.
 
     A last window that is not full is left out. Raises CalibrationError where no window holds two values.
@@ -69,7 +67,7 @@ class LineFit:
         return quantile * self.scatter / abs(self.slope_per_n) * math.sqrt(widening)
 
 
-def fit_line(shear_n: Floats, response: Floats) -> LineFit:
+def fit_line(shear_n: FloatArray, response: FloatArray) -> LineFit:
     """Return the least-squares line of at least three responses; raises CalibrationError for less."""
     n = len(shear_n)
     spread = float(np.var(shear_n) * n)
@@ -90,7 +88,7 @@ class Drift:
     trend_n_per_h: float
 
 
-def drift(time_s: Floats, response: Floats, sensitivity_per_n: float) -> Drift:
+def drift(time_s: FloatArray, response: FloatArray, sensitivity_per_n: float) -> Drift:
     """Return the drift over a recording at constant load; the paper's is one hour at 0.01 Hz, and gives the std."""
     if len(time_s) < 3:
         raise CalibrationError("Drift needs at least three responses at constant load; the paper's hour has 36.")
@@ -108,7 +106,7 @@ class Crosstalk:
     slope_n_per_n: float
 
 
-def crosstalk(normal_n: Floats, response: Floats, sensitivity_per_n: float) -> Crosstalk:
+def crosstalk(normal_n: FloatArray, response: FloatArray, sensitivity_per_n: float) -> Crosstalk:
     """Return the crosstalk from responses to normal forces without shear."""
     largest = float(abs(response).max())
     slope = origin_slope(normal_n, response)
@@ -116,7 +114,7 @@ def crosstalk(normal_n: Floats, response: Floats, sensitivity_per_n: float) -> C
 
 
 def temperature_sensitivity_per_k(
-    cold: tuple[Floats, Floats], hot: tuple[Floats, Floats], cold_c: float, hot_c: float
+    cold: tuple[FloatArray, FloatArray], hot: tuple[FloatArray, FloatArray], cold_c: float, hot_c: float
 ) -> float:
     """Return the relative change of sensitivity per kelvin, from (shear_n, response) at two temperatures in °C."""
     if hot_c == cold_c:

@@ -8,27 +8,25 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin import statistics
 from shearloop.bank.skin.membrane import UNSTRETCHED, Membrane
 
-Floats = NDArray[np.float64]
 
-
-def loading(up_to_n: float, step_n: float = 0.1) -> Floats:
+def loading(up_to_n: float, step_n: float = 0.1) -> FloatArray:
     """Return the paper's shear forces: from the first step to `up_to_n`, without zero."""
     return np.arange(1.0, round(up_to_n / step_n) + 1) * step_n
 
 
-def loop(amplitude_n: float, step_n: float = 0.1) -> Floats:
+def loop(amplitude_n: float, step_n: float = 0.1) -> FloatArray:
     """Return a whole cycle: from the first step to the amplitude, to its negative, and back to the amplitude."""
     n = round(amplitude_n / step_n)
     return np.concatenate([np.arange(1.0, n), np.arange(n, -n, -1), np.arange(-n, n + 1)]) * step_n
 
 
-def responses(membrane: Membrane, shear_n: Iterable[float], normal_n: float) -> Floats:
+def responses(membrane: Membrane, shear_n: Iterable[float], normal_n: float) -> FloatArray:
     """Return the membrane's responses along a path of shear forces, from the unstretched skin."""
     state, found = UNSTRETCHED, []
     for shear in shear_n:
@@ -76,7 +74,7 @@ def recover(membrane: Membrane, put_in: Figures, rng: np.random.Generator) -> Fi
     normal_n = np.array([0.5, 1.0, 1.5, 2.0])
     pressed = put_in.crosstalk * normal_n / 2 + rng.normal(0, noise / np.sqrt(600), len(normal_n))
 
-    def at_temperature(celsius: float) -> tuple[Floats, Floats]:
+    def at_temperature(celsius: float) -> tuple[FloatArray, FloatArray]:
         factor = sensitivity * (1 + put_in.sensitivity_per_k * (celsius - 25.0))
         return shear_n, shear_n * factor + rng.normal(0, noise / np.sqrt(10), len(shear_n))
 

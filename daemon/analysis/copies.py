@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from shearloop.bank.estimation.values import FloatArray, FrameSeries
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.errors import UserError
 
 

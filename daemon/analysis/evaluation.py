@@ -7,12 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame
-
-FloatArray = NDArray[np.float64]
 
 _NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?")
 

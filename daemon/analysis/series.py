@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import IntArray
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.analysis.tools import tool_of
@@ -12,8 +12,6 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab_streams import read_diameter_slices, read_torque_slices
 from shearloop.daemon.recording.reader import Recording, read_recording
 from shearloop.daemon.recording.schema import SIDES
-
-FloatArray = NDArray[np.float64]
 
 # The side that slices are said to be of: they do not tell.
 SLICE_SIDE = "right"
@@ -89,7 +87,7 @@ def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:
     return series.between(first, end)
 
 
-def _nearest(wanted: NDArray[np.int64], times: NDArray[np.int64]) -> NDArray[np.int64]:
+def _nearest(wanted: IntArray, times: IntArray) -> IntArray:
     after = np.clip(np.searchsorted(times, wanted), 1, max(len(times) - 1, 1))
     if len(times) == 1:
         return np.zeros(len(wanted), dtype=np.int64)

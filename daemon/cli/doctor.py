@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     import math
     from dataclasses import asdict
 
-    from shearloop.daemon.doctor.examination import examine
+    from shearloop.daemon.doctor import examine
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.logs import logging_to_stderr
 

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.analysis.series import part_of, read_series
     from shearloop.daemon.cli.recorded import check_kind, parsed_part
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.workers import in_order, workers
+    from shearloop.daemon.workers import in_order, open_executor
 
     if args.out is not None and args.out.suffix not in _FIGURES:
         raise UserError(f"--out {args.out} is not the name of a figure; give one that ends in {', '.join(_FIGURES)}")
@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     parts = [part_of(one, start, stop) for _, one in named]
     check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
     shared = (calibration, None if bank is None else str(args.bank.resolve()))
-    with workers(args.cluster) as pool:
+    with open_executor(args.cluster) as pool:
         tracks = in_order(pool.map(followed, shared, parts))
     figures = judge(tracks)
     if calibration.word:

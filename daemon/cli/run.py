@@ -80,7 +80,7 @@ def _run(
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.run_summary import RunSummary
-    from shearloop.daemon.service.priority import first_in_line
+    from shearloop.daemon.service.realtime import high_priority
 
     config = load_daemon_config(args.config)
     if args.recording is not None and not any(emulator.device == "eit-kit" for emulator in config.emulators):
@@ -88,7 +88,7 @@ def _run(
     if args.record is not None:
         config = config.model_copy(update={"recording": RecordingConfig(folder=args.record)})
     if config.lock_memory:
-        from shearloop.daemon.service.locked_memory import lock_memory
+        from shearloop.daemon.service.realtime import lock_memory
 
         lock_memory()
     checked_emulators(config.emulators, args.config)
@@ -105,7 +105,7 @@ def _run(
     try:
         with (
             # Not an error where it is not allowed: late commands are seen, and hold the wrist by themselves.
-            first_in_line() if config.robot is not None else nullcontext(),
+            high_priority() if config.robot is not None else nullcontext(),
             _emulators(config.emulators, args.config.parent, args.recording, truth) as processes,
         ):
             happenings = Happenings(config.emulators, processes)

@@ -3,8 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.characterisation import Characterisation, Curve
 from shearloop.bank.skin.section import PAPER_SECTION
 from shearloop.daemon.errors import UserError
@@ -15,7 +15,6 @@ try:
 except ImportError as error:
     raise UserError("Drawing needs matplotlib: install the extra `plot`, or leave out --out.") from error
 
-Floats = NDArray[np.float64]
 ONE_D, TWO_D, GREY = "#c44e52", "#1f4e79", "#888888"
 MARKERS = {0.5: "^", 1.0: "s", 1.5: "o", 2.0: "D"}
 PAPER_PREDICTION_N, PAPER_SENSITIVITY_PER_N, PAPER_LINEAR_N = 0.0802, 0.078, 1.2
@@ -71,7 +70,7 @@ def _figure_5(found: Characterisation) -> Figure:
     return figure
 
 
-def _both_sides(curve: Curve, response: Floats) -> tuple[Floats, Floats]:
+def _both_sides(curve: Curve, response: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A loading and its mirror image, each from zero: the skin is symmetrical."""
     shear = np.concatenate([-curve.shear_n[::-1], [0.0], curve.shear_n])
     return shear, np.concatenate([-response[::-1], [0.0], response])

@@ -1,18 +1,16 @@
-"""`shearloop uninstall`: take the service away again."""
+"""`shearloop uninstall`: remove the service."""
 
 import argparse
 
-from shearloop.daemon.cli.install import add_place, carry_out, systemd_runs
+from shearloop.daemon.cli.install import add_common_arguments as configure
+from shearloop.daemon.cli.install import run_steps, systemd_runs
 
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `uninstall`."""
-    add_place(parser)
+__all__ = ["configure", "run"]
 
 
 def run(args: argparse.Namespace) -> int:
-    """Take away what `install` put in place, saying each; your own files stay."""
+    """Remove everything that `install` added and print each step; your own files stay."""
     from shearloop.daemon.service.installation import uninstall_steps
 
     root = args.root.absolute()
-    return carry_out(uninstall_steps(root, running=systemd_runs(root)), root, args)
+    return run_steps(uninstall_steps(root, running=systemd_runs(root)), root, args)

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 import structlog
 
 from shearloop.daemon.control.gripper_task import GripperTask
-from shearloop.daemon.control.step_commands import Action, GripTo, MoveTo, Tare
+from shearloop.daemon.control.step_runner import Action, GripTo, MoveTo, Tare
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import ARRIVED, STOPPED_ON_COMMAND, MoveLinear, ZeroForceTorque
 

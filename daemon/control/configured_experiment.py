@@ -69,7 +69,10 @@ class ConfiguredExperiment:
             experiment = await self._ended()
             self.done = experiment.phase is ExperimentPhase.DONE
             structlog.get_logger().info(
-                "the experiment has ended", experiment=str(self.path), phase=experiment.phase.value, why=experiment.why
+                "the experiment has ended",
+                experiment=str(self.path),
+                phase=experiment.phase.value,
+                why=experiment.stop_reason,
             )
         finally:
             self._told.set()

@@ -1,6 +1,6 @@
-"""Decides, at every tick, what robot and gripper are told: experiment, controller and safety table in one place.
+"""The control loop: decides at every tick on robot and gripper, from experiment, controllers and safety table.
 
-A plain object without I/O or clock. Senses go in, `ControlOutput` come out; what the orders led to is told back.
+A plain object without I/O or clock: inputs come in, `ControlOutput` go out, and events report their results.
 """
 
 from collections.abc import Mapping
@@ -9,14 +9,17 @@ from types import MappingProxyType
 
 from shearloop.daemon.control.controller import TwistController
 from shearloop.daemon.control.creep import Creep
-from shearloop.daemon.control.experiment_schema import ExperimentFile, ExperimentLimits, turns_before_a_grip
-from shearloop.daemon.control.fault_detection import MonitorInputs, MonitorSettings, compared_for_s, troubles
-from shearloop.daemon.control.identify import ToolModel
+from shearloop.daemon.control.experiment_schema import ExperimentFile, ExperimentLimits, first_turn_before_grip
+from shearloop.daemon.control.fault_detection import MonitorInputs, compared_for_s, detect_faults
+from shearloop.daemon.control.identification import ToolModel
 from shearloop.daemon.control.loop_inputs import GripperStatus, LoopInputs, TorqueSample, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode, Response, SafetyDecision, SafetyMonitor
-from shearloop.daemon.control.step_commands import (
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import (
     Action,
     ActionState,
+    Experiment,
+    ExperimentPhase,
     GripTo,
     Hold,
     IdentifyStiffness,
@@ -25,214 +28,198 @@ from shearloop.daemon.control.step_commands import (
     Tare,
     TrackTorque,
 )
-from shearloop.daemon.control.step_runner import Experiment, ExperimentPhase
 from shearloop.daemon.control.wrist_controller import WristController, WristVelocity
 
-# Of no experiment; made once, for it is asked for at every tick.
+# The limits while no experiment runs.
 NO_LIMITS = ExperimentLimits()
 
 
 @dataclass(frozen=True, slots=True)
 class ControlOutput:
-    """What is to be told to the devices now; `begin` and `release` are for this tick alone.
+    """Commands to the devices; `action` and `release` are set for one tick.
 
-    `hold` is not the end as `stop` is: whatever moves the arm brakes, and goes on afterwards.
+    `hold` interrupts a motion, which continues afterwards; `stop` ends it.
     """
 
     wrist_rad_per_s: float = 0.0
     stop: bool = False
     hold: bool = False
-    begin: Action | None = None
+    action: Action | None = None
     release: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class LoopStatus:
-    """Where the loop stands, for `loop.state`."""
+    """State of the loop, for `loop.state`."""
 
     phase: str
-    doing: str
-    turn: WristVelocity
-    verdict: SafetyDecision
+    activity: str
+    velocity: WristVelocity
+    decision: SafetyDecision
 
 
 class ControlLoop:
-    """One closed loop: one arm, one hand, torques of which one drives."""
+    """One closed loop: one arm, one gripper, and one of several torques that drives."""
 
     def __init__(
         self,
-        wrists: dict[str, WristController],
-        watch: MonitorSettings,
-        supervisors: dict[str, TorqueSource],
+        config: LoopConfig,
+        sources: Mapping[str, TorqueSource],
         required: tuple[str, ...],
         creep: Mapping[str, Creep] = MappingProxyType({}),
     ) -> None:
-        """Take a wrist for each source that may drive, all sources by name, and the devices that must be there.
+        """Take all torque sources by name, the required devices, and the creep of sources that measure shear.
 
-        `creep` tells of the sources that see a gel's shear and not its torque.
+        Each source that measures torque may drive.
         """
-        self.senses = LoopInputs(kept_s=compared_for_s(supervisors.values(), watch))
-        self.gate = SafetyMonitor()
+        self.inputs = LoopInputs(kept_s=compared_for_s(sources.values(), config))
+        self.safety = SafetyMonitor()
         self.experiment: Experiment | None = None
-        self.standing = LoopStatus("idle", "", WristVelocity(), SafetyDecision(Response.NOTE))
-        self._wrists = wrists
-        self._watch = watch
-        self._sources = supervisors
-        # Of each that may drive, the others, which supervise it.
-        self._others = {
-            drive: tuple(source for name, source in supervisors.items() if name != drive) for drive in supervisors
+        self.status = LoopStatus("idle", "", WristVelocity(), SafetyDecision(Response.NOTE))
+        self._wrists = {
+            name: WristController(source, config) for name, source in sources.items() if source.measures_torque
         }
+        self._config = config
+        self._sources = sources
         self._required = required
         self._creep = creep
-        self._wish = StepCommand()
+        self._command = StepCommand()
+        # The step whose action has begun.
         self._begun = -1
-        self._action = ActionState.IDLE
-        self._failure = ""
+        self._action_state = ActionState.IDLE
+        self._action_error = ""
+        # The wrist's angle at the grip.
         self._origin_rad: float | None = None
-        # Whether a tool is meant to be between the fingers.
+        # Whether a tool should be between the fingers.
         self._grips = False
         self._released = False
-        # Why the gripper did not open when a stop asked for it, until the operator has seen to it.
-        self._unreleased = ""
-        self._notes: list[Fault] = []
+        # Why the gripper did not open after a stop, until the operator acknowledges it.
+        self._release_error = ""
+        self._refusals: list[Fault] = []
 
-    def hear(self, torque: TorqueSample) -> None:
-        """Take in a torque of any source."""
+    def on_torque(self, torque: TorqueSample) -> None:
+        """Take a torque of any source."""
         creep = self._creep.get(torque.source)
         if creep is not None and torque.torque_nm is not None:
             torque = replace(torque, torque_nm=creep.torque_nm(torque.torque_nm, torque.t_mid_ns))
-        self.senses.hear(torque)
+        self.inputs.add_torque(torque)
         for wrist in self._wrists.values():
-            wrist.hear(torque)
+            wrist.on_torque(torque)
 
     def start(self, file: ExperimentFile, t_ns: int) -> str | None:
-        """Begin an experiment, or return why it cannot be begun."""
+        """Begin an experiment; return None, or why it cannot begin."""
         if self.experiment is not None and self.experiment.running:
             return f"the experiment {self.experiment.file.name!r} is still running; stop it first"
         if file.drive not in self._wrists:
-            return f"`drive: {file.drive}` is none of the torques that are measured: {', '.join(self._wrists)}"
-        if self.gate.stopped:
-            return f"a stop has not been acknowledged: {' '.join(self.standing.verdict.reasons)}"
-        against = [
-            trouble.sentence
-            for trouble in self._troubles(file.limits, file.drive, t_ns)
-            if trouble.rule.response >= Response.REFUSE_START
+            return f"`drive: {file.drive}` is not a measured torque; choose one of {', '.join(self._wrists)}"
+        if self.safety.stopped:
+            return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
+        refusals = [
+            fault.sentence
+            for fault in self._faults(file.limits, file.drive, t_ns)
+            if fault.rule.response >= Response.REFUSE_START
         ]
-        if against:
-            return " ".join(against)
-        if why := self._may_hold_unknown(file):
-            return why
+        if refusals:
+            return " ".join(refusals)
+        number, hand = first_turn_before_grip(file), self._uncertain_gripper()
+        if number is not None and hand is not None:
+            turning = f"step {number} ({file.steps[number - 1].do}), which turns the wrist"
+            return f"{_uncertain(hand)}; put a `grip` or a `release` before {turning}"
         self.experiment = Experiment(file, t_ns)
-        self._begun, self._action, self._released = -1, ActionState.IDLE, False
-        # Without a gripper of ours, somebody else holds the tool; with one, it may hold it already.
-        hand = self.senses.hand
-        self._grips = "gripper" not in self._required or (hand is not None and hand.holding)
+        self._begun, self._action_state, self._released = -1, ActionState.IDLE, False
+        # Without a gripper of ours the tool is held by other means; with one, it may hold a tool already.
+        gripper = self.inputs.gripper
+        self._grips = "gripper" not in self._required or (gripper is not None and gripper.holding)
         self._origin_rad = None
-        self._wish = StepCommand()
+        self._command = StepCommand()
         return None
 
-    def _may_hold_unknown(self, file: ExperimentFile) -> str:
-        """Return why an experiment may turn a tool that nobody knows of and nothing would watch, or an empty text."""
-        number, hand = turns_before_a_grip(file), self._unknown_hand()
-        if number is None or hand is None:
-            return ""
-        return (
-            f"the gripper does not say whether it holds a tool: its fingers, {hand.width_mm:.1f} mm apart, "
-            f"{hand.stands}; put a `grip` or a `release` before step {number} ({file.steps[number - 1].do}), which "
-            "turns the wrist"
-        )
-
-    def _unknown_hand(self) -> GripperStatus | None:
-        """Return the hand where it does not say whether it holds a tool, else None."""
-        hand = self.senses.hand
-        return hand if "gripper" in self._required and hand is not None and (hand.unsure or hand.moving) else None
-
     def pause(self) -> str | None:
-        """Stand still until `resume`, or return why not."""
+        """Stand still until `resume`; return None, or why not."""
         if self.experiment is not None and self.experiment.phase is ExperimentPhase.PAUSED:
-            return "the experiment is paused already; `resume` goes on with it"
+            return "the experiment is paused already; `resume` continues it"
         if self.experiment is None or self.experiment.phase is not ExperimentPhase.RUNNING:
             return "no experiment is running"
         self.experiment.pause()
         return None
 
     def resume(self) -> str | None:
-        """Go on after `pause`, or return why not."""
+        """Continue after `pause`; return None, or why not."""
         if self.experiment is None or self.experiment.phase is not ExperimentPhase.PAUSED:
             return "no experiment is paused"
         self.experiment.resume()
         return None
 
-    def stop(self, why: str) -> None:
+    def stop(self, reason: str) -> None:
         """End the experiment and stand still."""
         if self.experiment is not None:
-            self.experiment.stop(why)
+            self.experiment.stop(reason)
 
     def acknowledge(self) -> None:
-        """Let a stop go, on the operator's word."""
-        self._unreleased = ""
-        self.gate.acknowledge()
+        """Clear a stop on the operator's command."""
+        self._release_error = ""
+        self.safety.acknowledge()
 
-    def note_refusal(self, sentence: str) -> None:
-        """Tell of a command that a device refused."""
-        self._notes.append(Fault(FaultCode.COMMAND_REFUSED, sentence))
+    def on_command_refused(self, sentence: str) -> None:
+        """Note a command that a device refused."""
+        self._refusals.append(Fault(FaultCode.COMMAND_REFUSED, sentence))
 
-    def note_unanswered(self, sentence: str) -> None:
-        """Tell of a command of the loop's own that the robot's process, which has ended, did not answer."""
-        self._notes.append(Fault(FaultCode.COMMAND_UNANSWERED, sentence))
+    def on_command_unanswered(self, sentence: str) -> None:
+        """Note a command that the robot's process did not answer before its end."""
+        self._refusals.append(Fault(FaultCode.COMMAND_UNANSWERED, sentence))
 
-    def action_ended(self, failure: str = "") -> None:
-        """Tell that the action that was begun has ended, well or with a reason."""
-        self._action = ActionState.FAILED if failure else ActionState.DONE
-        self._failure = failure
-        match self._wish.action:
-            case Tare() if not failure:
-                # Whatever was learnt of the tool was learnt from another zero.
-                self._driving_wrist.forget()
-                self._rest_gels()
-            case GripTo() as grip if not failure:
-                self._gripped(grip)
+    def on_action_ended(self, error: str = "") -> None:
+        """Take the end of the present action, with its error if it failed."""
+        self._action_state = ActionState.FAILED if error else ActionState.DONE
+        self._action_error = error
+        match self._command.action:
+            case Tare() if not error:
+                # The tool was identified with another zero.
+                self._driving_wrist.reset()
+                self._reset_creep()
+            case GripTo() as grip if not error:
+                self._on_gripped(grip)
             case _:
                 pass
 
-    def release_ended(self, failure: str = "") -> None:
-        """Tell that the gripper has opened after a stop, or why it has not."""
-        self._unreleased = failure
+    def on_release_ended(self, error: str = "") -> None:
+        """Take the end of the release after a stop, with its error if the gripper did not open."""
+        self._release_error = error
 
-    def sent(self, wrist_rad_per_s: float) -> None:
-        """Tell what wrist speed was really sent, after all clipping."""
+    def on_speed_sent(self, wrist_rad_per_s: float) -> None:
+        """Take the wrist speed that was sent, after all clipping."""
         if self.experiment is not None:
-            self._driving_wrist.sent(wrist_rad_per_s)
+            self._driving_wrist.on_speed_sent(wrist_rad_per_s)
 
     def tick(self, t_ns: int) -> ControlOutput:
-        """Return what is to be done now."""
-        experiment, arm = self.experiment, self.senses.arm
+        """Return the commands for now."""
+        experiment, arm = self.experiment, self.inputs.arm
         limits = experiment.limits if experiment is not None else NO_LIMITS
         drive = experiment.file.drive if experiment is not None else next(iter(self._wrists))
-        found = [*self._troubles(limits, drive, t_ns), *self._notes]
-        self._notes.clear()
-        if self._unreleased:
-            found.append(Fault(FaultCode.NOT_RELEASED, self._unreleased))
+        found = [*self._faults(limits, drive, t_ns), *self._refusals]
+        self._refusals.clear()
+        if self._release_error:
+            found.append(Fault(FaultCode.NOT_RELEASED, self._release_error))
         if experiment is None or not experiment.running:
-            # Nothing moves: what is wrong is told, and only what stopped an experiment waits for the operator.
-            return self._ended(self.gate.look(found))
-        verdict = self.gate.judge(found, t_ns)
-        if verdict.response >= Response.STOP_AND_KEEP_GRIP:
-            experiment.stop(" ".join(verdict.reasons))
-            return self._ended(verdict)
+            # Nothing moves: faults are reported, and only a stop of an experiment waits for the operator.
+            return self._ended(self.safety.report(found))
+        decision = self.safety.judge(found, t_ns)
+        if decision.response >= Response.STOP_AND_KEEP_GRIP:
+            experiment.stop(" ".join(decision.reasons))
+            return self._ended(decision)
         if arm is None:
-            return self._ended(verdict)
-        return self._carry_on(experiment, verdict, arm.wrist_rad, t_ns)
+            return self._ended(decision)
+        return self._run_step(experiment, decision, arm.wrist_rad, t_ns)
 
     @property
     def controller(self) -> TwistController | None:
-        """Return the controller while a loop is closed."""
+        """The torque controller while the loop is closed."""
         return self._driving_wrist.controller
 
     @property
-    def identified(self) -> ToolModel | None:
-        """Return what is known of the tool in the grip."""
-        return self._driving_wrist.identified
+    def tool(self) -> ToolModel | None:
+        """The identified tool."""
+        return self._driving_wrist.tool
 
     @property
     def _driving_wrist(self) -> WristController:
@@ -240,115 +227,127 @@ class ControlLoop:
             return next(iter(self._wrists.values()))
         return self._wrists[self.experiment.file.drive]
 
-    def _carry_on(self, experiment: Experiment, verdict: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
-        held = verdict.response is Response.HOLD
+    def _uncertain_gripper(self) -> GripperStatus | None:
+        """Return the gripper's state if it cannot say whether it holds a tool, else None."""
+        hand = self.inputs.gripper
+        uncertain = "gripper" in self._required and hand is not None and (hand.uncertain or hand.moving)
+        return hand if uncertain else None
+
+    def _run_step(self, experiment: Experiment, decision: SafetyDecision, wrist_rad: float, t_ns: int) -> ControlOutput:
+        held = decision.response is Response.HOLD
         if self._origin_rad is None:
             self._origin_rad = wrist_rad
-        latest = self.senses.torques.get(experiment.file.drive)
-        view = StepContext(
+        latest = self.inputs.torques.get(experiment.file.drive)
+        context = StepContext(
             wrist_rad - self._origin_rad,
             latest.torque_nm if latest is not None and not held else None,
             gripped_at_rad=self._origin_rad,
-            action=self._action,
-            failure=self._failure,
+            action=self._action_state,
+            action_error=self._action_error,
         )
-        experiment.update(view, t_ns, held=held)
-        # What is held back is still what the torque is needed for.
-        self._wish = experiment.wish
+        experiment.update(context, t_ns, held=held)
+        # While the wrist is held, faults still depend on the step's own command.
+        self._command = experiment.command
         if not experiment.running:
-            return self._ended(verdict)
+            return self._ended(decision)
         still = held or experiment.phase is ExperimentPhase.PAUSED
-        turns = not isinstance(self._wish.wrist, Hold) or isinstance(self._wish.action, IdentifyStiffness)
-        # What is held is watched for being lost; of a stop that came just before, the gripper may tell only now.
-        if turns and not self._grips and (hand := self._unknown_hand()) is not None:
-            experiment.stop(
-                f"step {experiment.number} ({experiment.step.do}) cannot be done: the gripper does not say whether it "
-                f"holds a tool: its fingers, {hand.width_mm:.1f} mm apart, {hand.stands}; put a `grip` or a `release` "
-                "before it"
-            )
-            return self._ended(verdict)
-        begin = None if still else self._begin(experiment, t_ns, wrist_rad)
+        # A tool that the gripper holds is watched. After a stop, the gripper's doubt may arrive only now.
+        if self._turns and not self._grips and (hand := self._uncertain_gripper()) is not None:
+            step = f"step {experiment.step_number} ({experiment.step.do}) cannot be done"
+            experiment.stop(f"{step}: {_uncertain(hand)}; put a `grip` or a `release` before it")
+            return self._ended(decision)
+        action = None if still else self._begin(experiment, t_ns, wrist_rad)
         if not experiment.running:
-            return self._ended(verdict)
-        turn = self._turn(t_ns, wrist_rad, still=still)
+            return self._ended(decision)
+        velocity = self._velocity(t_ns, wrist_rad, self._origin_rad, still=still)
         phase = "held" if held else experiment.phase.value
-        self.standing = LoopStatus(phase, experiment.doing, turn, verdict)
-        return ControlOutput(turn.speed_rad_per_s, hold=still, begin=begin)
+        self.status = LoopStatus(phase, experiment.activity, velocity, decision)
+        return ControlOutput(velocity.speed_rad_per_s, hold=still, action=action)
+
+    @property
+    def _turns(self) -> bool:
+        return not isinstance(self._command.wrist, Hold) or isinstance(self._command.action, IdentifyStiffness)
 
     def _begin(self, experiment: Experiment, t_ns: int, wrist_rad: float) -> Action | None:
-        """Begin what the wish asks for the first time: an action of the devices, an identification, a closed loop."""
-        wish, wrist = self._wish, self._driving_wrist
-        match wish.wrist:
-            case TrackTorque() as track if wrist.tracks != track:
-                why = wrist.refuses(track, experiment.limits.torque_nm)
-                if why:
-                    experiment.stop(f"step {wish.number + 1} ({experiment.step.do}) cannot be done: {why}")
+        """Close the loop or start the identification of a new command; return its action for the devices."""
+        command, wrist = self._command, self._driving_wrist
+        match command.wrist:
+            case TrackTorque() as track if wrist.tracked != track:
+                reason = wrist.why_not_trackable(track, experiment.limits.torque_nm)
+                if reason:
+                    experiment.stop(f"step {command.step_index + 1} ({experiment.step.do}) cannot be done: {reason}")
                     return None
                 wrist.begin_tracking(track, t_ns, wrist_rad, experiment.limits.torque_nm)
             case _:
                 pass
-        if wish.action is None:
-            self._action = ActionState.IDLE
+        if command.action is None:
+            self._action_state = ActionState.IDLE
             return None
-        if wish.number == self._begun:
+        if command.step_index == self._begun:
             return None
-        self._begun, self._action, self._failure = wish.number, ActionState.RUNNING, ""
-        if isinstance(wish.action, IdentifyStiffness):
-            wrist.begin_measuring(wish.action, experiment.limits.torque_nm)
+        self._begun, self._action_state, self._action_error = command.step_index, ActionState.RUNNING, ""
+        if isinstance(command.action, IdentifyStiffness):
+            wrist.begin_identification(command.action, experiment.limits.torque_nm)
             return None
-        return wish.action
+        return command.action
 
-    def _turn(self, t_ns: int, wrist_rad: float, *, still: bool) -> WristVelocity:
-        wrist, origin_rad = self._driving_wrist, self._origin_rad
-        if still or origin_rad is None:
+    def _velocity(self, t_ns: int, wrist_rad: float, origin_rad: float, *, still: bool) -> WristVelocity:
+        wrist = self._driving_wrist
+        if still:
             return wrist.hold()
-        if isinstance(self._wish.action, IdentifyStiffness) and self._action is ActionState.RUNNING:
-            turn, ended = wrist.measure(t_ns, wrist_rad)
+        if isinstance(self._command.action, IdentifyStiffness) and self._action_state is ActionState.RUNNING:
+            velocity, ended = wrist.identify(t_ns, wrist_rad)
             if ended is not None:
-                self.action_ended(ended)
-            return turn
-        return wrist.turn(self._wish.wrist, t_ns, wrist_rad, origin_rad)
+                self.on_action_ended(ended)
+            return velocity
+        return wrist.turn(self._command.wrist, t_ns, wrist_rad, origin_rad)
 
-    def _gripped(self, grip: GripTo) -> None:
-        arm, hand = self.senses.arm, self.senses.hand
+    def _on_gripped(self, grip: GripTo) -> None:
+        arm, gripper = self.inputs.arm, self.inputs.gripper
         self._origin_rad = arm.wrist_rad if arm is not None else None
-        # What was met though nobody had expected it is watched as well.
-        self._grips = grip.expect_object or (hand is not None and hand.holding)
-        self._driving_wrist.forget()
-        self._rest_gels()
+        # An unexpected object is watched as well.
+        self._grips = grip.expect_object or (gripper is not None and gripper.holding)
+        self._driving_wrist.reset()
+        self._reset_creep()
 
-    def _rest_gels(self) -> None:
+    def _reset_creep(self) -> None:
         for creep in self._creep.values():
-            creep.forget()
+            creep.reset()
 
-    def _ended(self, verdict: SafetyDecision) -> ControlOutput:
+    def _ended(self, decision: SafetyDecision) -> ControlOutput:
         experiment = self.experiment
         phase = experiment.phase.value if experiment is not None else "idle"
-        self.standing = LoopStatus(phase, experiment.why if experiment is not None else "", WristVelocity(), verdict)
-        self._wish = StepCommand()
-        release = verdict.response is Response.STOP_AND_RELEASE and not self._released
+        reason = experiment.stop_reason if experiment is not None else ""
+        self.status = LoopStatus(phase, reason, WristVelocity(), decision)
+        self._command = StepCommand()
+        release = decision.response is Response.STOP_AND_RELEASE and not self._released
         self._released |= release
         return ControlOutput(stop=True, release=release)
 
-    def _troubles(self, limits: ExperimentLimits, drive: str, t_ns: int) -> list[Fault]:
-        experiment, arm = self.experiment, self.senses.arm
+    def _faults(self, limits: ExperimentLimits, drive: str, t_ns: int) -> list[Fault]:
+        experiment, arm = self.experiment, self.inputs.arm
         running = experiment is not None and experiment.running
         paused = experiment is not None and experiment.phase is ExperimentPhase.PAUSED
         twisted_rad = 0.0
         if arm is not None and self._origin_rad is not None:
             twisted_rad = arm.wrist_rad - self._origin_rad
-        wish = self._wish
-        moves = not isinstance(wish.wrist, Hold) or isinstance(wish.action, IdentifyStiffness)
-        gripped = running and self._grips and not isinstance(wish.action, GripTo)
+        gripped = running and self._grips and not isinstance(self._command.action, GripTo)
         watched = MonitorInputs(
             driving=self._sources[drive],
-            supervising=self._others[drive],
+            supervising=tuple(source for name, source in self._sources.items() if name != drive),
             limits=limits,
-            torque_needed=gripped and moves and not paused,
+            torque_needed=gripped and self._turns and not paused,
             gripped=gripped,
             twisted_rad=twisted_rad,
             expected_nm=self._driving_wrist.expected_nm if running else None,
             overdue=experiment.overdue if running and experiment is not None else "",
             required=self._required,
         )
-        return list(troubles(self.senses, watched, self._watch, t_ns))
+        return detect_faults(self.inputs, watched, self._config, t_ns)
+
+
+def _uncertain(gripper: GripperStatus) -> str:
+    return (
+        "the gripper does not say whether it holds a tool: its fingers, "
+        f"{gripper.width_mm:.1f} mm apart, {gripper.uncertainty}"
+    )

@@ -1,51 +1,49 @@
-"""The twist controller: torque measurements, late and noisy, become a wrist speed, up to 125 times a second.
+"""The twist controller: late, noisy torque measurements become a wrist speed, up to 125 times a second.
 
-The tool in the grip is a torsion spring on a wrist whose angle is known at all times: torque = K·(θ − θ₀) + d, where
-the offset d takes in all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d has to be
-learnt from the torque sensor; the rest is known without delay.
+The tool in the grip is a torsion spring on a wrist with a known angle: torque = K·(θ − θ₀) + d. The offset d takes in
+all that the spring does not explain (relaxation, hysteresis, slip, a wrong K). Only d is learnt from the torque sensor;
+the rest is known without delay.
 
-- A measurement y that belongs to the time t_mid (an EIT frame: the middle of its acquisition) is compared with what
-  was to be expected *there and then*: ν = y − K·(mean of θ over that acquisition − θ₀) − d. This is the delay
-  compensator. It is the internal-model form of Smith's predictor (Smith 1957; Garcia & Morari, "Internal Model
-  Control. 1", Ind. Eng. Chem. Process Des. Dev. 21, 1982), with the *measured* angle in place of a simulated one. So
-  the delay of each measurement is its own, a dropped frame changes nothing but the time of the next correction, and
-  neither a clipped command nor a slow wrist is a modelling error.
+- A measurement y belongs to a past time t_mid (an EIT frame: the middle of its acquisition). It is compared with the
+  torque expected *at that time*: ν = y − K·(mean of θ over the acquisition − θ₀) − d. It is the delay compensator, the
+  internal-model form of Smith's predictor (Smith 1957; Garcia & Morari, "Internal Model Control. 1", Ind. Eng. Chem.
+  Process Des. Dev. 21, 1982) with the *measured* angle, not a simulated one. Each measurement has its own delay,
+  a dropped frame only postpones the next correction, and clipped commands or a slow wrist are no modelling error.
 - A PI controller in incremental form takes ν up into d: i ← i + ki·ν, d ← d + kp·ν + i. (An α-β filter, the steady
-  Kalman filter of an offset that drifts: Kalata 1984.) i is the drift of the torque at a fixed angle.
-- The wrist is driven to the angle at which the expected torque is the wanted one: speed = bandwidth·(r − torque)/K,
+  Kalman filter of a drifting offset: Kalata 1984.) i is the drift of the torque at a fixed angle.
+- The wrist is driven to the angle at which the expected torque equals the ramp r: speed = bandwidth·(r − torque)/K,
   with feed-forward of the ramp, ṙ/K.
 
-Wind-up: the expectation is made from the angle that the wrist really has, so there is nothing to wind up in d while
-a command is clipped (the observer form of anti-windup: Åström & Wittenmark, Computer-Controlled Systems).
-What could run ahead are the ramp and i: the ramp goes no faster than the wrist was really told to turn, and i stands
-still while less was sent than was wanted.
+Wind-up: the expectation uses the measured angle, so d does not wind up while a command is clipped (the observer form of
+anti-windup: Åström & Wittenmark, Computer-Controlled Systems). The ramp moves no faster than the wrist was commanded to
+turn, and i stands still while less was sent than was wanted.
 """
 
 import math
-from collections import Counter
-from collections.abc import Mapping
+from bisect import bisect_right
 from dataclasses import dataclass
 from enum import StrEnum
 
-from shearloop.daemon.control.history import AngleHistory
 from shearloop.daemon.control.settings import ControllerSettings
 from shearloop.daemon.errors import UserError
 
-# A ramp does not catch up on a loop that was late for longer than this.
+# The ramp does not catch up when the loop was late for longer than this.
 _LONGEST_STEP_NS = 50_000_000
-# A rest ends at the deadband, a motion at this share of it: otherwise noise would toggle the two.
+# A rest ends at the deadband, a motion at this share of it: the hysteresis keeps noise from toggling the two.
 _SETTLED_SHARE = 0.1
-# A jump is what a cumulative sum says (Page 1954): innovations, in standard deviations and less the first number, that
-# add up to the second. A lasting 2.5 sigma does that within four measurements, noise alone once in some 20 000.
+# CUSUM test for jumps (Page 1954), in standard deviations: the slack per innovation and the threshold of the sum. It
+# detects a lasting 2.5 sigma within four measurements; noise alone triggers it once in some 20 000.
 _JUMP_SLACK, _JUMP_SUM = 1.0, 4.5
-# After it the offset counts as no better known than from so many measurements: the gain starts again at 1/4.
+# After a jump the offset counts as known from this many measurements: the gain restarts at 1/4.
 _KNOWN_AFTER_JUMP = 3.0
-# A drift is carried on over so many dropped measurements at most.
+# A drift is extrapolated over at most this many dropped measurements.
 _MOST_MISSED = 4
+# The angle history is trimmed after this many new samples.
+_TRIM_EVERY = 512
 
 
 class ControllerReason(StrEnum):
-    """Why the wrist does not do what the torque asks for; the text is for the operator."""
+    """Why the wrist does not follow the torque; the text is for the operator."""
 
     NOT_STARTED = "the controller has not been started"
     HELD = "the wrist is held on command"
@@ -59,7 +57,7 @@ class ControllerReason(StrEnum):
 
 
 class ControllerRefusal(StrEnum):
-    """Why a measurement was not used."""
+    """Why a measurement was rejected."""
 
     NOT_A_NUMBER = "not a number"
     NOT_STARTED = "before the start"
@@ -74,20 +72,20 @@ _CLIPPED = frozenset({ControllerReason.TRAVEL, ControllerReason.SPEED})
 
 @dataclass(frozen=True, slots=True)
 class WristCommand:
-    """The wrist speed that is wanted now, and every reason why it is not the one that the torque asks for."""
+    """The wrist speed for now, and every reason for which it differs from the ideal one."""
 
     speed_rad_per_s: float
     reasons: tuple[ControllerReason, ...] = ()
 
     @property
     def holds(self) -> bool:
-        """Return whether the wrist is held, rather than driven with a clipped speed."""
+        """Whether the wrist is held, rather than driven with a clipped speed."""
         return any(reason not in _CLIPPED for reason in self.reasons)
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerState:
-    """What the controller believes; torques in N·m. None before the start."""
+    """The controller's estimates; torques in N·m, None before the start."""
 
     set_point_nm: float | None
     ramp_nm: float | None
@@ -97,12 +95,61 @@ class ControllerState:
     innovation_nm: float | None
 
 
+class AngleHistory:
+    """Wrist angles of the last `span_ns`, interpolated linearly, with their running integral.
+
+    A frame acquired over half a second sees the mean torque, so it is compared with the mean angle over that time. The
+    integral makes each mean two look-ups.
+    """
+
+    def __init__(self, span_ns: int) -> None:
+        self.span_ns = span_ns
+        self._t_ns: list[int] = []
+        self._angle_rad: list[float] = []
+        self._integral: list[float] = []  # rad·ns since the first sample
+
+    def add(self, t_ns: int, angle_rad: float) -> bool:
+        """Append an angle; return False, and drop it, if it is not later than the last one."""
+        if self._t_ns:
+            step_ns = t_ns - self._t_ns[-1]
+            if step_ns <= 0:
+                return False
+            self._integral.append(self._integral[-1] + 0.5 * (angle_rad + self._angle_rad[-1]) * step_ns)
+        else:
+            self._integral.append(0.0)
+        self._t_ns.append(t_ns)
+        self._angle_rad.append(angle_rad)
+        if len(self._t_ns) % _TRIM_EVERY == 0:
+            self._trim(t_ns - self.span_ns)
+        return True
+
+    def mean(self, from_ns: int, to_ns: int) -> float | None:
+        """Return the mean angle in rad between two times; None where the history does not cover the interval."""
+        if not self._t_ns or from_ns < self._t_ns[0] or to_ns > self._t_ns[-1] or to_ns < from_ns:
+            return None
+        if to_ns == from_ns:
+            return self._at(from_ns)[0]
+        return (self._at(to_ns)[1] - self._at(from_ns)[1]) / (to_ns - from_ns)
+
+    def _at(self, t_ns: int) -> tuple[float, float]:
+        """Return the angle and the running integral at a time within the history."""
+        last = bisect_right(self._t_ns, t_ns) - 1
+        angle, since_ns = self._angle_rad[last], t_ns - self._t_ns[last]
+        if since_ns:
+            following = self._angle_rad[last + 1]
+            angle += (following - angle) * since_ns / (self._t_ns[last + 1] - self._t_ns[last])
+        return angle, self._integral[last] + 0.5 * (angle + self._angle_rad[last]) * since_ns
+
+    def _trim(self, before_ns: int) -> None:
+        cut = max(bisect_right(self._t_ns, before_ns) - 1, 0)
+        del self._t_ns[:cut], self._angle_rad[:cut], self._integral[:cut]
+
+
 class TwistController:
-    """Drives the wrist so that the tool's torque takes and keeps a set point. Times are CLOCK_MONOTONIC ns."""
+    """Drives the wrist so that the tool's torque reaches and keeps a set point. Times are CLOCK_MONOTONIC ns."""
 
     def __init__(self, settings: ControllerSettings) -> None:
         self.settings = settings
-        self._refused: Counter[ControllerRefusal] = Counter()
         span_s = settings.age_limit_s + settings.window_s + abs(settings.lag_s)
         self._history = AngleHistory(int(1e9 * (span_s + 1.0)))
         self._started = self._held = self._measured = self._moving = self._lost = False
@@ -110,19 +157,15 @@ class TwistController:
         self._ramp_nm: float | None = None
         self._innovation_nm: float | None = None
         self._origin_rad = self._angle_rad = 0.0
-        self._offset_nm = self._first_offset_nm = self._creep_nm = 0.0  # the last one per measurement
+        self._offset_nm = self._first_offset_nm = 0.0
+        self._creep_nm = 0.0  # per measurement
         self._known = self._sum_up = self._sum_down = 0.0
         self._t_mid_ns = self._fresh_ns = self._t_ns = 0
         self._wanted = self._sent = 0.0
 
     @property
-    def refused(self) -> Mapping[ControllerRefusal, int]:
-        """Return how many measurements were refused, by kind."""
-        return self._refused
-
-    @property
     def state(self) -> ControllerState:
-        """Return what the controller believes now."""
+        """The present estimates."""
         return ControllerState(
             set_point_nm=self._set_point_nm,
             ramp_nm=self._ramp_nm,
@@ -133,10 +176,10 @@ class TwistController:
         )
 
     def start(self, t_ns: int, angle_rad: float, torque_nm: float, known_measurements: float = 0.0) -> None:
-        """Begin at a wrist angle and the torque there, known as well as the mean of so many measurements knows it.
+        """Reset, and begin at a wrist angle and its torque, known as well as the mean of `known_measurements`.
 
-        The first measurements are averaged with it (gain 1/(n+1)) until kp is the greater gain. What was learnt
-        before is forgotten; there is no set point afterwards. Raises UserError for values that are not numbers.
+        The first measurements are averaged with that torque (gain 1/(n+1)) until kp is the greater gain. There is no
+        set point afterwards. Raises UserError for values that are not numbers.
         """
         if not (math.isfinite(angle_rad) and math.isfinite(torque_nm) and known_measurements >= 0.0):
             raise UserError("controller: it cannot start without a wrist angle and a torque that are numbers")
@@ -153,9 +196,9 @@ class TwistController:
         self._wanted = self._sent = 0.0
 
     def set_point(self, torque_nm: float) -> None:
-        """Ask for a torque; the ramp sets out from where it stands, or from the present torque.
+        """Change the set point; the ramp continues, or begins at the present torque.
 
-        Raises UserError where the torque is not a number within the torque limit, or before the start.
+        Raises UserError for a torque beyond the limit, and before the start.
         """
         limit = self.settings.torque_limit_nm
         if not self._started:
@@ -167,30 +210,23 @@ class TwistController:
             self._ramp_nm = self._expected_nm(self._angle_rad)
 
     def hold(self) -> None:
-        """Keep the wrist where it is until `resume`; measurements are still followed."""
+        """Hold the wrist until `resume`; measurements are still used."""
         self._held = True
 
     def resume(self) -> None:
-        """Go on after `hold`, or after the torque did not follow: the ramp sets out anew from the present torque.
+        """Continue after a hold; the ramp restarts at the present torque.
 
-        The offset is accepted as it now is, so a grip that has slipped may slip as far again before it is held.
+        The present offset becomes the reference: a grip that slipped may slip as far again before the next hold.
         """
         self._held = self._lost = False
         self._first_offset_nm = self._offset_nm
         self._rest()
 
-    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
-        """Take in a torque that belongs to t_mid_ns and became known at t_ns; return why it was refused, or None."""
-        refusal = self._use(torque_nm, t_mid_ns, t_ns)
-        if refusal is not None:
-            self._refused[refusal] += 1
-        return refusal
-
     def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
-        """Return the wrist speed for now, from the wrist angle as the robot reports it now (NaN where it does not).
+        """Return the wrist speed for now, from the angle that the robot reports (NaN: unknown).
 
-        The speed is 0 where anything speaks against motion, and never exceeds the speed limit. Reported as sent
-        until `sent` says otherwise.
+        The speed is 0 while anything forbids motion, and never exceeds the limit. It counts as sent until `sent`
+        corrects it.
         """
         elapsed_ns = min(max(t_ns - self._t_ns, 0), _LONGEST_STEP_NS)
         self._t_ns = max(t_ns, self._t_ns)
@@ -201,10 +237,11 @@ class TwistController:
         return self._drive(self._set_point_nm, elapsed_ns / 1e9)
 
     def sent(self, speed_rad_per_s: float) -> None:
-        """Tell what was really sent for the last command, after all clipping by driver and safety gate."""
+        """Correct the speed that was sent for the last command, after clipping by driver and safety."""
         self._sent = speed_rad_per_s if math.isfinite(speed_rad_per_s) else 0.0
 
-    def _use(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> ControllerRefusal | None:
+        """Use a torque of the time t_mid_ns that arrived at t_ns; return why it was rejected, or None."""
         own = self.settings
         if torque_nm is None or not math.isfinite(torque_nm):
             return ControllerRefusal.NOT_A_NUMBER
@@ -242,7 +279,7 @@ class TwistController:
         self._lost |= abs(self._offset_nm - self._first_offset_nm) > own.offset_limit_nm
 
     def _has_jumped(self, innovation_sigmas: float) -> bool:
-        """Add an innovation to the two sums; return whether one of them is full, and empty them then."""
+        """Update the two CUSUMs; return whether one exceeds the threshold, and reset both in that case."""
         self._sum_up = max(self._sum_up + innovation_sigmas - _JUMP_SLACK, 0.0)
         self._sum_down = max(self._sum_down - innovation_sigmas - _JUMP_SLACK, 0.0)
         jumped = max(self._sum_up, self._sum_down) > _JUMP_SUM
@@ -251,7 +288,7 @@ class TwistController:
         return jumped
 
     def _against_motion(self, t_ns: int, wrist_angle_rad: float) -> tuple[ControllerReason, ...]:
-        """Take the angle in, and return everything that forbids motion at present."""
+        """Store the angle, and return everything that forbids motion now."""
         if not self._started:
             return (ControllerReason.NOT_STARTED,)
         stale_ns = self.settings.stale_periods * self.settings.sample_period_s * 1e9
@@ -274,7 +311,7 @@ class TwistController:
         return tuple(reasons)
 
     def _rest(self) -> None:
-        """Stand still; whatever comes next sets out from the torque that there is."""
+        """Stand still; the next ramp begins at the present torque."""
         self._moving = False
         self._wanted = self._sent = 0.0
         if self._set_point_nm is not None:
@@ -295,7 +332,7 @@ class TwistController:
         return WristCommand(speed, reasons)
 
     def _advance_ramp(self, ramp_nm: float, set_point_nm: float, elapsed_s: float) -> tuple[float, float]:
-        """Return the ramp moved on by no more than the wrist was really told to turn, and its slope in N·m/s."""
+        """Return the ramp, moved no further than the wrist was commanded to turn, and its slope in N·m/s."""
         own = self.settings
         blocked = self._sent == 0.0 and self._wanted != 0.0
         if blocked or elapsed_s <= 0.0:
@@ -317,12 +354,12 @@ class TwistController:
         speed = max(-own.speed_limit_rad_per_s, min(own.speed_limit_rad_per_s, wanted))
         if speed != wanted:
             reasons.append(ControllerReason.SPEED)
-        # Only speeding up is limited: the robot brakes as it can, and a stop is never softened.
+        # Only speeding up is limited; braking is not.
         turning = abs(self._sent) if speed * self._sent > 0.0 else 0.0
         fastest = turning + own.acceleration_limit_rad_per_s2 * elapsed_s
         speed = math.copysign(min(abs(speed), fastest), speed)
         travel = self._angle_rad - self._origin_rad
-        # Slower and slower towards the limit, so that it is not run over within one period.
+        # Slow down towards the limit, so that one period does not overshoot it.
         room = max(own.travel_limit_rad - travel * math.copysign(1.0, speed), 0.0)
         if abs(speed) > own.wrist_bandwidth_per_s * room:
             speed = math.copysign(own.wrist_bandwidth_per_s * room, speed)
@@ -330,7 +367,7 @@ class TwistController:
         return speed, tuple(reasons)
 
     def _is_clipped(self) -> bool:
-        """Return whether less was sent than was wanted: then nothing may be integrated."""
+        """Whether less was sent than was wanted; nothing is integrated then."""
         return abs(self._sent - self._wanted) > 1e-9 and abs(self._sent) < abs(self._wanted)
 
     def _expected_nm(self, angle_rad: float) -> float:

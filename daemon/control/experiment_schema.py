@@ -1,4 +1,4 @@
-"""What an experiment may ask for, as it is written in YAML. Every bound is one that the rig can keep."""
+"""The experiment file: its limits and its steps, as pydantic models with bounds that the rig can keep."""
 
 from typing import Annotated, Literal
 
@@ -13,7 +13,7 @@ class _Section(BaseModel):
 
 
 def _angles(given: object) -> object:
-    """Read `start:stop:steps` as evenly spaced angles, ends included; lists and numbers pass as they are."""
+    """Return `START:STOP:STEPS` as evenly spaced angles, ends included; lists and numbers unchanged."""
     if isinstance(given, int | float):
         return (given,)
     if not isinstance(given, str):
@@ -43,7 +43,7 @@ Pose = Annotated[tuple[float, float, float, float, float, float], Field(descript
 
 
 class ExperimentLimits(_Section):
-    """What no step may exceed; a step's own limits can only be tighter."""
+    """Limits of all steps; a step's limits can only be tighter."""
 
     torque_nm: PositiveTorqueNm = 0.5
     angle_rad: Annotated[float, Field(gt=0, le=6.28, description="from the angle at which the tool was gripped")] = 3.2
@@ -55,7 +55,7 @@ class _Step(_Section):
 
 
 class ApproachStep(_Step):
-    """Move the tool centre in a straight line to where it can grip: to a pose, or so far along the tool's axis."""
+    """Move the tool centre in a straight line, to a pose or by a distance along the tool's axis."""
 
     do: Literal["approach"]
     pose_m_rad: Pose | None = None
@@ -72,11 +72,11 @@ class ApproachStep(_Step):
 class RetreatStep(ApproachStep):
     """Move away in a straight line."""
 
-    do: Literal["retreat"]  # type: ignore[assignment]  # the same move under the name that the reader expects
+    do: Literal["retreat"]  # type: ignore[assignment]  # the same move under another name
 
 
 class GripStep(_Step):
-    """Close to a width or onto the object that is met before it."""
+    """Close to a width, or onto an object in between."""
 
     do: Literal["grip"]
     width_mm: Annotated[float, Field(ge=0, le=140)] = 0.0
@@ -86,13 +86,13 @@ class GripStep(_Step):
 
 
 class TareStep(_Step):
-    """Take the homogeneous frames and the load cell's zero anew; the wrist stands still meanwhile."""
+    """Take new homogeneous frames and a new zero of the load cell, with the wrist standing still."""
 
     do: Literal["tare"]
 
 
 class IdentifyStep(_Step):
-    """Measure stiffness, delay and noise on the tool in hand, with small twists."""
+    """Measure stiffness, delay and noise of the gripped tool, with small twists."""
 
     do: Literal["identify"]
     amplitude_rad: Annotated[float, Field(gt=0, le=0.6)] = 0.2
@@ -103,7 +103,7 @@ class TwistStep(_Step):
 
     do: Literal["twist"]
     angles_rad: Angles
-    absolute: bool = Field(False, description="whether angles are the wrist's own, or from where the tool was gripped")
+    absolute: bool = Field(False, description="angles of the wrist joint, not from the angle at the grip")
     speed_rad_per_s: WristSpeed = 0.2
     hold_s: Seconds = 2.0
     return_to_start: bool = True
@@ -111,7 +111,7 @@ class TwistStep(_Step):
 
 
 class TurnToStep(_Step):
-    """Turn the wrist to an angle of its own, before a tool is gripped."""
+    """Turn the wrist joint to an angle, before a tool is gripped."""
 
     do: Literal["turn_to"]
     angle_rad: Annotated[float, Field(ge=-6.28, le=6.28)]
@@ -119,7 +119,7 @@ class TurnToStep(_Step):
 
 
 class HoldTorqueStep(_Step):
-    """Bring the torque to a set point along a ramp, and hold it there in closed loop."""
+    """Ramp the torque to a set point, and hold it in closed loop."""
 
     do: Literal["hold_torque"]
     torque_nm: TorqueNm
@@ -128,7 +128,7 @@ class HoldTorqueStep(_Step):
 
 
 class TightenStep(_Step):
-    """Turn until a torque or an angle is reached, whichever comes first."""
+    """Turn until a torque or an angle is reached."""
 
     do: Literal["tighten"]
     until_torque_nm: PositiveTorqueNm
@@ -145,7 +145,7 @@ class ReleaseStep(_Step):
 
 
 class WaitStep(_Step):
-    """Stand still for a while."""
+    """Stand still for a time."""
 
     do: Literal["wait"]
     wait_s: Seconds
@@ -168,24 +168,31 @@ Step = Annotated[
 
 
 class ExperimentFile(_Section):
-    """One experiment: what drives it, what bounds it, and its steps in order."""
+    """One experiment: its torque source, its limits and its steps in order."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
     drive: Annotated[str, Field(min_length=1)] = Field(
-        "right", description="the torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
+        "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
     limits: ExperimentLimits = ExperimentLimits()
     tool_mm: Annotated[float, Field(gt=0, lt=140)] | None = Field(
-        None, description="diameter of the tool that it is done with; recordings name it, and calibrations go by it"
+        None, description="diameter of the tool; recordings store it, and calibrations use it"
     )
     slices: Literal["torque", "diameter"] | None = Field(
-        None, description="what `shearloop run --slices DIR` keeps of each held angle; nothing by default"
+        None,
+        description="kind of samples that `shearloop run --slices DIR` stores for each held angle; none by default",
     )
     steps: Annotated[tuple[Step, ...], Field(min_length=1)]
 
+    def limits_of(self, step: Step) -> ExperimentLimits:
+        """Return the tighter of the experiment's limits and the step's."""
+        own = step.limits or self.limits
+        torque_nm, angle_rad = min(own.torque_nm, self.limits.torque_nm), min(own.angle_rad, self.limits.angle_rad)
+        return ExperimentLimits(torque_nm=torque_nm, angle_rad=angle_rad)
 
-def turns_before_a_grip(file: ExperimentFile) -> int | None:
-    """Return the number, from 1, of the step that turns the wrist before any has gripped or released; None of none."""
+
+def first_turn_before_grip(file: ExperimentFile) -> int | None:
+    """Return the number, from 1, of the first step that turns the wrist before any grip or release, or None."""
     for number, step in enumerate(file.steps, 1):
         match step:
             case GripStep() | ReleaseStep():
@@ -195,24 +202,24 @@ def turns_before_a_grip(file: ExperimentFile) -> int | None:
     return None
 
 
-def beyond_limits(file: ExperimentFile) -> str:
-    """Return which step asks for what its limits forbid, or an empty text."""
+def check_limits(file: ExperimentFile) -> str:
+    """Return a sentence on the first step that exceeds its limits, or an empty string."""
     for number, step in enumerate(file.steps):
-        own = step.limits or file.limits
-        allowed = min(own.torque_nm, file.limits.torque_nm), min(own.angle_rad, file.limits.angle_rad)
-        for wants, limit, unit, key in zip(
+        limits = file.limits_of(step)
+        allowed = limits.torque_nm, limits.angle_rad
+        for value, limit, unit, key in zip(
             _reach(step), allowed, ("N·m", "rad"), ("torque_nm", "angle_rad"), strict=True
         ):
-            if wants >= limit:
+            if value >= limit:
                 return (
-                    f"`steps[{number}]` ({step.do}) asks for {wants:g} {unit}, and its limit is {limit:g} {unit}; "
+                    f"`steps[{number}]` ({step.do}) asks for {value:g} {unit}, and its limit is {limit:g} {unit}; "
                     f"raise `limits.{key}`, or ask for less"
                 )
     return ""
 
 
 def _reach(step: Step) -> tuple[float, float]:
-    """Return the torque (N·m) and the angle from the grip (rad) that a step asks for; 0 where that is not known."""
+    """Return the largest torque (N·m) and angle from the grip (rad) of a step; 0 if unknown."""
     match step:
         case HoldTorqueStep():
             return abs(step.torque_nm), 0.0

@@ -8,7 +8,7 @@ from shearloop.bank.eit.gaussian import TWO_SIDED_95
 from shearloop.bank.estimation import Measured, fused
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus
-from shearloop.daemon.control.step_commands import GripTo
+from shearloop.daemon.control.step_runner import GripTo
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.tool_diameter import unknown
@@ -149,5 +149,5 @@ def _hand(state: GripperState) -> GripperStatus:
         fault=state.fault.sentence if state.fault.needs_activation else "",
         # Its own word on objects counts only while it goes to a target (gGTO) or stands there. A reset, by which an
         # activation is ended, and a loss of power leave the fingers where they are, on a tool as well.
-        unsure=state.object is ObjectStatus.UNKNOWN,
+        uncertain=state.object is ObjectStatus.UNKNOWN,
     )

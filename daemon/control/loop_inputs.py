@@ -1,4 +1,4 @@
-"""The latest of everything that the loop goes by, with the times that say how old it is. Values only."""
+"""Inputs of the control loop: the latest torques and device states, with their times. Values only."""
 
 import math
 from bisect import bisect_left, bisect_right
@@ -8,26 +8,27 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True, slots=True)
 class TorqueSample:
-    """One torque of one source: None where it is not valid; when it was measured and when it became known.
+    """One torque of one source, with the time of its measurement (`t_mid_ns`) and of its arrival (`t_ns`).
 
-    Where friction hides the torque within a band, `low_nm` and `high_nm` are its ends: anything between is as likely.
+    `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the band within which friction
+    hides the torque.
     """
 
     source: str
     torque_nm: float | None
-    why: str
+    reason: str
     t_mid_ns: int
     t_ns: int
     low_nm: float | None = None
     high_nm: float | None = None
 
     def __post_init__(self) -> None:
-        """Take what is not a number for no torque at all."""
+        """Treat NaN and infinity as no torque."""
         if self.torque_nm is not None and not math.isfinite(self.torque_nm):
             object.__setattr__(self, "torque_nm", None)
 
     def nearest_to(self, expected_nm: float | None) -> float | None:
-        """Return the torque within the band that is nearest to the expected one; what is inside contradicts nothing."""
+        """Return the torque of the friction band that is nearest to the expected one."""
         if self.torque_nm is None or self.low_nm is None or self.high_nm is None or expected_nm is None:
             return self.torque_nm
         return min(max(expected_nm, self.low_nm), self.high_nm)
@@ -35,7 +36,7 @@ class TorqueSample:
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """What the loop needs of the robot's state."""
+    """State of the robot, as far as the loop needs it."""
 
     wrist_rad: float
     t_ns: int
@@ -46,10 +47,10 @@ class ArmStatus:
 
 @dataclass(frozen=True, slots=True)
 class GripperStatus:
-    """What the loop needs of the gripper's state.
+    """State of the gripper, as far as the loop needs it.
 
-    `unsure` where the gripper does not say whether it holds anything, though it may: it was not sent where its fingers
-    stand, as after a halt or without power, or it is not active.
+    `uncertain`: the gripper cannot say whether it holds an object, because it is inactive, lost its power, or was
+    stopped on its way.
     """
 
     t_ns: int
@@ -57,41 +58,40 @@ class GripperStatus:
     holding: bool
     moving: bool
     fault: str = ""
-    unsure: bool = False
+    uncertain: bool = False
 
     @property
-    def stands(self) -> str:
-        """How fingers stand that do not say whether they hold anything."""
+    def uncertainty(self) -> str:
+        """Why the gripper does not know whether it holds an object; completes "its fingers …"."""
         return "are moving" if self.moving else "stand where a stop, an activation or a lack of power has left them"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TorqueSource:
-    """A torque that can drive or supervise: how often it comes, and over what time it averages.
+    """A source of torques: its period and the averaging window of one torque.
 
-    `sticks` where friction hides it within a band: then it says nothing while the wrist turns through the band.
-    `of_the_arm` where it comes with the arm's state, whose age is watched already. `measures_torque` is false where
-    nothing makes a torque of what it measures, as of a fingertip without a calibration: that it is silent is told all
-    the same.
+    `has_friction_band`: friction hides the torque within a band, in which the wrist turns without a change.
+    `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
+    fingertip without a calibration; a silent one is a fault all the same.
     """
 
     name: str
     period_s: float
     window_s: float = 0.0
-    sticks: bool = False
-    of_the_arm: bool = False
+    has_friction_band: bool = False
+    from_robot: bool = False
     measures_torque: bool = True
 
 
 @dataclass(slots=True)
-class _Recent:
-    """The valid torques of one source, in order of the time that they belong to."""
+class _History:
+    """Valid torques of one source, ordered by the time of measurement."""
 
     t_mid_ns: list[int] = field(default_factory=list)
     torque_nm: list[float] = field(default_factory=list)
 
     def add(self, t_mid_ns: int, torque_nm: float, kept_ns: int) -> None:
-        """Append one; those before `kept_ns` are forgotten when they are as many as the others, which is cheap."""
+        """Append a torque, and trim once the list spans twice `kept_ns`."""
         self.t_mid_ns.append(t_mid_ns)
         self.torque_nm.append(torque_nm)
         if self.t_mid_ns[0] < t_mid_ns - 2 * kept_ns:
@@ -99,39 +99,39 @@ class _Recent:
             del self.t_mid_ns[:old], self.torque_nm[:old]
 
     def mean(self, from_ns: int, to_ns: int) -> float | None:
-        """Return the mean of those between two times, ends included; None where there is none."""
+        """Return the mean torque between two times, ends included; None without any."""
         first, end = bisect_left(self.t_mid_ns, from_ns), bisect_right(self.t_mid_ns, to_ns)
         return sum(self.torque_nm[first:end]) / (end - first) if end > first else None
 
 
 @dataclass(slots=True)
 class LoopInputs:
-    """The latest values. `lost` and `died` map a device or task to a sentence while it is gone.
+    """The latest inputs. `lost` and `died` map missing devices and dead tasks to a sentence.
 
-    Valid torques are kept for `kept_s`, to compare two sources at the same time, whatever their rates.
+    Valid torques are kept for `kept_s`, to compare two sources at the same time.
     """
 
     kept_s: float = 10.0
     torques: dict[str, TorqueSample] = field(default_factory=dict)
-    recent: dict[str, _Recent] = field(default_factory=dict)
+    history: dict[str, _History] = field(default_factory=dict)
     arm: ArmStatus | None = None
-    hand: GripperStatus | None = None
+    gripper: GripperStatus | None = None
     lost: dict[str, str] = field(default_factory=dict)
     died: Mapping[str, str] = field(default_factory=dict)
-    recording_failed: str = ""
+    recording_error: str = ""
     late_s: float = 0.0
 
-    def hear(self, torque: TorqueSample) -> None:
-        """Take in a torque; what is older than what is known already is left out."""
+    def add_torque(self, torque: TorqueSample) -> None:
+        """Store a torque, unless it is older than the latest one of its source."""
         known = self.torques.get(torque.source)
         if known is not None and torque.t_mid_ns <= known.t_mid_ns:
             return
         self.torques[torque.source] = torque
         if torque.torque_nm is not None:
-            recent = self.recent.setdefault(torque.source, _Recent())
-            recent.add(torque.t_mid_ns, torque.torque_nm, round(self.kept_s * 1e9))
+            history = self.history.setdefault(torque.source, _History())
+            history.add(torque.t_mid_ns, torque.torque_nm, round(self.kept_s * 1e9))
 
     def mean_torque_nm(self, source: str, from_ns: int, to_ns: int) -> float | None:
-        """Return the mean of a source's valid torques that belong to a time, or None where there is none."""
-        known = self.recent.get(source)
+        """Return the mean of a source's valid torques between two times, or None without any."""
+        known = self.history.get(source)
         return None if known is None else known.mean(from_ns, to_ns)

@@ -7,24 +7,24 @@ from shearloop.drivers.ur.messages import RobotState
 
 def loop_state(brain: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopState:
     """Return where the closed loop stands at now_ns, while so much was sent to the wrist."""
-    standing, experiment = brain.standing, brain.experiment
+    status, experiment = brain.status, brain.experiment
     progress = experiment.progress() if experiment is not None else None
     driving = experiment.file.drive if experiment is not None else ""
-    latest = brain.senses.torques.get(driving)
+    latest = brain.inputs.torques.get(driving)
     controller = brain.controller
     believed = controller.state if controller is not None else None
-    found = brain.identified
+    found = brain.tool
     return LoopState(
         source="loop",
         t_mono_ns=now_ns,
-        phase=standing.phase,
+        phase=status.phase,
         experiment=experiment.file.name if experiment is not None else "",
         step=progress.step if progress else 0,
         steps=progress.steps if progress else 0,
         step_name=experiment.step.do if experiment is not None else "",
         slices=experiment.file.slices or "" if experiment is not None else "",
-        hold=experiment.wish.hold if experiment is not None else 0,
-        doing=standing.doing,
+        hold=experiment.command.hold_number if experiment is not None else 0,
+        doing=status.activity,
         progress=progress.share if progress else 0.0,
         remaining_s=progress.remaining_s if progress else 0.0,
         tool_mm=experiment.file.tool_mm if experiment is not None else None,
@@ -36,10 +36,10 @@ def loop_state(brain: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopSt
         stiffness_nm_per_rad=found.stiffness_nm_per_rad if found is not None else None,
         delay_s=found.age_s + found.significant_lag_s if found is not None else None,
         noise_nm=found.noise_nm if found is not None else None,
-        speed_wanted_rad_per_s=standing.turn.speed_rad_per_s,
+        speed_wanted_rad_per_s=status.velocity.speed_rad_per_s,
         speed_sent_rad_per_s=sent_rad_per_s,
-        response=standing.verdict.response.name.lower().replace("_", " "),
-        reasons=" ".join((*standing.verdict.reasons, *standing.turn.reasons)),
+        response=status.decision.response.name.lower().replace("_", " "),
+        reasons=" ".join((*status.decision.reasons, *status.velocity.reasons)),
     )
 
 

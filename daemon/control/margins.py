@@ -1,13 +1,12 @@
-"""Gain, phase and delay margins of the sampled twist loop, and where its boundary of stability lies.
+"""Stability margins of the sampled twist loop, and the controller gain that noise and margins allow.
 
-Everything between two measurements is computed, not approximated: the wrist loop as the recursion that it is (a speed
-held for each command period, an actuation delay), the acquisition as the mean of the angle over its window, the
-delays with their fractions of a period. What is left is a discrete loop in x = z⁻¹, one step a measurement (the
-pulse-transfer function; Åström & Wittenmark, Computer-Controlled Systems).
+Everything between two measurements is computed exactly: the wrist loop as its recursion (a speed held for each command
+period, an actuation delay), the acquisition as the mean angle over its window, delays with their fractions of a period.
+The result is a discrete loop in x = z⁻¹, one step a measurement (the pulse-transfer function; Åström & Wittenmark,
+Computer-Controlled Systems).
 
-With P(x) = kp + ki/(1 − x), the stiffness ratio ρ = true/assumed, and D(x) the response of the window's mean angle
-to the corrections (D₀ where the compensator believes the window to be, D₁ where it really is), the controller has
-the characteristic equation
+With P(x) = kp + ki/(1 − x), the stiffness ratio ρ = true/assumed, and D(x) the response of the window's mean angle to
+the corrections (D₀ for the window that the compensator assumes, D₁ for the true one), the characteristic equation is
 
     compensated    (1 − x) + P·(x + ρ·D₁ − D₀) = 0        (exact model, ρ = 1 and D₁ = D₀: 1 − x + P·x = 0, no delay)
     uncompensated  (1 − x) + P·ρ·D₁ = 0
@@ -20,14 +19,23 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import solve_discrete_lyapunov
 
-FloatArray = NDArray[np.float64]
+from shearloop.bank.arrays import FloatArray
+from shearloop.daemon.control.identification import ToolModel
+from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
+
 ComplexArray = NDArray[np.complex128]
 
-# The wrist has arrived when so little of a step is left; the response is cut there.
+# The step response is cut at this remainder.
 _SETTLED = 1e-9
 _LONGEST_RESPONSE = 200_000
 _FREQUENCIES = 4000
+# Above this gain the loop follows single measurements rather than their mean.
+MOST_GAIN = 0.5
+LEAST_GAIN = 1e-3
+# The delay margin that a controller must have, in measurement periods.
+DELAY_MARGIN_PERIODS = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,7 +50,7 @@ class LoopModel:
     kp: float
     ki: float = 0.0
     command_period_s: float = 0.008
-    # What the compensator does not know: how much stiffer the tool is, and by how much its torque lags the stamps.
+    # Unknown to the compensator: the ratio of true to assumed stiffness, and the torque's lag behind its stamps.
     stiffness_ratio: float = 1.0
     lag_error_s: float = 0.0
     compensated: bool = True
@@ -50,10 +58,10 @@ class LoopModel:
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """How far the loop is from instability; all infinite (phase: 180°) where nothing could make it unstable.
+    """Distance of the loop from instability; infinite (phase: 180°) where no value makes it unstable.
 
-    gain: the tool may be so many times stiffer than it is. phase_deg: at the frequencies where the loop gain is 1.
-    delay_s: so much more delay that the compensator does not know of.
+    gain: factor on the tool's stiffness. phase_deg: at the frequencies where the loop gain is 1. delay_s: further delay
+    that is unknown to the compensator.
     """
 
     gain: float
@@ -62,10 +70,10 @@ class Margins:
 
 
 def wrist_response(model: LoopModel) -> FloatArray:
-    """Return the wrist's angle (n,) after a unit step of its target, at multiples of the command period, until 1.
+    """Return the wrist angle (n,) after a unit step of its target, at multiples of the command period, until 1.
 
-    The recursion of the real loop: a speed of bandwidth × (target − angle), held for one period, that the wrist
-    takes on after the actuation delay (with its fraction of a period). Raises ValueError where that does not settle.
+    The recursion of the real loop: a speed of bandwidth × (target − angle), held for one period and applied after the
+    actuation delay (with its fraction of a period). Raises ValueError if it does not settle.
     """
     return _wrist_response(model.command_period_s, model.wrist_bandwidth_per_s, model.actuation_s)
 
@@ -90,21 +98,21 @@ def _wrist_response(period_s: float, bandwidth_per_s: float, actuation_s: float)
 
 
 def pulse_response(model: LoopModel, lag_s: float = 0.0) -> FloatArray:
-    """Return the coefficients (n,) of D in x; `lag_s` moves the windows back. See `seen_through_window`."""
-    return seen_through_window(wrist_response(model), model, lag_s)
+    """Return the coefficients (n,) of D in x; `lag_s` moves the windows back. See `window_response`."""
+    return window_response(wrist_response(model), model, lag_s)
 
 
-def seen_through_window(angle: FloatArray, model: LoopModel, lag_s: float = 0.0) -> FloatArray:
-    """Return how the mean angle over a measurement's window (n,) grows from each measurement to the next.
+def window_response(angle: FloatArray, model: LoopModel, lag_s: float = 0.0) -> FloatArray:
+    """Return the growth of the windows' mean angle from each measurement to the next (n,).
 
-    `angle` (m,) is the wrist's way to 1, at multiples of the command period, after a unit correction that is made
-    with measurement 0 and held. Coefficient k is what measurement k sees beyond what measurement k−1 saw. Raises
-    ValueError where a measurement would see its own correction.
+    `angle` (m,) is the wrist's step response at multiples of the command period, after a unit correction made with
+    measurement 0. Coefficient k is the mean angle of measurement k minus the one of k−1. Raises ValueError if a
+    measurement would see its own correction.
     """
     period = model.command_period_s
     running = np.concatenate([[0.0], np.cumsum(0.5 * (angle[1:] + angle[:-1])) * period])
     t_s = np.arange(angle.size) * period
-    # A correction waits for the next command: half a command period on the average.
+    # A correction waits for the next command: half a command period on average.
     start_s = model.age_s + 0.5 * period + lag_s
     count = math.ceil((float(t_s[-1]) + start_s + 0.5 * model.window_s) / model.sample_period_s) + 2
     middle_s = np.arange(count, dtype=np.float64) * model.sample_period_s - start_s
@@ -126,10 +134,9 @@ def seen_through_window(angle: FloatArray, model: LoopModel, lag_s: float = 0.0)
 
 
 def gain_limit(model: LoopModel, highest: float = 4.0) -> float:
-    """Return the smallest kp at which the loop is unstable, ki following as kp²; infinite where `highest` is stable.
+    """Return the smallest unstable kp, with ki scaled as kp² (constant damping); infinite if `highest` is stable.
 
-    ki is scaled with the square so that the damping stays what it is. Where even the smallest gain that is tried
-    (a thousandth of the highest) is unstable, that one is returned.
+    The smallest gain that is tried is a thousandth of the highest.
     """
     trials = np.geomspace(1e-3 * highest, highest, 60)
     unstable = next((n for n, kp in enumerate(trials) if not is_stable(with_gain(model, float(kp)))), None)
@@ -141,12 +148,12 @@ def gain_limit(model: LoopModel, highest: float = 4.0) -> float:
 
 
 def with_gain(model: LoopModel, kp: float) -> LoopModel:
-    """Return the loop with another kp, and ki as its square follows."""
+    """Return the loop with another kp, and ki scaled with its square."""
     return replace(model, kp=kp, ki=model.ki * (kp / model.kp) ** 2)
 
 
 def margins(model: LoopModel) -> Margins:
-    """Return the margins of the loop, broken where the tool's torque arises; (0, 0, 0) where it is unstable."""
+    """Return the margins of the loop, opened at the tool's torque; (0, 0, 0) if it is unstable."""
     if not is_stable(model):
         return Margins(0.0, 0.0, 0.0)
     omega = np.concatenate([np.geomspace(1e-4, 0.1, _FREQUENCIES // 4), np.linspace(0.1, math.pi, _FREQUENCIES)[1:]])
@@ -155,7 +162,7 @@ def margins(model: LoopModel) -> Margins:
 
 
 def _return_ratio(model: LoopModel, omega: FloatArray) -> ComplexArray:
-    """Return what comes back (n,) of the tool's torque, with reversed sign, at the frequencies in rad a sample."""
+    """Return the loop's return ratio (n,) at frequencies in rad per sample, broken at the tool's torque."""
     x = np.exp(-1j * omega).astype(np.complex128)
     control = model.kp + (model.ki / (1.0 - x) if model.ki else 0.0)
     seen = model.stiffness_ratio * _at(pulse_response(model, model.lag_error_s), x) * control
@@ -173,7 +180,7 @@ def _gain_margin(ratio: ComplexArray) -> float:
     across = np.flatnonzero(imaginary[:-1] * imaginary[1:] < 0.0)
     share = imaginary[across] / (imaginary[across] - imaginary[across + 1])
     crossings = real[across] + share * (real[across + 1] - real[across])
-    # At the highest frequency, half the sampling rate, the ratio is always real.
+    # At half the sampling rate the ratio is real.
     factors = -1.0 / np.append(crossings, real[-1])
     return float(min(factors[factors > 1.0], default=math.inf))
 
@@ -189,7 +196,7 @@ def _phase_margin_deg(ratio: ComplexArray) -> float:
 
 
 def _delay_margin_s(model: LoopModel) -> float:
-    """Return the smallest further lag of the torque that makes the loop unstable, looked for up to 20 periods."""
+    """Return the smallest further lag of the torque that makes the loop unstable, searched up to 20 periods."""
 
     def stable(extra_s: float) -> bool:
         return is_stable(replace(model, lag_error_s=model.lag_error_s + extra_s))
@@ -202,7 +209,7 @@ def _delay_margin_s(model: LoopModel) -> float:
 
 
 def _bisect(good: Callable[[float], bool], low: float, high: float) -> float:
-    """Return where `good` ends, given that it holds at `low` and not at `high`, to a part in 10⁴ of the latter."""
+    """Return the end of `good`, which is true at `low` and false at `high`, with a relative error of 10⁻⁴."""
     while high - low > 1e-4 * high:
         middle = 0.5 * (low + high)
         low, high = (middle, high) if good(middle) else (low, middle)
@@ -212,7 +219,7 @@ def _bisect(good: Callable[[float], bool], low: float, high: float) -> float:
 def is_stable(model: LoopModel) -> bool:
     """Return whether all roots of the characteristic polynomial lie outside the unit circle of x = z⁻¹."""
     polynomial = characteristic_polynomial(model)
-    # np.roots wants the highest power first; z = 1/x has to lie inside, so the reversed polynomial is asked.
+    # np.roots takes the highest power first: this order gives the roots in z = 1/x, which must lie inside the circle.
     roots = np.roots(polynomial)
     return bool(np.all(np.abs(roots) < 1.0 - 1e-9))
 
@@ -232,3 +239,96 @@ def characteristic_polynomial(model: LoopModel) -> FloatArray:
 def _sum(one: FloatArray, other: FloatArray) -> FloatArray:
     size = max(one.size, other.size)
     return np.pad(one, (0, size - one.size)) + np.pad(other, (0, size - other.size))
+
+
+def integral_gain(kp: float) -> float:
+    """Return the ki for a kp: kp²/10, well damped (ζ = 1.6).
+
+    Critical damping (kp²/4) follows a drift faster, but passes a tenth more noise and extrapolates the gel's creep
+    further (docs/decisions/0020-controller.md).
+    """
+    return 0.1 * kp * kp
+
+
+def noise_share(kp: float, ki: float) -> float:
+    """Return the standard deviation of the torque caused by measurement noise of standard deviation 1.
+
+    The stationary variance of the controller's filter d ← d + i + (kp + ki)·ν, i ← i + ki·ν, ν = noise − d. It is exact
+    if the wrist arrives within a period, and slightly too large otherwise.
+    """
+    turn = np.array([[1.0 - kp - ki, 1.0], [-ki, 1.0]]) if ki else np.array([[1.0 - kp]])
+    push = np.array([[kp + ki], [ki]]) if ki else np.array([[kp]])
+    return math.sqrt(float(solve_discrete_lyapunov(turn, push @ push.T)[0, 0]))
+
+
+def gain_for_noise(noise_nm: float, allowed_nm: float) -> float:
+    """Return the largest kp, up to MOST_GAIN, at which noise moves the torque by at most `allowed_nm`."""
+    kps = np.geomspace(LEAST_GAIN, MOST_GAIN, 200)
+    fitting = [float(kp) for kp in kps if noise_share(float(kp), integral_gain(float(kp))) * noise_nm <= allowed_nm]
+    return max(fitting, default=LEAST_GAIN)
+
+
+def loop_model(settings: ControllerSettings, found: ToolModel) -> LoopModel:
+    """Return the loop that these settings close around an identified tool.
+
+    An unknown actuation delay counts as 8 ms. A negative lag is limited by the torque's age: no torque is known before
+    its acquisition has ended.
+    """
+    earliest_s = 0.5 * settings.window_s - found.age_s
+    return LoopModel(
+        sample_period_s=found.sample_period_s,
+        window_s=settings.window_s,
+        age_s=found.age_s,
+        actuation_s=found.actuation_s if math.isfinite(found.actuation_s) else 0.008,
+        wrist_bandwidth_per_s=settings.wrist_bandwidth_per_s,
+        kp=settings.kp,
+        ki=settings.ki,
+        stiffness_ratio=found.stiffness_nm_per_rad / settings.stiffness_nm_per_rad,
+        lag_error_s=max(found.significant_lag_s - settings.lag_s, earliest_s),
+    )
+
+
+def passing_gain(model: LoopModel, config: LoopConfig) -> float | None:
+    """Return the largest kp, to 1 % and at most MOST_GAIN, that gives the required margins, or None."""
+
+    def passes(kp: float) -> bool:
+        return _passes(margins(with_gain(model, kp)), config, model.sample_period_s)
+
+    trials = [float(kp) for kp in np.geomspace(MOST_GAIN, LEAST_GAIN, 25)]
+    first = next((number for number, kp in enumerate(trials) if passes(kp)), None)
+    if first is None:
+        return None
+    best, too_much = trials[first], trials[max(first - 1, 0)]
+    while too_much > 1.01 * best:
+        middle = math.sqrt(best * too_much)
+        best, too_much = (middle, too_much) if passes(middle) else (best, middle)
+    return best
+
+
+def margin_refusal(settings: ControllerSettings, found: ToolModel, config: LoopConfig) -> str | None:
+    """Return None for a controller with the required margins, else a sentence with the margins and the cure."""
+    model = loop_model(settings, found)
+    has = margins(model)
+    if _passes(has, config, found.sample_period_s):
+        return None
+    passing = passing_gain(model if settings.ki else replace(model, ki=0.0), config)
+    cure = "no gain would pass; identify again, and check the timestamps of the torque"
+    if passing is not None:
+        would = with_gain(model, passing)
+        cure = f"kp {would.kp:.3g} with ki {would.ki:.2g} would pass"
+    return (
+        f"controller refused: with kp {settings.kp:g} and ki {settings.ki:.2g} the gain margin is {has.gain:.2f} "
+        f"(required {config.gain_margin:.2f}), the phase margin {has.phase_deg:.0f}° ({config.phase_margin_deg:.0f}°) "
+        f"and the delay margin {has.delay_s:.2f} s ({DELAY_MARGIN_PERIODS * found.sample_period_s:.2f} s), for a "
+        f"stiffness of {found.stiffness_nm_per_rad:.3g} N·m/rad ({settings.stiffness_nm_per_rad:.3g} assumed), torques "
+        f"{found.age_s:.2f} s old, every {found.sample_period_s:.3g} s, {found.significant_lag_s:.2f} s behind their "
+        f"stamps; {cure}"
+    )
+
+
+def _passes(has: Margins, config: LoopConfig, period_s: float) -> bool:
+    return (
+        has.gain >= config.gain_margin
+        and has.phase_deg >= config.phase_margin_deg
+        and has.delay_s >= DELAY_MARGIN_PERIODS * period_s
+    )

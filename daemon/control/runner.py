@@ -1,7 +1,8 @@
-"""The task that closes the loop: the robot's states in, the brain's orders out, up to 125 times a second."""
+"""The task that closes the loop: the robot's states in, the brain's orders out, 125 times a second."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
 from functools import partial
 
 import structlog
@@ -20,31 +21,28 @@ from shearloop.daemon.control.watchdog_timer import WatchdogTimer
 from shearloop.daemon.messaging.messages import Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.supervisor import LONGEST_ERROR
-from shearloop.drivers.ur.client import UrRobot, unheard
+from shearloop.drivers.ur.client import UrRobot, ignore_state
 from shearloop.drivers.ur.messages import Enable, RobotState, Stop, Unlock
-from shearloop.drivers.ur.pace import EVEN_CYCLES
 
 WRENCH = "wrench"
 # Without a state it is asked after so long: half of the time after which the arm's is stale.
 LONGEST_SILENCE_S = 0.5 * ARM_STALE_S
-# Of every fifth of the robot's cycles the state is published, and speaks as the torque of the wrench: 25 a second.
-PUBLISH_EVERY = EVEN_CYCLES
-# While nothing can move no other state is needed; without one the brain is asked no less often than this.
+# Every fifth state is published, and speaks as the torque of the wrench: 25 a second.
+PUBLISH_EVERY = 5
+# While nothing can move a loop is late only after this.
 LONGEST_REST_S = ARM_STALE_S
-# As long as states come, they are published then, and decided upon no more often than this: it is for who looks on.
-SHORTEST_REST_S = 0.5 * LONGEST_REST_S
-# Then too states come twice within the time after which the arm's is stale.
-LONGEST_EASE_S = 0.5 * ARM_STALE_S
 LOOP_STATE_PERIOD_S = 1.0
 # A loop that died tells the arm to stop, and waits no longer than this for the answer.
 BRAKE_S = 0.5
+# A robot that has taken `Enable` says so in its next state.
+ENABLED_WITHIN_S = 0.5
 # A release is tried for five seconds and then opens the fingers; systemd ends a service ten seconds after it said so.
 RELEASED_WITHIN_S = 7.0
 
 
 def wrench_source(rate_hz: float) -> TorqueSource:
     """Return how often the wrench's torque comes, of a robot that tells its state so often: with those published."""
-    return TorqueSource(name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, of_the_arm=True)
+    return TorqueSource(name=WRENCH, period_s=PUBLISH_EVERY / rate_hz, from_robot=True)
 
 
 class ControlLoopRunner:
@@ -111,24 +109,23 @@ class ControlLoopRunner:
             self._listen_no_more()
             await self._end()
 
-    def _decide(self, state: RobotState | None = None) -> None:
+    def _decide(self, state: RobotState | None = None, newest: bool = True) -> None:
         """Ask the brain, with a new state or because none has come for too long; what goes wrong ends `drive`."""
         now_ns = self._clock.now_ns()
         passed_s = (now_ns - self._decided_ns) / 1e9
         try:
             if state is not None:
                 self._sense(state)
-                if self._robot.overtaken:
+                if not newest:
                     # Where this process was away they come at once. Decided upon one by one, all but the first would be
                     # in time, and a loop that is late again and again would not be late for more than a moment.
                     return
-            if passed_s >= SHORTEST_REST_S or state is None or not self._at_rest():
-                # From one decision to the next: what a decision itself takes is late as well.
-                self._brain.senses.late_s = max(0.0, passed_s - self._longest_s)
-                self._decided_ns = now_ns
-                self._brain.senses.died = self._deaths()
-                self._carry_out(self._brain.tick(now_ns))
-                self._tell(now_ns)
+            # From one decision to the next: what a decision itself takes is late as well.
+            self._brain.inputs.late_s = max(0.0, passed_s - self._longest_s)
+            self._decided_ns = now_ns
+            self._brain.inputs.died = self._deaths()
+            self._carry_out(self._brain.tick(now_ns))
+            self._tell(now_ns)
             self._listen()
         except Exception as error:  # noqa: BLE001 - raised again by `drive`, whose task it ends
             if self._action is not self._last_word:
@@ -144,12 +141,12 @@ class ControlLoopRunner:
             self._decide()
 
     def _listen(self) -> None:
-        """Agree with the robot on how often a state is needed, and decide without one where none comes in time."""
-        self._longest_s = self._pace()
+        """Decide without a state where none comes in time."""
+        self._longest_s = LONGEST_REST_S if self._stopped and not self._running() else LONGEST_TICK_S
         self._silence.heard(max(self._longest_s, LONGEST_SILENCE_S))
 
     def _listen_no_more(self) -> None:
-        self._robot.on_state = unheard
+        self._robot.on_state = ignore_state
         self._silence.end()
 
     async def start(self, file: ExperimentFile) -> str | None:
@@ -161,13 +158,11 @@ class ControlLoopRunner:
         if not reply.accepted:
             return reply.refused
         # The state that says so comes one cycle later.
-        for _ in range(25):
-            state = await self._robot.state_within(LONGEST_TICK_S)
-            if state is not None and not state.blocked:
+        with suppress(TimeoutError):
+            async with asyncio.timeout(ENABLED_WITHIN_S):
+                while (state := await self._robot.next_state()).blocked:
+                    pass
                 self._sense(state)
-                break
-        # From now on the brain is asked as often as the robot has something to say.
-        self._robot.hurry()
         return self._brain.start(file, self._clock.now_ns())
 
     async def ended(self) -> Experiment:
@@ -208,7 +203,7 @@ class ControlLoopRunner:
         }
 
     def _sense(self, state: RobotState) -> None:
-        self._brain.senses.arm = ArmStatus(
+        self._brain.inputs.arm = ArmStatus(
             wrist_rad=state.wrist_rad,
             # The moment that the controller speaks of: one that repeats itself is as stale as one that is silent.
             t_ns=state.t_mono_ns - state.age_ns,
@@ -219,32 +214,10 @@ class ControlLoopRunner:
         if (number := state.cycle // PUBLISH_EVERY) != self._published:
             self._published = number
             # The wrench is what the tool does to the wrist; the torque on the tool is its opposite.
-            self._brain.hear(
+            self._brain.on_torque(
                 TorqueSample(WRENCH, -state.wrist_torque_nm, "", state.t_mono_ns - state.age_ns, self._clock.now_ns())
             )
             self._publisher.publish(robot_state(state))
-
-    def _pace(self) -> float:
-        """Have the robot tell whatever is new of its state, unless nothing can move; return how long to wait for it.
-
-        While no experiment runs and the arm was told to stop, and does rest, the states that are published will do.
-        """
-        if not self._at_rest():
-            self._robot.hurry()
-            return LONGEST_TICK_S
-        state = self._robot.state
-        if state is not None and state.motion == "idle":
-            in_time = int(LONGEST_EASE_S * self._robot.settings.rate_hz)
-            self._robot.ease(min(in_time, PUBLISH_EVERY))
-        elif state is not None:
-            # The state by which it was put at ease was from before a command that was on its way. Without signs of life
-            # a gentle stop becomes a hard one.
-            self._robot.hurry()
-        return LONGEST_REST_S
-
-    def _at_rest(self) -> bool:
-        """Whether no experiment runs and the arm was told to stop."""
-        return self._stopped and not self._running()
 
     def _running(self) -> bool:
         experiment = self._brain.experiment
@@ -263,7 +236,7 @@ class ControlLoopRunner:
             if not self._stopped:
                 self._stopped = True
                 self._break_off()
-                self._wrist.stop(self._decided_ns)
+                self._wrist.stop()
             if orders.release and self._gripper is not None:
                 self._begin(self._gripper.release, self._has_released)
                 self._last_word = self._action
@@ -272,10 +245,10 @@ class ControlLoopRunner:
         if not orders.hold:
             self._actions.let_go()
         elif self._actions.hold_back():
-            self._wrist.stop(self._decided_ns)
-        if orders.begin is not None:
-            self._begin(partial(self._actions.perform, orders.begin), self._brain.action_ended)
-        self._wrist.turn(orders.wrist_rad_per_s, self._decided_ns)
+            self._wrist.stop()
+        if orders.action is not None:
+            self._begin(partial(self._actions.perform, orders.action), self._brain.on_action_ended)
+        self._wrist.turn(orders.wrist_rad_per_s)
 
     def _died_of(self, error: Exception) -> None:
         structlog.get_logger().exception("a command to the robot died")
@@ -298,7 +271,7 @@ class ControlLoopRunner:
     def _has_released(self, failure: str) -> None:
         if failure:
             structlog.get_logger().error("the gripper was told to open and did not", why=failure)
-        self._brain.release_ended(failure)
+        self._brain.on_release_ended(failure)
 
     def _break_off(self) -> None:
         """End the action that is under way; fingers that move go on by themselves, and are told not to."""
@@ -311,27 +284,27 @@ class ControlLoopRunner:
     def _has_halted(self, failure: str) -> None:
         if failure:
             structlog.get_logger().error("the fingers were told to stop and did not", why=failure)
-            self._brain.note_refusal(f"the fingers were told to stop and did not: {failure}")
+            self._brain.on_command_refused(f"the fingers were told to stop and did not: {failure}")
 
     def _cancel_action(self) -> None:
         if self._action is not None:
             self._action.cancel()
 
     def _tell(self, now_ns: int) -> None:
-        standing, experiment = self._brain.standing, self._brain.experiment
+        status, experiment = self._brain.status, self._brain.experiment
         key = (
-            standing.phase,
-            tuple(trouble.event for trouble in standing.verdict.troubles),
-            standing.turn.reasons,
-            experiment and experiment.number,
+            status.phase,
+            tuple(trouble.code for trouble in status.decision.faults),
+            status.velocity.reasons,
+            experiment and experiment.step_number,
         )
-        held = experiment.wish.hold if experiment is not None else 0
+        held = experiment.command.hold_number if experiment is not None else 0
         if (key, held) == (self._told, self._told_hold) and now_ns - self._told_ns < LOOP_STATE_PERIOD_S * 1e9:
             return
         self._told_hold = held
         if key != self._told:
             structlog.get_logger().info(
-                "loop", phase=standing.phase, doing=standing.doing, reasons=" ".join(standing.verdict.reasons)
+                "loop", phase=status.phase, doing=status.activity, reasons=" ".join(status.decision.reasons)
             )
         self._told, self._told_ns = key, now_ns
         self._publisher.publish(loop_state(self._brain, self._wrist.sent_rad_per_s, now_ns))

@@ -1,71 +1,80 @@
-"""What the twist controller is told, with the range of each value."""
+"""Settings of the closed loop: what the user configures, and what a controller of one tool needs."""
 
 import math
-from dataclasses import dataclass, fields
+from typing import Annotated
 
-from shearloop.daemon.errors import UserError
+from pydantic import ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from shearloop.daemon.config_file import ConfigModel
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopConfig(ConfigModel):
+    """Settings of the closed loop; docs/safety.md lists what each fault leads to."""
+
+    allowed_noise_nm: float = Field(default=0.0025, gt=0, le=1, description="true torque's std that noise may cause")
+    kp: float | None = Field(default=None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
+    deadband_nm: float = Field(default=0.001, ge=0, le=1, description="error below which the wrist rests")
+    disagreement_nm: float = Field(default=0.05, gt=0, le=5)
+    jump_nm: float = Field(default=0.08, gt=0, le=5)
+    slip_nm: float = Field(default=0.06, gt=0, le=5, description="drift of the torque at a fixed angle: slip")
+    wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14)
+    freshness_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
+    wrist_acceleration_rad_per_s2: float = Field(default=4.0, gt=0, le=1000, description="given to the robot")
+    angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=80, description="how fast the wrist approaches an angle")
+    torque_bandwidth_per_s: float = Field(default=4.0, gt=0, le=30, description="how fast it approaches a torque")
+    actuation_s: float = Field(default=0.02, ge=0, le=0.2, description="from sending a speed until the angle shows it")
+    gain_margin: float = Field(default=2.0, ge=1, le=100)
+    phase_margin_deg: float = Field(default=45.0, ge=0, le=90)
+
+    @property
+    def planned_acceleration_rad_per_s2(self) -> float:
+        """The acceleration that controller and identification plan with; the robot keeps twice as much in reserve."""
+        return 0.5 * self.wrist_acceleration_rad_per_s2
+
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+
+
+@checked_dataclass(frozen=True, slots=True, kw_only=True, config=ConfigDict(allow_inf_nan=False))
 class ControllerSettings:
-    """Everything that the controller needs to know beforehand. Raises UserError for a value out of its range."""
+    """A controller's settings for one tool. Raises pydantic's ValidationError for a value out of its range."""
 
-    # Of the tool in the grip, as identified: torque over wrist angle, positive.
-    stiffness_nm_per_rad: float
-    # Of the torque that drives the loop: how often it comes, and how long one measurement averages.
-    sample_period_s: float
-    window_s: float
+    # Of the tool in the grip, as identified: torque over wrist angle.
+    stiffness_nm_per_rad: Positive
+    # Of the driving torque: how often it comes, and how long one measurement averages.
+    sample_period_s: Positive
+    window_s: Annotated[float, Field(ge=0, le=60)]
     # By how much the torque lags behind its own stamp, as identified; 0 where the stamps are right.
-    lag_s: float = 0.0
-    # Share of what a measurement says more than expected that is taken up at once, and per measurement from then on.
-    kp: float
-    ki: float = 0.0
-    # Rate at which the wrist closes in on the angle that it should have.
-    wrist_bandwidth_per_s: float = 5.0
-    ramp_nm_per_s: float
-    # The wrist rests until the torque expected at its angle is this far from what it should be.
-    deadband_nm: float = 0.0
-    # Standard deviation of one measurement: what goes on differing beyond it is a jump, and is caught up with faster
-    # than kp would. 0 where that is not wanted.
-    noise_nm: float = 0.0
-    # One measurement is believed to differ from the expected one by no more than this.
-    innovation_limit_nm: float = math.inf
-    # Bound on the integral: how fast the torque at a fixed angle may be held to drift.
-    creep_limit_nm_per_s: float = math.inf
+    lag_s: Annotated[float, Field(ge=0, le=5)] = 0.0
+    # Shares of an innovation: taken up at once, and per measurement from then on.
+    kp: Annotated[float, Field(gt=0, le=4)]
+    ki: Annotated[float, Field(ge=0, le=4)] = 0.0
+    wrist_bandwidth_per_s: Positive
+    ramp_nm_per_s: Positive
+    # The wrist rests until the expected torque is this far from the set point.
+    deadband_nm: NotNegative = 0.0
+    # Standard deviation of one measurement; 0 turns the detection of jumps off.
+    noise_nm: NotNegative = 0.0
+    # Innovations are clipped to this.
+    innovation_limit_nm: Annotated[float, Field(gt=0, allow_inf_nan=True)] = math.inf
+    # Bound on the integral: how fast the torque at a fixed angle may drift.
+    creep_limit_nm_per_s: Annotated[float, Field(ge=0, allow_inf_nan=True)] = math.inf
     # The wrist is held when the torque at a fixed angle has moved by this much: slip, or a screw that broke loose.
-    offset_limit_nm: float = math.inf
-    torque_limit_nm: float
-    speed_limit_rad_per_s: float
-    acceleration_limit_rad_per_s2: float
+    offset_limit_nm: Annotated[float, Field(gt=0, allow_inf_nan=True)] = math.inf
+    torque_limit_nm: Positive
+    speed_limit_rad_per_s: Positive
+    acceleration_limit_rad_per_s2: Positive
     # From the angle at the start, either way.
-    travel_limit_rad: float
-    # A measurement that is older than this when it arrives is refused.
-    age_limit_s: float = 2.0
-    # No measurement for so many periods: the wrist is held.
-    stale_periods: float = 2.5
+    travel_limit_rad: Positive
+    # A measurement that is older than this on arrival is refused.
+    age_limit_s: Positive = 2.0
+    # Without a measurement for this many periods the wrist is held.
+    stale_periods: Annotated[float, Field(ge=1, allow_inf_nan=True)] = 2.5
 
-    def __post_init__(self) -> None:
-        """Refuse what cannot be meant."""
-        for item in fields(self):
-            value = getattr(self, item.name)
-            low, high, may_be_low = _RANGES.get(item.name, (0.0, math.inf, False))
-            fits = low <= value <= high if may_be_low else low < value <= high
-            if not fits or (math.isinf(value) and item.name not in _MAY_BE_OFF):
-                bound = f"{'at least' if may_be_low else 'above'} {low:g}"
-                bound += "" if math.isinf(high) else f" and at most {high:g}"
-                raise UserError(f"controller: {item.name} is {value!r}, and must be a number {bound}")
+    @model_validator(mode="after")
+    def _damped(self) -> "ControllerSettings":
         if self.ki > self.kp:
-            raise UserError(f"controller: ki ({self.ki:g}) must not exceed kp ({self.kp:g}); a quarter of kp² is usual")
-
-
-_RANGES = {
-    "window_s": (0.0, 60.0, True),
-    "lag_s": (0.0, 5.0, True),
-    "kp": (0.0, 4.0, False),
-    "ki": (0.0, 4.0, True),
-    "noise_nm": (0.0, math.inf, True),
-    "deadband_nm": (0.0, math.inf, True),
-    "creep_limit_nm_per_s": (0.0, math.inf, True),
-    "stale_periods": (1.0, math.inf, True),
-}
-_MAY_BE_OFF = frozenset({"innovation_limit_nm", "creep_limit_nm_per_s", "offset_limit_nm", "stale_periods"})
+            raise ValueError(f"ki ({self.ki:g}) must not exceed kp ({self.kp:g}); a tenth of kp² is usual")
+        return self

@@ -1,33 +1,153 @@
-"""Carries an experiment through its steps: start, pause, hold, resume, stop, done. No I/O; the time is passed in."""
+"""Runs an experiment step by step: its commands, its steps as generators, its phases. No I/O; time is an argument.
 
+Each step is a generator that receives a `StepContext`, yields a `StepCommand`, and returns at its end. The experiment's
+clock stands while it is paused or held.
+"""
+
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import TypeAlias
 
+from shearloop.daemon.control import experiment_schema as steps
 from shearloop.daemon.control.experiment_schema import ExperimentFile, ExperimentLimits, Step
-from shearloop.daemon.control.programme import Programme, StepFailedError, expected_s, programme_of
-from shearloop.daemon.control.step_commands import Hold, StepCommand, StepContext
+
+# An angle counts as reached within this; the wrist's resolution is ten times finer.
+ANGLE_TOLERANCE_RAD = 0.002
+# A torque counts as reached within this share of the set point: the closed loop's accuracy.
+TORQUE_TOLERANCE = 0.10
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """The wrist stands still."""
+
+
+@dataclass(frozen=True, slots=True)
+class MoveToAngle:
+    """The wrist turns to an angle, counted from the angle at the grip, at most at this speed."""
+
+    angle_rad: float
+    speed_rad_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ConstantVelocity:
+    """The wrist turns at a constant speed, counterclockwise positive."""
+
+    speed_rad_per_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class TrackTorque:
+    """The wrist follows a torque set point in closed loop."""
+
+    torque_nm: float
+    ramp_nm_per_s: float
+
+
+WristSetpoint: TypeAlias = Hold | MoveToAngle | ConstantVelocity | TrackTorque
+
+
+@dataclass(frozen=True, slots=True)
+class MoveTo:
+    """Move the tool centre in a straight line, to a pose or by a distance along the tool's axis."""
+
+    pose_m_rad: tuple[float, ...] | None
+    speed_m_per_s: float
+    along_tool_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class GripTo:
+    """Close or open the gripper."""
+
+    width_mm: float
+    speed_mm_per_s: float
+    force_n: float
+    expect_object: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Tare:
+    """Tare every torque sensor, with the wrist standing still."""
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifyStiffness:
+    """Identify stiffness, delay and noise with small twists."""
+
+    amplitude_rad: float
+
+
+Action: TypeAlias = MoveTo | GripTo | Tare | IdentifyStiffness
+
+
+class ActionState(Enum):
+    """State of the present action."""
+
+    IDLE = "idle"
+    RUNNING = "running"
+    DONE = "done"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True, slots=True)
+class StepContext:
+    """Input of a step: wrist angle since the grip, driving torque, state of its action.
+
+    `gripped_at_rad` is the wrist joint's angle at the grip. `torque_nm` is None without a fresh valid estimate.
+    """
+
+    wrist_rad: float
+    torque_nm: float | None
+    gripped_at_rad: float = 0.0
+    action: ActionState = ActionState.IDLE
+    action_error: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class StepCommand:
+    """Output of a step.
+
+    An action starts with the first command that has it; `step_index` distinguishes equal actions of two steps.
+    `hold_number` counts the held angles or torques of a step, from 1; 0 while none is held.
+    """
+
+    wrist: WristSetpoint = Hold()
+    action: Action | None = None
+    activity: str = ""
+    step_index: int = -1
+    hold_number: int = 0
 
 
 class ExperimentPhase(Enum):
-    """Where an experiment stands."""
+    """Phase of an experiment."""
 
     RUNNING = "running"
     PAUSED = "paused"  # by the operator
     DONE = "done"
-    STOPPED = "stopped"  # before its end, by the operator, by safety, or by a step that failed
+    STOPPED = "stopped"  # before its end: by the operator, by safety, or by a step that failed
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What an operator is shown."""
+    """Progress of an experiment, for the operator."""
 
     phase: ExperimentPhase
     step: int
     steps: int
-    doing: str
+    activity: str
     share: float
     remaining_s: float
     overdue: str = ""
+
+
+class StepFailedError(Exception):
+    """A step cannot continue; the message says why."""
+
+
+StepProgram: TypeAlias = Generator[StepCommand, StepContext, None]
 
 
 class Experiment:
@@ -35,15 +155,16 @@ class Experiment:
 
     def __init__(self, file: ExperimentFile, t_ns: int) -> None:
         self.file = file
-        self._expected_s = [expected_s(step) for step in file.steps]
         self.phase = ExperimentPhase.RUNNING
-        self.why = ""
+        self.stop_reason = ""
+        # The step's command, also while the wrist is paused or held.
+        self.command = StepCommand()
+        self._expected_s = [expected_s(step) for step in file.steps]
         self._t_ns = t_ns
         self._elapsed_s = 0.0
         self._index = -1
         self._step_began_s = 0.0
-        self._wish = StepCommand()
-        self._programme: Programme
+        self._program: StepProgram
         self._begin_next()
 
     @property
@@ -53,32 +174,27 @@ class Experiment:
 
     @property
     def step(self) -> Step:
-        """The step that is being carried out, or the last one."""
-        return self.file.steps[min(self._index, len(self.file.steps) - 1)]
+        """The present step, or the last one."""
+        return self.file.steps[self.step_number - 1]
 
     @property
-    def limits(self) -> ExperimentLimits:
-        """The tighter of the experiment's limits and the step's own."""
-        own, whole = self.step.limits, self.file.limits
-        if own is None:
-            return whole
-        return ExperimentLimits(
-            torque_nm=min(own.torque_nm, whole.torque_nm), angle_rad=min(own.angle_rad, whole.angle_rad)
-        )
-
-    @property
-    def number(self) -> int:
-        """The number of that step, counted from one."""
+    def step_number(self) -> int:
+        """The number of that step, from 1."""
         return min(self._index + 1, len(self.file.steps))
 
     @property
-    def doing(self) -> str:
-        """What is being done, or why nothing is any more."""
-        return self._wish.doing if self.running else self.why
+    def limits(self) -> ExperimentLimits:
+        """The tighter of the experiment's limits and the step's."""
+        return self.file.limits_of(self.step)
+
+    @property
+    def activity(self) -> str:
+        """The present activity, or the reason of the stop."""
+        return self.command.activity if self.running else self.stop_reason
 
     @property
     def overdue(self) -> str:
-        """Which step has taken longer than it may, or the empty string."""
+        """A sentence when the step has exceeded its timeout, else an empty string."""
         longest_s = self.step.timeout_s
         if not self.running or longest_s is None or self._spent_s <= longest_s:
             return ""
@@ -88,27 +204,22 @@ class Experiment:
     def _spent_s(self) -> float:
         return self._elapsed_s - self._step_began_s
 
-    @property
-    def wish(self) -> StepCommand:
-        """What is wished for, whether or not it is held back at present."""
-        return self._wish
-
     def update(self, view: StepContext, t_ns: int, *, held: bool = False) -> StepCommand:
-        """Return what is wished for now; while paused or held the wrist stands and no time passes."""
+        """Return the command for now; while paused or held the wrist and the experiment's clock stand still."""
         passed_s = max(0, t_ns - self._t_ns) / 1e9
         self._t_ns = max(t_ns, self._t_ns)
         if not self.running:
             return StepCommand()
         if self.phase is ExperimentPhase.PAUSED or held:
-            return replace(self._wish, wrist=Hold())
+            return replace(self.command, wrist=Hold())
         self._elapsed_s += passed_s
         try:
-            self._wish = self._numbered(self._programme.send(view))
+            self.command = replace(self._program.send(view), step_index=self._index)
         except StopIteration:
             self._begin_next()
         except StepFailedError as failure:
             self.stop(f"step {self._index + 1} ({self.step.do}) failed: {failure}")
-        return self._wish
+        return self.command
 
     def pause(self) -> None:
         """Stand still until `resume`."""
@@ -116,44 +227,157 @@ class Experiment:
             self.phase = ExperimentPhase.PAUSED
 
     def resume(self) -> None:
-        """Go on where it was paused."""
+        """Continue after `pause`."""
         if self.phase is ExperimentPhase.PAUSED:
             self.phase = ExperimentPhase.RUNNING
 
-    def stop(self, why: str) -> None:
-        """End for good; a stopped experiment is started anew, never resumed."""
+    def stop(self, reason: str) -> None:
+        """End for good; a stopped experiment cannot be resumed."""
         if self.running:
-            self.phase, self.why, self._wish = ExperimentPhase.STOPPED, why, StepCommand()
+            self.phase, self.stop_reason, self.command = ExperimentPhase.STOPPED, reason, StepCommand()
 
     def progress(self) -> Progress:
-        """Return where it stands."""
+        """Return the progress."""
         ahead_s = sum(self._expected_s[self._index + 1 :])
-        planned_s = sum(self._expected_s)
-        here_s = max(0.0, self._expected_s[self.number - 1] - self._spent_s)
+        here_s = max(0.0, self._expected_s[self.step_number - 1] - self._spent_s)
         remaining_s = here_s + ahead_s if self.running else 0.0
         return Progress(
             phase=self.phase,
-            step=self.number,
+            step=self.step_number,
             steps=len(self.file.steps),
-            doing=self.doing,
-            share=1.0 if self.phase is ExperimentPhase.DONE else max(0.0, 1.0 - remaining_s / max(planned_s, 1e-9)),
+            activity=self.activity,
+            share=1.0
+            if self.phase is ExperimentPhase.DONE
+            else max(0.0, 1.0 - remaining_s / max(sum(self._expected_s), 1e-9)),
             remaining_s=remaining_s,
             overdue=self.overdue,
         )
-
-    def _numbered(self, wish: StepCommand) -> StepCommand:
-        # In every cycle of the robot: `replace` would look the fields up each time.
-        return StepCommand(wish.wrist, wish.action, wish.doing, self._index, wish.hold)
 
     def _begin_next(self) -> None:
         while self._index + 1 < len(self.file.steps):
             self._index += 1
             self._step_began_s = self._elapsed_s
-            self._programme = programme_of(self.step, lambda: self._elapsed_s)
+            self._program = _program(self.step, lambda: self._elapsed_s)
             try:
-                self._wish = self._numbered(next(self._programme))
+                self.command = replace(next(self._program), step_index=self._index)
             except StopIteration:  # nothing to do, such as a wait of 0 s
                 continue
             return
         self._index = len(self.file.steps)
-        self.phase, self._wish = ExperimentPhase.DONE, StepCommand()
+        self.phase, self.command = ExperimentPhase.DONE, StepCommand()
+
+
+def expected_s(step: Step) -> float:
+    """Return the approximate duration of a step, for the remaining time shown to the operator."""
+    match step:
+        case steps.TwistStep():
+            reach = [abs(angle) for angle in step.angles_rad] if not step.absolute else [0.2] * len(step.angles_rad)
+            ways = (2.0 if step.return_to_start else 1.0) * sum(reach) / step.speed_rad_per_s
+            return step.repeats * (ways + len(reach) * step.hold_s)
+        case steps.HoldTorqueStep():
+            return abs(step.torque_nm) / step.ramp_nm_per_s + step.hold_s
+        case steps.TightenStep():
+            return step.until_angle_rad / step.speed_rad_per_s
+        case steps.WaitStep():
+            return step.wait_s
+        case steps.IdentifyStep():
+            return 20.0
+        case steps.TareStep():
+            return 6.0
+        case _:
+            return 3.0
+
+
+def _program(step: Step, elapsed_s: Callable[[], float]) -> StepProgram:
+    """Return the generator of one step; `elapsed_s()` is the experiment's time in seconds."""
+    match step:
+        case steps.ApproachStep() | steps.RetreatStep():
+            move = MoveTo(step.pose_m_rad, step.speed_m_per_s, step.along_tool_m or 0.0)
+            return _act(move, "moving in a straight line")
+        case steps.GripStep():
+            grip = GripTo(step.width_mm, step.speed_mm_per_s, step.force_n, step.expect_object)
+            return _act(grip, "closing the gripper")
+        case steps.ReleaseStep():
+            return _act(GripTo(step.width_mm, 60.0, 10.0, expect_object=False), "opening the gripper")
+        case steps.TareStep():
+            return _act(Tare(), "taking the zero of every torque sensor")
+        case steps.IdentifyStep():
+            return _act(IdentifyStiffness(step.amplitude_rad), "measuring the tool's stiffness, delay and noise")
+        case steps.TurnToStep():
+            return _turn_to(step)
+        case steps.TwistStep():
+            return _twist(step, elapsed_s)
+        case steps.HoldTorqueStep():
+            return _hold_torque(step, elapsed_s)
+        case steps.TightenStep():
+            return _tighten(step)
+        case steps.WaitStep():
+            return _wait(Hold(), step.wait_s, elapsed_s, "waiting")
+
+
+def _act(action: Action, activity: str) -> StepProgram:
+    while True:
+        view = yield StepCommand(Hold(), action, activity)
+        if view.action is ActionState.FAILED:
+            raise StepFailedError(view.action_error)
+        if view.action is ActionState.DONE:
+            return
+
+
+def _wait(
+    wrist: WristSetpoint, wait_s: float, elapsed_s: Callable[[], float], activity: str, hold_number: int = 0
+) -> StepProgram:
+    end_s = elapsed_s() + wait_s
+    while (left_s := end_s - elapsed_s()) > 0:
+        yield StepCommand(wrist, activity=f"{activity}, {left_s:.1f} s left", hold_number=hold_number)
+
+
+def _go_to(angle_rad: float, speed_rad_per_s: float, activity: str) -> StepProgram:
+    while True:
+        view = yield StepCommand(MoveToAngle(angle_rad, speed_rad_per_s), activity=activity)
+        if abs(view.wrist_rad - angle_rad) <= ANGLE_TOLERANCE_RAD:
+            return
+
+
+def _turn_to(step: steps.TurnToStep) -> StepProgram:
+    view = yield StepCommand(activity="reading the wrist's angle")
+    activity = f"turning the wrist to {step.angle_rad:.3f} rad"
+    yield from _go_to(step.angle_rad - view.gripped_at_rad, step.speed_rad_per_s, activity)
+
+
+def _twist(step: steps.TwistStep, elapsed_s: Callable[[], float]) -> StepProgram:
+    view = yield StepCommand(activity="reading the wrist's angle")
+    start_rad = view.wrist_rad
+    origin_rad = view.gripped_at_rad if step.absolute else 0.0
+    angles_rad = [angle_rad - origin_rad for angle_rad in step.angles_rad]
+    for repeat in range(1, step.repeats + 1):
+        for number, angle_rad in enumerate(angles_rad, start=1):
+            where = f"angle {number} of {len(angles_rad)}, repeat {repeat} of {step.repeats}"
+            yield from _go_to(angle_rad, step.speed_rad_per_s, f"twisting to {angle_rad:.3f} rad: {where}")
+            hold = MoveToAngle(angle_rad, step.speed_rad_per_s)
+            hold_number = (repeat - 1) * len(angles_rad) + number
+            yield from _wait(hold, step.hold_s, elapsed_s, f"holding {angle_rad:.3f} rad: {where}", hold_number)
+            if step.return_to_start:
+                yield from _go_to(start_rad, step.speed_rad_per_s, f"returning: {where}")
+
+
+def _hold_torque(step: steps.HoldTorqueStep, elapsed_s: Callable[[], float]) -> StepProgram:
+    track = TrackTorque(step.torque_nm, step.ramp_nm_per_s)
+    tolerance_nm = max(TORQUE_TOLERANCE * abs(step.torque_nm), 1e-3)
+    while True:
+        view = yield StepCommand(track, activity=f"bringing the torque to {step.torque_nm:+.3f} N·m")
+        if view.torque_nm is not None and abs(view.torque_nm - step.torque_nm) <= tolerance_nm:
+            break
+    yield from _wait(track, step.hold_s, elapsed_s, f"holding {step.torque_nm:+.3f} N·m", 1)
+
+
+def _tighten(step: steps.TightenStep) -> StepProgram:
+    sign = -1.0 if step.direction == "clockwise" else 1.0
+    start_rad = (yield StepCommand(activity="reading the wrist's angle")).wrist_rad
+    while True:
+        activity = f"turning {step.direction} until {step.until_torque_nm:.3f} N·m or {step.until_angle_rad:.2f} rad"
+        view = yield StepCommand(ConstantVelocity(sign * step.speed_rad_per_s), activity=activity)
+        if view.torque_nm is not None and abs(view.torque_nm) >= step.until_torque_nm:
+            return
+        if abs(view.wrist_rad - start_rad) >= step.until_angle_rad:
+            return

@@ -9,8 +9,6 @@ from shearloop.drivers.ur.messages import CommandReply, Stop, WristSpeed
 # Commands on their way to the robot's process at once; a reply takes one of its cycles, and a second command would
 # take the first one's place.
 MOST_UNANSWERED = 1
-# A wrist speed that stays the same is told again after so much of the time for which the robot's process holds it.
-RENEWED_AFTER = 0.2
 
 
 class VelocityCommandSender:
@@ -30,46 +28,25 @@ class VelocityCommandSender:
         self._died_of = died_of
         # Commands that the robot's process has not answered yet.
         self._unanswered = 0
-        # When the robot was commanded last, and how soon it is again though nothing else is wanted.
-        self._commanded_ns = 0
-        self._renewed_ns = round(RENEWED_AFTER * robot.settings.command_timeout_s * 1e9)
 
     @property
     def turns(self) -> bool:
         """Whether the wrist was told to turn, or is being told something."""
         return bool(self.sent_rad_per_s or self._unanswered)
 
-    def turn(self, rad_per_s: float, now_ns: int) -> None:
-        """Have the wrist turn so fast from now on, which is told where it is not known already."""
+    def turn(self, rad_per_s: float) -> None:
+        """Have the wrist turn so fast from now on."""
         if rad_per_s == 0.0 and self.sent_rad_per_s == 0.0:
             return
-        command = WristSpeed(rad_per_s, self._acceleration_rad_per_s2)
-        if self._unanswered < MOST_UNANSWERED and not self._turns_so(command, now_ns):
-            self._send(command, now_ns)
+        if self._unanswered < MOST_UNANSWERED:
+            self._send(WristSpeed(rad_per_s, self._acceleration_rad_per_s2))
 
-    def stop(self, now_ns: int) -> None:
+    def stop(self) -> None:
         """Have the whole arm stop, whatever is on its way."""
-        self._send(Stop(self._acceleration_rad_per_s2), now_ns)
+        self._send(Stop(self._acceleration_rad_per_s2))
 
-    def _turns_so(self, command: WristSpeed, now_ns: int) -> bool:
-        """Whether the robot's process turns the wrist just so, and will go on without being told again for now.
-
-        It holds that speed against the limits in each of its cycles, by what it reads in it. What it has clipped is
-        told again in each of ours: it would be taken up by itself as soon as the limits allow.
-        """
-        state = self._robot.state
-        return (
-            state is not None
-            and state.motion == "wrist"
-            and state.sent == command
-            and not state.clipped
-            and command.rad_per_s == self.sent_rad_per_s
-            and now_ns - self._commanded_ns < self._renewed_ns
-        )
-
-    def _send(self, command: WristSpeed | Stop, now_ns: int) -> None:
+    def _send(self, command: WristSpeed | Stop) -> None:
         self._unanswered += 1
-        self._commanded_ns = now_ns
         try:
             self._robot.tell(command, self._answered)
         except Exception as error:  # noqa: BLE001 - told by the next tick, which ends the experiment
@@ -82,8 +59,8 @@ class VelocityCommandSender:
             if not reply.accepted:
                 # Without a process there is nobody who could have refused it.
                 gone = self._robot.state is None
-                (self._brain.note_unanswered if gone else self._brain.note_refusal)(reply.refused)
+                (self._brain.on_command_unanswered if gone else self._brain.on_command_refused)(reply.refused)
             self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self._brain.sent(self.sent_rad_per_s)
+            self._brain.on_speed_sent(self.sent_rad_per_s)
         except Exception as error:  # noqa: BLE001 - not the robot's process, which has answered, but the next tick's
             self._died_of(error)

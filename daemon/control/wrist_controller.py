@@ -1,16 +1,15 @@
-"""What the wrist does for each wish: a speed in rad/s, up to 125 times a second. No I/O; times are passed in."""
+"""The wrist's controller: turns each set point into a speed, 125 times a second. No I/O; time is an argument."""
 
 import math
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from shearloop.daemon.control.controller import TwistController
-from shearloop.daemon.control.excitation import ExciteSettings, StiffnessExcitation
-from shearloop.daemon.control.identify import ToolModel
+from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
-from shearloop.daemon.control.settings import ControllerSettings
-from shearloop.daemon.control.step_commands import (
+from shearloop.daemon.control.margins import gain_for_noise, integral_gain, margin_refusal
+from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
+from shearloop.daemon.control.step_runner import (
     ConstantVelocity,
     Hold,
     IdentifyStiffness,
@@ -18,96 +17,77 @@ from shearloop.daemon.control.step_commands import (
     TrackTorque,
     WristSetpoint,
 )
-from shearloop.daemon.control.tuning import RequiredMargins, refusal
 
-# Torques that wait for an angle: while the wrist stands they may be many, and the latest say what has become of it.
-MOST_HEARD = 64
-# A speed that was sent for an angle no further away than this is as good, for it is a tenth of what the wrist resolves,
-# and what stays the same need not be sent again.
-AS_GOOD_RAD = 2e-5
-# But no more than this share of the speed that is allowed: a slower wrist would never turn back.
-AS_GOOD_SHARE = 0.1
-# A loop that was away for longer than this does not know what it sent last.
+# Torques that wait for the next wrist angle.
+MOST_PENDING = 64
+# After a longer pause of the loop, the speed sent last is unknown.
 LONGEST_STEP_NS = 50_000_000
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WristSettings:
-    """Bounds on the wrist's motion, and what the closed loop must have."""
-
-    speed_limit_rad_per_s: float = 0.5
-    acceleration_limit_rad_per_s2: float = 2.0
-    # How fast the wrist closes in on an angle, per second and per radian that is missing.
-    angle_bandwidth_per_s: float = 5.0
-    # From sending a speed until the angle shows it: so long what was sent is counted as travelled already.
-    actuation_s: float = 0.02
-    required: RequiredMargins = field(default_factory=RequiredMargins)
+# The largest drift of the torque at a fixed angle that counts as creep.
+CREEP_LIMIT_NM_PER_S = 0.005
+# Either way from the angle at which the loop was closed.
+TRAVEL_LIMIT_RAD = 3.2
+# Innovations are clipped to three times the noise, and never below this.
+LEAST_INNOVATION_LIMIT_NM = 0.01
 
 
 @dataclass(frozen=True, slots=True)
 class WristVelocity:
-    """The speed that is wanted now, and why it is not another."""
+    """The wanted wrist speed, and the reasons for which it differs from the set point's."""
 
     speed_rad_per_s: float = 0.0
     reasons: tuple[str, ...] = ()
 
 
 class WristController:
-    """Carries out one wish at a time; a wish that changes is begun anew from where the wrist is."""
+    """Carries out one set point at a time; a new one starts from the present wrist angle."""
 
-    def __init__(
-        self,
-        source: TorqueSource,
-        settings: WristSettings,
-        tune: Callable[[ToolModel, TorqueSource, TrackTorque, float], ControllerSettings],
-    ) -> None:
-        """Take the driving torque's source, bounds, and what makes controller settings from an identified tool."""
+    def __init__(self, source: TorqueSource, config: LoopConfig) -> None:
         self.source = source
-        self.identified: ToolModel | None = None
+        self.tool: ToolModel | None = None
         self.controller: TwistController | None = None
-        self._settings = settings
-        self._tune = tune
-        self._tracked: TrackTorque | None = None
+        # The torque set point of the closed loop.
+        self.tracked: TrackTorque | None = None
+        self._config = config
         self._held = False
-        # A torque that is newer than the latest angle waits for the next one: it is compared with the angle it had.
-        self._heard: deque[TorqueSample] = deque(maxlen=MOST_HEARD)
-        self._measuring: StiffnessExcitation | None = None
-        # Speeds sent in the last `actuation_s`, each with when it was taken over and for how long it held.
+        # A torque newer than the latest angle waits for the next angle.
+        self._pending: deque[TorqueSample] = deque(maxlen=MOST_PENDING)
+        self._excitation: StiffnessExcitation | None = None
+        # Speeds sent in the last `actuation_s`: time, speed, duration.
         self._under_way: deque[tuple[int, float, float]] = deque()
         self._sent_rad_per_s = 0.0
         self._turned_ns = 0
 
     @property
     def expected_nm(self) -> float | None:
-        """Return the torque that the controller expects at the wrist's angle, while it drives."""
-        return self.controller.state.torque_nm if self.controller is not None and self._tracked is not None else None
+        """The controller's expected torque at the present angle, while the loop is closed."""
+        return self.controller.state.torque_nm if self.controller is not None and self.tracked is not None else None
 
-    def hear(self, torque: TorqueSample) -> None:
-        """Pass the driving torque on to whatever listens."""
+    def on_torque(self, torque: TorqueSample) -> None:
+        """Pass a driving torque on to controller and identification."""
         if torque.source != self.source.name:
             return
-        if self._measuring is not None:
-            self._measuring.measure(torque.torque_nm, torque.t_mid_ns, torque.t_ns)
+        if self._excitation is not None:
+            self._excitation.measure(torque.torque_nm, torque.t_mid_ns, torque.t_ns)
         if self.controller is not None:
-            self._heard.append(torque)
+            self._pending.append(torque)
 
-    def sent(self, speed_rad_per_s: float) -> None:
-        """Tell what was really sent, after all clipping."""
+    def on_speed_sent(self, speed_rad_per_s: float) -> None:
+        """Store the speed that was sent, after all clipping."""
         self._sent_rad_per_s = speed_rad_per_s
         if self.controller is not None:
             self.controller.sent(speed_rad_per_s)
-        if self._measuring is not None:
-            self._measuring.sent(speed_rad_per_s)
+        if self._excitation is not None:
+            self._excitation.sent(speed_rad_per_s)
 
-    def turn(self, wish: WristSetpoint, t_ns: int, wrist_rad: float, origin_rad: float) -> WristVelocity:
-        """Return the speed for a wish; angles in wishes count from origin_rad."""
-        if not isinstance(wish, TrackTorque):
-            # A loop that is not driven sees no angles; the next one starts from what is then measured.
-            self._tracked = self.controller = None
+    def turn(self, setpoint: WristSetpoint, t_ns: int, wrist_rad: float, origin_rad: float) -> WristVelocity:
+        """Return the speed for a set point; its angles count from origin_rad."""
+        if not isinstance(setpoint, TrackTorque):
+            # An open loop records no angles; the next closed loop starts from the torque measured then.
+            self.tracked = self.controller = None
         elif self._held and self.controller is not None:
             self.controller.resume()
         self._held = False
-        match wish:
+        match setpoint:
             case Hold():
                 return WristVelocity()
             case MoveToAngle(angle_rad, speed_rad_per_s):
@@ -115,102 +95,123 @@ class WristController:
             case ConstantVelocity(speed_rad_per_s):
                 return self._bounded(speed_rad_per_s)
             case TrackTorque():
-                return self._follow(wish, t_ns, wrist_rad)
+                return self._follow(setpoint, t_ns, wrist_rad)
 
-    def refuses(self, wish: TrackTorque, torque_limit_nm: float) -> str | None:
-        """Return why a set point cannot be tracked with what is known of the tool, or None."""
-        if self.identified is None:
+    def why_not_trackable(self, setpoint: TrackTorque, torque_limit_nm: float) -> str | None:
+        """Return why a torque cannot be tracked with the identified tool, or None."""
+        if self.tool is None:
             return "the tool has not been identified; put an `identify` step before the first `hold_torque`"
-        settings = self._tune(self.identified, self.source, wish, torque_limit_nm)
-        return refusal(settings, self.identified, self._settings.required)
+        settings = controller_settings(self._config, self.tool, self.source, setpoint, torque_limit_nm)
+        return margin_refusal(settings, self.tool, self._config)
 
-    def begin_tracking(self, wish: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> None:
-        """Close the loop on a set point; `refuses` has been asked before."""
-        if self.identified is None:
+    def begin_tracking(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float, torque_limit_nm: float) -> None:
+        """Close the loop on a set point that `why_not_trackable` accepts."""
+        tool = self.tool
+        if tool is None:
             raise ValueError("a loop is closed on an identified tool")
-        found = self.identified
         if self.controller is None:
-            self.controller = TwistController(self._tune(found, self.source, wish, torque_limit_nm))
-            here_nm = found.torque_nm + found.stiffness_nm_per_rad * (wrist_rad - found.angle_rad)
-            self.controller.start(t_ns, wrist_rad, here_nm, found.known_measurements)
-        self.controller.set_point(wish.torque_nm)
-        self._tracked = wish
+            settings = controller_settings(self._config, tool, self.source, setpoint, torque_limit_nm)
+            self.controller = TwistController(settings)
+            here_nm = tool.torque_nm + tool.stiffness_nm_per_rad * (wrist_rad - tool.angle_rad)
+            self.controller.start(t_ns, wrist_rad, here_nm, tool.known_measurements)
+        self.controller.set_point(setpoint.torque_nm)
+        self.tracked = setpoint
 
-    @property
-    def tracks(self) -> TrackTorque | None:
-        """Return the set point that is being tracked."""
-        return self._tracked
-
-    def begin_measuring(self, action: IdentifyStiffness, torque_limit_nm: float) -> None:
-        """Shake the tool to learn its stiffness."""
-        self.forget()
-        self._measuring = StiffnessExcitation(
+    def begin_identification(self, action: IdentifyStiffness, torque_limit_nm: float) -> None:
+        """Begin the small twists that identify the tool."""
+        self.reset()
+        self._excitation = StiffnessExcitation(
             ExciteSettings(
                 amplitude_rad=action.amplitude_rad,
                 sample_period_s=self.source.period_s,
                 window_s=self.source.window_s,
                 torque_limit_nm=torque_limit_nm,
-                speed_rad_per_s=self._settings.speed_limit_rad_per_s,
-                acceleration_rad_per_s2=self._settings.acceleration_limit_rad_per_s2,
+                speed_rad_per_s=self._config.wrist_speed_rad_per_s,
+                acceleration_rad_per_s2=self._config.planned_acceleration_rad_per_s2,
+                bandwidth_per_s=self._config.angle_bandwidth_per_s,
             )
         )
 
-    def measure(self, t_ns: int, wrist_rad: float) -> tuple[WristVelocity, str | None]:
-        """Return the speed of the identification, and "" when it has ended well, or why it has ended badly."""
-        step = self._measuring
+    def identify(self, t_ns: int, wrist_rad: float) -> tuple[WristVelocity, str | None]:
+        """Return the identification's speed, and at its end "" or an error."""
+        step = self._excitation
         if step is None:
-            return WristVelocity(), "it was never begun"
+            return WristVelocity(), "the identification was not started"
         turn = self._bounded(step.command(t_ns, wrist_rad))
         if not step.done:
             return turn, None
-        self.identified, self._measuring = step.result, None
+        self.tool, self._excitation = step.result, None
         return WristVelocity(), step.failure or ""
 
     def hold(self) -> WristVelocity:
-        """Stand still for now; the next `turn` goes on without a jump."""
+        """Stand still; the next `turn` continues without a jump."""
         if self.controller is not None and not self._held:
             self.controller.hold()
         self._held = True
         return WristVelocity()
 
-    def forget(self) -> None:
-        """Forget the tool: it was let go, or another zero was taken."""
-        self.identified = self.controller = self._tracked = self._measuring = None
+    def reset(self) -> None:
+        """Forget the tool, after a new grip or a new zero."""
+        self.tool = self.controller = self.tracked = self._excitation = None
 
-    def _follow(self, wish: TrackTorque, t_ns: int, wrist_rad: float) -> WristVelocity:
-        if self.controller is None or self._tracked != wish:
+    def _follow(self, setpoint: TrackTorque, t_ns: int, wrist_rad: float) -> WristVelocity:
+        if self.controller is None or self.tracked != setpoint:
             return WristVelocity(reasons=("the loop has not been closed",))
         command = self.controller.command(t_ns, wrist_rad)
-        for torque in self._heard:
+        for torque in self._pending:
             torque_nm = torque.nearest_to(self.controller.state.torque_nm)
             self.controller.measure(torque_nm, torque.t_mid_ns, torque.t_ns)
-        self._heard.clear()
+        self._pending.clear()
         return WristVelocity(self._bounded(command.speed_rad_per_s).speed_rad_per_s, tuple(map(str, command.reasons)))
 
     def _on_the_way_rad(self, t_ns: int) -> float:
-        """Return how far the wrist will have turned by what was sent and does not show in its angle yet."""
+        """Return the turn that was sent and does not show in the angle yet."""
         passed_ns = t_ns - self._turned_ns
         self._turned_ns = t_ns
         if 0 < passed_ns <= LONGEST_STEP_NS:
             self._under_way.append((t_ns, self._sent_rad_per_s, passed_ns / 1e9))
-        since_ns = t_ns - self._settings.actuation_s * 1e9
+        since_ns = t_ns - self._config.actuation_s * 1e9
         while self._under_way and self._under_way[0][0] <= since_ns:
             self._under_way.popleft()
         return sum(speed * held_s for _, speed, held_s in self._under_way)
 
     def _towards(self, missing_rad: float, speed_rad_per_s: float) -> WristVelocity:
-        bandwidth_per_s = self._settings.angle_bandwidth_per_s
+        bandwidth_per_s = self._config.angle_bandwidth_per_s
         speed = math.copysign(min(abs(bandwidth_per_s * missing_rad), speed_rad_per_s), missing_rad)
-        as_good_rad_per_s = min(bandwidth_per_s * AS_GOOD_RAD, AS_GOOD_SHARE * speed_rad_per_s)
-        if self._sent_rad_per_s and abs(speed - self._sent_rad_per_s) <= as_good_rad_per_s:
-            speed = self._sent_rad_per_s
         return self._bounded(speed)
 
     def _bounded(self, speed_rad_per_s: float) -> WristVelocity:
         if not math.isfinite(speed_rad_per_s):
-            return WristVelocity(0.0, ("no speed follows from what is not a number",))
-        limit = self._settings.speed_limit_rad_per_s
+            return WristVelocity(0.0, ("the wanted speed is not a number",))
+        limit = self._config.wrist_speed_rad_per_s
         bounded = max(-limit, min(limit, speed_rad_per_s))
         if bounded == speed_rad_per_s:
             return WristVelocity(bounded)
         return WristVelocity(bounded, (f"the wrist turns no faster than {limit:g} rad/s",))
+
+
+def controller_settings(
+    config: LoopConfig, found: ToolModel, source: TorqueSource, setpoint: TrackTorque, torque_limit_nm: float
+) -> ControllerSettings:
+    """Return the controller's settings for an identified tool."""
+    kp = config.kp if config.kp is not None else gain_for_noise(found.noise_nm, config.allowed_noise_nm)
+    return ControllerSettings(
+        stiffness_nm_per_rad=found.stiffness_nm_per_rad,
+        sample_period_s=found.sample_period_s,
+        window_s=source.window_s,
+        lag_s=max(found.significant_lag_s, 0.0),
+        kp=kp,
+        # An integral that grows while friction hides the torque swings the wrist through the whole friction band.
+        ki=0.0 if source.has_friction_band else integral_gain(kp),
+        wrist_bandwidth_per_s=config.torque_bandwidth_per_s,
+        ramp_nm_per_s=setpoint.ramp_nm_per_s,
+        noise_nm=found.noise_nm,
+        deadband_nm=config.deadband_nm,
+        innovation_limit_nm=max(3.0 * found.noise_nm, LEAST_INNOVATION_LIMIT_NM),
+        creep_limit_nm_per_s=CREEP_LIMIT_NM_PER_S,
+        offset_limit_nm=config.slip_nm,
+        torque_limit_nm=torque_limit_nm,
+        speed_limit_rad_per_s=config.wrist_speed_rad_per_s,
+        acceleration_limit_rad_per_s2=config.planned_acceleration_rad_per_s2,
+        travel_limit_rad=TRAVEL_LIMIT_RAD,
+    )

@@ -1,19 +1,26 @@
-"""The devices, as long as no daemon holds them: found, opened, heard for some seconds, and let go."""
+"""Checks of the devices: opened and listened to directly, or through the daemon that holds them."""
 
 import asyncio
 import contextlib
 import os
-from collections.abc import AsyncIterator, Awaitable
+import time
+from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import zmq
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
-from shearloop.daemon.doctor.finding import Finding, from_sentence, good, note, trouble
+from shearloop.daemon.doctor.checks import Finding, from_error, good, note, trouble
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.messages import decode
+from shearloop.daemon.messaging.request import request
 from shearloop.daemon.ports import access_trouble
 from shearloop.daemon.rig import make_gripper_client
-from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.hx711 import LoadCalibration
 from shearloop.drivers.load_cell import LoadCell
@@ -22,93 +29,99 @@ from shearloop.drivers.serial_port import find_port
 from shearloop.drivers.ur.controller_query import look
 from shearloop.drivers.ur.settings import read_settings
 
-# A measured rate that is further from the configured one is told.
+# A larger relative difference between measured and configured rate is reported.
 RATE_TOLERANCE = 0.1
-LOOK_TIMEOUT_S = 2.0
+ROBOT_TIMEOUT_S = 2.0
+DAEMON_TIMEOUT_S = 1.0
 
 
-async def examine_devices(config: DaemonConfig, seconds: float) -> AsyncIterator[Finding]:
-    """Open every device at once, listen for some seconds, and yield what was found, in the configuration's order."""
-    looks: list[Awaitable[list[Finding]]] = []
+async def check_devices(config: DaemonConfig, seconds: float) -> list[Finding]:
+    """Open every device, listen to all at once for `seconds`, and return findings in the configuration's order."""
+    checks: list[Awaitable[list[Finding]]] = []
     for name, fingertip in config.fingertips.items():
-        looks.append(_fingertip(name, fingertip, seconds))
+        checks.append(_check_fingertip(name, fingertip, seconds))
     if config.load_cell is not None:
-        looks.append(_load_cell(config.load_cell, seconds))
+        checks.append(_check_load_cell(config.load_cell, seconds))
     if config.skin is not None:
-        for name, serial in (
-            ("skin's source", config.skin.source.serial),
-            ("skin's DAQ", config.skin.daq.adc.device if config.skin.daq.adc is not None else None),
-        ):
-            if serial is not None:
-                looks.append(_only_port(name, serial))
+        daq = config.skin.daq.adc
+        ports = {"skin's source": config.skin.source.serial, "skin's DAQ": None if daq is None else daq.device}
+        for name, device in ports.items():
+            if device is not None:
+                checks.append(asyncio.to_thread(lambda *args: [check_port(*args)], name, device))
     if config.gripper is not None:
-        looks.append(_gripper(config.gripper))
+        checks.append(_check_gripper(config.gripper))
     if config.robot is not None:
-        looks.append(asyncio.to_thread(robot_findings, config.robot))
-    for findings in await asyncio.gather(*looks):
-        for finding in findings:
-            yield finding
+        checks.append(asyncio.to_thread(_check_robot, config.robot))
+    return [finding for findings in await asyncio.gather(*checks) for finding in findings]
 
 
-def port_finding(name: str, device: SerialDevice) -> Finding:
-    """Say whether a serial device is plugged in and may be opened; nothing is opened."""
+def check_port(name: str, device: SerialDevice) -> Finding:
+    """Check that a serial device is plugged in and may be opened; does not open it."""
     subject = f"port of {name}"
     try:
         path = find_port(serial_number=device.serial_number, path=str(device.path) if device.path else None)
     except DriverError as error:
-        return from_sentence(subject, str(error), "the board is not plugged in, or has another serial number")
+        return from_error(subject, error, "the board is not plugged in, or has another serial number")
     denied = access_trouble(path)
     if denied:
         what, _, cure = denied.partition("; ")
-        return trouble(subject, f"{path} is there, but {what}", "the daemon cannot read the board", cure)
+        return trouble(subject, f"{path} exists, but {what}", "the daemon cannot read the board", cure)
     by = f"serial number {device.serial_number}" if device.serial_number else "its path"
-    return good(subject, f"{os.path.realpath(path)} is there, found by {by}")
+    return good(subject, f"{os.path.realpath(path)}, found by {by}")
 
 
-def rate_finding(subject: str, measured_hz: float | None, configured_hz: float) -> Finding:
-    """Hold a measured rate against the configured one."""
+def check_rate(subject: str, measured_hz: float | None, configured_hz: float) -> Finding:
+    """Compare a measured rate with the configured one; None means that nothing came."""
     if measured_hz is None:
         return trouble(
             subject,
-            "nothing was heard",
-            "it is silent: no power, another program's port, or another board",
-            "see that it has power; unplug it and plug it in again",
+            "nothing was received",
+            "the device is silent: no power, another program's port, or another board",
+            "check its power; unplug it and plug it in again",
         )
-    found = f"{measured_hz:.3g} a second, {configured_hz:.3g} configured"
+    found = f"{measured_hz:.3g} Hz measured, {configured_hz:.3g} Hz configured"
     if abs(measured_hz / configured_hz - 1.0) > RATE_TOLERANCE:
         return note(
             subject,
             found,
-            "freshness is judged by the configured rate: the loop may hold though all is well, or too late",
-            f"set the configured rate to {measured_hz:.3g} a second (frame_period_s {1.0 / measured_hz:.4f})",
+            "freshness is judged by the configured rate: the loop may hold needlessly, or too late",
+            f"configure {measured_hz:.3g} Hz (frame_period_s {1.0 / measured_hz:.4f})",
         )
     return good(subject, found)
 
 
-def channels_finding(name: str, saturated: int, dead: int, frames: int) -> Finding:
-    """Say how many channels tell nothing."""
+def check_channels(name: str, saturated: int, dead: int, frames: int) -> Finding:
+    """Judge the numbers of saturated and dead channels."""
     subject = f"channels of {name}"
     found = f"{saturated} saturated and {dead} dead of 896 in {frames} frames"
-    if not saturated and not dead:
-        return good(subject, found)
-    means = "what they would tell is missing from every estimate"
     if saturated:
         return trouble(
             subject,
             found,
-            f"more signal than the converter can follow: a short, or too much current; {means}",
-            "look at the electrodes' connector for bridges; wet the gel; lower the injected current",
+            "more signal than the converter can measure: a short, or too much current; every estimate lacks them",
+            "look for bridges at the electrodes' connector; wet the gel; lower the injected current",
         )
-    return trouble(
-        subject,
-        found,
-        f"an electrode without contact, or a broken wire; {means}",
-        "press the connector on; 28 or 56 dead channels that belong together point to one electrode",
-    )
+    if dead:
+        return trouble(
+            subject,
+            found,
+            "an electrode without contact, or a broken wire; every estimate lacks these channels",
+            "press the connector on; 28 or 56 dead channels that belong together point to one electrode",
+        )
+    return good(subject, found)
 
 
-async def _fingertip(name: str, config: FingertipConfig, seconds: float) -> list[Finding]:
-    port = port_finding(name, config.device)
+async def _received(source: AsyncIterator[Any], seconds: float) -> list[Any]:
+    found = []
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(seconds), contextlib.aclosing(source) as items:  # type: ignore[type-var]
+            async for item in items:
+                found.append(item)  # noqa: PERF401 - a timeout keeps what came before
+    return found
+
+
+async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -> list[Finding]:
+    port = check_port(name, config.device)
     if port.state == "trouble":
         return [port]
     board = EitKit(
@@ -117,18 +130,12 @@ async def _fingertip(name: str, config: FingertipConfig, seconds: float) -> list
         path=config.device.path,
         frame_period_s=config.frame_period_s,
     )
-    frames: list[Frame] = []
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(seconds), contextlib.aclosing(board.frames()) as heard:
-            async for frame in heard:
-                frames.append(frame)  # noqa: PERF401 - what came before the time is up is kept
+    frames = await _received(board.frames(), seconds)
     facts = board.facts()
     if not frames and facts["last_loss"]:
-        return [port, from_sentence(f"rate of {name}", str(facts["last_loss"]), "no frame came")]
-    findings = [
-        port,
-        rate_finding(f"rate of {name}", _rate_hz([f.t_arrival_ns for f in frames]), 1 / config.frame_period_s),
-    ]
+        return [port, from_error(f"rate of {name}", str(facts["last_loss"]), "no frame came")]
+    measured_hz = _rate_hz([frame.t_arrival_ns for frame in frames])
+    findings = [port, check_rate(f"rate of {name}", measured_hz, 1 / config.frame_period_s)]
     refused = facts["errors"]
     if isinstance(refused, dict) and sum(refused.values()):
         findings.append(
@@ -136,20 +143,19 @@ async def _fingertip(name: str, config: FingertipConfig, seconds: float) -> list
                 f"lines of {name}",
                 f"{sum(refused.values())} refused; {facts['last_refusal']}",
                 "a bad cable, or another program on the same board",
-                "exchange the USB cable",
+                "replace the USB cable",
             )
         )
     if frames:
         channels = np.array([frame.channels for frame in frames])
         saturated = np.array([frame.saturated for frame in frames]).any(axis=0)
-        findings.append(
-            channels_finding(name, int(saturated.sum()), int((channels == 0).all(axis=0).sum()), len(frames))
-        )
+        dead = (channels == 0).all(axis=0)
+        findings.append(check_channels(name, int(saturated.sum()), int(dead.sum()), len(frames)))
     return findings
 
 
-async def _load_cell(config: LoadCellConfig, seconds: float) -> list[Finding]:
-    port = port_finding("load_cell", config.device)
+async def _check_load_cell(config: LoadCellConfig, seconds: float) -> list[Finding]:
+    port = check_port("load_cell", config.device)
     if port.state == "trouble":
         return [port]
     cell = LoadCell(
@@ -158,90 +164,66 @@ async def _load_cell(config: LoadCellConfig, seconds: float) -> list[Finding]:
         path=config.device.path,
         rate_hz=config.rate_hz,
     )
-    times, saturated = [], 0
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(seconds), contextlib.aclosing(cell.samples()) as heard:
-            async for sample in heard:
-                times.append(sample.t_arrival_ns)
-                saturated += sample.saturated
-    findings = [port, rate_finding("rate of load_cell", _rate_hz(times), config.rate_hz)]
-    if saturated:
+    samples = await _received(cell.samples(), seconds)
+    measured_hz = _rate_hz([sample.t_arrival_ns for sample in samples])
+    findings = [port, check_rate("rate of load_cell", measured_hz, config.rate_hz)]
+    if saturated := sum(sample.saturated for sample in samples):
         findings.append(
             trouble(
                 "signal of load_cell",
-                f"{saturated} of {len(times)} readings are at the converter's end",
-                "overloaded, or a wire of the bridge is off",
-                "take the load off; look at the four wires of the cell",
+                f"{saturated} of {len(samples)} readings are at the converter's limit",
+                "overload, or a loose wire of the bridge",
+                "take the load off; check the four wires of the cell",
             )
         )
     return findings
 
 
-async def _only_port(name: str, device: SerialDevice) -> list[Finding]:
-    return [port_finding(name, device)]
-
-
-async def _gripper(config: GripperConfig) -> list[Finding]:
+async def _check_gripper(config: GripperConfig) -> list[Finding]:
     client = make_gripper_client(config)
     try:
         await client.connect()
         state = await client.read()
     except DriverError as error:
-        return [from_sentence("gripper", str(error), "nothing can be gripped")]
+        return [from_error("gripper", error, "nothing can be gripped")]
     finally:
         await client.close()
     if state.flt:
-        return [
-            trouble(
-                "gripper",
-                f"{client.name} answers, with fault {state.flt}",
-                "it does not move",
-                "clear what the fault names, then `shearloop command unlock`",
-            )
-        ]
+        found, cure = (
+            f"{client.name} answers, with fault {state.flt}",
+            "clear the fault, then `shearloop command unlock`",
+        )
+        return [trouble("gripper", found, "it does not move", cure)]
     if state.sta is not ActivationStatus.ACTIVE:
-        return [
-            note(
-                "gripper",
-                f"{client.name} answers and is not activated",
-                "it opens and closes once at the start",
-                "keep fingers and tools away when the daemon starts",
-            )
-        ]
+        cure = "keep fingers and tools away when the daemon starts"
+        return [note("gripper", f"{client.name} answers; not activated", "it opens and closes once at the start", cure)]
     return [good("gripper", f"{client.name} answers and is activated")]
 
 
-def robot_findings(settings: Path) -> list[Finding]:
-    """Look at the robot's controller: there, in remote control, in a mode to move, registers free."""
+def _check_robot(settings: Path) -> list[Finding]:
     try:
         host = read_settings(settings).host
-        seen = look(host, LOOK_TIMEOUT_S)
+        seen = look(host, ROBOT_TIMEOUT_S)
     except DriverError as error:
-        return [from_sentence("robot", str(error), "the robot cannot be driven")]
+        return [from_error("robot", error, "the robot cannot be driven")]
     findings = [good("robot", f"{host} answers, PolyScope {seen.version}")]
     if seen.remote is False:
         findings.append(
             trouble(
                 "remote control",
                 "the robot is in local control",
-                "it takes no motion from the network",
+                "it accepts no motion from the network",
                 "switch it to remote control, top right on the teach pendant",
             )
         )
     else:
-        findings.append(good("remote control", "on" if seen.remote else "this controller knows no such mode"))
+        findings.append(good("remote control", "on" if seen.remote else "this controller has no such mode"))
     mode = f"robot mode {seen.robot_mode}, safety mode {seen.safety_mode}"
-    if (seen.robot_mode, seen.safety_mode) in (("RUNNING", "NORMAL"), ("RUNNING", "REDUCED")):
+    if seen.robot_mode == "RUNNING" and seen.safety_mode in ("NORMAL", "REDUCED"):
         findings.append(good("robot's mode", mode))
     else:
-        findings.append(
-            note(
-                "robot's mode",
-                mode,
-                "the arm does not move as it is",
-                "make the cell safe, start the daemon, then `shearloop command unlock`",
-            )
-        )
+        cure = "make the cell safe, start the daemon, then `shearloop command unlock`"
+        findings.append(note("robot's mode", mode, "the arm does not move in this mode", cure))
     if seen.registers_free:
         findings.append(good("robot's registers", "free"))
     else:
@@ -250,7 +232,7 @@ def robot_findings(settings: Path) -> list[Finding]:
                 "robot's registers",
                 "in use",
                 "another RTDE client, EtherNet/IP or PROFINET commands the robot",
-                "end the other program, or disable the adapter under Installation → Fieldbus",
+                "close the other program, or disable the adapter under Installation → Fieldbus",
             )
         )
     return findings
@@ -260,3 +242,98 @@ def _rate_hz(times_ns: list[int]) -> float | None:
     if len(times_ns) < 2 or times_ns[-1] == times_ns[0]:
         return None
     return (len(times_ns) - 1) * 1e9 / (times_ns[-1] - times_ns[0])
+
+
+@dataclass(slots=True)
+class TopicLog:
+    """What was received of one topic and source."""
+
+    times_ns: list[int] = field(default_factory=list)
+    latest: Mapping[str, Any] = field(default_factory=dict)
+    saturated: int = 0
+    dead: int = 0
+
+
+def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
+    """Return the status of a running daemon's tasks; None when no daemon answers."""
+    try:
+        tasks = request(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
+    except UserError:
+        return None
+    return tasks if isinstance(tasks, dict) else {}
+
+
+def listen(address: str, seconds: float) -> dict[tuple[str, str], TopicLog]:
+    """Collect the messages of a local daemon for `seconds`, by topic and source."""
+    received: dict[tuple[str, str], TopicLog] = {}
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.SUBSCRIBE, b"")
+        socket.connect(address)
+        end_s = time.monotonic() + seconds
+        while (left_s := end_s - time.monotonic()) > 0:
+            if not socket.poll(int(left_s * 1000) + 1):
+                continue
+            topic, payload = socket.recv_multipart()[:2]
+            content = decode(payload)
+            log = received.setdefault((topic.decode(), str(content.get("source"))), TopicLog())
+            log.times_ns.append(int(content["t_mono_ns"]))
+            log.latest = content
+            log.saturated = max(log.saturated, int(content.get("saturated") or 0))
+            log.dead = max(log.dead, int(content.get("dead") or 0))
+    return received
+
+
+def check_daemon(
+    config: DaemonConfig, tasks: Mapping[str, Mapping[str, Any]], received: Mapping[tuple[str, str], TopicLog]
+) -> Iterator[Finding]:
+    """Judge a running daemon by its tasks and its messages."""
+    for name, status in tasks.items():
+        yield check_task(name, status)
+    for (topic, source), rate_hz in _expected_rates(config).items():
+        times_ns = received.get((topic, source), TopicLog()).times_ns
+        yield check_rate(f"rate of {topic} {source}", _rate_hz(times_ns), rate_hz)
+    for name in config.fingertips:
+        if frames := received.get(("eit.frame", name)):
+            yield check_channels(name, frames.saturated, frames.dead, len(frames.times_ns))
+        estimates = received.get(("eit.estimate", name))
+        if estimates and (reason := estimates.latest.get("why")):
+            yield note(f"estimate of {name}", "not valid", str(reason), "see docs/troubleshooting.md")
+    loop = received.get(("loop.state", "loop"))
+    if loop and (reasons := loop.latest.get("reasons")):
+        yield note("loop", str(loop.latest.get("phase")), str(reasons), "see docs/safety.md")
+
+
+def check_task(name: str, status: Mapping[str, Any]) -> Finding:
+    """Judge one task by the counters that it reports."""
+    subject = f"task {name}"
+    counted = ", ".join(f"{count} × {kind}" for kind, count in (status.get("errors") or {}).items() if count)
+    reason = str(status.get("trouble") or status.get("last_loss") or "")
+    restarts, last_error = status.get("restarts", 0), str(status.get("last_error", ""))
+    read_log = "read the daemon's log; report it if it comes back"
+    if status.get("alive") is False:
+        return trouble(subject, f"dead, {restarts} restarts", last_error, read_log)
+    if status.get("connected") is False:
+        return trouble(subject, "its device is not connected", reason, "check its port, cable and power")
+    if restarts:
+        return note(subject, f"alive after {restarts} restarts", last_error, read_log)
+    if counted:
+        means = reason or "refused data is not used"
+        return note(subject, f"alive; refused: {counted}", means, "see docs/troubleshooting.md")
+    return good(subject, "alive")
+
+
+def _expected_rates(config: DaemonConfig) -> dict[tuple[str, str], float]:
+    """Return each expected message's rate in Hz, by topic and source."""
+    rates = {("health", "daemon"): 1.0}
+    for name, fingertip in config.fingertips.items():
+        rates["eit.frame", name] = 1.0 / fingertip.frame_period_s
+    if config.load_cell is not None:
+        rates["load.torque", "load_cell"] = config.load_cell.rate_hz
+    if config.skin is not None:
+        rates["skin.shear", "skin"] = config.skin.daq.rate_hz
+    if config.robot is not None:
+        rates["robot.state", "robot"] = 25.0
+    if config.gripper is not None:
+        rates["gripper.state", "gripper"] = 10.0
+    return rates

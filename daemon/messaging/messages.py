@@ -6,9 +6,6 @@ has `timestamp` (Unix seconds), `t_mono_ns`, `seq` (per topic and source, withou
 """
 
 import dataclasses
-import sys
-import threading
-from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeAlias
@@ -19,24 +16,8 @@ from numpy.typing import NDArray
 
 Scalar: TypeAlias = float | int | str | bool | None
 FloatArray: TypeAlias = NDArray[np.floating]
-# An array of a few numbers, 25 times a second: NumPy takes longer to begin than they take to write.
-Few: TypeAlias = tuple[float, ...]
 
 _WIRE = np.dtype("<f4")
-_NAMES: dict[type, tuple[str, ...]] = {}
-
-
-class _Packing(threading.local):
-    """A thread's own packer: where it is of plain Python, another thread may be let in in the middle of a message.
-
-    Kept, for one takes a quarter of a megabyte; it packs one message after the other, whatever became of the last.
-    """
-
-    def __init__(self) -> None:
-        self.packer = msgpack.Packer(use_bin_type=True)
-
-
-_PACKING = _Packing()
 
 
 def column(unit: str, meaning: str) -> Any:
@@ -158,9 +139,9 @@ class RobotStateMessage(Message):
     topic: ClassVar[str] = "robot.state"
     rate_hz: ClassVar[float | None] = 25.0
 
-    joints_rad: Few = column("rad", "the six joint angles, base to wrist 3")
-    tcp_pose: Few = column("m, rad", "position and rotation vector of the tool centre in the base frame")
-    wrench: Few = column("N, N·m", "force and torque at the tool centre")
+    joints_rad: tuple[float, ...] = column("rad", "the six joint angles, base to wrist 3")
+    tcp_pose: tuple[float, ...] = column("m, rad", "position and rotation vector of the tool centre in the base frame")
+    wrench: tuple[float, ...] = column("N, N·m", "force and torque at the tool centre")
     wrist_rad: float = column("rad", "angle of wrist 3, about which the tool twists")
     wrist_speed_rad_per_s: float = column("rad/s", "its speed")
     wrist_torque_nm: float = column("N·m", "torque about the tool's axis, from the wrench")
@@ -244,38 +225,21 @@ class Health(Message):
 def wire_map(message: Message, timestamp: float, seq: int) -> dict[str, Any]:
     """Return the map that goes on the wire, arrays as little-endian float32 with their shapes beside them."""
     content: dict[str, Any] = {"timestamp": timestamp, "seq": seq}
-    for name in _names(type(message)):
-        value = getattr(message, name)
-        if isinstance(value, np.ndarray):
-            content[name] = value.astype(_WIRE, copy=False).tobytes()
-            content[f"{name}_shape"] = list(value.shape)
-        elif isinstance(value, tuple):
-            content[name] = _few_bytes(value)
-            content[f"{name}_shape"] = [len(value)]
+    for item in dataclasses.fields(message):
+        name, value = item.name, getattr(message, item.name)
+        if isinstance(value, np.ndarray | tuple):
+            # What is too large for float32 goes as infinite.
+            with np.errstate(over="ignore"):
+                array = np.asarray(value, _WIRE)
+            content[name], content[f"{name}_shape"] = array.tobytes(), list(array.shape)
         else:
             content[name] = value
     return content
 
 
-def _few_bytes(numbers: Few) -> bytes:
-    # Not `struct`, which raises where a number is too large for float32: as of NumPy, it is infinite then.
-    found = array("f", numbers)
-    if sys.byteorder == "big":
-        found.byteswap()
-    return found.tobytes()
-
-
-def _names(kind: type[Message]) -> tuple[str, ...]:
-    """Return the names of a message's fields, looked up once: `dataclasses.fields` is slow."""
-    names = _NAMES.get(kind)
-    if names is None:
-        names = _NAMES[kind] = tuple(item.name for item in dataclasses.fields(kind))
-    return names
-
-
 def encode(content: Mapping[str, Any]) -> bytes:
     """Return the second frame of a message."""
-    packed: bytes = _PACKING.packer.pack(content)
+    packed: bytes = msgpack.packb(content)
     return packed
 
 

@@ -1,12 +1,10 @@
 """Sends messages over ZeroMQ and hands them to whoever else listens in the process."""
 
-import asyncio
 import os
 import socket as sockets
 import stat
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import zmq
@@ -25,9 +23,6 @@ HIGH_WATER_MARK = 1000
 LARGEST_SUBSCRIPTION_BYTES = 1024
 # Subscriptions taken in at a time, so that a peer that changes its mind without end keeps nothing waiting.
 SUBSCRIPTIONS_AT_ONCE = 100
-# As plain numbers: to join two flags of ZeroMQ's enumerations takes half as long as to send a message.
-_AT_ONCE, _MORE_COMES = int(zmq.NOBLOCK), int(zmq.NOBLOCK | zmq.SNDMORE)
-_EVENTS, _TO_BE_READ = int(zmq.EVENTS), int(zmq.POLLIN)
 Listener: TypeAlias = Callable[[str, dict[str, Any]], None]
 
 
@@ -42,13 +37,8 @@ class Publisher:
         self._clock = clock
         self._numbers: Counter[tuple[str, str]] = Counter()
         self._listeners: list[Listener] = []
-        # Beginnings of topics that are subscribed to at present, and what that means for each topic asked about since.
+        # Beginnings of topics that are subscribed to at present.
         self._subscribed: set[bytes] = set()
-        self._wanted: dict[str, bool] = {}
-        # The loop that tells of subscribers, and whether there may be news of them; without a loop, always.
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._told = False
-        self._watched = False
         # To subscribers an XPUB is a PUB; to us it tells their subscriptions.
         self._socket: zmq.Socket[bytes] = zmq.Socket(context, zmq.XPUB)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_SUBSCRIPTION_BYTES)
@@ -65,46 +55,20 @@ class Publisher:
         stream = (message.topic, message.source)
         number = self._numbers[stream]
         self._numbers[stream] = number + 1
-        if self._listeners or self._goes_out(message.topic):
+        if self._listeners or self.wanted(message.topic):
             self.forward(message.topic, wire_map(message, self._clock.unix_s(message.t_mono_ns), number))
 
     def forward(self, topic: str, content: dict[str, Any]) -> None:
         """Send a message's map as it is, stamped and numbered already."""
-        # Most topics are listened to by nobody most of the time, and what goes nowhere needs no bytes.
-        if self._goes_out(topic):
-            # Before anything of it is sent: begun and not ended, it would be the beginning of the next message.
-            payload = encode(content)
-            self._socket.send(topic.encode(), _MORE_COMES)
-            self._socket.send(payload, _AT_ONCE)
-            # Whoever sends may have been told of subscribers by the way.
-            self._told = True
-            self._hear_subscribers()
+        if self.wanted(topic):
+            self._socket.send_multipart([topic.encode(), encode(content)], zmq.NOBLOCK)
         for listener in self._listeners:
             listener(topic, content)
-
-    @contextmanager
-    def told(self) -> Iterator[None]:
-        """Have the running event loop tell of subscribers, so that they are not looked for at every message."""
-        self._loop, self._told = asyncio.get_running_loop(), True
-        descriptor = int(self._socket.getsockopt(zmq.FD))
-        try:
-            yield
-        finally:
-            self._loop.remove_reader(descriptor)
-            self._loop, self._watched = None, False
 
     def wanted(self, topic: str) -> bool:
         """Return whether any subscriber asks for this topic: what is dear to compute waits for that."""
         self._hear_subscribers()
-        wanted = self._wanted.get(topic)
-        if wanted is None:
-            wanted = any(topic.encode().startswith(beginning) for beginning in self._subscribed)
-            self._wanted[topic] = wanted
-        return wanted
-
-    def _goes_out(self, topic: str) -> bool:
-        # What was wanted is sent before it is asked whether it still is: one message to nobody does no harm.
-        return self._wanted.get(topic) or self.wanted(topic)
+        return any(topic.encode().startswith(beginning) for beginning in self._subscribed)
 
     @property
     def subscribed(self) -> bool:
@@ -116,31 +80,11 @@ class Publisher:
         """Close the socket; what is not yet sent is dropped."""
         self._socket.close()
 
-    def _watch(self, loop: asyncio.AbstractEventLoop) -> None:
-        """Have the loop tell of what comes from now on, once: the descriptor stays readable until it is heard."""
-        self._told = False
-        if self._watched:
-            return
-        descriptor = int(self._socket.getsockopt(zmq.FD))
-
-        def there_is_news() -> None:
-            loop.remove_reader(descriptor)
-            self._watched, self._told = False, True
-
-        loop.add_reader(descriptor, there_is_news)
-        self._watched = True
-
     def _hear_subscribers(self) -> None:
-        if self._loop is not None and not self._told:
-            return
         for _ in range(SUBSCRIPTIONS_AT_ONCE):
-            # A poller would have to be made for each look.
-            if not int(self._socket.getsockopt(_EVENTS)) & _TO_BE_READ:
-                if self._loop is not None:
-                    self._watch(self._loop)
+            if not int(self._socket.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 return
-            self._wanted.clear()
-            message = self._socket.recv(_AT_ONCE)
+            message = self._socket.recv(zmq.NOBLOCK)
             kind, beginning = message[:1], message[1:]
             # Only beginnings of our own topics are kept: nobody can fill the memory with others.
             if kind == b"\x01" and any(topic.encode().startswith(beginning) for topic in TOPICS):

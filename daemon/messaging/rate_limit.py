@@ -7,7 +7,6 @@ PER_CLIENT_BURST, PER_CLIENT_PER_S = 20.0, 10.0
 ALL_BURST, ALL_PER_S = 100.0, 50.0
 # Clients remembered at once: one that reconnects to be forgotten still meets the bucket of all.
 MOST_CLIENTS = 256
-FLOOD_NS = 100_000_000
 
 
 class TokenBucket:
@@ -36,7 +35,6 @@ class RateLimit:
     def __init__(self) -> None:
         self._all = TokenBucket(ALL_BURST, ALL_PER_S)
         self._each: OrderedDict[bytes, TokenBucket] = OrderedDict()
-        self._refused_ns: int | None = None
 
     def allows(self, client: bytes, t_ns: int) -> bool:
         """Return whether a client may make one more request at this moment (monotonic).
@@ -49,11 +47,4 @@ class RateLimit:
             if len(self._each) > MOST_CLIENTS:
                 self._each.popitem(last=False)
         self._each.move_to_end(client)
-        allowed = bucket.take(t_ns) and self._all.take(t_ns)
-        if not allowed:
-            self._refused_ns = t_ns
-        return allowed
-
-    def flooded(self, t_ns: int) -> bool:
-        """Return whether requests have been too many a moment ago."""
-        return self._refused_ns is not None and t_ns - self._refused_ns < FLOOD_NS
+        return bucket.take(t_ns) and self._all.take(t_ns)

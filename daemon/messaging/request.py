@@ -20,17 +20,27 @@ def request(
         socket.setsockopt(zmq.SNDTIMEO, int(timeout_s * 1000))
         connect(socket, address, keys)
         if not (_sent(socket, encode(content)) and socket.poll(int(timeout_s * 1000))):
-            raise UserError(
-                f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
-                f"or give the address of its `commands` key with --connect{keys_hint(keys)}"
-            )
-        try:
-            return decode(socket.recv())
-        except ValueError as error:
-            raise UserError(
-                f"what answers at {address} is not a daemon of shearloop ({error}); give the address of its `commands` "
-                "key with --connect"
-            ) from error
+            raise no_reply(address, timeout_s, keys)
+        return reply_of(socket.recv(), address)
+
+
+def no_reply(address: str, timeout_s: float, keys: ClientKeys | None) -> UserError:
+    """Return the error for a request that got no reply."""
+    return UserError(
+        f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
+        f"or give the address of its `commands` key with --connect{keys_hint(keys)}"
+    )
+
+
+def reply_of(data: bytes, address: str) -> dict[str, Any]:
+    """Return the decoded reply; raise UserError if it is not a daemon's."""
+    try:
+        return decode(data)
+    except ValueError as error:
+        raise UserError(
+            f"what answers at {address} is not a daemon of shearloop ({error}); give the address of its `commands` "
+            "key with --connect"
+        ) from error
 
 
 def _sent(socket: "zmq.Socket[bytes]", data: bytes) -> bool:

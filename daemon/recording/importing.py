@@ -6,17 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter1d
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.estimation.values import LARGEST_TORQUE_NM
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab_streams import LoadStream, Stream, contents, read_load_stream, read_stream
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 from shearloop.daemon.recording.writer import RecordingWriter
 from shearloop.drivers.frame_clock import slope_below
-
-FloatArray = NDArray[np.float64]
 
 NOMINAL_PERIOD_NS = 541_200_000
 # Frames on either side among which one is hoped not to have waited for its reader.

@@ -17,15 +17,13 @@ from typing import Any
 
 import numpy as np
 import structlog
-from numpy.typing import NDArray
 from scipy.io import savemat
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.eit.stored import replaced
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import Scalar
-
-FloatArray = NDArray[np.float64]
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
 WINDOW_FRAMES, STD_FRAMES = 9, 9 / 5

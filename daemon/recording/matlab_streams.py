@@ -9,13 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.matlab_file import MatFileError, NotAMatrix, Variable, read_variables
-
-FloatArray = NDArray[np.float64]
 
 # The names that the recording scripts gave to the same thing over time.
 _SIDES = {"right": ("Right_Data", "plotthis2", "plotthis_right"), "left": ("Left_Data", "plotthis1", "plotthis_left")}
@@ -54,7 +52,7 @@ class TorqueSlices:
 
     differences: FloatArray
     torque_nm: FloatArray
-    numbers: NDArray[np.int64]
+    numbers: IntArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,11 +1,11 @@
 """An MCAP file that is whole at every moment: what was flushed survives a kill, and a full disk spoils nothing."""
 
+import io
 import json
 import os
-from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
@@ -17,52 +17,35 @@ PARTIAL = ".partial"
 _CHUNK_BYTES = 1 << 24
 
 
-class RawFile(Protocol):
-    """What is needed of an unbuffered file."""
+class _Stream:
+    """Keeps what the disk has not taken, so that a later flush can write it, and tells offsets as a file would."""
 
-    def write(self, data: memoryview, /) -> int | None:
-        """Write as much as there is room for; OSError where there is none."""
-
-    def seek(self, offset: int, /) -> int:
-        """Go to an offset."""
-
-    def truncate(self, size: int, /) -> int:
-        """Cut the file off."""
-
-    def fileno(self) -> int:
-        """Return the descriptor."""
-
-    def close(self) -> None:
-        """Close it."""
-
-
-class _Pending:
-    """The writer's stream: keeps whole records until they are on the disk, and tells offsets as a file would."""
-
-    def __init__(self) -> None:
-        self.records: deque[bytes] = deque()
-        self.waiting = 0
+    def __init__(self, file: io.FileIO) -> None:
+        self.file = file
+        self.pending = bytearray()
         self.written = 0
 
     def write(self, data: bytes) -> int:
-        if data:
-            self.records.append(data)
-            self.waiting += len(data)
+        self.pending += data
         return len(data)
 
     def tell(self) -> int:
-        return self.written + self.waiting
+        return self.written + len(self.pending)
 
     def flush(self) -> None:
-        """Nothing is passed on here: that is `McapFile.flush`."""
-
-
-class _ChunkEndingWriter(Writer):
-    """The library's writer, whose chunks end when they are told to: it knows a limit in bytes alone."""
-
-    def end_chunk(self) -> None:
-        """Write the open chunk and its index, if there is anything in it."""
-        self._Writer__finalize_chunk()  # type: ignore[attr-defined]
+        """Write all; raises OSError where that is not possible, and then nothing of it is in the file."""
+        with memoryview(self.pending) as data:
+            done = 0
+            try:
+                while done < len(data):
+                    done += self.file.write(data[done:])
+            except OSError:
+                # A torn record would end a reader's way.
+                self.file.truncate(self.written)
+                self.file.seek(self.written)
+                raise
+        self.written += done
+        self.pending.clear()
 
 
 class McapFile:
@@ -72,17 +55,14 @@ class McapFile:
     file is cut back to its last whole record, and the next flush tries again. Not for two threads at once.
     """
 
-    def __init__(self, path: Path, file: RawFile | None = None) -> None:
+    def __init__(self, path: Path, file: io.FileIO | None = None) -> None:
         """Create PATH.partial, or write to an open `file`; raises OSError, FileExistsError where there is one."""
         self.path = path
         self.partial = path.with_name(path.name + PARTIAL)
-        self._file: RawFile = file if file is not None else self.partial.open("xb", buffering=0)
-        self._pending = _Pending()
-        self._writer = _ChunkEndingWriter(
-            self._pending,  # type: ignore[arg-type]  # write and tell are all it needs
-            chunk_size=_CHUNK_BYTES,
-            compression=CompressionType.ZSTD,
-        )
+        self._file = file if file is not None else io.FileIO(self.partial, "xb")
+        self._stream = _Stream(self._file)
+        # Write, tell and flush are all that is needed of it.
+        self._writer = Writer(cast(IO[bytes], self._stream), _CHUNK_BYTES, CompressionType.ZSTD)
         self._writer.start(profile=PROFILE, library="shearloop")
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -92,12 +72,12 @@ class McapFile:
     @property
     def bytes_written(self) -> int:
         """Size of what is safe on the disk."""
-        return self._pending.written
+        return self._stream.written
 
     @property
     def bytes_waiting(self) -> int:
         """Size of what a flush could not yet write."""
-        return self._pending.waiting
+        return len(self._stream.pending)
 
     def metadata(self, name: str, content: Mapping[str, str]) -> None:
         """Append a metadata record."""
@@ -119,8 +99,7 @@ class McapFile:
 
     def flush(self) -> None:
         """End the chunk and put it on the disk; raises OSError, after which a later flush tries again."""
-        self._writer.end_chunk()
-        self._drain()
+        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap leaves its return type out
 
     def close(self, complete: bool = True) -> Path:
         """Write the index, and return the file's path: its name where it is complete, else NAME.partial.
@@ -129,7 +108,7 @@ class McapFile:
         """
         try:
             self._writer.finish()  # type: ignore[no-untyped-call]  # mcap leaves its return type out
-            self._drain()
+            self._stream.flush()
             os.fsync(self._file.fileno())
         finally:
             self._file.close()
@@ -150,19 +129,3 @@ class McapFile:
             text = json.dumps(schemas()[name], sort_keys=True, ensure_ascii=False).encode()
             self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
         return self._writer.register_channel(topic, "json", self._schemas[name])
-
-    def _drain(self) -> None:
-        pending = self._pending
-        while pending.records:
-            data = memoryview(pending.records[0])
-            try:
-                while data:
-                    data = data[self._file.write(data) or 0 :]
-            except OSError:
-                # A torn record at the end would end a reader's way: back to the last whole one.
-                self._file.truncate(pending.written)
-                self._file.seek(pending.written)
-                raise
-            size = len(pending.records.popleft())
-            pending.written += size
-            pending.waiting -= size

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 from mcap.records import Channel, Message
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.errors import UserError
@@ -32,8 +32,6 @@ from shearloop.drivers.raw_event import InputKind
 _IDENTITIES = ("format_version", "channel_table_hash", "software", "code_sha256")
 # How a raw input of this kind is written; see `input_json`.
 _TELLS_OF_A_TOOL = as_json({"kind": InputKind.TOOL.value})[1:-1]
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,5 +1,6 @@
 """Writes a recording message by message, from data that is there already; a live one is `recorder`'s business."""
 
+import io
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -27,7 +28,7 @@ class RecordingWriter:
         self.path = Path(path)
         try:
             partial = self.path.with_name(self.path.name + PARTIAL)
-            self._file = McapFile(self.path, partial.open("wb", buffering=0))
+            self._file = McapFile(self.path, io.FileIO(partial, "wb"))
         except OSError as error:
             raise self._unwritable(error) from error
         self._file.metadata(METADATA, {**basic_identity(source), **(notes or {})})

@@ -7,19 +7,17 @@ the bank, and the best cell's sigma and k become torque and diameter through the
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, TypeAlias
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.matching import Match, signal_above_noise
 from shearloop.bank.eit.polynomial import Interval
 from shearloop.bank.estimation import Measured
 from shearloop.bank.estimation.fingertip_validator import LEAST_NOISE_V
 from shearloop.drivers.eit_kit import Frame
-
-FloatArray: TypeAlias = NDArray[np.float64]
 
 # Above this share of unusable channels the match would be made of what is left over.
 LARGEST_UNUSABLE_SHARE = 0.10
@@ -42,9 +40,6 @@ class Matcher(Protocol):
 
     def match(self, difference: FloatArray) -> Match:
         """Return the best cell of a (896,) difference, and its runner-up."""
-
-    def match_quickly(self, difference: FloatArray) -> Match | None:
-        """Return the same, or None where that takes more than a few milliseconds."""
 
     def heatmap(self, difference: FloatArray) -> FloatArray:
         """Return the (k, sigma) scores of a (896,) difference, NaN at cells that are not valid."""
@@ -191,8 +186,7 @@ class Estimator:
         found = self._difference(frame)
         if isinstance(found, Reading):
             return found
-        match = self._matcher.match_quickly(found.difference)
-        return None if match is None else self._read(found, match)
+        return None
 
     def _difference(self, frame: Frame) -> "_Difference | Reading":
         """Return what is to be matched, or why there is nothing; only then the frame has been taken in."""

@@ -8,7 +8,7 @@ from weakref import WeakValueDictionary
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.calibration import Calibration
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.estimation import Calibration as FittedCalibration
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
 from shearloop.daemon.errors import UserError
@@ -17,12 +17,12 @@ from shearloop.daemon.sensing.estimator import LONGEST_GAP_NS, Estimator
 from shearloop.daemon.sensing.tracking import Scoring, TrackedEstimator
 
 AnyEstimator: TypeAlias = Estimator | TrackedEstimator
-_MATCHERS: Mapping[str, type[FastMatcher | FastZeroLagMatcher]] = {
-    "all_lags": FastMatcher,
-    "zero_lag": FastZeroLagMatcher,
+_MATCHERS: Mapping[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
+    "all_lags": PrunedMatcher,
+    "zero_lag": PrunedZeroLagMatcher,
 }
 # Matchers in use, which keep no state between calls: fingertips of one bank share one, its memory and its start.
-_in_use: WeakValueDictionary[tuple[str, str], FastMatcher | FastZeroLagMatcher] = WeakValueDictionary()
+_in_use: WeakValueDictionary[tuple[str, str], PrunedMatcher | PrunedZeroLagMatcher] = WeakValueDictionary()
 
 
 def open_estimator(config: FingertipConfig, name: str) -> AnyEstimator:
@@ -91,7 +91,7 @@ def _tracked(fitted: FittedCalibration, config: FingertipConfig) -> TrackedEstim
     )
 
 
-def _matcher(bank: Bank, matching: str) -> FastMatcher | FastZeroLagMatcher:
+def _matcher(bank: Bank, matching: str) -> PrunedMatcher | PrunedZeroLagMatcher:
     key = (f"{bank.identity} {bank.signals_sha256}", matching)
     shared = _in_use.get(key)
     if shared is not None:

@@ -122,7 +122,7 @@ def skin_source(config: SkinConfig) -> TorqueSource | None:
     """Return how often the skin's torque comes; None where no radius makes a torque of its force."""
     if config.tool_radius_mm is None:
         return None
-    return TorqueSource(name=SKIN, period_s=1.0 / config.daq.rate_hz, sticks=True)
+    return TorqueSource(name=SKIN, period_s=1.0 / config.daq.rate_hz, has_friction_band=True)
 
 
 def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimator:

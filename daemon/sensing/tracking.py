@@ -9,12 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.polynomial import Interval
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, Measured, TactileFrame
-from shearloop.daemon.sensing.estimator import FloatArray, Matcher, Reading
+from shearloop.daemon.sensing.estimator import Matcher, Reading
 from shearloop.drivers.eit_kit import Frame
 
 # These take a millisecond, always the same few products; the others search a bank or reconstruct.
@@ -99,7 +100,7 @@ class TrackedEstimator:
             match = Match(estimate.k, estimate.sigma, (0, 0), estimate.score, estimate.runner_up, None)
         elif self._scoring is not None and first is not None and first.any():
             matcher = self._scoring.matcher
-            match = matcher.match_quickly(first) if at_once else matcher.match(first)
+            match = None if at_once else matcher.match(first)
             if match is None:
                 # The session has moved on by this frame already.
                 self._unmatched = frames, estimate, first

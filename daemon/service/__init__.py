@@ -1,1 +1,1 @@
-"""What makes the daemon a service of the operating system: the files, where they go, and the memory it keeps."""
+"""The daemon as a systemd service: installation and real-time options."""

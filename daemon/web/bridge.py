@@ -1,4 +1,4 @@
-"""Between the daemon's sockets and the page: messages in, commands out."""
+"""Connects the page to the daemon's sockets: messages in, commands out."""
 
 import asyncio
 import time
@@ -12,77 +12,77 @@ import zmq.asyncio
 
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.keys import ClientKeys
-from shearloop.daemon.messaging.messages import EitFrame, EitHeatmap, decode
+from shearloop.daemon.messaging.messages import EitFrame, EitHeatmap, decode, encode
 from shearloop.daemon.messaging.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
+from shearloop.daemon.messaging.request import no_reply, reply_of
 from shearloop.daemon.messaging.subscriber import connect
 from shearloop.daemon.messaging.topics import TOPICS
-from shearloop.daemon.web.asked import Requests
-from shearloop.daemon.web.latest import Latest
+from shearloop.daemon.web.latest import LatestMessages
 
 # The largest message is a heatmap of 200 × 200 float32.
-LARGEST_MESSAGE_BYTES = 1 << 20
+MAX_MESSAGE_BYTES = 1 << 20
 HIGH_WATER_MARK = 1000
-COMMANDS_AT_ONCE = 4
+MAX_PENDING_COMMANDS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where a daemon is found, with the keys for one on the network."""
+class DaemonAddress:
+    """A daemon's sockets, with the keys if it is on the network."""
 
     publish: str
     commands: str
     keys: ClientKeys | None = None
-    # Where a stop is heard now: where commands need a key, a socket of this machine's own that needs none.
+    # Returns the local address that accepts a stop without a key.
     stop_address: Callable[[], str] | None = None
 
 
 class BusyError(Exception):
-    """Too many commands are on their way already."""
+    """Too many commands are pending."""
 
 
 class Bridge:
-    """Keeps the latest messages of one daemon, and passes commands to it."""
+    """Receives the messages of one daemon and sends commands to it."""
 
-    def __init__(self, context: zmq.asyncio.Context, place: Place, latest: Latest) -> None:
-        """Connect to the daemon's PUB socket, whether or not it is there; raises UserError for a malformed address."""
+    def __init__(self, context: zmq.asyncio.Context, address: DaemonAddress, latest: LatestMessages) -> None:
+        """Subscribe to the daemon, whether or not it runs; raise UserError for a malformed address."""
         self.latest = latest
-        self._place = place
+        self._context = context
+        self._address = address
         self._watchers = 0
-        self._on_their_way = 0
+        self._pending = 0
         self._stopping: asyncio.Future[dict[str, Any]] | None = None
-        # Each has a thread of its own: no command can be before a stop in a queue.
-        self._requests = Requests()
         self._socket = context.socket(zmq.SUB)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RCVHWM, HIGH_WATER_MARK)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_MESSAGE_BYTES)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_MESSAGE_BYTES)
         self._socket.setsockopt(zmq.RECONNECT_IVL_MAX, 1000)
         try:
-            connect(self._socket, place.publish, place.keys)
-            _check_address(context, place)
+            connect(self._socket, address.publish, address.keys)
+            with self._command_socket(address.commands):
+                pass
         except UserError:
-            self.close()
+            self._socket.close()
             raise
         for topic in TOPICS:
-            # Heatmaps only while somebody looks: the daemon computes them for that alone.
+            # The daemon computes heatmaps only for subscribers: subscribe while a page is open.
             if topic not in (EitFrame.topic, EitHeatmap.topic):
                 self._socket.subscribe(topic)
 
     async def run(self) -> None:
-        """Take messages in until cancelled."""
+        """Receive messages until cancelled."""
         while True:
             parts = await self._socket.recv_multipart()
             try:
                 topic, payload = parts
                 content = decode(payload)
             except ValueError:
-                self.latest.refuse("malformed message")
+                self.latest.refused["malformed message"] += 1
                 continue
-            self.latest.take(topic.decode(errors="replace"), content, time.monotonic())
+            self.latest.add(topic.decode(errors="replace"), content, time.monotonic())
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Have heatmaps sent while a page is open."""
+        """Subscribe to heatmaps while a page is open."""
         self._watchers += 1
         if self._watchers == 1:
             self._socket.subscribe(EitHeatmap.topic)
@@ -94,41 +94,50 @@ class Bridge:
                 self._socket.unsubscribe(EitHeatmap.topic)
 
     async def command(self, name: str) -> dict[str, Any]:
-        """Return the daemon's reply to a command; raises UserError where none comes, BusyError where too many wait."""
-        if self._on_their_way >= COMMANDS_AT_ONCE:
+        """Return the daemon's reply to a command; raise UserError without a reply, BusyError if too many wait."""
+        if self._pending >= MAX_PENDING_COMMANDS:
             raise BusyError
-        self._on_their_way += 1
+        self._pending += 1
         try:
             timeout_s = UNLOCK_TIMEOUT_S if name == "unlock" else COMMAND_TIMEOUT_S
-            return await self._ask(self._place.commands, {"command": name}, timeout_s)
+            return await self._request(self._address.commands, {"command": name}, timeout_s)
         finally:
-            self._on_their_way -= 1
+            self._pending -= 1
 
     async def stop(self) -> dict[str, Any]:
-        """Return the daemon's reply to a stop of what moves; all that want it at the same time share one request.
+        """Return the daemon's reply to a stop of all motion; simultaneous calls share one request.
 
-        Raises UserError where no reply comes.
+        Raises UserError without a reply.
         """
         if self._stopping is None or self._stopping.done():
-            place, content = self._place, {"command": "stop", "spare_daemon": True}
-            address = place.commands if place.stop_address is None else place.stop_address()
-            self._stopping = asyncio.ensure_future(self._ask(address, content, COMMAND_TIMEOUT_S))
-        # Shielded: a page that goes away has still said stop.
+            local = self._address.stop_address
+            address = self._address.commands if local is None else local()
+            content = {"command": "stop", "spare_daemon": True}
+            self._stopping = asyncio.ensure_future(self._request(address, content, COMMAND_TIMEOUT_S))
+        # Shielded: a page that disappears has still requested the stop.
         return await asyncio.shield(self._stopping)
 
-    async def _ask(self, address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
-        # A socket of this machine's own is spoken to in the clear.
-        keys = self._place.keys if address == self._place.commands else None
-        return await self._requests.ask(address, content, timeout_s, keys)
+    async def _request(self, address: str, content: Mapping[str, Any], timeout_s: float) -> dict[str, Any]:
+        with self._command_socket(address) as socket:
+            try:
+                async with asyncio.timeout(timeout_s):
+                    await socket.send(encode(content))
+                    data = await socket.recv()
+            except TimeoutError as error:
+                raise no_reply(address, timeout_s, self._address.keys) from error
+        return reply_of(data, address)
 
-    def close(self) -> None:
-        """Close the socket; commands on their way are waited for."""
+    @contextmanager
+    def _command_socket(self, address: str) -> "Iterator[zmq.asyncio.Socket]":
+        # The local stop socket is not encrypted.
+        keys = self._address.keys if address == self._address.commands else None
+        with self._context.socket(zmq.DEALER) as socket:
+            socket.setsockopt(zmq.LINGER, 0)
+            connect(socket, address, keys)
+            yield socket
+
+    async def close(self) -> None:
+        """Close the socket; wait for a stop that is on its way."""
         self._socket.close()
-        self._requests.close()
-
-
-def _check_address(context: zmq.asyncio.Context, place: Place) -> None:
-    """Raise UserError for commands at an address that no socket can be connected to, before one is needed."""
-    with context.socket(zmq.DEALER) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        connect(socket, place.commands, place.keys)
+        if self._stopping is not None:
+            await asyncio.gather(self._stopping, return_exceptions=True)

@@ -1,34 +1,40 @@
-"""The page's web server: files, a stream of messages for each page, and commands, on loopback alone."""
+"""The page's web server on loopback: files, a stream of messages for each page, and commands."""
 
 import asyncio
-import json
 import time
 from collections.abc import Awaitable, Callable
 from importlib import resources
 from typing import Any
 
 import structlog
+import zmq.asyncio
 from aiohttp import WSCloseCode, web
 
+from shearloop.bank.eit.fingertip import Fingertip
+from shearloop.daemon.ending_signals import ending_signals
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, TOPICS, stale_after_s
-from shearloop.daemon.web.access import host_allowed, origin_allowed, token_given
-from shearloop.daemon.web.bridge import Bridge, BusyError
+from shearloop.daemon.web.access import host_allowed, origin_allowed, token_valid
+from shearloop.daemon.web.bridge import Bridge, BusyError, DaemonAddress
+from shearloop.daemon.web.latest import LatestMessages, fingertip_outline
 
-# What may move something, or change what moves it.
+HOST = "127.0.0.1"
+# Requests in progress get this long at the end.
+SHUTDOWN_S = 1.0
+# Commands that move something, or change what moves it.
 NEEDS_TOKEN = ("tare", "start", "pause", "resume", "unlock")
-# A page draws no more often than this; between two batches only the latest of each topic counts.
+# Maximum redraw rate of a page.
 BATCHES_PER_S = 30.0
-# So often a page hears from us when nothing else is new.
+# A page gets a batch at least this often.
 HEARTBEAT_S = 0.25
-# A page that takes nothing for so long is gone.
+# A page that accepts nothing for this long is disconnected.
 SEND_TIMEOUT_S = 5.0
-MOST_PAGES = 16
-LARGEST_BODY_BYTES = 4096
-# Health comes once a second: longer silence than this is a daemon that is dead, and the page says so within 2 s.
+MAX_PAGES = 16
+MAX_BODY_BYTES = 4096
+# Health comes once a second. After a longer silence the page shows a dead daemon, within 2 s in all.
 DEAD_AFTER_S = 1.6
-# What a message may take through us and the browser: nothing on the page is called old before.
-LEAST_STALE_S = 0.5
+# Allows for the delay through this process and the browser.
+MIN_STALE_S = 0.5
 
 _TYPES = {"html": "text/html", "js": "text/javascript", "css": "text/css", "svg": "image/svg+xml"}
 HEADERS = {
@@ -42,43 +48,84 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-Answer = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+async def serve(
+    address: DaemonAddress, port: int, token: str, fingertip: Fingertip, on_ready: Callable[[int], None]
+) -> None:
+    """Serve the page, call `on_ready` with its port, and return after SIGINT, SIGTERM or SIGHUP.
+
+    Raises UserError for a port that is in use and for a malformed address.
+    """
+    loop = asyncio.get_running_loop()
+    signals, stopped = ending_signals(), asyncio.Event()
+    with zmq.asyncio.Context() as context:
+        bridge = Bridge(context, address, LatestMessages(fingertip.height_cm))
+        app = make_app(bridge, token, fingertip_outline(fingertip), address.publish)
+        runner = web.AppRunner(app, access_log=None, shutdown_timeout=SHUTDOWN_S)
+        receiving = asyncio.create_task(bridge.run(), name="messages")
+        try:
+            await runner.setup()
+            try:
+                await web.TCPSite(runner, HOST, port).start()
+            except OSError as error:
+                raise UserError(
+                    f"the page cannot be served on {HOST}:{port} ({error.strerror}); give another --port"
+                ) from error
+            for number in signals:
+                loop.add_signal_handler(number, stopped.set)
+            on_ready(runner.addresses[0][1])
+            waiting = asyncio.create_task(stopped.wait())
+            # Without its subscription the page would show stale data: an error there ends the server.
+            await asyncio.wait((waiting, receiving), return_when=asyncio.FIRST_COMPLETED)
+            waiting.cancel()
+            if receiving.done():
+                receiving.result()
+        finally:
+            for number in signals:
+                loop.remove_signal_handler(number)
+            receiving.cancel()
+            await asyncio.gather(receiving, return_exceptions=True)
+            await runner.cleanup()
+            await bridge.close()
 
 
 def make_app(bridge: Bridge, token: str, fingertip: dict[str, Any], publish: str) -> web.Application:
-    """Return the application; fingertip is the outline that the page draws, publish the address that it tells."""
+    """Return the web application; the page draws the fingertip's outline and shows the address `publish`."""
     page = _Page(bridge, token, fingertip, publish)
-    app = web.Application(middlewares=[_guarded], client_max_size=LARGEST_BODY_BYTES)
+    app = web.Application(middlewares=[_check_access], client_max_size=MAX_BODY_BYTES)
     app.router.add_get("/", page.file)
     app.router.add_get("/assets/{name}", page.file)
     app.router.add_get("/settings.json", page.settings)
     app.router.add_get("/stream", page.stream)
     app.router.add_post("/stop", page.stop)
     app.router.add_post("/commands/{name}", page.command)
-    app.on_shutdown.append(page.hang_up)
+    app.on_shutdown.append(page.disconnect)
     return app
 
 
 @web.middleware
-async def _guarded(request: web.Request, handler: Answer) -> web.StreamResponse:
-    """Answer only the page itself and programs of this computer; say everywhere what a browser may do with it."""
+async def _check_access(
+    request: web.Request, handler: Callable[[web.Request], Awaitable[web.StreamResponse]]
+) -> web.StreamResponse:
+    """Refuse requests of other sites, and add the security headers to every response."""
     host = request.headers.get("Host")
     if not host_allowed(host):
-        return _refused(421, f"{host!r} is not this computer's loopback; open http://127.0.0.1:PORT/")
+        return _refuse(421, f"{host!r} is not this computer's loopback; open http://127.0.0.1:PORT/")
     if not origin_allowed(request.headers.get("Origin"), host):
-        return _refused(403, "requests from other sites are not answered")
+        return _refuse(403, "requests from other sites are not answered")
     try:
         response = await handler(request)
     except web.HTTPException as error:
-        response = _refused(error.status, error.reason)
+        response = _refuse(error.status, error.reason)
     if not response.prepared:
         response.headers.update(HEADERS)
     return response
 
 
-def _refused(status: int, why: str) -> web.Response:
-    structlog.get_logger().warning("request refused", status=status, why=why)
-    return web.json_response({"ok": False, "why": why}, status=status, headers=HEADERS)
+def _refuse(status: int, reason: str) -> web.Response:
+    structlog.get_logger().warning("request refused", status=status, why=reason)
+    return web.json_response({"ok": False, "why": reason}, status=status, headers=HEADERS)
 
 
 class _Page:
@@ -91,24 +138,23 @@ class _Page:
             "dead_after_s": DEAD_AFTER_S,
             "stale_after_periods": STALE_AFTER_PERIODS,
             "stale_after_s": {
-                topic: max(stale_after_s(topic), LEAST_STALE_S)
+                topic: max(stale_after_s(topic), MIN_STALE_S)
                 for topic, kind in TOPICS.items()
                 if kind.rate_hz is not None
             },
         }
         self._open: set[web.WebSocketResponse] = set()
-        folder = resources.files("shearloop.daemon.web") / "assets"
-        # Only what is there at the start is ever sent: no name from outside becomes a path.
+        # Only these files are ever sent: no name from a request becomes a path.
         self._files = {
             item.name: (item.read_bytes(), _TYPES[item.name.rsplit(".", 1)[-1]])
-            for item in folder.iterdir()
+            for item in (resources.files("shearloop.daemon.web") / "assets").iterdir()
             if item.name.rsplit(".", 1)[-1] in _TYPES
         }
 
     async def file(self, request: web.Request) -> web.Response:
         name = request.match_info.get("name", "index.html")
         if name not in self._files:
-            return _refused(404, "there is no such file")
+            return _refuse(404, "there is no such file")
         body, kind = self._files[name]
         return web.Response(body=body, content_type=kind, charset="utf-8")
 
@@ -116,41 +162,38 @@ class _Page:
         return web.json_response(self._settings)
 
     async def stop(self, _request: web.Request) -> web.Response:
-        """Stop what moves: for everyone on this computer, without a token."""
-        structlog.get_logger().info("stop wanted")
-        return await self._answered("stop", self._bridge.stop())
+        """Stop all motion; needs no token."""
+        structlog.get_logger().info("stop requested")
+        return await self._reply("stop", self._bridge.stop())
 
     async def command(self, request: web.Request) -> web.Response:
         name = request.match_info["name"]
         if name not in NEEDS_TOKEN:
-            return _refused(404, f"there is no command {name!r} here; there are {', '.join(NEEDS_TOKEN)}")
-        if not token_given(request.headers.get("Authorization"), self._token):
-            return _refused(403, f"{name} needs the token: open the address that `shearloop view` printed")
-        return await self._answered(name, self._bridge.command(name))
+            return _refuse(404, f"there is no command {name!r} here; there are {', '.join(NEEDS_TOKEN)}")
+        if not token_valid(request.headers.get("Authorization"), self._token):
+            return _refuse(403, f"{name} needs the token: open the address that `shearloop view` printed")
+        return await self._reply(name, self._bridge.command(name))
 
-    async def _answered(self, name: str, asked: Awaitable[dict[str, Any]]) -> web.Response:
+    async def _reply(self, name: str, requested: Awaitable[dict[str, Any]]) -> web.Response:
         try:
-            reply = await asked
+            reply = await requested
         except BusyError:
-            return _refused(429, "too many commands at once; wait for their answers")
+            return _refuse(429, "too many commands at once; wait for their answers")
         except UserError as error:
-            return _refused(503, str(error))
+            return _refuse(503, str(error))
         structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), why=reply.get("why"))
-        # A status has nothing that JSON lacks, and of other replies only what was asked for is told.
-        told = {key: reply.get(key) for key in ("ok", "why", "stopped", "tared", "experiment") if key in reply}
-        return web.Response(
-            text=json.dumps(told, default=str), status=200 if reply.get("ok") else 409, content_type="application/json"
-        )
+        content = {key: reply[key] for key in ("ok", "why", "stopped", "tared", "experiment") if key in reply}
+        return web.json_response(content, status=200 if reply.get("ok") else 409)
 
     async def stream(self, request: web.Request) -> web.StreamResponse:
-        if len(self._open) >= MOST_PAGES:
-            return _refused(503, f"{MOST_PAGES} pages are open already; close one")
-        socket = web.WebSocketResponse(heartbeat=SEND_TIMEOUT_S, max_msg_size=LARGEST_BODY_BYTES, compress=False)
+        if len(self._open) >= MAX_PAGES:
+            return _refuse(503, f"{MAX_PAGES} pages are open already; close one")
+        socket = web.WebSocketResponse(heartbeat=SEND_TIMEOUT_S, max_msg_size=MAX_BODY_BYTES, compress=False)
         await socket.prepare(request)
         self._open.add(socket)
         sending = asyncio.create_task(self._send(socket))
         try:
-            # A page says nothing; reading tells when it has gone.
+            # A page sends nothing; reading notices when it disconnects.
             async for _ in socket:
                 continue
         finally:
@@ -160,24 +203,24 @@ class _Page:
         return socket
 
     async def _send(self, socket: web.WebSocketResponse) -> None:
-        latest, sent, first, told_s = self._bridge.latest, 0, True, 0.0
+        latest, sent, first, sent_s = self._bridge.latest, 0, True, 0.0
         with self._bridge.watching():
             while not socket.closed:
                 now_s = time.monotonic()
-                if first or latest.number > sent or now_s - told_s >= HEARTBEAT_S:
+                if first or latest.number > sent or now_s - sent_s >= HEARTBEAT_S:
                     history = latest.history(now_s) if first else []
                     text = latest.batch(sent, now_s, first=first, now=time.time(), history=history)
-                    sent, first, told_s = latest.number, False, now_s
+                    sent, first, sent_s = latest.number, False, now_s
                     try:
                         async with asyncio.timeout(SEND_TIMEOUT_S):
                             await socket.send_str(text)
                     except (TimeoutError, ConnectionError):
-                        structlog.get_logger().warning("a page takes nothing any more and is left")
+                        structlog.get_logger().warning("a page accepts no data and is disconnected")
                         await socket.close(code=WSCloseCode.TRY_AGAIN_LATER)
                         return
                 await asyncio.sleep(1.0 / BATCHES_PER_S)
 
-    async def hang_up(self, _app: web.Application) -> None:
-        """Tell every page that we go."""
+    async def disconnect(self, _app: web.Application) -> None:
+        """Close the connection of every page."""
         for socket in tuple(self._open):
             await socket.close(code=WSCloseCode.GOING_AWAY)

@@ -18,17 +18,10 @@ from typing import Final, Literal
 from shearloop.drivers.cancelled import is_cancelled
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur import error_messages as sentences
-from shearloop.drivers.ur.messages import Command, CommandReply, Ease, Failed, Message, RobotState
+from shearloop.drivers.ur.messages import Command, CommandReply, Failed, Message, RobotState
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.drivers.ur.wire import encode
-from shearloop.drivers.ur.worker_connection import (
-    HEARTBEAT,
-    Descriptor,
-    LossKind,
-    LostError,
-    WorkerConnection,
-    output,
-)
+from shearloop.drivers.ur.worker_connection import Descriptor, LossKind, LostError, WorkerConnection, output
 
 LinkStatus = Literal["starting", "up", "down"]
 
@@ -60,10 +53,8 @@ class UrRobot:
         self.losses: Counter[str] = Counter()
         self.pid: int | None = None
         self._on_link = on_link or (lambda _event: None)
-        # Hears of each state where it is read, before those who wait for one: no task has to be woken for it.
-        self.on_state: Callable[[RobotState], None] = unheard
-        # Whether a newer state than the one that is told has been read along with it.
-        self.overtaken = False
+        # Called with each state where it is read, and with whether no newer one was read along with it.
+        self.on_state: Callable[[RobotState, bool], None] = ignore_state
         self._state: RobotState | None = None
         self._stdin: asyncio.StreamWriter | None = None
         # When the process was told anything last: whatever it hears is a sign of life.
@@ -75,11 +66,8 @@ class UrRobot:
         self.stops_in_vain = 0
         # How many states have come since the beginning.
         self.states = 0
-        # Who waits for the next state; None is for those who wait no longer.
-        self._awaiting: dict[asyncio.Future[RobotState | None], None] = {}
-        # Clear while the process was told that states are needed less often.
-        self._hurried = asyncio.Event()
-        self._hurried.set()
+        # Done with the next state; made when somebody waits for it.
+        self._next: asyncio.Future[RobotState] | None = None
 
     @property
     def takes_over(self) -> bool:
@@ -93,51 +81,9 @@ class UrRobot:
 
     async def next_state(self) -> RobotState:
         """Return the next state that arrives; waits through losses of the connection."""
-        while True:
-            state = await self._awaited(None)
-            if state is not None:
-                return state
-
-    async def state_within(self, seconds: float) -> RobotState | None:
-        """Return the next state that arrives, or None where none does within so many seconds."""
-        return await self._awaited(seconds)
-
-    @property
-    def at_ease(self) -> bool:
-        """Whether the process was told that states are needed less often."""
-        return not self._hurried.is_set()
-
-    def ease(self, cycles: int) -> None:
-        """Have a state only every so many cycles, or where something happens, until `hurry` or the next command.
-
-        Where something moves it is as if the process had been told nothing.
-        """
-        if cycles > 1 and self._stdin is not None and not self.at_ease:
-            self._hurried.clear()
-            self._write(self._stdin, encode(Ease(cycles)))
-
-    def hurry(self) -> None:
-        """Have every cycle gone through again, and whatever is new in it told."""
-        if self.at_ease:
-            self._hurried.set()
-            if self._stdin is not None:
-                self._write(self._stdin, HEARTBEAT)
-
-    async def hurried(self) -> None:
-        """Wait until every cycle is gone through, and signs of life are needed in them."""
-        await self._hurried.wait()
-
-    async def _awaited(self, seconds: float | None) -> RobotState | None:
-        loop = asyncio.get_running_loop()
-        arrived: asyncio.Future[RobotState | None] = loop.create_future()
-        self._awaiting[arrived] = None
-        timer = loop.call_later(seconds, _give_up, arrived) if seconds is not None else None
-        try:
-            return await arrived
-        finally:
-            self._awaiting.pop(arrived, None)
-            if timer is not None:
-                timer.cancel()
+        if self._next is None:
+            self._next = asyncio.get_running_loop().create_future()
+        return await asyncio.shield(self._next)
 
     async def send(self, command: Command) -> CommandReply:
         """Return the one reply to a command; `tell` says which."""
@@ -161,8 +107,6 @@ class UrRobot:
             return
         self._number += 1
         self._waiting[self._number] = answered
-        # Whatever the process hears ends its ease.
-        self._hurried.set()
         self._write(self._stdin, encode(command, self._number))
 
     def _write(self, stdin: asyncio.StreamWriter, data: bytes) -> None:
@@ -229,8 +173,6 @@ class UrRobot:
 
     def _disconnected(self) -> None:
         self._stdin = None
-        # The next process begins with every cycle.
-        self._hurried.set()
         if self._state is not None:
             # A network that failed makes no program ours.
             self._lost_s = time.monotonic() if self._state.ours else -math.inf
@@ -244,16 +186,13 @@ class UrRobot:
                 asyncio.get_running_loop().call_exception_handler(said)
 
     def take_all(self, messages: Sequence[tuple[int, Message]]) -> None:
-        """Act on what was read of the process at once, in order; of several states only the last is not `overtaken`."""
-        newest = len(messages) - 1
-        while newest > 0 and not isinstance(messages[newest][1], RobotState):
-            newest -= 1
-        for index, (number, message) in enumerate(messages):
-            self.overtaken = index < newest
-            self.take(number, message)
+        """Act on what was read of the process at once, in order."""
+        newest = next((message for _, message in reversed(messages) if isinstance(message, RobotState)), None)
+        for number, message in messages:
+            self.take(number, message, newest=message is newest)
 
-    def take(self, number: int, message: Message) -> None:
-        """Act on a message of the process."""
+    def take(self, number: int, message: Message, *, newest: bool = True) -> None:
+        """Act on a message of the process; `newest`: no later state was read along with it."""
         match message:
             case RobotState():
                 before = self._state
@@ -263,10 +202,10 @@ class UrRobot:
                 if before is None:
                     self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
                 self.states += 1
-                self.on_state(message)
-                for arrived in self._awaiting:
-                    if not arrived.done():
-                        arrived.set_result(message)
+                self.on_state(message, newest)
+                if self._next is not None:
+                    self._next.set_result(message)
+                    self._next = None
             case CommandReply():
                 answered = self._waiting.pop(number, None)
                 if answered is not None:
@@ -289,10 +228,5 @@ async def _in_any_case(ending: Coroutine[None, None, None]) -> None:
         raise
 
 
-def unheard(_state: RobotState) -> None:
-    """Hear of a state as long as nobody else does."""
-
-
-def _give_up(arrived: "asyncio.Future[RobotState | None]") -> None:
-    if not arrived.done():
-        arrived.set_result(None)
+def ignore_state(_state: RobotState, _newest: bool) -> None:
+    """Do nothing with a state."""

@@ -65,10 +65,6 @@ class CommandHandler:
         """Whether no motion is under way."""
         return self._mover.kind == "idle"
 
-    def rests(self, reading: RtdeSample) -> bool:
-        """Whether nothing moves and nothing is under way: no cycle is needed then but to look."""
-        return self.at_rest and reading.rests and not self.recovering
-
     @property
     def recovering(self) -> bool:
         """Whether calls may take seconds: the dashboard's, and the first one to a new program."""

@@ -2,23 +2,17 @@
 the bytes."""
 
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal
+from typing import Final, Literal
 
 from shearloop.drivers.ur.settings import Six, UrSettings
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal["not-installed", "unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
 
-_FINITE: dict[str, object] = {"extra": "forbid", "strict": True, "allow_inf_nan": False}
-# What the controller reports is passed on even where it is no number; `limits.violation` then says so.
-_STRICT: dict[str, object] = {"extra": "forbid", "strict": True, "ser_json_inf_nan": "constants"}
-
 
 @dataclass(frozen=True, slots=True)
 class WristSpeed:
     """Turn the tool about its axis; holds for `command_timeout_s`, then has to be commanded again."""
-
-    __pydantic_config__: ClassVar = _FINITE
 
     rad_per_s: float
     acceleration_rad_per_s2: float
@@ -27,8 +21,6 @@ class WristSpeed:
 @dataclass(frozen=True, slots=True)
 class MoveLinear:
     """Move the tool on a straight line to a pose: x, y, z in m and the rotation vector in rad, in the base frame."""
-
-    __pydantic_config__: ClassVar = _FINITE
 
     pose: Six
     speed_m_per_s: float
@@ -39,8 +31,6 @@ class MoveLinear:
 class Stop:
     """Slow every joint down to rest, whatever moves."""
 
-    __pydantic_config__: ClassVar = _FINITE
-
     deceleration_rad_per_s2: float
 
 
@@ -48,28 +38,20 @@ class Stop:
 class ZeroForceTorque:
     """Take the present wrench as zero; only at rest."""
 
-    __pydantic_config__: ClassVar = _STRICT
-
 
 @dataclass(frozen=True, slots=True)
 class Enable:
     """Allow motion: after every start of the robot's process, and after everything that stopped the arm."""
-
-    __pydantic_config__: ClassVar = _STRICT
 
 
 @dataclass(frozen=True, slots=True)
 class Unlock:
     """The operator's word after a protective or emergency stop: unlock, power, start the control program, enable."""
 
-    __pydantic_config__: ClassVar = _STRICT
-
 
 @dataclass(frozen=True, slots=True)
 class Disconnect:
     """Stop, end the control program, go."""
-
-    __pydantic_config__: ClassVar = _STRICT
 
 
 Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | Disconnect
@@ -78,8 +60,6 @@ Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | D
 @dataclass(frozen=True, slots=True)
 class CommandReply:
     """The one answer to a command: what is sent to the robot after clipping, or why nothing is."""
-
-    __pydantic_config__: ClassVar = _STRICT
 
     refused: str = ""
     sent: WristSpeed | MoveLinear | Stop | None = None
@@ -94,8 +74,6 @@ class CommandReply:
 @dataclass(frozen=True, slots=True)
 class Sample:
     """What the controller says of itself at one time: SI units, base frame, joints from base to wrist 3."""
-
-    __pydantic_config__: ClassVar = _STRICT
 
     # By the controller's own clock.
     timestamp_s: float
@@ -164,7 +142,7 @@ class RobotState(RtdeSample):
     # What was last sent to the robot, after clipping, and every reason for clipping it.
     sent: WristSpeed | MoveLinear | Stop | None
     clipped: tuple[str, ...]
-    # Number of the process's cycle; several pass between two states while the daemon is at ease.
+    # Number of the process's cycle.
     cycle: int
     # Whether a program on the robot is one that was started here, or that a process before has left behind.
     ours: bool
@@ -176,8 +154,6 @@ class RobotState(RtdeSample):
 class Configure:
     """The first message to the process."""
 
-    __pydantic_config__: ClassVar = _STRICT
-
     settings: UrSettings
     # Whether a program that runs on the robot is one that a process before this one has just left behind.
     takes_over: bool = False
@@ -187,26 +163,10 @@ class Configure:
 class Heartbeat:
     """The daemon is alive."""
 
-    __pydantic_config__: ClassVar = _STRICT
-
-
-@dataclass(frozen=True, slots=True)
-class Ease:
-    """The daemon is alive, and while nothing moves needs a state of every so many cycles alone, and what is news.
-
-    It holds until anything else comes. No signs of life are sent meanwhile: nothing moves that they would keep moving.
-    """
-
-    __pydantic_config__: ClassVar = _STRICT
-
-    cycles: int
-
 
 @dataclass(frozen=True, slots=True)
 class RobotPhase:
     """What the process is about to do, said before doing it: it may hang or crash there."""
-
-    __pydantic_config__: ClassVar = _STRICT
 
     doing: str
 
@@ -215,13 +175,11 @@ class RobotPhase:
 class Failed:
     """Why the process ends."""
 
-    __pydantic_config__: ClassVar = _STRICT
-
     kind: FailureKind
     sentence: str
 
 
-Message = Command | CommandReply | RobotState | Configure | Heartbeat | Ease | RobotPhase | Failed
+Message = Command | CommandReply | RobotState | Configure | Heartbeat | RobotPhase | Failed
 
 # Why a motion ended that did as it was asked, or was told to stop; any other reason is a sentence of its own.
 ARRIVED: Final = "arrived"

@@ -1,9 +1,7 @@
 """The motion under way: begun, kept within the limits cycle by cycle, and ended. Which may begin is the pilot's to say.
 
 No clock and no ur-rtde: the arm is a port and the time an argument. A motion that does not end as it should ends by the
-robot's watchdog: nothing is sent to the program any more, and only another one may move the arm again. What is sent is
-looked at in each cycle, and where something moves and it is the same as before sent again just often enough to keep the
-watchdog quiet.
+robot's watchdog: nothing is sent to the program any more, and only another one may move the arm again.
 """
 
 from shearloop.drivers.ur import error_messages as sentences
@@ -18,7 +16,6 @@ from shearloop.drivers.ur.messages import (
     WristSpeed,
 )
 from shearloop.drivers.ur.motion import is_close, longest_move_s, longest_stop_s
-from shearloop.drivers.ur.pace import OF_THE_WATCHDOG
 from shearloop.drivers.ur.ports import PilotArm
 from shearloop.drivers.ur.settings import Six, UrSettings
 
@@ -49,11 +46,6 @@ class MotionExecutor:
         self.puzzled = False
         self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
         self._speed_thread = False
-        # What the speed thread was told last, and when the robot was told anything; it is again once so much has
-        # passed, for the next cycle is one period away.
-        self._turned = WristSpeed(0.0, 0.0)
-        self._said_ns = 0
-        self._unsaid_ns = int(1e9 * (OF_THE_WATCHDOG / settings.watchdog_hz - 1.0 / settings.rate_hz))
         self._asked_ns = self._rested_ns = now_ns
         self._deadline_ns = self._move_ns = 0
         self._move_seen = False
@@ -65,7 +57,7 @@ class MotionExecutor:
         """Turn the wrist so from now on; return whether the robot took it."""
         self._begin("wrist", number)
         self._asked, self._asked_ns = asked, now_ns
-        return self._send_wrist(reading, now_ns)
+        return self._send_wrist(reading)
 
     def move(self, number: int, asked: MoveLinear, reading: RtdeSample, now_ns: int) -> bool:
         """Begin a linear move of an arm that rests; return whether the robot took it."""
@@ -147,7 +139,7 @@ class MotionExecutor:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
             self.stop_now(reading, now_ns, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
         else:
-            self._send_wrist(reading, now_ns)
+            self._send_wrist(reading)
 
     def _keep_moving(self, reading: RtdeSample, now_ns: int) -> None:
         self._move_seen = self._move_seen or reading.moving_linearly
@@ -160,7 +152,7 @@ class MotionExecutor:
         elif why:
             self.stop(reading, now_ns, why)
             return
-        self._kick(now_ns)
+        self._arm.kick()
 
     def _is_there(self, reading: RtdeSample, now_ns: int) -> bool:
         waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
@@ -171,42 +163,32 @@ class MotionExecutor:
             self.let_go(sentences.NOT_STOPPING)
         elif self._speed_thread:
             braking = clip_stop(self._braking, reading, self._limits, self._settings.reaction_s)
-            if self._speed(WristSpeed(0.0, braking.deceleration_rad_per_s2), now_ns) and reading.rests:
+            if self._speed(WristSpeed(0.0, braking.deceleration_rad_per_s2)) and reading.rests:
                 self._end_speed_thread()
                 self.kind = "idle"
         else:
             if not reading.moving_linearly and reading.rests:
                 self.kind = "idle"
-            self._kick(now_ns)
+            self._arm.kick()
 
     def _keep_resting(self, now_ns: int) -> None:
         if now_ns - self._rested_ns > ASTRAY_S * 1e9:
             self.ended = "it moved although nothing was asked of it"
             self.let_go(sentences.ASTRAY)
         else:
-            self._kick(now_ns)
+            self._arm.kick()
 
     # ---- calls on the arm -----------------------------------------------------------------------------------------
 
     def _begin(self, kind: MotionKind, number: int) -> None:
         self.kind, self.number, self.ended = kind, number, ""
 
-    def _send_wrist(self, reading: RtdeSample, now_ns: int) -> bool:
+    def _send_wrist(self, reading: RtdeSample) -> bool:
         self.sent, self.clipped = clip_wrist(self._asked, reading, self._limits, self._settings.reaction_s)
-        if self._speed_thread and self.sent == self._turned and now_ns - self._said_ns < self._unsaid_ns:
-            # The program on the robot reads its registers in each of its own cycles: it turns on just so by itself.
-            return True
-        return self._speed(self.sent, now_ns)
+        return self._speed(self.sent)
 
-    def _kick(self, now_ns: int) -> None:
-        # The cycle after one at rest may be all of that time away (`shearloop.drivers.ur.pace`).
-        if self.kind == "idle" or now_ns - self._said_ns >= self._unsaid_ns:
-            self._said_ns = now_ns
-            self._arm.kick()
-
-    def _speed(self, command: WristSpeed, now_ns: int) -> bool:
+    def _speed(self, command: WristSpeed) -> bool:
         self._speed_thread = True
-        self._turned, self._said_ns = command, now_ns
         taken = self._arm.wrist(command)
         if not taken:
             # An earlier speed may still hold.

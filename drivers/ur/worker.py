@@ -1,7 +1,6 @@
 """The robot's own process, `python -m shearloop.drivers.ur.worker`: commands on stdin, states and replies on stdout.
 
-It goes through 125 cycles a second, or fewer while the daemon is at ease and nothing moves, and tells of those in which
-something is new.
+It goes through 125 cycles a second, and tells the state of each.
 
 It may hang or crash in ur-rtde at any time and holds nothing worth saving. Before every stretch that may hang it sets
 an alarm that the kernel answers by ending it, whatever holds the interpreter lock; the robot's watchdog then ends the
@@ -25,7 +24,6 @@ from shearloop.drivers.ur.messages import (
     CommandReply,
     Configure,
     Disconnect,
-    Ease,
     Failed,
     FailureKind,
     Heartbeat,
@@ -36,8 +34,6 @@ from shearloop.drivers.ur.messages import (
     Stop,
     WristSpeed,
 )
-from shearloop.drivers.ur.news import News
-from shearloop.drivers.ur.pace import Pace
 from shearloop.drivers.ur.probe import ProbeError, probe
 from shearloop.drivers.ur.settings import UrSettings
 from shearloop.drivers.ur.wire import Decoder, encode
@@ -49,8 +45,6 @@ EXIT_DONE, EXIT_FAILED = 0, 3
 COMMANDS = Command.__args__
 # Motion that the daemon leaves behind is braked in this time; the robot's watchdog ends what is not.
 FAREWELL_S = 1.0
-# A reading so old is as good as a new one: the controller's samples come four times as far apart.
-FRESH_S = 0.002
 # States that a slow daemon does not fetch are dropped, as the latest counts; replies wait, within this bound.
 MOST_UNSENT = 1 << 16
 
@@ -62,7 +56,7 @@ class Pipe:
         """Take over both descriptors."""
         self._in, self._out = stdin, stdout
         self._decoder = Decoder()
-        self._unsent = self._held = b""
+        self._unsent = b""
         self.open = True
         os.set_blocking(stdin, False)
         os.set_blocking(stdout, False)
@@ -81,25 +75,17 @@ class Pipe:
         return self._decoder.feed(data)
 
     def send(self, message: Message, number: int = 0) -> None:
-        """Send a message that must arrive, and what was held back for the next one."""
-        self.hold(message, number)
-        self._unsent, self._held = self._unsent + self._held, b""
+        """Send a message that must arrive."""
+        self._unsent += encode(message, number)
         self._flush()
-
-    def hold(self, message: Message, number: int) -> None:
-        """Send a message that must arrive together with the next one: a write, and a daemon that wakes, less."""
-        self._held += encode(message, number)
-        if len(self._unsent) + len(self._held) > MOST_UNSENT:
+        if len(self._unsent) > MOST_UNSENT:
             self.open = False
 
-    def send_latest(self, message: Message) -> bool:
-        """Send a message unless others are still waiting, and return whether it was."""
-        if self._unsent:
-            self._flush()
-        if self._unsent:
-            return False
-        self.send(message)
-        return True
+    def send_latest(self, message: Message) -> None:
+        """Send a message unless others are still waiting."""
+        self._flush()
+        if not self._unsent:
+            self.send(message)
 
     def _flush(self) -> None:
         try:
@@ -173,53 +159,38 @@ def _explain(host: str, text: str) -> tuple[FailureKind, str]:
 def _fly(pipe: Pipe, configured: Configure, arm: "UrArm") -> NoReturn:
     settings = configured.settings
     pilot = CommandHandler(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
-    pace, news = Pace(settings, time.monotonic()), News()
+    period_s, due_s, cycle = 1.0 / settings.rate_hz, time.monotonic(), 0
     leaving_s = 0.0
-    # Whether nothing of the daemon's has come until the cycle was due.
-    quiet = False
     while True:
-        pace.begin()
         _alarm(settings.hang_timeout_s)
         reading = arm.read()
         if not reading.connected or reading.age_ns > 3 * settings.state_timeout_s * 1e9:
             _fail(pipe, "lost", sentences.unfit(reading, settings.host, settings.state_timeout_s))
-        if not quiet and _obey(pipe, pilot, pace, reading):
+        if _obey(pipe, pilot, reading):
             leaving_s = time.monotonic() + FAREWELL_S
         if not pipe.open and not leaving_s:
             pilot.request(0, Disconnect(), reading, time.monotonic_ns())
             leaving_s = time.monotonic() + FAREWELL_S
         if pilot.recovering:
             # The daemon learns beforehand that this cycle may take long.
-            state = pilot.state(reading, pace.cycle)
-            if pipe.send_latest(state):
-                news.tell(state)
+            pipe.send_latest(pilot.state(reading, cycle))
             _alarm(RECOVERY_HANG_S)
         decided = pilot.tick(reading, time.monotonic_ns())
         if decided is not None:
             pipe.send(decided[1], decided[0])
-        rests = pilot.rests(reading) and not leaving_s
         if not pilot.puzzled():
-            state = pilot.state(reading, pace.cycle)
-            if pace.tells(rests=rests, news=news.brings(state)) and pipe.send_latest(state):
-                news.tell(state)
+            pipe.send_latest(pilot.state(reading, cycle))
         if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
             _end_program(settings, pilot, arm)
             _leave(EXIT_DONE)
-        pace.plan(time.monotonic(), rests=rests)
-        quiet = False
-        while pipe.open and not leaving_s and (left_s := pace.left_s(time.monotonic())) > 0:
+        # A late cycle begins at once, and is not caught up with.
+        due_s, cycle = max(due_s + period_s, time.monotonic()), cycle + 1
+        while (left_s := due_s - time.monotonic()) > 0:
+            if leaving_s or not pipe.open:
+                time.sleep(left_s)
             # A command is carried out when it comes: waiting for the next cycle would be a delay in the loop.
-            quiet = not pipe.wait(left_s)
-            if quiet:
-                continue
-            if time.monotonic_ns() - reading.t_mono_ns > FRESH_S * 1e9:
-                reading = arm.read()
-            if _obey(pipe, pilot, pace, reading):
+            elif pipe.wait(left_s) and _obey(pipe, pilot, arm.read()):
                 leaving_s = time.monotonic() + FAREWELL_S
-            if not (pace.at_ease and pipe.open):
-                pace.hurry(time.monotonic())
-        if (left_s := pace.left_s(time.monotonic())) > 0:
-            time.sleep(left_s)
 
 
 def _end_program(settings: UrSettings, pilot: CommandHandler, arm: "UrArm") -> None:
@@ -237,33 +208,26 @@ def _end_program(settings: UrSettings, pilot: CommandHandler, arm: "UrArm") -> N
         arm.stop_program()
 
 
-def _obey(pipe: Pipe, pilot: CommandHandler, pace: Pace, reading: RtdeSample) -> bool:
+def _obey(pipe: Pipe, pilot: CommandHandler, reading: RtdeSample) -> bool:
     """Carry out what the daemon has sent; return whether it says to go."""
     goes = False
-    for number, command in _newest(pipe, pilot, pace):
+    for number, command in _newest(pipe, pilot):
         reply = pilot.request(number, command, reading, time.monotonic_ns())
-        if isinstance(command, WristSpeed) and reply is not None and reply.accepted:
-            # The loop asks for the next speed at the next state, and needs the reply no sooner.
-            pipe.hold(reply, number)
-        elif reply is not None:
+        if reply is not None:
             pipe.send(reply, number)
         goes = goes or isinstance(command, Disconnect)
     return goes
 
 
-def _newest(pipe: Pipe, pilot: CommandHandler, pace: Pace) -> list[tuple[int, Command]]:
+def _newest(pipe: Pipe, pilot: CommandHandler) -> list[tuple[int, Command]]:
     """Return the commands to carry out in this cycle: of motions only the latest, the others answered as overtaken."""
     commands: list[tuple[int, Command]] = []
     for number, message in pipe.receive():
         pilot.heard(time.monotonic_ns())
-        pace.hear(message)
         if isinstance(message, COMMANDS):
             commands.append((number, message))
-        elif not isinstance(message, Heartbeat | Ease):
+        elif not isinstance(message, Heartbeat):
             raise TypeError(f"the daemon sent a {type(message).__name__}, which is no command")
-    if len(commands) < 2:
-        # In every cycle of a wrist that turns.
-        return commands
     motions = [n for n, (_, command) in enumerate(commands) if isinstance(command, WristSpeed | MoveLinear | Stop)]
     # A stop is never overtaken: what comes after it finds the arm stopping.
     overtaken = [n for n in motions[:-1] if not isinstance(commands[n][1], Stop)]

@@ -71,9 +71,6 @@ class Outliving(Protocol):
     def take_all(self, messages: Sequence[tuple[int, Message]]) -> None:
         """Act on what was read of the process at once, in order."""
 
-    async def hurried(self) -> None:
-        """Wait until signs of life are needed."""
-
 
 class WorkerConnection:
     """The pipe to one process."""
@@ -151,13 +148,12 @@ class WorkerConnection:
             self._over.set_result(error)
 
     async def keep_alive(self) -> None:
-        """Give signs of life four times in the time after which motion would be stopped; at ease nothing moves.
+        """Give signs of life four times in the time after which motion would be stopped.
 
         A command is one too, and as long as they come there is no need of others: each wakes the process once more.
         """
         longest_s = self._settings.silence_timeout_s / 4
         while True:
-            await self._robot.hurried()
             left_s = longest_s - (time.monotonic() - self._robot.told_s)
             if left_s <= 0:
                 self._robot.told_s, left_s = time.monotonic(), longest_s

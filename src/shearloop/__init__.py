@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from shearloop.bank.eit.bank_file import Bank
-    from shearloop.bank.eit.fast_matching import FastMatcher as Matcher
+    from shearloop.bank.eit.pruned_matching import PrunedMatcher as Matcher
     from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame, fit
     from shearloop.daemon.analysis.series import read_series
     from shearloop.daemon.messaging.subscriber import messages as subscribe
@@ -55,7 +55,7 @@ _HOMES = {
     "Estimate": "shearloop.bank.estimation:Estimate",
     "EstimatorSession": "shearloop.bank.estimation:EstimatorSession",
     "FrameSeries": "shearloop.bank.estimation:FrameSeries",
-    "Matcher": "shearloop.bank.eit.fast_matching:FastMatcher",
+    "Matcher": "shearloop.bank.eit.pruned_matching:PrunedMatcher",
     "TactileFrame": "shearloop.bank.estimation:TactileFrame",
     "fit": "shearloop.bank.estimation:fit",
     "read_recording": "shearloop.daemon.recording.reader:read_recording",

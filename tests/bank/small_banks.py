@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from shearloop.bank.eit import compiled
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Match, Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 
 SHAPE = (22, 20)
 
@@ -57,38 +56,17 @@ def pair(slow: type[Matcher], fast: type[Matcher], bank: tuple[np.ndarray, np.nd
     return slow(*bank, *grids), fast(*bank, *grids)
 
 
-class Searching(FastMatcher):
+class Searching(PrunedMatcher):
     """Searches however few cells there are."""
 
-    _fewest = 0
+    _min_cells = 0
 
 
-class SearchingByNumpy(Searching):
-    """Searches as where there was no C compiler."""
-
-    def _compiled_search(self, *_) -> None:
-        return None
-
-
-class ZeroLagByNumpy(FastZeroLagMatcher):
-    """The same at lag 0."""
-
-    def _compiled_search(self, *_) -> None:
-        return None
-
-
-KINDS = ((ReferenceMatcher, SearchingByNumpy), (ZeroLagMatcher, ZeroLagByNumpy))
-COMPILED = ((ReferenceMatcher, Searching), (ZeroLagMatcher, FastZeroLagMatcher))
+KINDS = ((ReferenceMatcher, Searching), (ZeroLagMatcher, PrunedZeroLagMatcher))
 BANK = smooth_bank()
 PAIRS = [pair(*kind, BANK) for kind in KINDS]
-COMPILED_PAIRS = [pair(*kind, BANK) for kind in COMPILED]
 NAMES = ["all lags", "zero lag"]
-by_numpy = pytest.mark.parametrize(("slow", "fast"), PAIRS, ids=NAMES)
-by_compiled = pytest.mark.parametrize(("slow", "fast"), COMPILED_PAIRS, ids=NAMES)
-both = pytest.mark.parametrize(
-    ("slow", "fast"), [*PAIRS, *COMPILED_PAIRS], ids=[*NAMES, *(f"{name}, compiled" for name in NAMES)]
-)
-is_compiled = pytest.mark.skipif(not compiled.IS_COMPILED, reason="nothing is compiled here")
+both = pytest.mark.parametrize(("slow", "fast"), PAIRS, ids=NAMES)
 cells = st.sampled_from([tuple(cell) for cell in np.argwhere(BANK[1]).tolist()])
 
 

@@ -5,18 +5,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit import bounds, fast_matching
+from shearloop.bank.eit import pruned_matching
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.compression import COARSE_RANK, ROUNDING, columns
-from shearloop.bank.eit.fast_matching import FastMatcher
-from shearloop.bank.eit.matching import Matcher, unit_magnitude, unit_magnitudes
-from tests.bank.small_banks import BANK, PAIRS, assert_same, by_numpy, cells, without_runner_up
+from shearloop.bank.eit.matching import Matcher, unit_magnitude
+from shearloop.bank.eit.pruned_matching import AllLagsBounds, ZeroLagBounds
+from tests.bank.small_banks import BANK, PAIRS, assert_same, both, cells, without_runner_up
 
 
-@by_numpy
-@pytest.mark.parametrize(("module", "limit", "value"), [(bounds, "_MOST_BOUNDS", 10), (fast_matching, "_FEW_LAGS", 0)])
-def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, module, limit, value) -> None:
-    monkeypatch.setattr(module, limit, value)
+@both
+@pytest.mark.parametrize(("limit", "value"), [("_MAX_BOUNDS", 10), ("_FEW_LAGS", 0)])
+def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, limit, value) -> None:
+    monkeypatch.setattr(pruned_matching, limit, value)
     for frame in np.random.default_rng(5).random((4, N_CHANNELS)):
         assert_same(fast.match(frame), slow.match(frame))
 
@@ -29,12 +29,12 @@ def test_no_bound_is_below_its_score(cell, noise, seed) -> None:
     frame = unit_magnitude(BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS))
     signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
     scores = (signals @ frame) / np.linalg.norm(signals, axis=1)
-    found = bounds.ZeroLagBounds(fast._bank, frame)
-    everything = found.left(-1.0)
+    found = ZeroLagBounds(fast._bank, frame)
+    everything = found.candidates(-1.0)
     np.testing.assert_array_equal(everything.cells, np.arange(len(scores)))
     assert (everything.bounds - scores).min() >= -ROUNDING / 2
     for score in np.quantile(scores, [0.5, 0.9, 1.0]):
-        assert set(np.flatnonzero(scores >= score)) <= set(found.left(score).cells)
+        assert set(np.flatnonzero(scores >= score)) <= set(found.candidates(score).cells)
 
 
 def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
@@ -54,26 +54,23 @@ def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
         group_of = level.part_of[group_of]
 
 
-@settings(max_examples=6, deadline=None)
-@given(st.lists(cells, min_size=1, max_size=3), st.sampled_from([0.0, 1e-6, 1e-2, 1.0]), st.integers(0, 2**32 - 1))
-def test_no_bound_at_any_lag_is_below_its_score(chosen, noise, seed) -> None:
-    """Of several frames at once, each with a limit of its own."""
+@settings(max_examples=12, deadline=None)
+@given(cells, st.sampled_from([0.0, 1e-6, 1e-2, 1.0]), st.integers(0, 2**32 - 1))
+def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed) -> None:
     slow, fast = PAIRS[0]
-    random = np.random.default_rng(seed)
-    frames = np.array([BANK[0][cell] + noise * random.normal(size=N_CHANNELS) for cell in chosen])
-    found = bounds.AllLagsBounds(fast._bank, fast._spectra, unit_magnitudes(frames), fast._score)
-    scores = slow.heatmaps(frames)[:, BANK[1]]
-    for (cell, reached), each in zip(found.reached, scores, strict=True):
-        assert 0 < reached <= each[cell] + 1e-12
-    for share in (0.9, 1.0, 0.0):
-        limits = np.quantile(scores, share, axis=1).tolist()
-        for left, limit, each in zip(found.left(limits), limits, scores, strict=True):
-            assert set(np.flatnonzero(each >= limit)) <= set(left.cells)
-            reaching = each[left.cells] >= limit
-            assert (left.bounds - each[left.cells])[reaching].min() >= -ROUNDING / 2
+    frame = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS)
+    found = AllLagsBounds(fast._bank, fast._spectra, unit_magnitude(frame), fast._score)
+    scores = slow.heatmap(frame)[BANK[1]]
+    best, reached = found.reached
+    assert 0 < reached <= scores[best] + 1e-12
+    for limit in np.quantile(scores, [0.9, 1.0, 0.0]).tolist():
+        left = found.candidates(limit)
+        assert set(np.flatnonzero(scores >= limit)) <= set(left.cells)
+        reaching = scores[left.cells] >= limit
+        assert (left.bounds - scores[left.cells])[reaching].min() >= -ROUNDING / 2
 
 
-@by_numpy
+@both
 def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
     """What makes it fast: of a frame near to the bank's, most cells are never read."""
     read = []
@@ -89,7 +86,7 @@ def test_few_cells_are_scored_exactly(slow, fast, monkeypatch) -> None:
     assert sum(read) < BANK[1].sum() / 4
 
 
-@by_numpy
+@both
 def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, monkeypatch) -> None:
     frame = BANK[0][6, 6] + BANK[0][16, 5]
     expected = slow.match(frame)
@@ -97,41 +94,7 @@ def test_a_tie_that_hangs_on_rounding_is_left_to_the_slow_matcher(slow, fast, mo
     monkeypatch.setattr(type(slow), "heatmap", lambda self, each: scored.append(each) or Matcher.heatmap(self, each))
     assert_same(fast.match(frame), expected)
     assert not scored
-    monkeypatch.setattr(fast_matching, "_ROUNDING_64", 2.0)
+    monkeypatch.setattr(pruned_matching, "_ROUNDING_64", 2.0)
     assert_same(fast.match(frame), expected)
     assert len(scored) == 1
     assert_same(fast.match(frame, runner_up=False), without_runner_up(expected))
-
-
-@pytest.mark.parametrize(
-    ("module", "limit", "value"), [(bounds, "_QUICK_BOUNDS", 10), (fast_matching, "_ROUNDING_64", 2)]
-)
-def test_frames_of_a_batch_that_are_hard_are_matched_alone(monkeypatch, module, limit, value) -> None:
-    slow, fast = PAIRS[0]
-    frames = BANK[0][BANK[1]][[3, 70, 200]] + 0.3 * np.random.default_rng(10).random((3, N_CHANNELS))
-    alone = []
-    monkeypatch.setattr(type(fast), "match", lambda self, *a, **k: alone.append(a) or FastMatcher.match(self, *a, **k))
-    monkeypatch.setattr(module, limit, value)
-    assert [match.cell for match in fast.matches(frames)] == [slow.match(frame).cell for frame in frames]
-    assert len(alone) == 3
-
-
-@by_numpy
-def test_a_quick_match_is_the_same_or_none(slow, fast, monkeypatch) -> None:
-    frame = BANK[0][7, 12] * (1 + 0.05 * np.random.default_rng(8).normal(size=N_CHANNELS))
-    for limit in ("_QUICK_SCORES", "_FEW_LAGS"):
-        monkeypatch.setattr(fast_matching, limit, 1 << 30)
-    assert fast.match_quickly(frame) == fast.match(frame)
-    assert_same(fast.match_quickly(frame), slow.match(frame))
-    monkeypatch.setattr(fast_matching, "_QUICK_SCORES", 0)
-    assert fast.match_quickly(frame) is None
-    monkeypatch.undo()
-    monkeypatch.setattr(fast_matching, "_ROUNDING_64", 2.0)
-    assert fast.match_quickly(frame) is None
-
-
-def test_a_frame_that_leaves_many_bounds_is_not_matched_quickly(monkeypatch) -> None:
-    _, fast = PAIRS[0]
-    frame = np.random.default_rng(9).random(N_CHANNELS)
-    monkeypatch.setattr(bounds, "_QUICK_BOUNDS", 10)
-    assert fast.match_quickly(frame) is None

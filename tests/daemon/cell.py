@@ -4,19 +4,15 @@ import asyncio
 import math
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from functools import partial
 from typing import Any
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.fault_detection import MonitorSettings
 from shearloop.daemon.control.loop_inputs import GripperStatus
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
-from shearloop.daemon.control.step_commands import GripTo
-from shearloop.daemon.control.step_runner import ExperimentPhase
-from shearloop.daemon.control.tune import TuneSettings, tuned
-from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply, Message, MoveLinear, RobotState, WristSpeed
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, Flight
@@ -38,19 +34,10 @@ class Robot(UrRobot):
         self.flight.fly(5)
         self._held: list[tuple[Callable[[CommandReply], None], CommandReply]] = []
         self._unread: list[tuple[int, Message]] = []
-        # Of how many cycles the daemon needs one.
-        self.of_cycles = 1
         # For how many cycles there is no process yet.
         self.gone_for = 0
 
-    def ease(self, cycles: int) -> None:
-        self.of_cycles = cycles
-
-    def hurry(self) -> None:
-        self.of_cycles = 1
-
     def tell(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
-        self.hurry()
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
@@ -99,8 +86,7 @@ class Robot(UrRobot):
             arm.be(tcp_pose=(*arm.reading.tcp_pose[:2], z, *arm.reading.tcp_pose[3:]), moving_linearly=z != self.end_m)
         arm.be(t_mono_ns=self.flight.now_ns)
         self.flight.fly(1)
-        if self.flight.cycle % self.of_cycles == 0:
-            self._unread.append((0, self.flight.state))
+        self._unread.append((0, self.flight.state))
         if not read:
             return
         held, self._held = self._held, []
@@ -177,8 +163,7 @@ class Cell:
     def __init__(self) -> None:
         self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
         source = wrench_source(SETTINGS.rate_hz)
-        wrist = WristController(source, WristSettings(), partial(tuned, TuneSettings()))
-        self.brain = ControlLoop({WRENCH: wrist}, MonitorSettings(), {WRENCH: source}, ("robot",))
+        self.brain = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
         self.died: Mapping[str, str] = {}
 
         async def no_zero() -> str:
@@ -200,7 +185,7 @@ class Cell:
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):
-            self.brain.senses.hand = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
+            self.brain.inputs.gripper = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
             self.robot.cycle()
             # A state is sensed, decided upon and answered within a few turns of the event loop.
             for _ in range(8):
@@ -228,7 +213,7 @@ class Cell:
     @property
     def why(self) -> str:
         assert self.brain.experiment is not None
-        return self.brain.experiment.why
+        return self.brain.experiment.stop_reason
 
     @property
     def state(self) -> RobotState:

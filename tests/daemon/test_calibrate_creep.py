@@ -75,7 +75,7 @@ def test_a_recording_without_held_twists_is_refused(
     monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
     monkeypatch.setattr("shearloop.daemon.analysis.evaluation.follow", lambda *_: found)
     assert main(["calibrate", "creep", "held.mcap", "--calibration", "right.cal"]) == 2
-    assert "10 readings are too few to learn it from; hold a twist for a minute" in capsys.readouterr().err
+    assert "10 readings are too few for a fit; hold a twist for a minute" in capsys.readouterr().err
 
 
 def test_twists_that_are_given_twice_are_refused(

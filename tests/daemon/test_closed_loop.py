@@ -19,8 +19,8 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.request import request
 from shearloop.daemon.run_summary import RunSummary
-from shearloop.daemon.web.bridge import Bridge, Place
-from shearloop.daemon.web.latest import Latest
+from shearloop.daemon.web.bridge import Bridge, DaemonAddress
+from shearloop.daemon.web.latest import LatestMessages
 from shearloop.daemon.web.server import make_app
 from tests.daemon.conftest import DEADLINE_S, Log, shearloop
 from tests.emulator_process import own_address
@@ -164,9 +164,9 @@ async def test_a_tool_is_gripped_twisted_and_released(rig_config: Path, tiny_ban
 @asynccontextmanager
 async def served_page(folder: Path) -> AsyncIterator[str]:
     """Serve the live view's page before the daemon of this folder, and yield its address."""
-    place = Place(f"ipc://{folder}/publish", f"ipc://{folder}/commands")
+    place = DaemonAddress(f"ipc://{folder}/publish", f"ipc://{folder}/commands")
     with zmq.asyncio.Context() as context:
-        bridge = Bridge(context, place, Latest(3.6))
+        bridge = Bridge(context, place, LatestMessages(3.6))
         runner = web.AppRunner(make_app(bridge, "secret", {}, place.publish), access_log=None)
         await runner.setup()
         await web.TCPSite(runner, "127.0.0.1", 0).start()
@@ -174,7 +174,7 @@ async def served_page(folder: Path) -> AsyncIterator[str]:
             yield f"http://127.0.0.1:{runner.addresses[0][1]}"
         finally:
             await runner.cleanup()
-            bridge.close()
+            await bridge.close()
 
 
 async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(
@@ -300,7 +300,7 @@ async def test_a_daemon_that_ends_with_its_experiment_lets_the_tool_go_first(rig
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("unplug load", "no new torque has come"),
+        ("unplug load", "no new torque has arrived"),
         ("gripper fault 14", "the gripper reports a fault"),
         ("gripper drop", "the gripper no longer holds an object"),
     ],

@@ -11,12 +11,17 @@ import pytest
 import yaml
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.doctor import machine
-from shearloop.daemon.doctor.devices import channels_finding, rate_finding
-from shearloop.daemon.doctor.examination import examine, ports_finding
-from shearloop.daemon.doctor.files import bank_finding, keys_finding
-from shearloop.daemon.doctor.finding import Finding, from_sentence
-from shearloop.daemon.doctor.live import task_finding
+from shearloop.daemon.doctor import Finding, checks, examine
+from shearloop.daemon.doctor.checks import (
+    check_bank,
+    check_clock,
+    check_disk,
+    check_keys,
+    check_ports,
+    clock_state,
+    from_error,
+)
+from shearloop.daemon.doctor.devices import check_channels, check_rate, check_task
 from shearloop.daemon.messaging.keys import make_key_pair
 from shearloop.daemon.messaging.subscriber import messages
 from shearloop.daemon.ports import PortThere
@@ -56,7 +61,7 @@ async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, t
     assert "There is no serial port" in found["port of right"].found
     assert "switched on" in found["robot"].next_step
     assert found["bank of right"].state == "good"
-    assert found["calibration of right"].found == "none is configured"
+    assert found["calibration of right"].found == "not configured"
     options = ("--bank", str(tiny_bank), "--run-dir", str(rig_config.parent), "--host", HOST, "--speed", str(SPEED))
     async with shearloop("emulate", "rig", *options, stdin=asyncio.subprocess.PIPE) as rig:
         assert rig.stdout is not None
@@ -66,12 +71,12 @@ async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, t
         for subject in ("port of right", "channels of right", "robot", "robot's registers"):
             assert found[subject].state == "good", found[subject]
         # How near a busy computer comes to it is not the question here.
-        assert f"{SPEED / 0.5412:.3g} configured" in found["rate of right"].found
+        assert f"{SPEED / 0.5412:.3g} Hz configured" in found["rate of right"].found
         assert found["channels of right"].found.startswith("0 saturated and 0 dead of 896 in ")
         assert found["remote control"].state == "good"
         # The board sends more often than the configuration says.
         assert found["rate of load_cell"].state == "note"
-        assert "5 configured" in found["rate of load_cell"].found
+        assert "5 Hz configured" in found["rate of load_cell"].found
         rig.stdin.write(b"registers-in-use\nlocal-control\n")
         assert b"obeyed" in await rig.stdout.readline()
         assert b"obeyed" in await rig.stdout.readline()
@@ -84,11 +89,11 @@ async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, t
             await asyncio.to_thread(next, published)
             published.close()
             found = await examined(rig_config, 2.0)
-            assert found["daemon"].found.startswith("one answers")
+            assert found["daemon"].found.startswith("answers at")
             for subject in ("task right", "task robot", "channels of right"):
                 assert found[subject].state == "good", found[subject]
             for subject, configured in (("eit.frame right", f"{SPEED / 0.5412:.3g}"), ("robot.state robot", "25")):
-                assert f"a second, {configured} configured" in found[f"rate of {subject}"].found
+                assert f" Hz measured, {configured} Hz configured" in found[f"rate of {subject}"].found
             assert found["rate of load.torque load_cell"].state == "note"
 
 
@@ -103,16 +108,16 @@ def test_a_configuration_that_is_wrong_ends_the_examination(tmp_path: Path, caps
 
 
 def test_the_clock() -> None:
-    assert machine.clock_finding(1e9, 0).state == "trouble"
-    assert machine.clock_finding(1.8e9, 5).state == "note"
-    assert machine.clock_finding(1.8e9, 0).state == "good"
-    assert machine.clock_state() in range(-1, 6)
+    assert check_clock(1e9, 0).state == "trouble"
+    assert check_clock(1.8e9, 5).state == "note"
+    assert check_clock(1.8e9, 0).state == "good"
+    assert clock_state() in range(-1, 6)
 
 
 def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for free, state in ((1e8, "trouble"), (1e9, "note"), (1e11, "good")):
-        monkeypatch.setattr(machine.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
-        assert machine.disk_finding(tmp_path / "not/yet/there").state == state
+        monkeypatch.setattr(checks.shutil, "disk_usage", lambda _, free=free: SimpleNamespace(free=free))
+        assert check_disk(tmp_path / "not/yet/there").state == state
 
 
 @pytest.mark.parametrize(
@@ -126,52 +131,52 @@ def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_a_task_is_judged_by_what_it_counts(facts: dict[str, Any], state: str, part: str) -> None:
-    finding = task_finding("right", facts)
+    finding = check_task("right", facts)
     assert finding.state == state
     assert part in finding.found
 
 
 def test_rates_and_channels() -> None:
-    assert rate_finding("rate", None, 1.85).state == "trouble"
-    assert rate_finding("rate", 1.9, 1.85).state == "good"
-    assert "frame_period_s 1.0000" in rate_finding("rate", 1.0, 1.85).next_step
-    assert channels_finding("right", 0, 0, 9).state == "good"
-    assert "bridges" in channels_finding("right", 2, 0, 9).next_step
-    assert "one electrode" in channels_finding("right", 0, 28, 9).next_step
+    assert check_rate("rate", None, 1.85).state == "trouble"
+    assert check_rate("rate", 1.9, 1.85).state == "good"
+    assert "frame_period_s 1.0000" in check_rate("rate", 1.0, 1.85).next_step
+    assert check_channels("right", 0, 0, 9).state == "good"
+    assert "bridges" in check_channels("right", 2, 0, 9).next_step
+    assert "one electrode" in check_channels("right", 0, 28, 9).next_step
 
 
-def test_a_bank_of_another_geometry_is_told(config: Write) -> None:
+def test_a_bank_of_another_geometry_is_reported(config: Write) -> None:
     from shearloop.daemon.config import load_daemon_config
 
     fingertip = load_daemon_config(config()).fingertips["right"]
-    assert bank_finding("right", fingertip).state == "good"
-    other = bank_finding("right", fingertip, Path("config/fingertips/paper.yaml"))
-    assert (other.state, "of another fingertip" in other.means) == ("trouble", True)
-    assert bank_finding("right", fingertip, Path("no.yaml")).state == "trouble"
+    assert check_bank("right", fingertip).state == "good"
+    other = check_bank("right", fingertip, Path("config/fingertips/paper.yaml"))
+    assert (other.state, "another fingertip" in other.means) == ("trouble", True)
+    assert check_bank("right", fingertip, Path("no.yaml")).state == "trouble"
 
 
-def test_a_secret_key_that_others_can_read_is_told(tmp_path: Path) -> None:
+def test_a_secret_key_that_others_can_read_is_reported(tmp_path: Path) -> None:
     from shearloop.daemon.config import CurveConfig
 
     _, secret = make_key_pair(tmp_path, "server")
     (tmp_path / "clients").mkdir()
     curve = CurveConfig(server_key=secret, clients=tmp_path / "clients")
-    assert "nobody could connect" in keys_finding(curve, {}).found
+    assert "nobody could connect" in check_keys(curve, {}).found
     make_key_pair(tmp_path / "clients", "ada")
-    assert keys_finding(curve, {"publish": "tcp://0.0.0.0:1"}).found == "ada may connect to tcp://0.0.0.0:1"
-    assert keys_finding(curve, {}).state == "note"
+    assert check_keys(curve, {"publish": "tcp://0.0.0.0:1"}).found == "ada may connect to tcp://0.0.0.0:1"
+    assert check_keys(curve, {}).state == "note"
     secret.chmod(0o644)
-    assert "mode 644" in keys_finding(curve, {}).found
-    assert keys_finding(None, {}).state == "good"
+    assert "mode 644" in check_keys(curve, {}).found
+    assert check_keys(None, {}).state == "good"
 
 
 def test_an_error_sentence_becomes_a_finding_with_its_cure() -> None:
-    finding = from_sentence("bank", "a.bank: it is cut off; build it anew.", "nothing")
+    finding = from_error("bank", "a.bank: it is cut off; build it anew.", "nothing")
     assert (finding.found, finding.next_step) == ("a.bank: it is cut off", "build it anew")
-    finding = from_sentence("robot", "No controller at arm: refused. Look at the pendant.", "nothing")
+    finding = from_error("robot", "No controller at arm: refused. Look at the pendant.", "nothing")
     assert (finding.found, finding.next_step) == ("No controller at arm: refused", "Look at the pendant")
     for sentence in ("oh no", "c.yaml: `bnk` is not a known key, did you mean `bank`?"):
-        finding = from_sentence("x", sentence, "nothing")
+        finding = from_error("x", sentence, "nothing")
         assert finding.found == sentence
         assert "shearloop doctor CONFIG" in finding.next_step
 
@@ -200,7 +205,7 @@ def test_ports_are_listed_with_what_a_configuration_names_them_by(
     assert "sudo usermod -aG dialout" in capsys.readouterr().out
 
 
-def test_each_port_that_is_denied_is_told_with_its_own_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_denied_port_is_reported_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     def port(path: str, trouble: str) -> PortThere:
         return PortThere(path, "1", "", "", "", "", trouble)
 
@@ -209,6 +214,6 @@ def test_each_port_that_is_denied_is_told_with_its_own_trouble(monkeypatch: pyte
         port("/dev/ttyUSB0", "another program holds it"),
         port("/dev/ttyUSB1", "no right"),
     ]
-    monkeypatch.setattr("shearloop.daemon.doctor.examination.ports_there", lambda: there)
-    found = ports_finding()
+    monkeypatch.setattr("shearloop.daemon.doctor.checks.ports_there", lambda: there)
+    found = check_ports()
     assert (found.state, found.means) == ("note", "/dev/ttyUSB0: another program holds it; /dev/ttyUSB1: no right")

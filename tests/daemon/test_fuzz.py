@@ -187,8 +187,6 @@ def test_the_limit_is_a_clients_own_and_lets_go_again() -> None:
     allowed = [limit.allows(b"loud", 0) for _ in range(1000)]
     assert sum(allowed) == PER_CLIENT_BURST
     assert limit.allows(b"quiet", 0)
-    assert limit.flooded(0)
-    assert not limit.flooded(10**9)
     assert sum(limit.allows(b"loud", 10**9) for _ in range(1000)) == PER_CLIENT_PER_S
 
 

@@ -11,7 +11,7 @@ from shearloop.daemon.control import gripper_task
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus
-from shearloop.daemon.control.step_commands import GripTo
+from shearloop.daemon.control.step_runner import GripTo
 from tests.daemon.conftest import DEADLINE_S
 from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 
@@ -60,11 +60,11 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
         read = tasks.create_task(task.read())
         while rig.driver.latest is None:  # noqa: ASYNC110 - the driver is asked, as the loop is
             await asyncio.sleep(0)
-        assert felt[-1].unsure, "one without power keeps hold of a tool, and does not tell"
+        assert felt[-1].uncertain, "one without power keeps hold of a tool, and does not tell"
         await rig.driver.activate()
         for turns in range(1, 40, 3):
             assert await task.release() == ""
-            assert not felt[-1].unsure
+            assert not felt[-1].uncertain
             grip = asyncio.create_task(task.grip(GRIP))
             for _ in range(turns):
                 await asyncio.sleep(0)
@@ -76,7 +76,7 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
             # What is written is taken up at the model's next step.
             assert rig.model.width_mm == pytest.approx(halted_mm, abs=60.0 * STEP_S + 1e-6)
             assert not rig.model.gto
-            assert felt[-1].unsure
+            assert felt[-1].uncertain
             assert not felt[-1].holding
         assert rig.driver.facts()["openings"] == 1
         read.cancel()

@@ -47,7 +47,7 @@ class Story:
             self.look()
 
     def look(self) -> None:
-        experiment, verdict = self.cell.brain.experiment, self.cell.brain.standing.verdict
+        experiment, verdict = self.cell.brain.experiment, self.cell.brain.status.decision
         runs = (
             experiment is not None and experiment.phase is ExperimentPhase.RUNNING and verdict.response is Response.NOTE
         )
@@ -95,7 +95,7 @@ class Story:
 
     def beyond(self) -> None:
         now_ns = self.cell.robot.flight.now_ns
-        self.cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        self.cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
 
     def process_dies(self) -> None:
         self.cell.robot.die(50)

@@ -52,7 +52,7 @@ async def test_a_stop_that_lets_the_tool_go_in_the_middle_of_a_grip_opens_the_fi
         await cell.start(GRIP)
         await cell.cycles(10)
         now_ns = cell.robot.flight.now_ns
-        cell.brain.hear(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "grip"], "the second one wide open"
 

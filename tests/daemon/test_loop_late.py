@@ -26,7 +26,7 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
 
         monkeypatch.setattr(cell.brain, "tick", at_length)
         await cell.cycles(2)
-        assert FaultCode.LOOP_LATE in [trouble.event for trouble in cell.brain.standing.verdict.troubles]
+        assert FaultCode.LOOP_LATE in [trouble.code for trouble in cell.brain.status.decision.faults]
 
 
 @pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2), (12, 1)])
@@ -40,7 +40,7 @@ async def test_a_loop_that_is_late_again_and_again_is_stopped(missed: int, read:
             await cell.cycles(read)
             if cell.phase is not ExperimentPhase.RUNNING:
                 break
-        assert "loop was woken" in cell.why
+        assert "loop ran" in cell.why
 
 
 async def test_a_daemon_that_was_paused_says_so_first_and_not_what_follows_from_it() -> None:
@@ -62,7 +62,7 @@ async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -
             for _ in range(11):
                 cell.robot.cycle(read=False)
             await cell.cycles(1)
-            assert cell.brain.standing.verdict.troubles == ()
+            assert cell.brain.status.decision.faults == ()
 
 
 async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -72,8 +72,8 @@ async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkey
         decide = cell.brain.tick
 
         def tick(t_ns: int) -> Any:
-            assert cell.brain.senses.arm is not None
-            decided.append(cell.brain.senses.arm.t_ns)
+            assert cell.brain.inputs.arm is not None
+            decided.append(cell.brain.inputs.arm.t_ns)
             return decide(t_ns)
 
         monkeypatch.setattr(cell.brain, "tick", tick)

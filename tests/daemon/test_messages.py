@@ -1,6 +1,4 @@
 import dataclasses
-import threading
-from collections.abc import ItemsView
 
 import numpy as np
 import pytest
@@ -62,22 +60,6 @@ def test_a_message_that_cannot_be_encoded_leaves_nothing_in_the_next() -> None:
     with pytest.raises(TypeError):
         encode({"source": "left", "k": object()})
     assert decode(encode({"source": "right"})) == {"source": "right"}
-
-
-def test_a_message_that_another_thread_encodes_meanwhile_leaves_nothing_in_it() -> None:
-    """Where msgpack is of plain Python, a thread may be interrupted in the middle of a message, as here."""
-    others: list[bytes] = []
-
-    class Interrupted(dict[str, object]):
-        def items(self) -> ItemsView[str, object]:
-            thread = threading.Thread(target=lambda: others.append(encode({"command": "pause"})))
-            thread.start()
-            thread.join()
-            return super().items()
-
-    content = {"command": "run", "arguments": Interrupted({"tool_mm": 6.0})}
-    assert decode(encode(content)) == {"command": "run", "arguments": {"tool_mm": 6.0}}
-    assert [decode(other) for other in others] == [{"command": "pause"}]
 
 
 @given(st.binary(max_size=300))

@@ -51,7 +51,7 @@ class Tree:
     def __init__(self, root: Path) -> None:
         self.root, self.log = root, root / "log"
         shutil.copytree(REPOSITORY / "config", root / "config")
-        for name in ("Makefile", "pyproject.toml", "setup.py", "bank", "bench", "daemon", "drivers"):
+        for name in ("Makefile", "pyproject.toml", "bank", "bench", "daemon", "drivers"):
             (root / name).symlink_to(REPOSITORY / name)
         binaries = root / ".venv" / "bin"
         binaries.mkdir(parents=True)

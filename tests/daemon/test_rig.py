@@ -36,14 +36,14 @@ async def a_rig() -> AsyncIterator[Rig]:
 
 async def test_a_robot_that_is_lost_is_told_at_once_and_not_when_its_state_is_missed() -> None:
     async with a_rig() as rig:
-        assert rig.brain.standing.verdict.troubles == ()
+        assert rig.brain.status.decision.faults == ()
         rig._robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
-        assert "the robot's process died" in " ".join(rig.brain.standing.verdict.reasons)
+        assert "the robot's process died" in " ".join(rig.brain.status.decision.reasons)
 
 
 async def test_a_device_that_is_lost_before_the_loop_runs_and_after_its_end_is_noted() -> None:
     async with a_rig() as rig:
         pass
     rig._robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
-    assert rig.brain.senses.lost == {"robot": "the robot's process died"}
-    assert rig.brain.standing.verdict.troubles == ()
+    assert rig.brain.inputs.lost == {"robot": "the robot's process died"}
+    assert rig.brain.status.decision.faults == ()

@@ -48,7 +48,7 @@ def test_a_torque_that_is_measured_may_drive(tmp_path: Path) -> None:
 
 def test_a_torque_that_is_not_measured_may_not_drive(tmp_path: Path) -> None:
     assert refusal(tmp_path, {"drive": "load_cell"}).endswith(
-        "experiment.yaml: `drive: load_cell` is none of the torques that are measured: take another, or configure its "
+        "experiment.yaml: `drive: load_cell` is not a measured torque: choose another, or configure its "
         "device; there are right, wrench"
     )
     assert "`drive: left` is a fingertip without a calibration" in refusal(tmp_path, {"drive": "left"})

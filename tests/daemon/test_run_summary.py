@@ -105,7 +105,7 @@ def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[
 
 
 def test_holds_and_refusals_are_counted_by_their_kind() -> None:
-    reason = "no new torque has come: the last came 1.5 s ago. Look at the cable."
+    reason = "no new torque has arrived: the last came 1.5 s ago. Look at the cable."
     text = told(
         None,
         [],
@@ -114,7 +114,7 @@ def test_holds_and_refusals_are_counted_by_their_kind() -> None:
         loop_state(23, phase="held", response="hold", reasons=reason.replace("1.5", "1.7")),
         loop_state(24, reasons="a command was refused: the robot is not connected."),
     )
-    assert "held for 2.5 s in all: 2 times no new torque has come" in text
+    assert "held for 2.5 s in all: 2 times no new torque has arrived" in text
     assert "1 times a command was refused: the robot is not connected." in text
 
 

@@ -58,7 +58,7 @@ def flapping(event: FaultCode, held: int, gone: int, for_s: float = 60.0) -> flo
 
 
 HOLDS = [(event, rule.hold_at_most_s) for event, rule in TABLE.items() if rule.hold_at_most_s is not None]
-OF_THE_MOMENT = [(event, longest_s) for event, longest_s in HOLDS if not TABLE[event].told_afterwards]
+OF_THE_MOMENT = [(event, longest_s) for event, longest_s in HOLDS if not TABLE[event].is_past]
 
 
 @pytest.mark.parametrize(("event", "longest_s"), OF_THE_MOMENT)
@@ -98,7 +98,7 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     assert stopped is not None
     stopped_s, gate = stopped
     assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
-    told = gate.look([]).reasons[-1]
+    told = gate.report([]).reasons[-1]
     assert "held for too long" in told
     assert all(f"{event.value} for " in told for event in events[:4])
 
@@ -106,7 +106,7 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
 def test_one_cause_alone_is_told_alone() -> None:
     stopped = taking_turns((FaultCode.ESTIMATE_STALE, 1.0))
     assert stopped is not None
-    assert [found.event for found in stopped[1].look([]).troubles] == [FaultCode.ESTIMATE_STALE]
+    assert [found.code for found in stopped[1].report([]).faults] == [FaultCode.ESTIMATE_STALE]
 
 
 def test_what_does_not_hold_is_not_counted_as_a_hold() -> None:
@@ -149,7 +149,7 @@ def test_a_loop_that_is_late_now_and_then_is_held_and_goes_on() -> None:
 def test_what_was_before_the_first_judgement_does_not_count() -> None:
     gate = SafetyMonitor()
     assert gate.judge(LATE, 3600 * SECOND).response is Response.HOLD
-    gate.look([])
+    gate.report([])
     assert gate.judge(LATE, 7200 * SECOND).response is Response.HOLD
 
 
@@ -171,7 +171,7 @@ def test_whatever_holds_a_wrist_for_more_than_a_third_of_the_time_ends_in_a_stop
 
 
 def test_a_hold_begins_anew_with_the_next_experiment_and_after_the_operators_word() -> None:
-    for ends in (SafetyMonitor.acknowledge, lambda gate: gate.look([trouble(FaultCode.STATE_STALE)])):
+    for ends in (SafetyMonitor.acknowledge, lambda gate: gate.report([trouble(FaultCode.STATE_STALE)])):
         gate = SafetyMonitor()
         gate.judge([trouble(FaultCode.STATE_STALE)], 0)
         ends(gate)
@@ -208,7 +208,7 @@ def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(
         assert verdict.response >= max((TABLE[event].response for event in events), default=Response.NOTE)
         if strongest in STOPS:
             assert verdict.response >= strongest
-        assert {found.event for found in verdict.troubles} >= set(events)
+        assert {found.code for found in verdict.faults} >= set(events)
         strongest = max(strongest, verdict.response)
         assert gate.stopped == (strongest in STOPS)
 
@@ -216,8 +216,8 @@ def test_no_sequence_of_events_weakens_a_stop_or_answers_less_than_the_table(
 def test_two_things_of_one_kind_are_both_told() -> None:
     both = [Fault(FaultCode.DEVICE_LOST, "the gripper"), Fault(FaultCode.DEVICE_LOST, "the load cell")]
     gate = SafetyMonitor()
-    for seen in (gate.judge(both, 0), gate.judge([], SECOND), gate.look([])):
-        assert [found.detail for found in seen.troubles] == ["the gripper", "the load cell"]
+    for seen in (gate.judge(both, 0), gate.judge([], SECOND), gate.report([])):
+        assert [found.detail for found in seen.faults] == ["the gripper", "the load cell"]
 
 
 def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_leads_to_is_not_repeated() -> None:
@@ -236,7 +236,7 @@ def test_a_pause_of_the_daemon_is_told_first_until_nothing_is_wrong_and_what_it_
     assert (away.response, away.reasons) == (Response.HOLD, (paused.sentence,))
     stopped = gate.judge([invalid, old, lost], 3 * SECOND + 1)
     assert (stopped.response, stopped.reasons) == (Response.STOP_AND_KEEP_GRIP, (paused.sentence, lost.sentence))
-    assert {one.event for one in stopped.troubles} == {one.event for one in (paused, invalid, old, lost)}
+    assert {one.code for one in stopped.faults} == {one.code for one in (paused, invalid, old, lost)}
     # Without a stop: what holds for longer than it takes to settle is told beside it, until nothing holds.
     gate = SafetyMonitor()
     gate.judge([paused], 0)
@@ -280,7 +280,7 @@ def test_what_explains_changes_what_is_told_and_never_what_is_done(moments: list
         verdict = explaining.judge(map(trouble, events), t_ns)
         late = {FaultCode.LOOP_LATE if event is FaultCode.DAEMON_PAUSED else event for event in events}
         assert verdict.response >= plain.judge(map(trouble, late), t_ns).response
-        told = [one for one in verdict.troubles if not one.follows]
+        told = [one for one in verdict.faults if not one.is_consequence]
         assert told or not events
-        for one in verdict.troubles:
-            assert one in told or TABLE[one.event].response in (Response.NOTE, Response.HOLD)
+        for one in verdict.faults:
+            assert one in told or TABLE[one.code].response in (Response.NOTE, Response.HOLD)

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
-from shearloop.drivers import eit_format, eit_line
 from shearloop.drivers.eit_format import (
     ADC_STEP_V,
     FULL_SCALE_SINE_RMS_V,
@@ -47,18 +46,6 @@ def with_value(position: int, value: bytes, line: bytes = GOOD) -> bytes:
     return b", ".join(values)
 
 
-def read_either_way(line: bytes, zero_slots: NDArray[np.bool_] = ZERO_SLOTS) -> NDArray[np.float64] | FrameError:
-    """Return what numpy reads; where a compiled reader takes a line it reads the same, and it takes no other."""
-    found = eit_format._read_by_numpy(line, zero_slots)
-    if eit_format.cells is not None:
-        values = np.full(1024, np.nan)
-        taken = eit_format.cells.read(line, zero_slots, eit_format.ADC_REFERENCE_V, values)
-        assert taken == isinstance(found, np.ndarray)
-        if taken:
-            assert values.tobytes() == found.tobytes()
-    return found
-
-
 # Each kind of refusal, and a way to earn it.
 CHANNEL, SLOT = int(LINE_SLOTS[500]), int(np.flatnonzero(ZERO_SLOTS)[60])
 BROKEN = [
@@ -92,7 +79,7 @@ def test_every_value_that_four_decimals_can_write_is_the_double_that_float_reads
     for start in range(0, len(every), 1024):
         texts = every[start : start + 1024]
         texts += [b"0.0001"] * (1024 - len(texts))
-        values = read_either_way(b", ".join(texts) + b", ", np.array([text == b"0.0000" for text in texts]))
+        values = read_line(b", ".join(texts) + b", ", np.array([text == b"0.0000" for text in texts]))
         assert isinstance(values, np.ndarray)
         assert values.tolist() == [float(text) for text in texts]
 
@@ -104,7 +91,7 @@ def test_a_cell_is_sound_with_digits_and_punctuation_in_their_places_alone() -> 
             line = bytearray(GOOD.rstrip())
             line += b" "
             line[8 * CHANNEL + place] = byte
-            found = read_either_way(bytes(line))
+            found = read_line(bytes(line), ZERO_SLOTS)
             if byte in sound:
                 # A first digit above 2 V, or digits that are all 0, are refused for what they say.
                 assert not isinstance(found, FrameError) or found.kind in (
@@ -115,19 +102,8 @@ def test_a_cell_is_sound_with_digits_and_punctuation_in_their_places_alone() -> 
 
 
 @given(st.one_of(st.binary(max_size=9000), st.sampled_from([line.rstrip(b"\r\n") for _, line in BROKEN])))
-def test_what_is_no_line_is_taken_by_neither_reader(line: bytes) -> None:
-    read_either_way(line)
-
-
-@pytest.mark.parametrize("look", [eit_line._look_by_numpy, eit_line.look])
-def test_a_look_at_the_channels_notes_which_changed_and_sees_the_largest(look) -> None:
-    before, now = np.array([np.nan, 0.1, 0.2, 0.3]), np.array([0.1, 0.1, 0.2, 0.4])
-    changed_in = np.array([1, 2, 3, 4])
-    assert not look(now, before, changed_in, 9, 0.4)
-    assert changed_in.tolist() == [9, 2, 3, 9]
-    assert look(now, before, changed_in, 9, 0.3)
-    with pytest.raises((ValueError, IndexError)):
-        look(now, before[:2], changed_in, 9, 0.3)
+def test_no_bytes_make_the_reader_fail(line: bytes) -> None:
+    read_line(line, ZERO_SLOTS)
 
 
 def test_a_line_is_read_to_the_last_digit() -> None:
@@ -195,7 +171,7 @@ def test_a_line_with_any_one_byte_changed_is_refused_or_reads_as_another_number(
     changed = GOOD[:position] + bytes([byte]) + GOOD[position + 1 :]
     parser = FrameParser(ZERO_SLOTS)
     frames = parser.feed(LINES[1] + changed + LINES[2], 0)
-    read_either_way(changed.rstrip(b"\n"))
+    read_line(changed.rstrip(b"\n"), ZERO_SLOTS)
     is_digit = chr(byte).isdigit() and byte < 128 and chr(GOOD[position]).isdigit()
     assert len(frames) + parser.refused.total() == 3
     assert [frames[0].line + b"\n", frames[-1].line + b"\n"] == LINES[1:3]

@@ -97,21 +97,21 @@ def _speed_accuracy(args: argparse.Namespace) -> list[Path]:
 def _stability(args: argparse.Namespace) -> list[Path]:
     from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
     from shearloop.daemon.analysis.charts.stability_chart import chart
-    from shearloop.daemon.workers import workers
+    from shearloop.daemon.workers import open_executor
 
     scratch, mesh = args.out / "banks", mesh_of(args.mesh)
     # Before a bank is built there: what cannot be read leaves nothing behind.
     parts = splits(args.recordings, args.split, scratch)
     bank = bank_of(args.bank, mesh, scratch)
-    with workers(args.cluster, args.jobs) as pool:
+    with open_executor(args.cluster, args.jobs) as pool:
         return chart(parts, bank, mesh, scratch, args.out, pool)
 
 
 def _scene(args: argparse.Namespace) -> list[Path]:
     from shearloop.daemon.analysis.charts.scene import chart
     from shearloop.daemon.analysis.charts.sources import splits
-    from shearloop.daemon.workers import workers
+    from shearloop.daemon.workers import open_executor
 
     parts = splits(args.recordings, args.split, args.out / "banks")
-    with workers(args.cluster, args.jobs) as pool:
+    with open_executor(args.cluster, args.jobs) as pool:
         return chart(parts, args.out, pool)

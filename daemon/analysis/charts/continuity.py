@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
 from shearloop.bank.estimation.bank_match import NOT_TURNED, BankMatcher, BestCell, NearestCell
@@ -14,7 +14,6 @@ from shearloop.bank.estimation.fitting_regressor import fit_reader
 from shearloop.bank.estimation.regressors import Ridge
 from shearloop.daemon.analysis.charts.sources import Split
 
-Floats = NDArray[np.float64]
 STEPS = 25
 
 
@@ -23,7 +22,7 @@ class Walk:
     """Torques (n,) in N·m along a way through frames, NaN where not valid; hops are the moves from step to step."""
 
     name: str
-    torque_nm: Floats
+    torque_nm: FloatArray
     share_nm: float
 
     @property
@@ -38,7 +37,7 @@ class Walk:
         return int(np.count_nonzero(np.nan_to_num(np.abs(np.diff(self.torque_nm))) > 10 * self.share_nm))
 
 
-def way(split: Split) -> tuple[Floats, float]:
+def way(split: Split) -> tuple[FloatArray, float]:
     """Return (n, 896) differences from the least to the largest torque of the future, and a step's share of it."""
     torque = split.future.torque_at_frames()
     frames = np.abs(split.future.channels[np.argsort(torque), 0])
@@ -65,12 +64,12 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Wal
     return found
 
 
-def _read(split: Split, locator: BankMatcher, path: Floats) -> Floats:
-    def features(frames: Floats) -> Floats:
+def _read(split: Split, locator: BankMatcher, path: FloatArray) -> FloatArray:
+    def features(frames: FloatArray) -> FloatArray:
         sigma = np.array([locator.locate(one).sigma for one in frames])
         return np.column_stack([sigma, sigma**2])
 
     past = features(np.abs(split.past.channels[:, 0]))
     reader = fit_reader(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=(1e-9,))
-    read: Callable[[Floats], float] = lambda one: reader.read(one)[0]  # noqa: E731
+    read: Callable[[FloatArray], float] = lambda one: reader.read(one)[0]  # noqa: E731
     return np.array([read(one) for one in features(path)])

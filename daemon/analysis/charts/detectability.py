@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.bank_match import Registration
@@ -19,7 +19,6 @@ from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.reciprocity import ReciprocityCheck
 from shearloop.daemon.analysis.charts.picture import SHADES, figure, look
 
-Floats = NDArray[np.float64]
 SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
 ORIGINS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _SHOWN_ORIGIN = 0.6
@@ -74,7 +73,7 @@ def detected(series: FrameSeries, origins: Sequence[float] = ORIGINS, seed: int 
     return found
 
 
-def _misfits(twins: ReciprocityCheck, frames: Floats) -> Floats:
+def _misfits(twins: ReciprocityCheck, frames: FloatArray) -> FloatArray:
     usable = np.ones(N_CHANNELS, dtype=np.bool_)
     return np.array([twins.misfit(one, usable) for one in frames]) / twins.largest_misfit
 

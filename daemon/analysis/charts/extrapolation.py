@@ -4,18 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import EstimatorSession, FrameSeries, Name, Physics, fit
 from shearloop.daemon.analysis.charts.faults import Spoilt
 from shearloop.daemon.analysis.charts.sources import Split
-from shearloop.daemon.analysis.charts.stability import Curve, Floats, Level, curve, estimates_of, judged
-from shearloop.daemon.workers import Workers, in_order
+from shearloop.daemon.analysis.charts.stability import Curve, Level, curve, estimates_of, judged
+from shearloop.daemon.workers import Executor, in_order
 
-Rows = NDArray[np.int64]
 # So many of the slices are calibrated on, those of the smallest torques or those of the largest.
 SHARES = (0.8, 0.65, 0.5, 0.4, 0.3)
 SMALLER = "calibrated on the smaller torques alone"
@@ -28,8 +27,8 @@ class Part:
     """The slices that are calibrated on, up to the limit in N·m or from it on, and those that are judged."""
 
     limit_nm: float
-    fitted: Rows
-    others: Rows
+    fitted: IntArray
+    others: IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +50,7 @@ class Extrapolation:
         return tuple(None if good is None or width is None else width / good for width in self.width_nm)
 
 
-def parts(torque_nm: Floats) -> dict[str, list[Part]]:
+def parts(torque_nm: FloatArray) -> dict[str, list[Part]]:
     """Return the parts of (n,) torques by direction, of ever fewer torques.
 
     Limits are quantiles of the torques, each that of a slice; one at which no slice would be left to judge is left out.
@@ -66,7 +65,7 @@ def parts(torque_nm: Floats) -> dict[str, list[Part]]:
 
 
 def extrapolated(
-    split: Split, names: Sequence[Name], bank: Bank, mesh: Mesh | None, pool: Workers
+    split: Split, names: Sequence[Name], bank: Bank, mesh: Mesh | None, pool: Executor
 ) -> list[Extrapolation]:
     """Return each estimator beyond the torques that it was calibrated on; each calibration is a task of its own.
 
@@ -90,7 +89,7 @@ def extrapolated(
     return found
 
 
-def of_rows(series: FrameSeries, rows: Rows) -> FrameSeries:
+def of_rows(series: FrameSeries, rows: IntArray) -> FrameSeries:
     """Return these frames of a series with the torques at them alone: beside the others' nothing may be learned."""
     t_s = series.t_s[rows]
     return replace(

@@ -4,15 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.estimation import FrameSeries
 from shearloop.bank.estimation.bank_match import Registration
 from shearloop.drivers.eit_format import ADC_STEP_V
-
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -20,9 +17,9 @@ class Scene:
     """Frames to be spoilt: idle (m, 896) is what the untouched fingertips read, in volts; foreign as another reads."""
 
     series: FrameSeries
-    idle: Floats
+    idle: FloatArray
     noise_v: float
-    foreign: Floats
+    foreign: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,7 +27,7 @@ class Spoilt:
     """Frames with a fault; usable (n, m, 896) is False where the board itself says so, None where it says nothing."""
 
     series: FrameSeries
-    usable: Mask | None = None
+    usable: BoolArray | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +40,7 @@ class Fault:
     apply: Callable[[Scene, float, np.random.Generator], Spoilt]
 
 
-def _shown(scene: Scene, channels: Floats) -> FrameSeries:
+def _shown(scene: Scene, channels: FloatArray) -> FrameSeries:
     """Return the frames with other channels; a difference is a magnitude."""
     return replace(scene.series, channels=np.abs(channels) if scene.series.kind == "difference" else channels)
 
@@ -53,12 +50,12 @@ def _noise(scene: Scene, level: float, rng: np.random.Generator) -> Spoilt:
     return Spoilt(_shown(scene, channels + rng.normal(0.0, 1.0, channels.shape) * level * scene.noise_v))
 
 
-def lost_channels(electrodes: NDArray[np.int64]) -> Mask:
+def lost_channels(electrodes: IntArray) -> BoolArray:
     """Return the (896,) channels that inject or measure at one of these electrodes."""
     return np.asarray(np.isin(CHANNELS, electrodes).any(axis=1))
 
 
-def _read_nothing(scene: Scene, level: float, rng: np.random.Generator) -> tuple[FrameSeries, Mask]:
+def _read_nothing(scene: Scene, level: float, rng: np.random.Generator) -> tuple[FrameSeries, BoolArray]:
     """Return frames whose lost electrodes read one step of the converter, and which channels those are."""
     lost = lost_channels(rng.choice(N_ELECTRODES, int(level), replace=False))
     channels = scene.series.channels.copy()
@@ -141,7 +138,7 @@ FAULTS = (
 )
 
 
-def scene_of(series: FrameSeries, idle: Floats, noise_v: float, seed: int = 7) -> Scene:
+def scene_of(series: FrameSeries, idle: FloatArray, noise_v: float, seed: int = 7) -> Scene:
     """Return a scene; the foreign frame is another fingertip's: the same voltages, at other channels."""
     rng = np.random.default_rng(seed)
     mean = series.channels.mean(axis=0)

@@ -5,16 +5,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from benchmarks.peers import EIDORS_CELL_S, pyeit_solver
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import Conductivities, conductivity
 from shearloop.daemon.analysis.charts.sources import own_fingertip
 
-Floats = NDArray[np.float64]
 MODEL = "gaussian_derivative"
 # Cells all over the valid part of the paper's grid.
 CELLS = ((3.2, 1.2), (3.3, 1.9), (2.2, 1.0), (1.4, 1.4), (0.8, 2.5), (4.0, 3.5))
@@ -52,7 +51,7 @@ class _Solver:
     mesh: Mesh
     solve: Callable[[], object]
     # None where another model is solved, with other signals.
-    truth: Floats | None
+    truth: FloatArray | None
 
     @property
     def times(self) -> int:
@@ -123,7 +122,7 @@ def pyeit(mesh: Mesh) -> Callable[[], object] | None:
     return lambda: [solve(cell) for cell in cells]
 
 
-def batch(mesh: Mesh) -> Callable[[], Floats]:
+def batch(mesh: Mesh) -> Callable[[], FloatArray]:
     """Return what solves the same signals all at once, as `bank build` does."""
     model, of = BatchForwardModel(mesh), Conductivities(mesh)
     (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
@@ -133,19 +132,19 @@ def batch(mesh: Mesh) -> Callable[[], Floats]:
     return lambda: (model.voltages(cells[many]) - homogeneous)[: len(CELLS)]
 
 
-def direct(mesh: Mesh) -> Callable[[], Floats]:
+def direct(mesh: Mesh) -> Callable[[], FloatArray]:
     """Return what solves the (m, 896) difference signals of the cells on a mesh."""
     model = ForwardModel(mesh)
     homogeneous = model.homogeneous()
     return lambda: np.array([model.voltages(conductivity(mesh, MODEL, k, s)) - homogeneous for k, s in CELLS])
 
 
-def converged(coarse: Mesh, fine: Mesh, ratio: float) -> Floats:
+def converged(coarse: Mesh, fine: Mesh, ratio: float) -> FloatArray:
     """Return the signals that two meshes point to, the first `ratio` times as coarse, with an error of first order."""
     first, second = direct(coarse)(), direct(fine)()
     return np.asarray(second + (second - first) / (ratio - 1.0))
 
 
-def error_of(signals: Floats, truth: Floats) -> float:
+def error_of(signals: FloatArray, truth: FloatArray) -> float:
     """Return the median over the cells of ‖signal − truth‖ / ‖truth‖."""
     return float(np.median(np.linalg.norm(signals - truth, axis=1) / np.linalg.norm(truth, axis=1)))

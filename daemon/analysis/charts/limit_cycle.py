@@ -23,10 +23,10 @@ from benchmarks.held_shear import (
 )
 from shearloop.bank.skin.calibration_file import load_calibration
 from shearloop.daemon.analysis.charts.picture import figure, look, save
-from shearloop.daemon.workers import Workers
+from shearloop.daemon.workers import Executor
 
 
-def chart(out: Path, pool: Workers, name: str, told: Callable[[Held], None] = lambda _: None) -> list[Path]:
+def chart(out: Path, pool: Executor, name: str, told: Callable[[Held], None] = lambda _: None) -> list[Path]:
     """Measure every case, draw and write; `told` hears of each as it is found."""
     calibration = load_calibration(CALIBRATION)
     gains, delays = over_gains(), over_delays()

@@ -8,9 +8,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import Float32Array, FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.fast_matching import FastMatcher, FastZeroLagMatcher
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit
 from shearloop.bank.estimation.bank_match import NOT_TURNED, NearestCell
@@ -20,8 +21,6 @@ from shearloop.bank.estimation.regressors import Ridge, ranked_channels
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.analysis.evaluation import follow
 
-Floats = NDArray[np.float64]
-Single = NDArray[np.float32]
 RANKS = (4, 8, 16, 32, 64, 128)
 CHANNEL_COUNTS = (8, 16, 32, 64, 128, 272, 512)
 # The paper's polynomial needs no holding back.
@@ -37,7 +36,7 @@ class Method:
 
     name: str
     family: str
-    run: Callable[[], tuple[Floats, Floats]]
+    run: Callable[[], tuple[FloatArray, FloatArray]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,10 +53,10 @@ class Measured:
     valid_fraction: float
 
 
-def measure(methods: list[Method], truth_nm: Floats, rounds: int) -> list[Measured]:
+def measure(methods: list[Method], truth_nm: FloatArray, rounds: int) -> list[Measured]:
     """Run all methods in turn, `rounds` times, so that a busy moment of the machine meets all of them alike."""
     times: dict[str, list[float]] = {method.name: [] for method in methods}
-    torques: dict[str, Floats] = {}
+    torques: dict[str, FloatArray] = {}
     for _ in range(rounds):
         for method in methods:
             torques[method.name], latency_ms = method.run()
@@ -96,7 +95,7 @@ def estimators(split: Split, physics: Physics, names: tuple[Name, ...], sides: t
         yield Method(f"{name}{count}", family, partial(_followed, calibration, future, physics.bank))
 
 
-def _followed(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[Floats, Floats]:
+def _followed(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[FloatArray, FloatArray]:
     track = follow(calibration, future, bank)
     torque = [np.nan if one.torque_nm is None else one.torque_nm for one in track.estimates]
     return np.array(torque), track.latency_ms
@@ -107,9 +106,9 @@ def matchers(split: Split, bank: Bank) -> Iterator[Method]:
     sigma = bank.sigma_grid
     for name, family, kind in (
         ("paper: all lags, reference", "all lags", ReferenceMatcher),
-        ("all lags, fast and exact", "all lags", FastMatcher),
+        ("all lags, fast and exact", "all lags", PrunedMatcher),
         ("zero lag, reference", "zero lag", ZeroLagMatcher),
-        ("zero lag, fast and exact", "zero lag", FastZeroLagMatcher),
+        ("zero lag, fast and exact", "zero lag", PrunedZeroLagMatcher),
     ):
         yield _read_by(split, name, family, _sigma_by(kind.from_bank(bank)))
     nearest = NearestCell(bank, NOT_TURNED)
@@ -118,7 +117,7 @@ def matchers(split: Split, bank: Bank) -> Iterator[Method]:
     shapes = np.abs(bank.signals.reshape(-1, bank.signals.shape[-1])[cells])
     shapes /= np.linalg.norm(shapes, axis=1, keepdims=True)
 
-    def best_of(scores: Callable[[Single], Single]) -> Callable[[Floats], float]:
+    def best_of(scores: Callable[[Float32Array], Float32Array]) -> Callable[[FloatArray], float]:
         column = sigma[cells % len(sigma)]
         return lambda x: float(column[np.argmax(scores((x / np.linalg.norm(x)).astype(np.float32)))])
 
@@ -131,17 +130,17 @@ def matchers(split: Split, bank: Bank) -> Iterator[Method]:
         yield _read_by(split, f"rank {rank}", "zero lag, bank of rank r", best_of(scores))
 
 
-def _sigma_by(matcher: Matcher) -> Callable[[Floats], float]:
-    if isinstance(matcher, FastMatcher | FastZeroLagMatcher):
+def _sigma_by(matcher: Matcher) -> Callable[[FloatArray], float]:
+    if isinstance(matcher, PrunedMatcher | PrunedZeroLagMatcher):
         return lambda x: matcher.match(x, runner_up=False).sigma
     return lambda x: matcher.match(x).sigma
 
 
-def _compressed_scores(directions: Single, numbers: Single, frame: Single) -> Single:
+def _compressed_scores(directions: Float32Array, numbers: Float32Array, frame: Float32Array) -> Float32Array:
     return numbers @ (directions @ frame)
 
 
-def _half_scores(shapes: NDArray[np.float16], frame: Single) -> Single:
+def _half_scores(shapes: NDArray[np.float16], frame: Float32Array) -> Float32Array:
     """Return the scores of signals kept in half the memory; products are in float32, which BLAS knows."""
     parts = [shapes[i : i + _CHUNK].astype(np.float32) @ frame for i in range(0, len(shapes), _CHUNK)]
     return np.concatenate(parts)
@@ -161,12 +160,12 @@ def fewer_channels(split: Split) -> Iterator[Method]:
         )
 
 
-def _read_some(reader: IntervalRegressor, channels: NDArray[np.int64], difference: Floats) -> float:
+def _read_some(reader: IntervalRegressor, channels: IntArray, difference: FloatArray) -> float:
     return reader.read(difference[channels])[0]
 
 
-def _read_by(split: Split, name: str, family: str, locate: Callable[[Floats], float]) -> Method:
-    def features(difference: Floats) -> Floats:
+def _read_by(split: Split, name: str, family: str, locate: Callable[[FloatArray], float]) -> Method:
+    def features(difference: FloatArray) -> FloatArray:
         sigma = float(locate(difference))
         return np.array([sigma, sigma**2])
 
@@ -175,10 +174,10 @@ def _read_by(split: Split, name: str, family: str, locate: Callable[[Floats], fl
     return Method(name, family, _timed(split, lambda x: reader.read(features(x))[0]))
 
 
-def _timed(split: Split, read: Callable[[Floats], float]) -> Callable[[], tuple[Floats, Floats]]:
+def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tuple[FloatArray, FloatArray]]:
     frames = np.abs(split.future.channels[:, 0])
 
-    def run() -> tuple[Floats, Floats]:
+    def run() -> tuple[FloatArray, FloatArray]:
         values, times = [], []
         for frame in frames:
             begun = time.perf_counter()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.models import conductivity
@@ -19,7 +20,7 @@ from shearloop.daemon.analysis.charts.sources import (
     played_bank,
     torque_of,
 )
-from shearloop.daemon.analysis.charts.stability import Curve, Floats, curve, estimates_of, judged
+from shearloop.daemon.analysis.charts.stability import Curve, curve, estimates_of, judged
 from shearloop.daemon.synthetic import Synthesiser
 
 MODEL = "gaussian_derivative"
@@ -61,9 +62,9 @@ class _Solving(Synthesiser):
         super().__init__(bank, seed=seed)
         self._forward = ForwardModel(own_fingertip(PLAYED_MESH_SIZE_CM).mesh())
         self._homogeneous = self._forward.homogeneous()
-        self._solved: dict[tuple[float, float], Floats] = {}
+        self._solved: dict[tuple[float, float], FloatArray] = {}
 
-    def signal(self, k: float, sigma: float | Floats) -> Floats:
+    def signal(self, k: float, sigma: float | FloatArray) -> FloatArray:
         """Return the (896,) difference signal of one k and σ, solved once: frames of a place differ by noise alone."""
         place = k, float(np.mean(sigma))
         if place not in self._solved:
@@ -88,7 +89,7 @@ def at_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -> I
             yield curve(rim.name, rim.unit, tracker.calibration.estimator, levels)
 
 
-def _series(synthesiser: Synthesiser, homogeneous: Floats, k: float, sigma: float) -> FrameSeries:
+def _series(synthesiser: Synthesiser, homogeneous: FloatArray, k: float, sigma: float) -> FrameSeries:
     frames = np.array([np.abs(mean_frame(synthesiser, k, sigma, 1.0) - homogeneous) for _ in range(_FRAMES)])[:, None]
     t_s = np.arange(float(_FRAMES))
     return FrameSeries(

@@ -13,13 +13,13 @@ from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.analysis.charts.picture import SHADES, figure, save
 from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
 from shearloop.daemon.scene import choices_of, doubts, scene_of
-from shearloop.daemon.workers import Workers, in_order
+from shearloop.daemon.workers import Executor, in_order
 
 _MESH_SIZE_CM = 0.07
 _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
 
 
-def chart(parts: Sequence[Split], out: Path, pool: Workers) -> list[Path]:
+def chart(parts: Sequence[Split], out: Path, pool: Executor) -> list[Path]:
     """Design for the whole of each recording, draw and write; each recording is a task of its own.
 
     Why a design may not be worth building is told on stderr, as `bank design` tells it.

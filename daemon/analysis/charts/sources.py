@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS, channels_of_line
 from shearloop.bank.eit.fingertip import Fingertip
@@ -18,8 +18,6 @@ from shearloop.daemon.bank_config import FingertipGeometryConfig, load_geometry
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.synthetic import Synthesiser, TwistProgramme
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
-
-Floats = NDArray[np.float64]
 
 # Frames before the judged part of a stream that fill the memory of an estimator that has one.
 WARM_UP_FRAMES = 15
@@ -96,13 +94,13 @@ def played_bank(scratch: Path) -> Bank:
     return cached_bank("played", _PLAYED_GRID, mesh, scratch, 1, lambda *_: None)
 
 
-def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> Floats:
+def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> FloatArray:
     """Return the mean of nine frames, (896,) in volts, as the paper's slices are smoothed over time."""
     lines = [synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
     return np.asarray(np.mean([channels_of_line(line) for line in lines], axis=0))
 
 
-def homogeneous_of(synthesiser: Synthesiser) -> Floats:
+def homogeneous_of(synthesiser: Synthesiser) -> FloatArray:
     """Return the homogeneous frame that synthetic slices of this seed are differences to, if asked for first."""
     return mean_frame(synthesiser, 3.2, 1.5, 0.0)
 

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import (
@@ -22,9 +22,8 @@ from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.daemon.analysis.charts.faults import FAULTS, Fault, Scene, Spoilt, scene_of
 from shearloop.daemon.analysis.charts.sources import Split
 from shearloop.daemon.scene import residual_noise
-from shearloop.daemon.workers import Workers, in_order
+from shearloop.daemon.workers import Executor, in_order
 
-Floats = NDArray[np.float64]
 # Of valid estimates one in twenty may miss its 95 % interval; an estimator that is wrong so often says it is right
 # when it is not: it breaks silently.
 BROKEN_SHARE = 0.2
@@ -68,7 +67,7 @@ def curve(fault: str, unit: str, estimator: str, levels: Iterable[Level]) -> Cur
     return Curve(fault, unit, estimator, found, mildest)
 
 
-def judged(estimates: Sequence[Estimate], truth_nm: Floats, level: float) -> Level:
+def judged(estimates: Sequence[Estimate], truth_nm: FloatArray, level: float) -> Level:
     """Return the figures of estimates against (n,) truths, of which only those that are known count."""
     known = np.isfinite(truth_nm)
     rows = [
@@ -95,13 +94,13 @@ def estimates_of(tracker: EstimatorSession, spoilt: Spoilt) -> list[Estimate]:
     return found
 
 
-def truth_of(series: FrameSeries) -> Floats:
+def truth_of(series: FrameSeries) -> FloatArray:
     """Return the (n,) torques that a series is judged by, NaN where it is not."""
     torque = series.torque_at_frames()
     return balanced(torque) if series.kind == "raw" else torque
 
 
-def balanced(truth_nm: Floats) -> Floats:
+def balanced(truth_nm: FloatArray) -> FloatArray:
     """Return (n,) truths of which as many are loaded as free of load, the rest NaN: most of a stream is free of load.
 
     Zero is easily met; an estimator that always says so would look stable.
@@ -180,7 +179,7 @@ def scene_for(split: Split, bank: Bank) -> Scene:
 _MEAN_V = 0.13
 
 
-def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, pool: Workers) -> list[Curve]:
+def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, pool: Executor) -> list[Curve]:
     """Return all estimators through all faults on one split; each estimator is a task of its own."""
     tasks = fitted(split, names, physics)
     found = in_order(pool.map(swept, (scene_for(split, bank), str(bank.path.resolve())), tasks))

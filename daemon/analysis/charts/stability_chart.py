@@ -17,14 +17,14 @@ from shearloop.daemon.analysis.charts.sources import Split, splits
 from shearloop.daemon.analysis.charts.stability import BROKEN_SHARE, Curve, fitted, misaligned, sweeps
 from shearloop.daemon.analysis.charts.stability_picture import continuity_figure, extrapolation_figure, sweeps_figure
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.workers import Workers
+from shearloop.daemon.workers import Executor
 
 SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
 STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "fused")
 SHIFTS_S = (-0.54, -0.27, -0.13, 0.0, 0.13, 0.27, 0.54, 1.08)
 
 
-def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, pool: Workers) -> list[Path]:
+def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, pool: Executor) -> list[Path]:
     """Sweep, draw and write: a chart per recording, more of slices, and the bank's rims and the loop on the skin."""
     physics, written = Physics(bank, mesh), []
     made_for = {"raw": STREAM_NAMES, "difference": SLICE_NAMES}
@@ -43,7 +43,7 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
     return written + limit_cycle.chart(out, pool, "stability-skin")
 
 
-def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, pool: Workers) -> list[Path]:
+def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, pool: Executor) -> list[Path]:
     """Write what is asked of slices alone: continuity, torques beyond those calibrated on, foreign frames."""
     slug, physics = _slug(split.title), Physics(bank, mesh)
     found = walks(split, bank, fitted(split, ("regression", "fused"), physics))

@@ -6,10 +6,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.analysis.charts.continuity import STEPS, Walk
 from shearloop.daemon.analysis.charts.extrapolation import Extrapolation
 from shearloop.daemon.analysis.charts.picture import figure, look
-from shearloop.daemon.analysis.charts.stability import BROKEN_SHARE, Curve, Floats
+from shearloop.daemon.analysis.charts.stability import BROKEN_SHARE, Curve
 
 
 def sweeps_figure(title: str, curves: Sequence[Curve]) -> Figure:
@@ -50,7 +51,7 @@ def _label(panel: Axes, unit: str, heading: str) -> None:
     panel.grid(alpha=0.25)
 
 
-def _beside(count: int, number: int, of: int) -> Floats:
+def _beside(count: int, number: int, of: int) -> FloatArray:
     """Return where the marks of a curve of this number stand: beside those of the other curves, not upon them."""
     return np.arange(float(count)) + 0.12 * (number - (of - 1) / 2)
 

@@ -12,9 +12,9 @@ from benchmarks.closed_loop import Loop, nanoseconds, run
 from benchmarks.plant import EIT, Plant, Sensor
 from benchmarks.step_response import SOURCES, identified, settings_for, tool_of
 from shearloop.daemon.control.controller import TwistController, WristCommand
-from shearloop.daemon.control.identify import ToolModel
+from shearloop.daemon.control.identification import ToolModel
+from shearloop.daemon.control.margins import integral_gain
 from shearloop.daemon.control.settings import ControllerSettings
-from shearloop.daemon.control.tuning import integral_gain
 
 WINDOWS = (1, 2, 3, 4, 6, 9)
 # All smoothing is left to the window: each mean is believed by this much. The tuned controller beside believes single

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
 from shearloop.bank.eit.channels import smoothed_along_channels
 from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.grouping import Labels, group_means, kmeans_groups, place_in_series
+from shearloop.bank.eit.grouping import group_means, kmeans_groups, place_in_series
 from shearloop.bank.eit.matching import Match, ReferenceMatcher, best_match
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.model_scores import (
@@ -29,7 +29,6 @@ from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError, MatchingError
 from shearloop.daemon.recording.matlab_streams import DiameterSlices, TorqueSlices
 
-FloatArray = NDArray[np.float64]
 # Called with how many slices have been matched since the last call.
 Progress = Callable[[int], object]
 
@@ -66,7 +65,7 @@ class TorqueResult:
     wide: Matches
     r_focused: float | None
     r_wide: float | None
-    groups: Labels
+    groups: IntArray
     grouping: str
     r_clustered: float | None
     fit: Polynomial | None
@@ -216,7 +215,7 @@ def correlation(x: FloatArray, y: FloatArray) -> float | None:
     return float(np.corrcoef(x, y)[0, 1])
 
 
-def _levels(torque: FloatArray) -> tuple[Labels, str]:
+def _levels(torque: FloatArray) -> tuple[IntArray, str]:
     series = place_in_series(torque)
     if series is not None:
         return series.level, f"by place in {int(series.repeat.max()) + 1} repeated series"
@@ -224,7 +223,7 @@ def _levels(torque: FloatArray) -> tuple[Labels, str]:
     return kmeans_groups(torque[:, None], count), f"by k-means of the torques into {count} (no repeated series found)"
 
 
-def _held_out_parts(torque: FloatArray) -> tuple[Labels, str]:
+def _held_out_parts(torque: FloatArray) -> tuple[IntArray, str]:
     """Return the part of time that each slice belongs to: neighbours in time are not independent of each other."""
     series = place_in_series(torque)
     if series is not None:
@@ -234,7 +233,7 @@ def _held_out_parts(torque: FloatArray) -> tuple[Labels, str]:
     return stretches, f"one of {count} stretches of time left out at a time"
 
 
-def _cross_validated_rmse(sigma: FloatArray, torque: FloatArray, parts: Labels, notes: list[str]) -> float | None:
+def _cross_validated_rmse(sigma: FloatArray, torque: FloatArray, parts: IntArray, notes: list[str]) -> float | None:
     errors = np.empty_like(torque)
     for part in np.unique(parts):
         out = parts == part

@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 from matplotlib.gridspec import SubplotSpec
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import Match
@@ -16,8 +16,6 @@ from shearloop.bank.eit.models import MODELS
 from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, ModelScores, TorqueResult
 from shearloop.daemon.analysis.reproduce.report import PAPER_MODEL_SCORES, Reproduction
-
-FloatArray = NDArray[np.float64]
 
 _GREY, _BLACK, _PINK, _BLUE, _TEAL, _ORANGE = "#8c8c8c", "#222222", "#d6338a", "#1f5f99", "#2a9d8f", "#d9822b"
 _HEAT = "viridis"

@@ -5,17 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, ModelScores, TorqueResult, all_notes
 from shearloop.daemon.analysis.reproduce.banks import Grid
-
-FloatArray = NDArray[np.float64]
 
 PAPER = "Trehan, Hardman and Iida 2025, Sensors 25, 5159"
 # As published, and without the signs: sigma falls as torque rises, and k as diameter does.

@@ -90,7 +90,7 @@ def _build(args: argparse.Namespace) -> int:
     from shearloop.bank.errors import EmptyBankError
     from shearloop.daemon.bank_config import load_bank_plans
     from shearloop.daemon.cli.writing_over import check_writes_over
-    from shearloop.daemon.workers import workers
+    from shearloop.daemon.workers import open_executor
 
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
     if jobs < 1:
@@ -102,7 +102,7 @@ def _build(args: argparse.Namespace) -> int:
     if paths == [args.out]:
         check_writes_over(args.out, "a bank", BANK_MAGIC)
     built = []
-    with workers(args.cluster, jobs) as pool:
+    with open_executor(args.cluster, jobs) as pool:
 
         def on_cluster(
             mesh: "Mesh", definition: "BankDefinition", rows: "Sequence[int]"

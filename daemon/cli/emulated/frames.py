@@ -3,15 +3,13 @@
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.calibration import Calibration
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.synthetic import INJECTIONS, Synthesiser
 from shearloop.drivers.emulators.rig import FrameOf
-
-FloatArray = NDArray[np.float64]
 
 # σ at rest and at the largest torque of the recorded slices, in N·m; k of the thinnest and thickest recorded cylinder.
 SIGMA_CM, LARGEST_TORQUE_NM = (1.85, 1.25), 0.14
@@ -86,7 +84,7 @@ def _sigma_range(bank: Bank, within: float) -> tuple[float, float]:
     return float(bank.sigma_grid[first]), float(bank.sigma_grid[last])
 
 
-def _run(flags: NDArray[np.bool_], at: int) -> tuple[int, int]:
+def _run(flags: BoolArray, at: int) -> tuple[int, int]:
     """Return the first and last index of the true values around an index, itself where it stands alone."""
     missing = np.flatnonzero(~flags)
     first = int(missing[missing < at].max(initial=-1)) + 1

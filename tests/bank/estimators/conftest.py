@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation import Calibration, FrameSeries, fit
@@ -14,8 +14,6 @@ from shearloop.bank.estimation import Calibration, FrameSeries, fit
 PERIOD_S = 0.54
 IDLE_S, CYCLE_S = 20.0, 30.0
 CREEP_S = 4.0
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,12 @@
 import copy
 import pickle
 from collections.abc import Callable
-from unittest import mock
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit import compiled
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, Measured, TactileFrame, fit
 
@@ -65,7 +63,6 @@ FAULTS = st.lists(
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("is_compiled", [True, False])
 @pytest.mark.parametrize("how", COPIES)
 @settings(deadline=None, max_examples=12)
 @given(
@@ -73,22 +70,21 @@ FAULTS = st.lists(
     st.integers(0, 130), st.booleans(),
 )  # fmt: skip
 def test_a_copy_goes_on_with_the_same_estimates_to_the_bit(
-    how, is_compiled, calibration_of, twisting, name, m, faults, at, tared
+    how, calibration_of, twisting, name, m, faults, at, tared
 ) -> None:
     calibration = calibration_of(name, m)
     series = twisting(cycles=2, seed=9).of_sides(calibration.sides)
-    with mock.patch.object(compiled, "IS_COMPILED", compiled.IS_COMPILED and is_compiled):
-        tracker = EstimatorSession(calibration, period_s=0.54)
-        tracker.hold(Measured(20.0, 1.0))
-        if tared:
-            tracker.take_idle(6)
-        frames = faulty(series, faults)
-        for frame in frames[:at]:
-            tracker.estimate(frame)
-        again = COPIES[how](tracker)
-        expected = [(tracker.estimate(frame), tracker.difference) for frame in frames[at:]]
-        for frame, (estimate, difference) in zip(frames[at:], expected, strict=True):
-            assert again.estimate(frame) == estimate
-            np.testing.assert_array_equal(again.difference, difference)
+    tracker = EstimatorSession(calibration, period_s=0.54)
+    tracker.hold(Measured(20.0, 1.0))
+    if tared:
+        tracker.take_idle(6)
+    frames = faulty(series, faults)
+    for frame in frames[:at]:
+        tracker.estimate(frame)
+    again = COPIES[how](tracker)
+    expected = [(tracker.estimate(frame), tracker.difference) for frame in frames[at:]]
+    for frame, (estimate, difference) in zip(frames[at:], expected, strict=True):
+        assert again.estimate(frame) == estimate
+        np.testing.assert_array_equal(again.difference, difference)
     if not faults:
         assert sum(estimate.valid for estimate, _ in expected) > 80 - at

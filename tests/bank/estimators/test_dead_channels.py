@@ -3,19 +3,12 @@
 import numpy as np
 import pytest
 
-from shearloop.bank.eit import compiled
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, TactileFrame
 from shearloop.bank.estimation.session_state import SessionState
 from tests.bank.estimators.conftest import IDLE_S, PERIOD_S
 
 GRIPPED = round(IDLE_S / PERIOD_S) + 2
-
-
-@pytest.fixture(params=["compiled", "by numpy"])
-def way(request, monkeypatch) -> None:
-    if request.param == "by numpy":
-        monkeypatch.setattr(compiled, "IS_COMPILED", False)
 
 
 def without(dead: slice, kind: str, series: FrameSeries) -> list[TactileFrame]:
@@ -44,7 +37,6 @@ def wrong_share(found: np.ndarray, series: FrameSeries) -> float:
     return float(np.mean((found[known, 0] > truth[known]) | (truth[known] > found[known, 2])))
 
 
-@pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("kind", ["electrode", "a fifth", "lost"])
 def test_channels_that_the_session_began_without_say_nothing_when_they_come_back_in_the_grip(
     fused_calibration, twisting, kind
@@ -60,7 +52,6 @@ def test_channels_that_the_session_began_without_say_nothing_when_they_come_back
     assert wrong_share(found, series) < 0.12
 
 
-@pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("kind", ["electrode", "a fifth", "lost"])
 @pytest.mark.parametrize("with_motion", [True, False])
 def test_channels_that_come_back_while_idle_are_used_from_then_on(

@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from shearloop.bank.eit import compiled
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
@@ -21,12 +20,6 @@ DEAD = {
     "an electrode that measures": (CHANNELS[:, 2:] == 5).any(axis=1),
     "a fifth": np.random.default_rng(0).uniform(size=N_CHANNELS) < 0.2,
 }
-
-
-@pytest.fixture(params=["compiled", "by numpy"])
-def way(request, monkeypatch) -> None:
-    if request.param == "by numpy":
-        monkeypatch.setattr(compiled, "IS_COMPILED", False)
 
 
 @pytest.fixture(scope="module", params=["regression", "bank"])
@@ -52,20 +45,18 @@ def judged(found: list[Estimate], series: FrameSeries) -> tuple[int, float]:
 
 
 @cache
-def _n_valid_of_whole(calibration: Calibration, bank: Bank, is_compiled: bool) -> int:
+def _n_valid_of_whole(calibration: Calibration, bank: Bank) -> int:
     """Return how many torques of a session of which no channel dies are valid."""
-    assert is_compiled == compiled.IS_COMPILED
     series = conftest.series(seed=3, cycles=3)
     return judged(without(~ELECTRODE, len(series.t_s), series, EstimatorSession(calibration, bank)), series)[0]
 
 
-@pytest.mark.usefixtures("way")
 @pytest.mark.parametrize("start", [0, DEATH])
 @pytest.mark.parametrize("dead", list(DEAD))
 def test_what_died_after_the_calibration_is_told_by_the_others(calibration, bank, twisting, dead, start) -> None:
     """It stayed what it was when it died: up to 62 % of the torques were false-valid."""
     series = twisting(seed=3, cycles=3)
-    whole = _n_valid_of_whole(calibration, bank, compiled.IS_COMPILED)
+    whole = _n_valid_of_whole(calibration, bank)
     n, wrong = judged(without(DEAD[dead], start, series, EstimatorSession(calibration, bank)), series)
     assert whole > 120
     assert n > 0.95 * whole

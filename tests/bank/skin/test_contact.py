@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin import closed_form
 from shearloop.bank.skin.annulus import CondensedSkin, MeshSize, condense
 from shearloop.bank.skin.contact import (
@@ -25,7 +25,6 @@ from shearloop.bank.skin.section import Section
 from shearloop.bank.skin.statistics import fit_line, origin_slope
 from shearloop.bank.skin.synthetic import loading, loop
 
-Floats = NDArray[np.float64]
 NORMAL_FORCES = (0.5, 1.0, 1.5, 2.0)
 
 
@@ -35,11 +34,11 @@ def loadings(skin_112: CondensedSkin) -> dict[float, list[ContactState]]:
     return {normal_n: follow(skin_112, normal_n, loading(normal_n)) for normal_n in NORMAL_FORCES}
 
 
-def responses_of(skin: CondensedSkin, states: list[ContactState]) -> Floats:
+def responses_of(skin: CondensedSkin, states: list[ContactState]) -> FloatArray:
     return response_of_strains(*gauge_strains(skin, states).T)
 
 
-def shears(states: list[ContactState]) -> Floats:
+def shears(states: list[ContactState]) -> FloatArray:
     return np.array([state.shear_n for state in states])
 
 
@@ -157,8 +156,8 @@ def ring_sensitivity(section: Section) -> float:
     equations = [[inner, 1 / inner], [p_wave + lame, (lame - p_wave) / outer**2]]
     a, b = np.linalg.solve(equations, [-d * inner * np.log(inner), -p_wave * (log + d) - lame * (log + 1)])
 
-    def along(r: Floats) -> Floats:
-        strain: Floats = a + b / r**2 + d * np.log(r) + 1
+    def along(r: FloatArray) -> FloatArray:
+        strain: FloatArray = a + b / r**2 + d * np.log(r) + 1
         return strain
 
     r = np.linspace(inner, outer, 2001)
@@ -188,7 +187,9 @@ def test_the_contact_conditions_hold_at_every_node(
             assert (abs(along) <= SECTION.friction * pressing + 1e-14).all()
 
 
-def projected_gauss_seidel(compliance: Floats, displacement: Floats, before: Floats, friction: float) -> Floats:
+def projected_gauss_seidel(
+    compliance: FloatArray, displacement: FloatArray, before: FloatArray, friction: float
+) -> FloatArray:
     """Contact forces by going round the nodes: each takes the force that mends its own gap or slip, within bounds."""
     n, diagonal = len(before), np.diag(compliance)
     force = np.zeros(2 * n)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from shearloop.daemon.control.controller import ControllerReason, ControllerRefusal, TwistController
 from shearloop.daemon.control.settings import ControllerSettings
@@ -74,7 +75,7 @@ def test_refused_measurements_change_nothing(batch: list[tuple[float | None, int
     assert poked.advance(0.4) == left_alone.advance(0.4)
 
 
-def test_every_refusal_is_counted_by_kind(bench: Bench) -> None:
+def test_unusable_measurements_are_rejected_by_kind(bench: Bench) -> None:
     bench.advance(1.0)
     fresh = TwistController(bench.settings)
     assert fresh.measure(0.1, 0, 1) is ControllerRefusal.NOT_STARTED
@@ -87,8 +88,6 @@ def test_every_refusal_is_counted_by_kind(bench: Bench) -> None:
     assert bench.measure(0.0, 0.5) is ControllerRefusal.OUT_OF_ORDER
     bench.advance(3.0)
     assert bench.measure(0.0, 2.5) is ControllerRefusal.LATE
-    assert sum(bench.controller.refused.values()) == 7
-    assert bench.controller.refused[ControllerRefusal.OUT_OF_ORDER] == 2
 
 
 def test_one_wild_value_moves_the_wrist_by_no_more_than_its_bounded_share() -> None:
@@ -313,7 +312,7 @@ def test_noise_alone_hardly_ever_passes_for_a_jump(bench: Bench) -> None:
     ],
 )
 def test_settings_out_of_range_are_refused_by_name(name: str, value: float) -> None:
-    with pytest.raises(UserError, match=name):
+    with pytest.raises(ValidationError, match=name):
         ControllerSettings(**(DEFAULTS | {name: value}))
 
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.history import AngleHistory
+from shearloop.daemon.control.controller import AngleHistory
 
 STEP_NS = 8_000_000
 

@@ -5,10 +5,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
-from shearloop.daemon.control.excitation import ExciteSettings, StiffnessExcitation
-from shearloop.daemon.control.identify import IdentifyError, NotYetKnownError, Record, identify
-from shearloop.daemon.errors import UserError
+from shearloop.daemon.control.identification import (
+    ExciteSettings,
+    IdentifyError,
+    NotYetKnownError,
+    Record,
+    StiffnessExcitation,
+    identify,
+)
 
 WINDOW_S = 0.5412
 
@@ -104,7 +110,7 @@ def test_a_record_too_short_or_too_small_asks_for_more() -> None:
 def test_a_wrist_that_rests_and_a_reversed_sign_are_refused() -> None:
     with pytest.raises(IdentifyError, match="did not turn"):
         identify(record_of(angle_rad=np.full(record_of().angle_t_s.size, 0.2)), WINDOW_S)
-    with pytest.raises(IdentifyError, match="wrong way round"):
+    with pytest.raises(IdentifyError, match="sign of torque or wrist angle is wrong"):
         identify(record_of(stiffness=-0.25), WINDOW_S)
 
 
@@ -123,17 +129,21 @@ def test_a_torque_that_is_no_springs_is_refused() -> None:
 
 # --- the step with its wrist programme
 
+SETTINGS: dict[str, Any] = {
+    "amplitude_rad": 0.4,
+    "sample_period_s": 0.5,
+    "window_s": 0.5,
+    "torque_limit_nm": 0.15,
+    "stiffness_share": 0.05,
+    "speed_rad_per_s": 0.5,
+    "acceleration_rad_per_s2": 2.0,
+    "bandwidth_per_s": 5.0,
+}
+
 
 def step_on(stiffness: float, noise_nm: float, **changes: Any) -> tuple[StiffnessExcitation, list[float], list[float]]:
     """Run the step on a wrist that does what it is told at once; return it with all angles and speeds."""
-    values: dict[str, Any] = {
-        "amplitude_rad": 0.4,
-        "sample_period_s": 0.5,
-        "window_s": 0.5,
-        "torque_limit_nm": 0.15,
-        "stiffness_share": 0.05,
-    }
-    step = StiffnessExcitation(ExciteSettings(**(values | changes)))
+    step = StiffnessExcitation(ExciteSettings(**(SETTINGS | changes)))
     rng, angle, angles, speeds, since = np.random.default_rng(3), 1.0, [], [], []
     for number in range(40_000):
         now_ns = 10**9 + number * 8_000_000
@@ -185,9 +195,7 @@ def test_the_step_gives_up_when_it_cannot_know_better() -> None:
 
 
 def test_nonsense_does_not_reach_the_record() -> None:
-    step = StiffnessExcitation(
-        ExciteSettings(amplitude_rad=0.4, sample_period_s=0.5, window_s=0.5, torque_limit_nm=0.1)
-    )
+    step = StiffnessExcitation(ExciteSettings(**SETTINGS))
     step.measure(0.1, 0, 1)
     assert step.command(0, math.nan) == 0.0
     step.command(0, 1.0)
@@ -195,7 +203,7 @@ def test_nonsense_does_not_reach_the_record() -> None:
         step.measure(torque, t_mid, 10)
     assert step.record().torque_nm.tolist() == [0.05]
     assert step.record().angle_rad.tolist() == [1.0]
-    with pytest.raises(UserError, match="amplitude_rad"):
-        ExciteSettings(amplitude_rad=0.0, sample_period_s=0.5, window_s=0.5, torque_limit_nm=0.1)
-    with pytest.raises(UserError, match="dwell_s"):
-        ExciteSettings(amplitude_rad=0.1, sample_period_s=0.5, window_s=0.5, torque_limit_nm=0.1, dwell_s=-1.0)
+    with pytest.raises(ValidationError, match="amplitude_rad"):
+        ExciteSettings(**(SETTINGS | {"amplitude_rad": 0.0}))
+    with pytest.raises(ValidationError, match="dwell_s"):
+        ExciteSettings(**(SETTINGS | {"dwell_s": -1.0}))

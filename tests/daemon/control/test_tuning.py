@@ -6,17 +6,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.identify import ToolModel
-from shearloop.daemon.control.settings import ControllerSettings
-from shearloop.daemon.control.tuning import (
+from shearloop.daemon.control.identification import ToolModel
+from shearloop.daemon.control.margins import (
     MOST_GAIN,
-    RequiredMargins,
     gain_for_noise,
     integral_gain,
     loop_model,
+    margin_refusal,
     noise_share,
-    refusal,
 )
+from shearloop.daemon.control.settings import ControllerSettings, LoopConfig
 
 from .conftest import DEFAULTS
 
@@ -63,25 +62,25 @@ def test_the_gain_is_the_largest_that_the_noise_allows() -> None:
 
 
 def test_a_sound_controller_is_not_refused() -> None:
-    assert refusal(SETTINGS, FOUND, RequiredMargins()) is None
+    assert margin_refusal(SETTINGS, FOUND, LoopConfig()) is None
 
 
 def test_a_refusal_names_a_gain_that_passes() -> None:
     wild = replace(SETTINGS, kp=1.5, ki=0.1)
-    sentence = refusal(wild, replace(FOUND, age_s=1.6, stiffness_nm_per_rad=0.4), RequiredMargins())
+    sentence = margin_refusal(wild, replace(FOUND, age_s=1.6, stiffness_nm_per_rad=0.4), LoopConfig())
     assert sentence is not None
     for part in ("kp 1.5", "gain margin", "phase margin", "delay margin", "0.4 N·m/rad", "1.60 s old", "required 2.00"):
         assert part in sentence
     cure = re.search(r"kp ([\d.]+) with ki ([\d.e-]+) would pass", sentence)
     assert cure is not None
     cured = replace(wild, kp=float(cure[1]) * 0.999, ki=float(cure[2]))
-    assert refusal(cured, replace(FOUND, age_s=1.6, stiffness_nm_per_rad=0.4), RequiredMargins()) is None
+    assert margin_refusal(cured, replace(FOUND, age_s=1.6, stiffness_nm_per_rad=0.4), LoopConfig()) is None
     bolder = replace(wild, kp=float(cure[1]) * 1.05, ki=float(cure[2]) * 1.1)
-    assert refusal(bolder, replace(FOUND, age_s=1.6, stiffness_nm_per_rad=0.4), RequiredMargins()) is not None
+    assert margin_refusal(bolder, replace(FOUND, age_s=1.6, stiffness_nm_per_rad=0.4), LoopConfig()) is not None
 
 
 def test_where_no_gain_passes_the_sentence_says_so() -> None:
-    sentence = refusal(SETTINGS, FOUND, RequiredMargins(phase_deg=170.0))
+    sentence = margin_refusal(SETTINGS, FOUND, LoopConfig.model_construct(phase_margin_deg=170.0))
     assert sentence is not None
     assert "no gain would pass" in sentence
 

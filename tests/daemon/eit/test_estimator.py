@@ -20,15 +20,11 @@ class OneCell:
 
     def __init__(self, cell: tuple[int, int] = (5, 5)) -> None:
         self.cell = cell
-        self.quick = True
         self.asked: list[NDArray[np.float64]] = []
 
     def match(self, difference: NDArray[np.float64]) -> Match:
         self.asked.append(difference)
         return best_match(self.heatmap(difference), K_GRID, SIGMA_GRID)
-
-    def match_quickly(self, difference: NDArray[np.float64]) -> Match | None:
-        return self.match(difference) if self.quick else None
 
     def heatmap(self, difference: NDArray[np.float64]) -> NDArray[np.float64]:  # noqa: ARG002 - always the same
         scores = np.full((11, 11), 0.2)
@@ -148,19 +144,3 @@ def test_frames_from_before_an_outage_are_not_averaged_with_those_after_it() -> 
     alone = matcher.asked[-1] + made._baseline.homogeneous
     np.testing.assert_allclose(alone, after, atol=1e-12)
     assert reading.lag_ns == 0
-
-
-def test_what_takes_long_is_left_to_the_caller_and_then_comes_out_the_same() -> None:
-    matcher, slow = OneCell(), OneCell()
-    quick, patient = estimator(matcher, average=3), estimator(slow, average=3)
-    slow.quick = False
-    signals = [PATTERN, 0.5 * PATTERN, 0.0 * PATTERN, PATTERN, PATTERN]
-    for number, signal in enumerate(signals, 10):
-        taken = frame(number, HOMOGENEOUS + signal)
-        one = quick.quickly(taken)
-        if signal.any():
-            assert patient.quickly(taken) is None, "and nothing has been taken in"
-        other = patient.update(taken)
-        assert one is not None
-        assert (one.match, one.why, one.lag_ns) == (other.match, other.why, other.lag_ns)
-    assert len(matcher.asked) == len(slow.asked) > 3

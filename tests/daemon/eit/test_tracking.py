@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.fast_matching import FastZeroLagMatcher
+from shearloop.bank.eit.pruned_matching import PrunedZeroLagMatcher
 from shearloop.bank.estimation import Calibration, FrameSeries, fit
 from shearloop.daemon.cli.check import _torque
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
@@ -98,7 +98,7 @@ def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_says_nothing(
 def test_a_bank_gives_k_sigma_and_heatmaps_beside(calibration: Calibration, tiny_bank: Path) -> None:
     bank = Bank.open(tiny_bank)
     estimator = TrackedEstimator(
-        calibration, bank, Scoring(FastZeroLagMatcher.from_bank(bank), bank.model), baseline_frames=10
+        calibration, bank, Scoring(PrunedZeroLagMatcher.from_bank(bank), bank.model), baseline_frames=10
     )
     played = series(seed=3)
     gripped = int((IDLE_S + 12.0) / PERIOD_S)
@@ -111,19 +111,13 @@ def test_a_bank_gives_k_sigma_and_heatmaps_beside(calibration: Calibration, tiny
     assert reading.match.score == pytest.approx(np.nanmax(heatmap), abs=1e-6)
 
 
-class Reluctant(FastZeroLagMatcher):
-    """Finds nothing quickly."""
-
-    def match_quickly(self, _difference: object) -> None:
-        return None
-
-
-@pytest.mark.parametrize("kind", [FastZeroLagMatcher, Reluctant])
-def test_readings_are_the_same_at_once_and_in_a_thread(kind, calibration: Calibration, tiny_bank: Path) -> None:
+def test_readings_are_the_same_at_once_and_in_a_thread(calibration: Calibration, tiny_bank: Path) -> None:
     bank = Bank.open(tiny_bank)
     slow, quick = (
-        TrackedEstimator(calibration, bank, Scoring(matcher.from_bank(bank), bank.model), baseline_frames=10)
-        for matcher in (FastZeroLagMatcher, kind)
+        TrackedEstimator(
+            calibration, bank, Scoring(PrunedZeroLagMatcher.from_bank(bank), bank.model), baseline_frames=10
+        )
+        for _ in range(2)
     )
     left_undone = 0
     for number, pair in enumerate(series(seed=3).channels[: int((IDLE_S + 14.0) / PERIOD_S)]):
@@ -134,7 +128,7 @@ def test_readings_are_the_same_at_once_and_in_a_thread(kind, calibration: Calibr
             found = quick.update(*frames)
         expected = slow.update(*frames)
         assert (found.match, found.torque_nm, found.why) == (expected.match, expected.torque_nm, expected.why)
-    assert (left_undone > 0) == (kind is Reluctant)
+    assert left_undone > 0
 
 
 @pytest.mark.parametrize(("name", "quick"), [("fused", True), ("reconstruction", False)])

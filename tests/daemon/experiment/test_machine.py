@@ -8,16 +8,17 @@ from pydantic import ValidationError
 
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.step_commands import (
+from shearloop.daemon.control.step_runner import (
     ActionState,
     ConstantVelocity,
+    Experiment,
+    ExperimentPhase,
     Hold,
     MoveToAngle,
     StepCommand,
     StepContext,
     TrackTorque,
 )
-from shearloop.daemon.control.step_runner import Experiment, ExperimentPhase
 
 TICK_NS = 8_000_000
 STIFFNESS_NM_PER_RAD = 0.2
@@ -43,7 +44,7 @@ class Bench:
     def tick(self, *, held: bool = False) -> StepCommand:
         self.t_ns += self.tick_ns
         wish = self.machine.update(self.view(), self.t_ns, held=held)
-        if wish.action is not None and wish.number != self.wish.number:
+        if wish.action is not None and wish.step_index != self.wish.step_index:
             self.begun.append(type(wish.action).__name__)
         step_s = self.tick_ns / 1e9
         match wish.wrist:
@@ -82,9 +83,9 @@ def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
     assert bench.machine.phase is ExperimentPhase.DONE
     assert bench.begun == ["MoveTo", "GripTo", "Tare", "GripTo", "MoveTo"]
     assert bench.machine.progress().share == 1.0
-    holds = [wish for wish in bench.seen if wish.doing.startswith("holding 0.200 rad")]
+    holds = [wish for wish in bench.seen if wish.activity.startswith("holding 0.200 rad")]
     assert len(holds) * TICK_NS / 1e9 == pytest.approx(2 * 1.0, abs=0.05)
-    assert {wish.doing.split(": ")[1].split(",")[1] for wish in holds} == {" repeat 1 of 2", " repeat 2 of 2"}
+    assert {wish.activity.split(": ")[1].split(",")[1] for wish in holds} == {" repeat 1 of 2", " repeat 2 of 2"}
 
 
 def test_absolute_angles_are_the_wrists_own() -> None:
@@ -107,10 +108,10 @@ def test_a_failed_action_stops_the_experiment_with_its_reason() -> None:
     machine = experiment({"do": "grip"}, {"do": "release"})
     machine.update(StepContext(0.0, None, action=ActionState.RUNNING), TICK_NS)
     wish = machine.update(
-        StepContext(0.0, None, action=ActionState.FAILED, failure="nothing was between the fingers"), TICK_NS
+        StepContext(0.0, None, action=ActionState.FAILED, action_error="nothing was between the fingers"), TICK_NS
     )
     assert (machine.phase, wish) == (ExperimentPhase.STOPPED, StepCommand())
-    assert machine.why == "step 1 (grip) failed: nothing was between the fingers"
+    assert machine.stop_reason == "step 1 (grip) failed: nothing was between the fingers"
 
 
 def test_while_paused_or_held_the_wrist_stands_and_no_time_passes() -> None:

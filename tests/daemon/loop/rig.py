@@ -2,31 +2,26 @@
 
 from collections import deque
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import numpy as np
 
 from shearloop.daemon.control.control_loop import ControlLoop, ControlOutput
 from shearloop.daemon.control.experiment_schema import ExperimentFile
-from shearloop.daemon.control.fault_detection import MonitorSettings
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample, TorqueSource
-from shearloop.daemon.control.step_commands import Action, GripTo
-from shearloop.daemon.control.step_runner import ExperimentPhase
-from shearloop.daemon.control.tune import TuneSettings, tuned
-from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
 from shearloop.drivers.emulators.twin import Twin, TwinSettings
 
 TICK_S = 0.008
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)
 GRIP = {"do": "grip", "width_mm": 10.0, "force_n": 60.0}
-TUNE = TuneSettings()
+CONFIG = LoopConfig()
 
 
-def brain(watch: MonitorSettings | None = None) -> ControlLoop:
-    wrists = {source.name: WristController(source, WristSettings(), partial(tuned, TUNE)) for source in (EIT, LOAD)}
-    return ControlLoop(wrists, watch or MonitorSettings(), {"right": EIT, "load_cell": LOAD}, ("gripper", "right"))
+def brain() -> ControlLoop:
+    return ControlLoop(CONFIG, {"right": EIT, "load_cell": LOAD}, ("gripper", "right"))
 
 
 class Rig:
@@ -70,26 +65,26 @@ class Rig:
                 self._finish(action)
         orders = self.orders = self.brain.tick(self.t_ns)
         self.speed = 0.0 if orders.stop else orders.wrist_rad_per_s
-        self.brain.sent(self.speed)
+        self.brain.on_speed_sent(self.speed)
         if orders.release:
             self.force_n = 0.0
-        if orders.begin is not None:
-            self.begun.append(orders.begin)
-            self.pending.append((self.tick + 100, orders.begin))
+        if orders.action is not None:
+            self.begun.append(orders.action)
+            self.pending.append((self.tick + 100, orders.action))
 
     def _sense(self, torque_nm: float) -> None:
         now = self.t_ns
         if "arm" not in self.silent:
-            self.brain.senses.arm = replace(self.arm, wrist_rad=self.wrist_rad, t_ns=now)
+            self.brain.inputs.arm = replace(self.arm, wrist_rad=self.wrist_rad, t_ns=now)
         if "hand" not in self.silent:
-            self.brain.senses.hand = replace(self.hand, t_ns=now, holding=self.force_n > 0, width_mm=self.width_mm)
+            self.brain.inputs.gripper = replace(self.hand, t_ns=now, holding=self.force_n > 0, width_mm=self.width_mm)
         if self.tick % 68 == 0 and "right" not in self.silent:
             middle = now - round(EIT.window_s * 0.5e9)
             value = float(np.mean(self.window) + self.random.normal(0.0, self.noise_nm))
-            self.brain.hear(TorqueSample("right", value, "", middle, now))
+            self.brain.on_torque(TorqueSample("right", value, "", middle, now))
         if self.tick % 11 == 0 and "load_cell" not in self.silent:
             value = torque_nm + self.offset_nm + float(self.random.normal(0.0, 0.0005))
-            self.brain.hear(TorqueSample("load_cell", None if self.void else value, "", now - 1_000_000, now))
+            self.brain.on_torque(TorqueSample("load_cell", None if self.void else value, "", now - 1_000_000, now))
 
     def _finish(self, action: Action) -> None:
         if isinstance(action, GripTo):
@@ -97,8 +92,8 @@ class Rig:
             self.force_n = action.force_n if holds else 0.0
             self.width_mm = 30.0 if holds else action.width_mm
             # As the gripper's task does, before it says that the fingers have closed.
-            self.brain.senses.hand = replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm)
-        self.brain.action_ended()
+            self.brain.inputs.gripper = replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm)
+        self.brain.on_action_ended()
 
     def run(self, most_s: float) -> None:
         for _ in range(round(most_s / TICK_S)):

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from shearloop.daemon.control.step_commands import GripTo, MoveTo, Tare
-from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.control.step_runner import ExperimentPhase, GripTo, MoveTo, Tare
 from tests.daemon.loop.rig import GRIP, TICK_S, Rig, brain, phase, started
 
 
@@ -22,7 +21,7 @@ def test_the_loop_grips_identifies_holds_a_torque_and_lets_go(drive: str) -> Non
     )
     rig.run(200)
     assert rig.brain.experiment is not None
-    assert phase(rig) is ExperimentPhase.DONE, rig.brain.experiment.why
+    assert phase(rig) is ExperimentPhase.DONE, rig.brain.experiment.stop_reason
     assert [type(action) for action in rig.begun] == [MoveTo, GripTo, Tare, GripTo]
     held = np.array(rig.true_nm)[-round(15 / TICK_S) - 110 : -110]
     assert held.mean() == pytest.approx(0.1, abs=0.008)
@@ -34,7 +33,7 @@ def test_a_set_point_without_identification_is_refused_with_the_cure() -> None:
     rig.run(20)
     assert phase(rig) is ExperimentPhase.STOPPED
     assert rig.brain.experiment is not None
-    assert "put an `identify` step before" in rig.brain.experiment.why
+    assert "put an `identify` step before" in rig.brain.experiment.stop_reason
 
 
 def test_a_pause_is_refused_with_the_reason() -> None:

@@ -22,7 +22,7 @@ def test_no_fault_at_any_time_makes_the_wrist_faster_than_its_limit_or_move_afte
         for _ in range(ticks):
             rig.step()
             assert abs(rig.speed) <= 0.5
-            if rig.brain.standing.verdict.response >= Response.HOLD or phase(rig) is not ExperimentPhase.RUNNING:
+            if rig.brain.status.decision.response >= Response.HOLD or phase(rig) is not ExperimentPhase.RUNNING:
                 assert rig.speed == 0.0
         match fault:
             case "protective":
@@ -60,13 +60,13 @@ def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
         rig.silent = {*wrong} & {"right", "load_cell", "arm", "hand"}
         rig.offset_nm = 0.2 if "apart" in wrong else 0.0
         rig.void = "void" in wrong
-        rig.brain.senses.late_s = 0.15 if "late" in wrong else 0.0
+        rig.brain.inputs.late_s = 0.15 if "late" in wrong else 0.0
         for _ in range(ticks):
             rig.step()
             if phase(rig) is not ExperimentPhase.RUNNING:
                 assert rig.speed == 0.0
                 continue
-            held = rig.brain.standing.verdict.response is Response.HOLD
+            held = rig.brain.status.decision.response is Response.HOLD
             assert not (held and rig.speed)
             assert not held or held_s <= 5.0 + 2 * TICK_S
             held_s = held_s + TICK_S if held else max(0.0, held_s - 0.5 * TICK_S)

@@ -18,7 +18,7 @@ def test_a_tool_that_is_taken_away_is_noticed() -> None:
     rig.run(5)
     rig.force_n = 0.0
     rig.step()
-    assert FaultCode.GRIP_LOST in {trouble.event for trouble in rig.brain.standing.verdict.troubles}
+    assert FaultCode.GRIP_LOST in {trouble.code for trouble in rig.brain.status.decision.faults}
     assert phase(rig) is ExperimentPhase.STOPPED
 
 
@@ -31,14 +31,14 @@ def test_a_tool_that_is_met_though_nobody_expected_it_is_watched_as_well(step: d
     assert phase(rig) is ExperimentPhase.RUNNING
     rig.force_n = 0.0
     rig.step()
-    assert FaultCode.GRIP_LOST in {trouble.event for trouble in rig.brain.standing.verdict.troubles}
+    assert FaultCode.GRIP_LOST in {trouble.code for trouble in rig.brain.status.decision.faults}
     assert phase(rig) is ExperimentPhase.STOPPED
 
 
 @pytest.mark.parametrize(
     ("sense", "what"),
     [
-        ({"unsure": True}, "stand where a stop, an activation or a lack of power has left them"),
+        ({"uncertain": True}, "stand where a stop, an activation or a lack of power has left them"),
         ({"moving": True}, "are moving"),
     ],
 )
@@ -67,7 +67,7 @@ def test_nothing_turns_a_tool_that_the_gripper_may_hold_and_does_not_tell_of(
     assert refused({"do": "release"}, turning) is None
 
 
-@pytest.mark.parametrize("sense", [{"unsure": True}, {"moving": True}])
+@pytest.mark.parametrize("sense", [{"uncertain": True}, {"moving": True}])
 @pytest.mark.parametrize("turning", [TWIST, {"do": "turn_to", "angle_rad": 0.4}, {"do": "identify"}])
 def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_what_turns(
     sense: dict[str, Any], turning: dict[str, Any]
@@ -78,6 +78,6 @@ def test_a_gripper_that_tells_only_after_the_start_that_it_does_not_know_stops_w
     rig.run(1)
     assert rig.brain.experiment is not None
     assert not rig.brain.experiment.running
-    assert f"step 2 ({turning['do']}) cannot be done: the gripper does not say" in rig.brain.experiment.why
-    assert rig.brain.experiment.why.endswith("; put a `grip` or a `release` before it")
+    assert f"step 2 ({turning['do']}) cannot be done: the gripper does not say" in rig.brain.experiment.stop_reason
+    assert rig.brain.experiment.stop_reason.endswith("; put a `grip` or a `release` before it")
     assert rig.speed == 0.0

@@ -17,8 +17,8 @@ def test_a_silent_board_holds_the_wrist_and_then_stops_it() -> None:
     assert rig.speed > 0
     rig.silent.add("right")
     rig.run(2.5 * EIT.period_s + 0.7)
-    assert (rig.speed, rig.brain.standing.phase) == (0.0, "held")
-    assert "Look at the sensor's cable" in rig.brain.standing.verdict.reasons[0]
+    assert (rig.speed, rig.brain.status.phase) == (0.0, "held")
+    assert "Check the sensor's cable" in rig.brain.status.decision.reasons[0]
     rig.run(6)
     assert phase(rig) is ExperimentPhase.STOPPED
     assert rig.orders.stop
@@ -30,7 +30,7 @@ def test_a_board_that_speaks_again_in_time_lets_the_twist_go_on() -> None:
     rig.run(4)
     rig.silent.add("right")
     rig.run(3)
-    assert rig.brain.standing.phase == "held"
+    assert rig.brain.status.phase == "held"
     rig.silent.clear()
     rig.run(30)
     assert phase(rig) is ExperimentPhase.DONE
@@ -79,17 +79,17 @@ def test_what_the_robot_reports_ends_a_running_experiment_at_once(sense: dict[st
     rig.step()
     assert rig.orders.stop
     assert rig.speed == 0.0
-    assert event in {trouble.event for trouble in rig.brain.standing.verdict.troubles}
+    assert event in {trouble.code for trouble in rig.brain.status.decision.faults}
 
 
 def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_which() -> None:
     rig = started(Rig(brain()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
-    rig.brain.senses.lost["load_cell"] = "/dev/ttyUSB3 was unplugged."
+    rig.brain.inputs.lost["load_cell"] = "/dev/ttyUSB3 was unplugged."
     rig.step()
     assert rig.speed == 0.0
-    assert "load_cell is gone: /dev/ttyUSB3 was unplugged." in rig.brain.standing.verdict.reasons[0]
-    rig.brain.senses.lost.clear()
+    assert "load_cell is gone: /dev/ttyUSB3 was unplugged." in rig.brain.status.decision.reasons[0]
+    rig.brain.inputs.lost.clear()
     rig.run(1)
     assert rig.speed > 0.0, "it goes on by itself"
 
@@ -97,26 +97,26 @@ def test_a_supervising_sensor_that_is_gone_holds_the_wrist_at_once_and_says_whic
 def test_a_task_that_died_stops_the_wrist_and_says_of_what() -> None:
     rig = started(Rig(brain()), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01, "hold_s": 60})
     rig.run(5)
-    rig.brain.senses.died = {"right.estimator": "ValueError: no number"}
+    rig.brain.inputs.died = {"right.estimator": "ValueError: no number"}
     rig.step()
     assert phase(rig) is ExperimentPhase.STOPPED
-    assert "right.estimator: ValueError: no number" in rig.brain.standing.verdict.reasons[0]
+    assert "right.estimator: ValueError: no number" in rig.brain.status.decision.reasons[0]
 
 
 def test_a_single_torque_that_disagrees_holds_until_the_next_one_and_stops_nothing() -> None:
     """Of the slower sensor: what it says stands until it says something else."""
     rig = started(Rig(brain(), noise_nm=0.0), GRIP, {"do": "twist", "angles_rad": [0.5], "speed_rad_per_s": 0.01})
     rig.run(5)
-    while (spiked := rig.brain.senses.torques["right"]).t_ns != rig.t_ns:
+    while (spiked := rig.brain.inputs.torques["right"]).t_ns != rig.t_ns:
         rig.step()
     assert spiked.torque_nm is not None
     spike = replace(spiked, torque_nm=spiked.torque_nm + 0.07, t_mid_ns=spiked.t_mid_ns + 1)
-    rig.brain.hear(spike)
+    rig.brain.on_torque(spike)
     held = 0
     for _ in range(300):
         rig.step()
         assert phase(rig) is ExperimentPhase.RUNNING
-        if rig.brain.standing.verdict.response is Response.HOLD:
+        if rig.brain.status.decision.response is Response.HOLD:
             held += 1
             assert rig.speed == 0.0
     assert held * TICK_S == pytest.approx(EIT.period_s, abs=2 * TICK_S)

@@ -11,8 +11,7 @@ from shearloop.daemon.control.actions import along_tool
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
 from shearloop.daemon.control.safety import Response
-from shearloop.daemon.control.step_commands import Action, GripTo, MoveTo
-from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo, MoveTo
 from shearloop.drivers.emulators.twin import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
@@ -123,15 +122,15 @@ class WholeRig:
             self.force_n = 0.0 if orders.release else self.force_n
             return
         self.stopped = False
-        if orders.begin is not None:
-            self._begin(orders.begin)
+        if orders.action is not None:
+            self._begin(orders.action)
         assert math.isfinite(orders.wrist_rad_per_s)
-        if self.brain.standing.verdict.response >= Response.HOLD:
+        if self.brain.status.decision.response >= Response.HOLD:
             assert orders.wrist_rad_per_s == 0.0, "held, and yet it turns"
         if orders.wrist_rad_per_s or self.sent:
             reply = self._ask(WristSpeed(orders.wrist_rad_per_s, 4.0))
             self.sent = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self.brain.sent(self.sent)
+            self.brain.on_speed_sent(self.sent)
 
     def befall(self, fault: str) -> None:
         match fault:
@@ -166,17 +165,17 @@ class WholeRig:
 
     def _sense(self, torque_nm: float) -> None:
         state = self.pilot.state(self.arm.reading, self.number)
-        self.brain.senses.arm = ArmStatus(
+        self.brain.inputs.arm = ArmStatus(
             state.wrist_rad, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked
         )
         holding = self.force_n > 0
-        self.brain.senses.hand = GripperStatus(self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)
+        self.brain.inputs.gripper = GripperStatus(self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)
         said = 1e30 if self.absurd else torque_nm
         if not self.silent and self.number % 11 == 0:
-            self.brain.hear(TorqueSample("load_cell", said, "", self.now_ns - CYCLE_NS, self.now_ns))
+            self.brain.on_torque(TorqueSample("load_cell", said, "", self.now_ns - CYCLE_NS, self.now_ns))
         if not self.silent and self.number % 68 == 0:
             middle = self.now_ns - round(EIT.window_s * 0.5e9)
-            self.brain.hear(TorqueSample("right", math.nan if self.absurd else torque_nm, "", middle, self.now_ns))
+            self.brain.on_torque(TorqueSample("right", math.nan if self.absurd else torque_nm, "", middle, self.now_ns))
 
     def _begin(self, action: Action) -> None:
         self.action = (self.number + 30, action)
@@ -189,9 +188,9 @@ class WholeRig:
         self.arm.be(moving_linearly=False)
         if isinstance(action, GripTo):
             self.force_n = action.force_n if action.expect_object else 0.0
-            if self.brain.senses.hand is not None:
-                self.brain.senses.hand = dataclasses.replace(self.brain.senses.hand, holding=action.expect_object)
-        self.brain.action_ended()
+            if self.brain.inputs.gripper is not None:
+                self.brain.inputs.gripper = dataclasses.replace(self.brain.inputs.gripper, holding=action.expect_object)
+        self.brain.on_action_ended()
 
 
 @settings(max_examples=40, deadline=None)
@@ -227,4 +226,4 @@ def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits
         for _ in range(60):
             rig.cycle()
         assert abs(rig.arm.reading.qd_rad_per_s[5]) < 1e-9, "stopped, and yet it turns"
-        assert experiment.why
+        assert experiment.stop_reason

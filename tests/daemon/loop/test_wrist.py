@@ -1,52 +1,38 @@
-"""The speed of the wrist for a wish: near what is asked, and not another one in each cycle."""
-
-from dataclasses import replace
-from functools import partial
-from itertools import pairwise
+"""The speed of the wrist for a wish: near what is asked."""
 
 import pytest
 
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.control.step_commands import MoveToAngle
-from shearloop.daemon.control.tune import TuneSettings, tuned
-from shearloop.daemon.control.wrist_controller import AS_GOOD_RAD, AS_GOOD_SHARE, WristController, WristSettings
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import MoveToAngle
+from shearloop.daemon.control.wrist_controller import WristController
 
 CYCLE_NS = 8_000_000
-SETTINGS = WristSettings()
+SETTINGS = LoopConfig()
+# A tenth of what the wrist resolves.
+CLOSE_RAD = 2e-5
 # Without anything under way: what is sent shows in the angle at once.
-AT_ONCE = WristSettings(actuation_s=0.0)
+AT_ONCE = LoopConfig(actuation_s=0.0)
 
 
-def wrist(settings: WristSettings = AT_ONCE) -> WristController:
-    return WristController(TorqueSource(name="load_cell", period_s=0.1), settings, partial(tuned, TuneSettings()))
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_speed_as_good_as_the_one_that_was_sent_is_that_one(sign: float) -> None:
-    one, sent = wrist(), sign * 0.01
-    one.sent(sent)
-    for apart_rad, is_kept in ((0.9 * AS_GOOD_RAD, True), (1.1 * AS_GOOD_RAD, False)):
-        wanted = sent + sign * apart_rad * SETTINGS.angle_bandwidth_per_s
-        turn = one.turn(MoveToAngle(wanted / SETTINGS.angle_bandwidth_per_s, 0.2), 10**9, 0.0, 0.0)
-        assert turn.speed_rad_per_s == pytest.approx(sent if is_kept else wanted, abs=1e-12)
+def wrist(config: LoopConfig = AT_ONCE) -> WristController:
+    return WristController(TorqueSource(name="load_cell", period_s=0.1), config)
 
 
 def test_a_wrist_that_stands_sets_out_for_however_little() -> None:
-    turn = wrist().turn(MoveToAngle(0.1 * AS_GOOD_RAD, 0.2), 10**9, 0.0, 0.0)
-    assert turn.speed_rad_per_s == pytest.approx(0.1 * AS_GOOD_RAD * SETTINGS.angle_bandwidth_per_s)
+    turn = wrist().turn(MoveToAngle(0.1 * CLOSE_RAD, 0.2), 10**9, 0.0, 0.0)
+    assert turn.speed_rad_per_s == pytest.approx(0.1 * CLOSE_RAD * SETTINGS.angle_bandwidth_per_s)
 
 
-def test_a_held_angle_is_kept_and_seldom_needs_another_speed() -> None:
-    one, angle_rad, speeds, errors_rad = wrist(), 0.0, [], []
+def test_a_held_angle_is_kept() -> None:
+    one, angle_rad, errors_rad = wrist(), 0.0, []
     for cycle in range(1000):
         speed = one.turn(MoveToAngle(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
-        one.sent(speed)
+        one.on_speed_sent(speed)
         angle_rad += speed * CYCLE_NS / 1e9
-        speeds.append(speed)
         errors_rad.append(abs(angle_rad - 0.15))
     # From two seconds after the arrival on.
-    assert max(errors_rad[375:]) < 1.1 * AS_GOOD_RAD
-    assert sum(one != other for one, other in pairwise(speeds[375:])) < 30
+    assert max(errors_rad[375:]) < 1.1 * CLOSE_RAD
 
 
 @pytest.mark.parametrize("allowed_rad_per_s", [1e-5, 4e-5, 1e-3, 0.2])
@@ -54,15 +40,15 @@ def test_a_held_angle_is_kept_and_seldom_needs_another_speed() -> None:
 def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(
     allowed_rad_per_s: float, bandwidth_per_s: float
 ) -> None:
-    one, angle_rad, t_ns = wrist(replace(AT_ONCE, angle_bandwidth_per_s=bandwidth_per_s)), 0.0, 10**9
+    one, angle_rad, t_ns = wrist(AT_ONCE.model_copy(update={"angle_bandwidth_per_s": bandwidth_per_s})), 0.0, 10**9
     way_rad = 200 * CYCLE_NS / 1e9 * allowed_rad_per_s
     # As long as the way takes, and as its last part does at this bandwidth.
     cycles = round(300 + 12.0 / bandwidth_per_s / (CYCLE_NS / 1e9))
     for goal_rad in (way_rad, -way_rad):
         for _ in range(2 * cycles):
             speed = one.turn(MoveToAngle(goal_rad, allowed_rad_per_s), t_ns, angle_rad, 0.0).speed_rad_per_s
-            assert abs(speed) <= (1.0 + AS_GOOD_SHARE) * allowed_rad_per_s
-            one.sent(speed)
+            assert abs(speed) <= allowed_rad_per_s
+            one.on_speed_sent(speed)
             angle_rad += speed * CYCLE_NS / 1e9
             t_ns += CYCLE_NS
-        assert angle_rad == pytest.approx(goal_rad, abs=1.5 * AS_GOOD_RAD)
+        assert angle_rad == pytest.approx(goal_rad, abs=1.5 * CLOSE_RAD)

@@ -1,4 +1,4 @@
-"""The wrist closes in on an angle by the states that the robot's process tells, which are not those of each cycle."""
+"""The wrist closes in on an angle, decided upon at each of the robot's states."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -6,16 +6,14 @@ from typing import cast
 
 import pytest
 
-from shearloop.daemon.config import LoopConfig
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.control.step_commands import MoveToAngle
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import MoveToAngle
 from shearloop.daemon.control.velocity_sender import VelocityCommandSender
-from shearloop.daemon.control.wrist_controller import WristController, WristSettings
+from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply
-from shearloop.drivers.ur.news import News
-from shearloop.drivers.ur.pace import Pace
 from tests.drivers.ur.flight import SETTINGS, flying
 
 FASTEST_PER_S = next(
@@ -25,11 +23,9 @@ FASTEST_PER_S = next(
 
 def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> list[float]:
     """Return how far from the angle the wrist is in each cycle."""
-    flight, news, pace = flying(), News(), Pace(SETTINGS, 0.0)
-    settings = WristSettings(angle_bandwidth_per_s=bandwidth_per_s)
-    wrist = WristController(
-        TorqueSource(name="load_cell", period_s=0.1), settings, lambda *_: pytest.fail("no loop is closed")
-    )
+    flight = flying()
+    config = LoopConfig(angle_bandwidth_per_s=bandwidth_per_s)
+    wrist = WristController(TorqueSource(name="load_cell", period_s=0.1), config)
     replies: list[Callable[[], None]] = []
 
     def tell(command: Command, answered: Callable[[CommandReply], None]) -> None:
@@ -39,20 +35,18 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
         replies.append(lambda: answered(reply))
 
     robot = SimpleNamespace(settings=SETTINGS, state=None, tell=tell)
-    brain = SimpleNamespace(sent=wrist.sent, note_refusal=pytest.fail)
+    brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail)
     commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain), 4.0, pytest.fail)
     origin_rad, errors = flight.state.wrist_rad, []
-    for pace.cycle in range(cycles):
+    for _ in range(cycles):
         flight.fly(1)
         state = flight.state
         errors.append(state.wrist_rad - origin_rad - angle_rad)
-        if pace.tells(rests=False, news=news.brings(state)):
-            news.tell(state)
-            robot.state = state
-            while replies:
-                replies.pop()()
-            turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
-            commands.turn(turn.speed_rad_per_s, flight.now_ns)
+        robot.state = state
+        while replies:
+            replies.pop()()
+        turn = wrist.turn(MoveToAngle(angle_rad, 0.5), flight.now_ns, state.wrist_rad, origin_rad)
+        commands.turn(turn.speed_rad_per_s)
     return errors
 
 

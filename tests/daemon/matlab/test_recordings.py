@@ -191,7 +191,7 @@ def test_the_shared_recordings_are_read(shared: Path) -> None:
     torque, diameter = read_torque_slices(folder / "torque_slices"), read_diameter_slices(folder / "diameter_slices")
     assert torque.numbers.tolist() == list(range(1, 50))
     assert torque.torque_nm[9] == pytest.approx(0.0085, abs=5e-5)
-    assert diameter.diameter_mm.tolist() == [10.0] * 4 + [20.0] * 3 + [30.0] * 2 + [40.0] * 4
+    assert diameter.diameter_mm.tolist() == [10.0] * 8 + [20.0] * 7 + [30.0] * 4 + [40.0] * 8
     assert read_line(folder / "torque_slices" / "TorqueSlice.mat").max() == 0.45
     streams = folder / "streams"
     for name in ("2024-12-03_16-09/device1", "20241202_153632/left", "cylinders/10mm_1_right"):

@@ -2,10 +2,12 @@
 
 import asyncio
 import errno
+import io
 import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,30 +23,18 @@ from tests.daemon.conftest import deadline
 from tests.daemon.recording.test_recorder import IDENTITY, frame, topics, torque
 
 
-class SmallDisk:
+class SmallDisk(io.FileIO):
     """A file on a disk that has room for so many bytes, and takes what it can, as a file system does."""
 
     def __init__(self, path: Path, room: int) -> None:
-        self.file = path.open("xb", buffering=0)
+        super().__init__(path, "xb")
         self.room = room
 
-    def write(self, data: memoryview, /) -> int:
-        room = self.room - self.file.tell()
+    def write(self, data: Any, /) -> int:
+        room = self.room - self.tell()
         if room <= 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        return self.file.write(data[:room])
-
-    def seek(self, offset: int, /) -> int:
-        return self.file.seek(offset)
-
-    def truncate(self, size: int, /) -> int:
-        return self.file.truncate(size)
-
-    def fileno(self) -> int:
-        return self.file.fileno()
-
-    def close(self) -> None:
-        self.file.close()
+        return super().write(data[:room])
 
 
 def test_wherever_the_disk_is_full_all_that_was_flushed_is_kept(tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ def test_what_was_edited_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert place(tmp_path, "install") == 0
     assert not (tmp_path / REAL_TIME).parent.exists(), "real-time options go when they are not asked for"
     assert place(tmp_path, "uninstall") == 0
-    assert f"left, having been edited: {edited}" in capsys.readouterr().out
+    assert f"left because it was edited: {edited}" in capsys.readouterr().out
     assert edited.read_text() == "fingertips: {}\n"
     assert key.exists()
 
@@ -97,8 +97,8 @@ def test_for_a_script_the_steps_are_json(tmp_path: Path, capsys: pytest.CaptureF
     assert {"acts": False, "says": f"not there: {tmp_path / EXAMPLE}"} in json.loads(capsys.readouterr().out)["steps"]
 
 
-def test_a_running_system_is_told(tmp_path: Path) -> None:
-    told = [step.sentence() for step in install_steps(tmp_path, Path(PROGRAM), real_time=False, running=True)]
+def test_a_running_system_is_notified(tmp_path: Path) -> None:
+    told = [step.sentence for step in install_steps(tmp_path, Path(PROGRAM), real_time=False, running=True)]
     for command in ("udevadm control --reload", "udevadm trigger --subsystem-match=tty", "systemctl daemon-reload"):
         assert any(f"run `{command}`" in sentence for sentence in told)
 

@@ -3,16 +3,16 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon.service import priority
+from shearloop.daemon.service import realtime
 
 
 def test_the_session_gets_its_place_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     group = tmp_path / "autogroup"
     group.write_text("/autogroup-3 nice 2")
-    monkeypatch.setattr(priority, "AUTOGROUP", group)
+    monkeypatch.setattr(realtime, "AUTOGROUP", group)
     monkeypatch.setattr(os, "setpriority", lambda _kind, _who, niceness: asked.append(niceness))
-    with priority.first_in_line() as allowed:
+    with realtime.high_priority() as allowed:
         assert allowed
         assert group.read_text() == "-10"
     assert group.read_text() == "2"
@@ -23,8 +23,8 @@ def test_where_it_is_not_allowed_nothing_changes(tmp_path: Path, monkeypatch: py
     def refuse(_kind: int, _who: int, _niceness: int) -> None:
         raise PermissionError
 
-    monkeypatch.setattr(priority, "AUTOGROUP", tmp_path / "absent")
+    monkeypatch.setattr(realtime, "AUTOGROUP", tmp_path / "absent")
     monkeypatch.setattr(os, "setpriority", refuse)
-    with priority.first_in_line() as allowed:
+    with realtime.high_priority() as allowed:
         assert not allowed
     assert list(tmp_path.iterdir()) == []

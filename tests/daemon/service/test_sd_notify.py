@@ -14,7 +14,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sd_notify import notify
-from shearloop.daemon.service.locked_memory import lock_memory
+from shearloop.daemon.service.realtime import lock_memory
 from shearloop.daemon.supervisor import Supervisor, TaskRecord
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
@@ -119,5 +119,5 @@ def test_memory_that_may_not_be_locked_is_a_sentence(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: Libc)
-    with pytest.raises(UserError, match="refused by the system"):
+    with pytest.raises(UserError, match="the system refused"):
         lock_memory()

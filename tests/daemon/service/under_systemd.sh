@@ -35,7 +35,7 @@ pivot_root . run/before
 umount -l /run/before
 cat >/opt/shearloop/bin/shearloop <<RUN
 #!/bin/sh
-export PYTHONPATH=/opt/code:/opt/site LD_LIBRARY_PATH=/opt/python/lib
+export PYTHONPATH=/opt/code/src:/opt/site LD_LIBRARY_PATH=/opt/python/lib
 exec /opt/python/bin/python3 -m shearloop "\$@"
 RUN
 chmod +x /opt/shearloop/bin/shearloop

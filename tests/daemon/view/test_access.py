@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.web.access import host_allowed, origin_allowed, token_given
-from shearloop.daemon.web.token_file import default_path, kept_token
+from shearloop.daemon.web.access import default_token_path, host_allowed, load_token, origin_allowed, token_valid
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.1:7760", "localhost:9000", "LOCALHOST:1", "[::1]:7760"])
@@ -47,45 +46,45 @@ def test_only_the_page_itself_and_programs_without_an_origin_are_answered() -> N
 
 
 def test_the_token_is_taken_whole_or_not_at_all() -> None:
-    assert token_given("Bearer abc", "abc")
+    assert token_valid("Bearer abc", "abc")
     for header in (None, "", "abc", "Bearer", "Bearer ", "Bearer ab", "Bearer abcd", "Basic abc", "Bearer äbc"):
-        assert not token_given(header, "abc"), header
+        assert not token_valid(header, "abc"), header
 
 
 def test_a_token_is_made_once_and_read_by_its_owner_alone(tmp_path: Path) -> None:
     path = tmp_path / "state" / "shearloop" / "view-token"
-    token = kept_token(path)
+    token = load_token(path)
     assert len(token) >= 43
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    assert kept_token(path) == token
-    assert kept_token(path, anew=True) != token
+    assert load_token(path) == token
+    assert load_token(path, new=True) != token
 
 
 def test_a_token_that_others_may_read_is_refused_and_so_is_what_is_none(tmp_path: Path) -> None:
     path = tmp_path / "token"
-    kept_token(path)
+    load_token(path)
     path.chmod(0o640)
     with pytest.raises(UserError, match="nobody else may read"):
-        kept_token(path)
+        load_token(path)
     for content in ("", "short", "x" * 500, "a token with spaces in it, long enough as it is"):
         path.write_text(content)
         path.chmod(0o600)
         with pytest.raises(UserError, match="holds no token"):
-            kept_token(path)
+            load_token(path)
 
 
 def test_a_link_or_a_pipe_in_the_tokens_place_is_refused(tmp_path: Path) -> None:
-    kept_token(tmp_path / "other")
+    load_token(tmp_path / "other")
     (tmp_path / "link").symlink_to(tmp_path / "other")
     os.mkfifo(tmp_path / "pipe", 0o600)
     for name, why in (("link", "cannot be kept"), ("pipe", "must be a file")):
         with pytest.raises(UserError, match=why):
-            kept_token(tmp_path / name)
+            load_token(tmp_path / name)
 
 
 def test_the_token_is_kept_where_programs_keep_their_state(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", "/state")
-    assert default_path() == Path("/state/shearloop/view-token")
+    assert default_token_path() == Path("/state/shearloop/view-token")
     monkeypatch.setenv("XDG_STATE_HOME", "not/absolute")
     monkeypatch.setenv("HOME", "/home/somebody")
-    assert default_path() == Path("/home/somebody/.local/state/shearloop/view-token")
+    assert default_token_path() == Path("/home/somebody/.local/state/shearloop/view-token")

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from shearloop.bank.eit.models import conductivity as conductivity_of_mesh
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.web.conductivity import HEIGHTS, profile
-from shearloop.daemon.web.latest import MOST_STREAMS, Latest, plain
+from shearloop.daemon.web.latest import HEIGHTS, MAX_STREAMS, LatestMessages, conductivity_profile, json_value
 from tests.bank.conftest import small_fingertip
 
 
@@ -18,15 +17,15 @@ def message(source: str = "right", **content: Any) -> dict[str, Any]:
     return {"timestamp": 1.5, "t_mono_ns": 5, "seq": 0, "source": source, **content}
 
 
-def batch(latest: Latest, after: int = 0, now_s: float = 10.0) -> dict[str, Any]:
+def batch(latest: LatestMessages, after: int = 0, now_s: float = 10.0) -> dict[str, Any]:
     return dict(json.loads(latest.batch(after, now_s, first=True)))
 
 
 def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age() -> None:
-    latest = Latest(3.6)
-    latest.take("load.torque", message("load_cell", torque_nm=0.1), 1.0)
-    latest.take("load.torque", message("load_cell", torque_nm=0.2), 2.0)
-    latest.take("eit.estimate", message("left", torque_nm=None, valid=False), 3.0)
+    latest = LatestMessages(3.6)
+    latest.add("load.torque", message("load_cell", torque_nm=0.1), 1.0)
+    latest.add("load.torque", message("load_cell", torque_nm=0.2), 2.0)
+    latest.add("eit.estimate", message("left", torque_nm=None, valid=False), 3.0)
     told = batch(latest)
     assert told["first"]
     assert told["quiet_s"] == 7.0
@@ -35,14 +34,14 @@ def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age() -> None:
         ("eit.estimate", 7.0, None),
     ]
     assert batch(latest, after=latest.number)["messages"] == []
-    latest.take("health", message("daemon", tasks={"a": {"alive": True}}), 4.0)
+    latest.add("health", message("daemon", tasks={"a": {"alive": True}}), 4.0)
     assert [each["topic"] for each in batch(latest, after=latest.number - 1)["messages"]] == ["health"]
 
 
 def test_a_new_page_gets_the_minute_that_was_before_it() -> None:
-    latest = Latest(3.6)
+    latest = LatestMessages(3.6)
     for second in range(100):
-        latest.take("load.torque", message("load_cell", torque_nm=0.01 * second, raw=1.0, valid=True), float(second))
+        latest.add("load.torque", message("load_cell", torque_nm=0.01 * second, raw=1.0, valid=True), float(second))
     told = latest.history(99.0)
     assert [each["content"]["torque_nm"] for each in told] == pytest.approx(np.arange(34, 100) * 0.01)
     assert told[0] == {
@@ -53,30 +52,29 @@ def test_a_new_page_gets_the_minute_that_was_before_it() -> None:
 
 
 def test_where_nothing_was_heard_the_silence_has_no_length() -> None:
-    assert batch(Latest(3.6))["quiet_s"] is None
+    assert batch(LatestMessages(3.6))["quiet_s"] is None
 
 
 def test_what_is_no_message_of_ours_is_counted_by_kind_and_is_no_sign_of_life() -> None:
-    latest = Latest(3.6)
-    latest.take("weather", message(), 1.0)
-    latest.take("health", {"source": "daemon"}, 1.0)
-    latest.take("health", message(source="x" * 65), 1.0)
-    latest.take("health", message(tasks=b"bytes"), 1.0)
-    latest.take("health", message(tasks=np.zeros(50_000)), 1.0)
-    latest.refuse("malformed message")
-    for number in range(MOST_STREAMS):
-        latest.take("health", message(f"daemon {number}"), 2.0)
-    latest.take("health", message("one more"), 3.0)
+    latest = LatestMessages(3.6)
+    latest.add("weather", message(), 1.0)
+    latest.add("health", {"source": "daemon"}, 1.0)
+    latest.add("health", message(tasks=b"bytes"), 1.0)
+    latest.add("health", message(tasks=np.zeros(50_000)), 1.0)
+    latest.refused["malformed message"] += 1
+    for number in range(MAX_STREAMS):
+        latest.add("health", message(f"daemon {number}"), 2.0)
+    latest.add("health", message("one more"), 3.0)
     told = batch(latest)
     assert told["refused"] == {
         "unknown topic": 1,
-        "incomplete message": 2,
+        "incomplete message": 1,
         "message without a JSON form": 2,
         "malformed message": 1,
         "too many sources": 1,
     }
     assert told["quiet_s"] == 8.0
-    assert len(told["messages"]) == MOST_STREAMS
+    assert len(told["messages"]) == MAX_STREAMS
 
 
 VALUES: st.SearchStrategy[Any] = st.recursive(
@@ -88,15 +86,17 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 
 @given(st.dictionaries(st.text(), VALUES, max_size=4))
 def test_whatever_the_daemon_sends_the_page_gets_json(content: dict[str, Any]) -> None:
-    latest = Latest(3.6)
-    latest.take("eit.estimate", message(**content) | {"source": "right"}, 1.0)
+    latest = LatestMessages(3.6)
+    latest.add("eit.estimate", message(**content) | {"source": "right"}, 1.0)
     told = batch(latest)
     assert len(told["messages"]) + sum(told["refused"].values()) == 1
 
 
 def test_arrays_come_as_float32_and_numbers_that_are_none_as_nothing() -> None:
     scores = np.array([[0.25, np.nan], [0.5, 1.0]])
-    told = plain(decode(encode({"scores": scores.astype("<f4").tobytes(), "scores_shape": [2, 2], "k": float("inf")})))
+    told = json_value(
+        decode(encode({"scores": scores.astype("<f4").tobytes(), "scores_shape": [2, 2], "k": float("inf")}))
+    )
     assert told["k"] is None
     assert told["scores"]["shape"] == [2, 2]
     unpacked = np.frombuffer(base64.b64decode(told["scores"]["float32"]), "<f4").reshape(2, 2)
@@ -106,33 +106,33 @@ def test_arrays_come_as_float32_and_numbers_that_are_none_as_nothing() -> None:
 def test_a_heatmap_comes_with_its_maximum_and_runner_up() -> None:
     scores = np.full((20, 30), 0.1)
     scores[3, 4], scores[4, 5], scores[15, 20], scores[0, 0] = 0.9, 0.85, 0.7, np.nan
-    latest = Latest(3.6)
-    latest.take("eit.heatmap", message(scores=scores, model="gaussian_derivative"), 1.0)
+    latest = LatestMessages(3.6)
+    latest.add("eit.heatmap", message(scores=scores, model="gaussian_derivative"), 1.0)
     assert batch(latest)["messages"][0]["peaks"] == {"best": [3, 4], "runner_up": [15, 20]}
     for empty in (np.full((2, 2), np.nan), np.zeros(4), 0.5):
-        latest.take("eit.heatmap", message(scores=empty, model="linear"), 1.0)
+        latest.add("eit.heatmap", message(scores=empty, model="linear"), 1.0)
         assert batch(latest)["messages"][0]["peaks"] is None
 
 
 def test_an_estimate_comes_with_the_conductivity_that_its_model_gives_k_and_sigma() -> None:
-    latest = Latest(3.6)
-    latest.take("eit.estimate", message(k=1.8, sigma=0.9), 1.0)
+    latest = LatestMessages(3.6)
+    latest.add("eit.estimate", message(k=1.8, sigma=0.9), 1.0)
     assert batch(latest)["messages"][0]["conductivity"] is None, "the model is not known yet"
-    latest.take("eit.heatmap", message(scores=np.ones((3, 3)), model="gaussian_derivative"), 1.0)
-    latest.take("eit.estimate", message(k=1.8, sigma=0.9), 2.0)
+    latest.add("eit.heatmap", message(scores=np.ones((3, 3)), model="gaussian_derivative"), 1.0)
+    latest.add("eit.estimate", message(k=1.8, sigma=0.9), 2.0)
     told = batch(latest)["messages"][-1]["conductivity"]
-    assert told == pytest.approx(profile("gaussian_derivative", 1.8, 0.9, 3.6))
+    assert told == pytest.approx(conductivity_profile("gaussian_derivative", 1.8, 0.9, 3.6))
 
 
 def test_the_profile_is_the_conductivity_that_the_bank_is_built_with() -> None:
     mesh = small_fingertip()
     height_cm = float(mesh.nodes[:, 1].max())
-    told = profile("gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm, height_cm)
+    told = conductivity_profile("gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm, height_cm)
     assert told is not None
     middles_cm = mesh.nodes[:, 1][mesh.triangles].mean(axis=1)
     at_middles = np.interp(middles_cm, np.linspace(0, height_cm, HEIGHTS), told)
     built = conductivity_of_mesh(mesh, "gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm)
     np.testing.assert_allclose(at_middles, built, atol=5e-3)
-    assert profile("no such model", 1.0, 1.0, 3.6) is None
-    assert profile("linear", 1.0, 0.0, 3.6) is None
-    assert profile("linear", float("nan"), 1.0, 3.6) is None
+    assert conductivity_profile("no such model", 1.0, 1.0, 3.6) is None
+    assert conductivity_profile("linear", 1.0, 0.0, 3.6) is None
+    assert conductivity_profile("linear", float("nan"), 1.0, 3.6) is None

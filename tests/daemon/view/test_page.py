@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from shearloop.daemon.web.conductivity import profile
+from shearloop.daemon.web.latest import conductivity_profile
 from tests.daemon.view.conftest import Browsed
 from tests.daemon.view.fake_daemon import MESSAGES, REASONS
 
@@ -100,7 +100,7 @@ def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> 
     assert "maximum at row 90, column 10, runner-up at row 70, column 30" in str(
         browsed.page.get_attribute(".fingertip .map", "aria-label")
     )
-    values = profile("gaussian_derivative", estimate["k"], estimate["sigma"], 3.6)
+    values = conductivity_profile("gaussian_derivative", estimate["k"], estimate["sigma"], 3.6)
     assert values is not None
     spread = f"conductivity over the height, from {min(values):.2f} to {max(values):.2f} of the untouched gel's"
     browsed.page.wait_for_function("text => document.querySelector('.gel').ariaLabel === text", arg=spread)

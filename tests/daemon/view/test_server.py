@@ -17,7 +17,9 @@ import pytest
 import zmq.asyncio
 from aiohttp import web
 
+from shearloop.daemon.bank_config import FingertipGeometryConfig
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
@@ -25,10 +27,9 @@ from shearloop.daemon.messaging.messages import EitHeatmap, LoadTorque
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.web import bridge as bridge_module
 from shearloop.daemon.web import server as server_module
-from shearloop.daemon.web.bridge import Bridge, Place
-from shearloop.daemon.web.latest import Latest
-from shearloop.daemon.web.serve import serve
-from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, make_app
+from shearloop.daemon.web.bridge import Bridge, DaemonAddress
+from shearloop.daemon.web.latest import LatestMessages
+from shearloop.daemon.web.server import HEADERS, NEEDS_TOKEN, make_app, serve
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 TOKEN = "the token of this test, long enough for anybody"  # noqa: S105 - opens nothing but this test's page
@@ -65,7 +66,7 @@ async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
     with zmq.asyncio.Context() as context:
         publisher = Publisher(context, publish, Clock())
         daemon = CommandServer(context, commands, handlers)
-        bridge = Bridge(context, Place(publish, commands), Latest(3.6))
+        bridge = Bridge(context, DaemonAddress(publish, commands), LatestMessages(3.6))
         tasks = [asyncio.create_task(run()) for run in (daemon.run, bridge.run)]
         runner = web.AppRunner(make_app(bridge, TOKEN, {"width_cm": 4.4}, publish), access_log=None)
         await runner.setup()
@@ -78,7 +79,7 @@ async def served(tmp_path: Path, **other: Any) -> AsyncIterator[Served]:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
-            bridge.close()
+            await bridge.close()
             daemon.close()
             publisher.close()
 
@@ -235,7 +236,7 @@ async def test_without_a_daemon_a_stop_says_that_it_was_not_heard(
 ) -> None:
     monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
     async with served(tmp_path) as page:
-        page.bridge._place = Place("", f"ipc://{tmp_path}/nobody")
+        page.bridge._address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
         status, reply = await post(page, "/stop")
         assert (status, reply["ok"]) == (503, False)
         assert "no daemon answered" in reply["why"]
@@ -244,7 +245,7 @@ async def test_without_a_daemon_a_stop_says_that_it_was_not_heard(
 async def test_no_more_pages_than_can_be_served_and_none_that_talks_at_length(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(server_module, "MOST_PAGES", 1)
+    monkeypatch.setattr(server_module, "MAX_PAGES", 1)
     async with served(tmp_path) as page:
         async with page.http.ws_connect(f"{page.base}/stream") as stream:
             with pytest.raises(aiohttp.WSServerHandshakeError):
@@ -261,20 +262,17 @@ async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tm
     def ready(_: int) -> None:
         raise AssertionError
 
-    from shearloop.daemon.cli.view import _fingertip
-
-    tip = _fingertip(None)
-    assert (tip.width_cm, tip.height_cm) == (4.4, 3.6)
+    tip = load_yaml_model(Path("config/fingertips/paper.yaml"), FingertipGeometryConfig).fingertip()
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
         with pytest.raises(UserError, match=f"cannot be served on 127.0.0.1:{port}"):
-            await serve(Place(PUBLISH_ADDRESS, f"ipc://{tmp_path}/c"), port, TOKEN, tip, ready)
+            await serve(DaemonAddress(PUBLISH_ADDRESS, f"ipc://{tmp_path}/c"), port, TOKEN, tip, ready)
     for wrong, said in (("nonsense", "'nonsense' is not an address"), ("tcp://127.0.0.1:70000", "ends in no port")):
         for publish, commands in ((wrong, PUBLISH_ADDRESS), (PUBLISH_ADDRESS, wrong)):
             with pytest.raises(UserError, match=said):
-                await serve(Place(publish, commands), 0, TOKEN, tip, ready)
+                await serve(DaemonAddress(publish, commands), 0, TOKEN, tip, ready)
 
 
 @pytest.mark.usefixtures("hears_of_terminal")

@@ -1,4 +1,3 @@
-import asyncio
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -74,63 +73,34 @@ def test_subscriptions_to_what_there_is_not_are_not_kept(tmp_path: Path) -> None
         publisher.close()
 
 
-async def until_told(is_so: Callable[[], bool]) -> None:
-    async with asyncio.timeout(DEADLINE_S):
-        while not is_so():  # noqa: ASYNC110 - another thread of libzmq brings it about
-            await asyncio.sleep(0.001)
-
-
 def reading(number: int) -> LoadTorque:
     return LoadTorque(
         source="load_cell", t_mono_ns=number, torque_nm=0.1, raw=1.0, saturated=False, spike=False, valid=True, why=""
     )
 
 
-async def test_told_by_the_loop_of_subscribers_the_publisher_does_not_look_for_them(tmp_path: Path) -> None:
+def test_subscribers_come_and_go_while_messages_are_sent(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/publish"
-    with zmq.Context() as context:
-        publisher = Publisher(context, address, Clock())
-        with publisher.told():
-            assert not publisher.wanted("load.torque")
-            looked: list[int] = []
-            look = publisher._socket.getsockopt
-            publisher._socket.getsockopt = lambda option: looked.append(option) or look(option)  # type: ignore[method-assign]
-            for number in range(100):
-                publisher.publish(reading(number))
-            assert looked == [], "nobody came"
-            with context.socket(zmq.SUB) as one:
-                one.setsockopt(zmq.RCVTIMEO, round(DEADLINE_S * 1000))
-                one.connect(address)
-                one.subscribe("load.")
-                await until_told(lambda: publisher.wanted("load.torque"))
-                assert not publisher.wanted("health")
-                publisher.publish(reading(100))
-                topic, payload = one.recv_multipart()
-                assert topic == b"load.torque"
-                assert decode(payload)["seq"] == 100, "those that nobody heard are counted"
-                # A second one comes while messages are sent.
-                with context.socket(zmq.SUB) as two:
-                    two.connect(address)
-                    two.subscribe("health")
-                    publisher.publish(reading(101))
-                    await until_told(lambda: publisher.wanted("health"))
-                await until_told(lambda: not publisher.wanted("health"))
-            await until_told(lambda: not publisher.subscribed)
-        assert not publisher.wanted("load.torque"), "without the loop too"
-        publisher.close()
-
-
-async def test_more_subscriptions_than_are_taken_in_at_a_time_are_taken_in_by_and_by(tmp_path: Path) -> None:
-    address = f"ipc://{tmp_path}/publish"
-    with zmq.Context() as context:
-        publisher = Publisher(context, address, Clock())
-        with publisher.told(), context.socket(zmq.XSUB) as stranger:
-            stranger.connect(address)
-            for number in range(300):
-                stranger.send(b"\x01eit.%d" % number)
-            stranger.send(b"\x01health")
-            await until_told(lambda: publisher.wanted("health"))
-        publisher.close()
+    with zmq.Context() as context, closing(Publisher(context, address, Clock())) as publisher:
+        for number in range(100):
+            publisher.publish(reading(number))
+        with context.socket(zmq.SUB) as one:
+            one.setsockopt(zmq.RCVTIMEO, round(DEADLINE_S * 1000))
+            one.connect(address)
+            one.subscribe("load.")
+            until(lambda: publisher.wanted("load.torque"))
+            assert not publisher.wanted("health")
+            publisher.publish(reading(100))
+            topic, payload = one.recv_multipart()
+            assert topic == b"load.torque"
+            assert decode(payload)["seq"] == 100, "messages without a subscriber are numbered too"
+            with context.socket(zmq.SUB) as two:
+                two.connect(address)
+                two.subscribe("health")
+                publisher.publish(reading(101))
+                until(lambda: publisher.wanted("health"))
+            until(lambda: not publisher.wanted("health"))
+        until(lambda: not publisher.subscribed)
 
 
 def test_who_listens_where_nobody_speaks_is_told_so_once_and_hears_who_comes_later(

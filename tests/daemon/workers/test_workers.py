@@ -6,7 +6,6 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import pytest
 
 from shearloop.daemon.cli import main
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.workers import LOCAL, Processes, SerialExecutor, workers
+from shearloop.daemon.workers import LOCAL, ProcessExecutor, SerialExecutor, open_executor
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 from tests.daemon.workers.conftest import ROOT, STARTED_S
 
@@ -48,35 +47,40 @@ def dies_once(folder: str, item: int) -> int:
 def test_the_numbers_are_the_same_wherever_they_are_computed(scheduler: str) -> None:
     items, shared = list(range(12)), {"factor": 0.37}
     alone = dict(SerialExecutor().map(square, shared, items))
-    assert dict(Processes(2).map(square, shared, items)) == alone
-    with workers(scheduler) as cluster:
+    assert dict(ProcessExecutor(2).map(square, shared, items)) == alone
+    with open_executor(scheduler) as cluster:
         assert dict(cluster.map(square, shared, items)) == alone
 
 
-def test_a_cluster_of_this_machines_own_has_a_worker_for_each_processor(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
-
-    @contextmanager
-    def local(jobs: int) -> Iterator[None]:
-        asked.append(jobs)
-        yield None
-
-    monkeypatch.setattr("shearloop.daemon.workers._local_client", local)
-    for jobs in (None, 1, 5):
-        with workers(LOCAL, jobs):
-            pass
-    assert asked == [len(os.sched_getaffinity(0)), 1, 5]
-    with workers(None) as alone:
-        assert isinstance(alone, SerialExecutor)
+@pytest.mark.parametrize(
+    ("cluster", "jobs", "count"),
+    [
+        (None, None, 1),
+        (None, 1, 1),
+        (None, 3, 3),
+        (LOCAL, None, len(os.sched_getaffinity(0))),
+        (LOCAL, 1, 1),
+        (LOCAL, 5, 5),
+    ],
+)
+def test_without_an_address_tasks_run_in_processes_of_this_computer(
+    cluster: str | None, jobs: int | None, count: int
+) -> None:
+    with open_executor(cluster, jobs) as executor:
+        if count == 1:
+            assert isinstance(executor, SerialExecutor)
+        else:
+            assert isinstance(executor, ProcessExecutor)
+            assert executor._count == count
 
 
 def test_what_a_task_raises_is_raised_here(scheduler: str) -> None:
-    with workers(scheduler) as cluster, pytest.raises(UserError, match="item 2 is wrong"):
+    with open_executor(scheduler) as cluster, pytest.raises(UserError, match="item 2 is wrong"):
         list(cluster.map(fails, None, range(4)))
 
 
 def test_a_worker_killed_in_the_middle_costs_only_its_tasks(scheduler: str, tmp_path: Path) -> None:
-    with workers(scheduler) as cluster:
+    with open_executor(scheduler) as cluster:
         results = dict(cluster.map(dies_once, str(tmp_path), range(12)))
     assert results == {item: item * item for item in range(12)}
     assert (tmp_path / "killed").exists()
@@ -88,7 +92,7 @@ def test_a_worker_killed_in_the_middle_costs_only_its_tasks(scheduler: str, tmp_
 
 def test_results_that_nobody_goes_on_with_are_let_go_after_the_end_of_the_cluster(scheduler: str) -> None:
     """So ends what is interrupted where a result is used; a traceback told of it after the sentence."""
-    with workers(scheduler) as cluster:
+    with open_executor(scheduler) as cluster:
         found = cluster.map(square, {"factor": 0.37}, range(3))
         next(found)
     # Python throws the iterator away here; what fails in it then is a warning, and so an error.
@@ -102,7 +106,7 @@ def size(_: None, item: Any) -> int:
 
 def test_a_large_recording_is_sent_to_a_cluster_without_a_warning(scheduler: str) -> None:
     """Dask warned of what is over 10 MB, in six lines; warnings are errors here."""
-    with workers(scheduler) as cluster:
+    with open_executor(scheduler) as cluster:
         assert list(cluster.map(size, None, [np.zeros(1_500_000)])) == [(0, 1_500_000)]
 
 
@@ -118,7 +122,10 @@ def test_what_listens_and_is_no_scheduler_is_not_waited_for_for_ever(monkeypatch
     monkeypatch.setattr("shearloop.daemon.workers.CONNECT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
-        with pytest.raises(UserError, match=f"no Dask scheduler answers at {address} within 0.5 s"), workers(address):
+        with (
+            pytest.raises(UserError, match=f"no Dask scheduler answers at {address} within 0.5 s"),
+            open_executor(address),
+        ):
             pass
 
 
@@ -149,19 +156,23 @@ def test_a_scheduler_without_workers_and_one_that_ends_are_one_sentence_each(
 
     process, address = lonely
     monkeypatch.setattr("shearloop.daemon.workers.FIRST_WORKER_S", 0.5)
-    with pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"), workers(address):
+    with (
+        pytest.raises(UserError, match=f"at {address} has no worker; start some with `dask worker"),
+        open_executor(address),
+    ):
         pass
-    monkeypatch.setattr("shearloop.daemon.workers._wait_for_a_worker", lambda *_: None)
+    monkeypatch.setattr(distributed.Client, "wait_for_workers", lambda *_, **__: None)
     # As soon as the tasks are waited for.
     begun = distributed.as_completed
     monkeypatch.setattr(distributed, "as_completed", lambda tasks: (process.kill(), begun(tasks))[1])
-    with workers(address) as cluster, pytest.raises(UserError, match="the connection to the Dask scheduler was lost"):
+    with (
+        open_executor(address) as cluster,
+        pytest.raises(UserError, match="the connection to the Dask scheduler was lost"),
+    ):
         list(cluster.map(square, {"factor": 1.0}, range(3)))
 
 
-def test_without_the_extra_an_address_is_refused_and_a_local_cluster_is_processes(monkeypatch) -> None:
+def test_without_the_extra_an_address_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with workers("local", 2) as pool:
-        assert isinstance(pool, Processes)
-    with pytest.raises(UserError, match=r"pip install 'shearloop\[cluster\]'"), workers("tcp://127.0.0.1:9"):
+    with pytest.raises(UserError, match=r"pip install 'shearloop\[cluster\]'"), open_executor("tcp://127.0.0.1:9"):
         pass

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.workers import Cluster, SerialExecutor, workers
+from shearloop.daemon.workers import DaskExecutor, SerialExecutor, open_executor
 from tests.daemon.test_bank_config import BANK, FINGERTIP
 from tests.daemon.workers.conftest import STARTED_S
 
@@ -61,16 +61,16 @@ def killed(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int
     from distributed import Client
 
     found: list[int] = []
-    whole = Cluster.map
+    whole = DaskExecutor.map
 
-    def interrupted(self: Cluster, function: Any, shared: Any, items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
+    def interrupted(self: DaskExecutor, function: Any, shared: Any, items: Sequence[Any]) -> Iterator[tuple[int, Any]]:
         for number, result in whole(self, function, shared, items):
             if not found:
                 found.append(next(iter(self._client.run(os.getpid).values())))
                 os.kill(found[0], signal.SIGKILL)
             yield number, result
 
-    monkeypatch.setattr(Cluster, "map", interrupted)
+    monkeypatch.setattr(DaskExecutor, "map", interrupted)
     yield found
     with Client(scheduler, timeout=STARTED_S) as client:
         client.wait_for_workers(2, timeout=STARTED_S)
@@ -118,7 +118,7 @@ def test_a_chart_has_the_same_numbers_from_a_cluster_that_a_worker_is_killed_of(
     split = Split("slices", slices.between(0, 29), slices.between(29, 31), slices)
     # The quickest one, twice: a task each.
     names: tuple[Name, ...] = ("regression", "regression")
-    with workers(scheduler) as cluster:
+    with open_executor(scheduler) as cluster:
         there = sweeps(split, names, Physics(bank, None), bank, cluster)
     assert killed
     assert there == sweeps(split, names[:1], Physics(bank, None), bank, SerialExecutor()) * 2

@@ -90,7 +90,7 @@ class TimedArm(CyclingArm):
         return self.reading
 
 
-class Eased:
+class Timed:
     """A flight in a time of its own: at some times the daemon says something; what was done when is kept."""
 
     def __init__(
@@ -117,12 +117,3 @@ class Eased:
             return True
         self.time.now_s += timeout_s
         return False
-
-    def cycles_between(self, from_s: float, to_s: float) -> list[int]:
-        """Return the numbers of the cycles that were gone through in that time, as the readings tell."""
-        periods = [read_s * SETTINGS.rate_hz for read_s in self.arm.read_s if from_s < read_s < to_s]
-        return sorted({round(period) for period in periods if abs(period - round(period)) < 1e-6})
-
-    def told_between(self, from_s: float, to_s: float) -> list[int]:
-        """Return the numbers of the cycles whose states were told in that time."""
-        return sorted({state.cycle for state in self.states if from_s < state.t_mono_ns / 1e9 - 1000.0 < to_s})

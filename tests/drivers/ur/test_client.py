@@ -5,7 +5,6 @@ import os
 import signal
 import sys
 import time
-from itertools import pairwise
 
 import pytest
 
@@ -91,49 +90,6 @@ async def test_state_comes_125_times_a_second_with_the_controllers_own_time(cont
         # Both clocks tell the same, but for cycles that a busy machine made late.
         assert own_s == pytest.approx(ours_s, abs=0.3)
         assert sorted(states, key=lambda state: state.timestamp_s) == states
-
-
-async def test_states_come_less_often_at_ease_until_someone_is_in_a_hurry(controller: ControllerProcess) -> None:
-    async with running(settings_for(controller.host)) as robot:
-
-        async def steps() -> list[int]:
-            cycles = [(await robot.next_state()).cycle for _ in range(10)]
-            return [later - earlier for earlier, later in pairwise(cycles)][2:]
-
-        await until(robot, lambda state: not state.recovering)
-        for end in (robot.hurry, lambda: robot.send(Enable())):
-            robot.ease(5)
-            # One state of each five cycles; every third is gone through.
-            assert set(await steps()) == {3, 6}
-            # Longer than the time after which motion would be stopped that nobody stands by.
-            waited = end()
-            if waited is not None:
-                assert (await waited).accepted
-            # Of each five now two are told.
-            assert set(await steps()) == {2, 3}
-        assert not robot.losses
-
-
-async def test_a_twist_is_begun_at_ease_at_once_and_a_protective_stop_told(controller: ControllerProcess) -> None:
-    async with running(settings_for(controller.host)) as robot:
-        await enable(robot)
-        for _ in range(3):
-            robot.ease(5)
-            await robot.state_within(1.0)
-            await robot.state_within(1.0)
-            assert robot.at_ease
-            since_ns = time.monotonic_ns()
-            assert (await robot.send(WristSpeed(0.1, 4.0))).accepted
-            started = await controller.event("motion-started", since_ns)
-            assert stopped_after_s(started, since_ns) < 0.1
-            await robot.send(Stop(4.0))
-            await until(robot, lambda state: state.motion == "idle")
-        robot.ease(5)
-        since_ns = time.monotonic_ns()
-        await controller.fault("protective-stop")
-        state = await until(robot, lambda state: state.protective_stop)
-        assert robot.at_ease
-        assert (state.t_mono_ns - since_ns) / 1e9 < 0.5
 
 
 async def test_twist_stops_when_the_client_is_killed(controller: ControllerProcess) -> None:

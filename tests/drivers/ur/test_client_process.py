@@ -192,10 +192,10 @@ async def test_stops_in_vain_are_counted_across_processes() -> None:
     assert robot.stops_in_vain == 5
 
 
-async def test_of_states_that_are_read_at_once_all_but_the_last_are_overtaken() -> None:
+async def test_of_states_that_are_read_at_once_only_the_last_is_the_newest() -> None:
     robot = UrRobot(SETTINGS)
-    overtaken: list[bool] = []
-    robot.on_state = lambda _: overtaken.append(robot.overtaken)
+    newest: list[bool] = []
+    robot.on_state = lambda _, is_newest: newest.append(is_newest)
     flight = Flight()
     flight.fly(1)
     with output() as (stdout, its_stdout):
@@ -205,7 +205,7 @@ async def test_of_states_that_are_read_at_once_all_but_the_last_are_overtaken() 
         conversation._hear()
         os.write(its_stdout.number, encode(flight.state))
         conversation._hear()
-    assert overtaken == [True, True, False, False]
+    assert newest == [False, False, True, True]
 
 
 async def test_loss_that_is_told_when_nobody_listens_any_more_is_no_complaint_of_asyncio() -> None:

@@ -24,9 +24,6 @@ class Played:
         self._commands_until_s, self._ends_s = commands_until_s, ends_s
         self.transport = SimpleNamespace(get_write_buffer_size=lambda: 0)
 
-    async def hurried(self) -> None:
-        """Signs of life are needed."""
-
     def write(self, data: bytes) -> None:
         """Take what the process is told."""
         if data == HEARTBEAT:

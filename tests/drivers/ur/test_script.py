@@ -13,9 +13,9 @@ from tests.emulator_process import EmulatorProcess as ControllerProcess
 # Uploads the script, and is gone before the watchdog is armed by a command.
 DIES_TOO_SOON = """
 import os, sys
-from shearloop.drivers.ur.arm import Arm
+from shearloop.drivers.ur.arm import UrArm
 from tests.drivers.ur.robots import settings_for
-arm = Arm(settings_for(sys.argv[1]), "5.17.3.0")
+arm = UrArm(settings_for(sys.argv[1]), "5.17.3.0")
 while not arm.clear_command():
     pass
 arm.upload()

@@ -1,0 +1,385 @@
+"""Identification: small twists excite the tool, and its stiffness, delay and noise are fitted to the record."""
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass as checked_dataclass
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.daemon.control.settings import NotNegative, Positive
+from shearloop.daemon.errors import UserError
+
+# The grid of the torque's lag behind its stamp.
+_LAG_GRID_S = np.arange(-0.4, 1.0001, 0.02)
+_ACTUATION_GRID_S = np.arange(0.0, 0.3001, 0.002)
+_FEWEST = 12
+_NO_TURN_RAD = 1e-4
+# The share of the angle's range that counts as rest, and the torque at rest that may be lost over the record.
+_REST_SHARE = 0.2
+_SLIP_SHARE = 0.3
+# The residual beyond the noise, relative to the spring's part (relaxation gives about 0.1).
+_MISFIT_SHARE = 0.3
+_ARRIVED_RAD = 2e-3
+
+
+class IdentifyError(UserError):
+    """A record without a reliable result; the message has the numbers and the cure."""
+
+
+class NotYetKnownError(IdentifyError):
+    """A record that is too short: more twists would help."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Record:
+    """Wrist angles, commanded speeds and tool torques; times in s from one origin, ascending.
+
+    angle_t_s, angle_rad (n,). sent_t_s, sent_rad_per_s (s,), may be empty. t_mid_s, t_s, torque_nm (m,): middle of each
+    acquisition, its arrival, and its torque.
+    """
+
+    angle_t_s: FloatArray
+    angle_rad: FloatArray
+    sent_t_s: FloatArray
+    sent_rad_per_s: FloatArray
+    t_mid_s: FloatArray
+    t_s: FloatArray
+    torque_nm: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ToolModel:
+    """The tool in the grip and the delays of its torque, with standard deviations.
+
+    lag_s: lag of the torque behind its stamps. age_s: from the middle of an acquisition to its arrival (95th
+    percentile). actuation_s: from sending a speed until the wrist has it; nan without recorded speeds. torque_nm: at
+    angle_rad, the record's last angle.
+    """
+
+    stiffness_nm_per_rad: float
+    stiffness_std: float
+    lag_s: float
+    lag_std_s: float
+    age_s: float
+    actuation_s: float
+    noise_nm: float
+    sample_period_s: float
+    angle_rad: float
+    torque_nm: float
+    torque_std_nm: float
+    measurements: int
+
+    @property
+    def known_measurements(self) -> float:
+        """The number of measurements that would give the torque's accuracy; at most 8."""
+        return min((self.noise_nm / self.torque_std_nm) ** 2, 8.0) if self.torque_std_nm else 8.0
+
+    @property
+    def significant_lag_s(self) -> float:
+        """The lag if it exceeds two standard deviations, else 0."""
+        return self.lag_s if abs(self.lag_s) > 2.0 * self.lag_std_s else 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Least squares of torque = stiffness·angle + offset + drift·time, with its residuals (m,) and covariance."""
+
+    lag_s: float
+    coefficients: FloatArray
+    covariance: FloatArray
+    residuals: FloatArray
+    angle_rad: FloatArray
+
+    @property
+    def squares(self) -> float:
+        return float(self.residuals @ self.residuals)
+
+
+def identify(record: Record, window_s: float, stiffness_share: float = 0.1) -> ToolModel:
+    """Return the tool model of a record whose torques are means over `window_s`.
+
+    For every lag of a grid, the torques are fitted by least squares to the mean angles of their windows, with an offset
+    and a drift. The lag with the smallest residual wins, refined by a parabola; the curvature gives its standard
+    deviation. Raises IdentifyError if the record is too short, the wrist turned too little for a stiffness known to
+    `stiffness_share`, the tool slipped, or the torque does not follow a spring.
+    """
+    used = np.isfinite(record.torque_nm) & (record.t_mid_s - 0.5 * window_s > record.angle_t_s[0])
+    if used.sum() < _FEWEST:
+        raise NotYetKnownError(
+            f"identify: {used.sum()} valid torques are too few to learn the stiffness from, {_FEWEST} are needed; "
+            f"record for longer, and check why torques are missing"
+        )
+    t_mid_s, torque_nm = record.t_mid_s[used], record.torque_nm[used]
+    angles = _Angles(record)
+    fits = [_fit(angles, t_mid_s, torque_nm, window_s, float(lag)) for lag in _LAG_GRID_S]
+    best = min(fits, key=lambda fit: fit.squares)
+    noise_nm = _noise(best.residuals)
+    _refuse_bad(best, torque_nm, noise_nm, stiffness_share)
+    lag_s, lag_std_s = _lag(fits, noise_nm)
+    now = np.array([record.angle_rad[-1], 1.0, 1.0])
+    return ToolModel(
+        stiffness_nm_per_rad=float(best.coefficients[0]),
+        stiffness_std=math.sqrt(best.covariance[0, 0]),
+        lag_s=lag_s,
+        lag_std_s=lag_std_s,
+        age_s=float(np.quantile(record.t_s[used] - t_mid_s, 0.95)),
+        actuation_s=_actuation(record),
+        noise_nm=noise_nm,
+        sample_period_s=float(np.median(np.diff(record.t_mid_s))),
+        angle_rad=float(record.angle_rad[-1]),
+        torque_nm=float(now @ best.coefficients),
+        torque_std_nm=math.sqrt(now @ best.covariance @ now),
+        measurements=int(used.sum()),
+    )
+
+
+def _fit(angles: "_Angles", t_mid_s: FloatArray, torque_nm: FloatArray, window_s: float, lag_s: float) -> _Fit:
+    angle = angles.mean(t_mid_s - lag_s, window_s)
+    span = t_mid_s[-1] - t_mid_s[0]
+    design = np.column_stack([angle, np.ones_like(angle), (t_mid_s - t_mid_s[-1]) / span + 1.0])
+    coefficients = np.linalg.lstsq(design, torque_nm, rcond=None)[0]
+    residuals = torque_nm - design @ coefficients
+    variance = float(residuals @ residuals) / (torque_nm.size - design.shape[1])
+    covariance = variance * np.linalg.pinv(design.T @ design)
+    return _Fit(lag_s, coefficients, covariance, residuals, angle)
+
+
+class _Angles:
+    """The integral of the wrist angle, computed once for all lags."""
+
+    def __init__(self, record: Record) -> None:
+        self._t_s, self._rad = record.angle_t_s, record.angle_rad
+        parts = 0.5 * (self._rad[1:] + self._rad[:-1]) * np.diff(self._t_s)
+        self._integral = np.concatenate([[0.0], np.cumsum(parts)])
+
+    def mean(self, middle_s: FloatArray, window_s: float) -> FloatArray:
+        """Return the mean angle (m,) over windows around m times."""
+        half = max(0.5 * window_s, 1e-3)
+        mean: FloatArray = (self._until(middle_s + half) - self._until(middle_s - half)) / (2.0 * half)
+        return mean
+
+    def _until(self, time_s: FloatArray) -> FloatArray:
+        # The wrist rests before the first motion and after the last.
+        inside = np.interp(time_s, self._t_s, self._integral)
+        before, after = np.minimum(time_s - self._t_s[0], 0.0), np.maximum(time_s - self._t_s[-1], 0.0)
+        total: FloatArray = inside + before * self._rad[0] + after * self._rad[-1]
+        return total
+
+
+def _noise(residuals: FloatArray) -> float:
+    """Return the standard deviation of one measurement, from differences of neighbours (von Neumann 1941)."""
+    return float(min(np.sqrt(np.mean(np.diff(residuals) ** 2) / 2.0), np.sqrt(np.mean(residuals**2))))
+
+
+def _refuse_bad(fit: _Fit, torque_nm: FloatArray, noise_nm: float, stiffness_share: float) -> None:
+    stiffness, std = float(fit.coefficients[0]), math.sqrt(fit.covariance[0, 0])
+    turned = float(np.ptp(fit.angle_rad))
+    if turned < _NO_TURN_RAD:
+        raise IdentifyError("identify: the wrist did not turn, so the stiffness is unknown")
+    if stiffness < -2.0 * std:
+        raise IdentifyError(
+            f"identify: the torque falls by {-stiffness:.3g} N·m for each rad that the wrist turns; the sign of torque "
+            f"or wrist angle is wrong"
+        )
+    lost, lost_std = _lost_at_rest(fit, torque_nm, noise_nm)
+    if lost > max(_SLIP_SHARE * abs(stiffness) * turned, 3.5 * lost_std):
+        raise IdentifyError(
+            f"identify: back at its first angle the torque is {lost:.3g} N·m lower than before; the tool slipped in "
+            f"the grip, so grip harder or turn less than {turned:.2g} rad"
+        )
+    if stiffness <= 0.0 or std > stiffness_share * stiffness:
+        raise NotYetKnownError(
+            f"identify: turning {turned:.2g} rad gives a stiffness of {stiffness:.3g} ± {std:.2g} N·m/rad, and it must "
+            f"be known to {100 * stiffness_share:.3g} %; turn farther, or more often (noise {noise_nm:.2g} N·m)"
+        )
+    misfit = math.sqrt(max(float(np.mean(fit.residuals**2)) - noise_nm**2, 0.0))
+    explained = stiffness * float(np.std(fit.angle_rad))
+    if misfit > _MISFIT_SHARE * explained:
+        raise IdentifyError(
+            f"identify: a spring of {stiffness:.3g} N·m/rad leaves {misfit:.2g} N·m of the torque unexplained and "
+            f"explains {explained:.2g}; check for slip, play or a saturated torque sensor"
+        )
+
+
+def _lost_at_rest(fit: _Fit, torque_nm: FloatArray, noise_nm: float) -> tuple[float, float]:
+    """Return the loss of torque at the first angle, from before the first motion to after the last, and its std."""
+    away = np.flatnonzero(np.abs(fit.angle_rad - fit.angle_rad[0]) > _REST_SHARE * np.ptp(fit.angle_rad))
+    before, after = torque_nm[: away[0]], torque_nm[away[-1] + 1 :]
+    if before.size < 2 or after.size < 2:
+        return 0.0, 0.0
+    return float(before.mean() - after.mean()), noise_nm * math.sqrt(1.0 / before.size + 1.0 / after.size)
+
+
+def _lag(fits: list[_Fit], noise_nm: float) -> tuple[float, float]:
+    """Return the lag of the smallest residual, and its standard deviation from the curvature."""
+    squares = np.array([fit.squares for fit in fits])
+    at = int(np.clip(np.argmin(squares), 2, len(fits) - 3))
+    near = slice(at - 2, at + 3)
+    curve = np.polyfit(_LAG_GRID_S[near] - _LAG_GRID_S[at], squares[near], 2)
+    if curve[0] <= 0.0:
+        return float(_LAG_GRID_S[at]), math.inf
+    offset = float(np.clip(-curve[1] / (2.0 * curve[0]), -0.04, 0.04))
+    return float(_LAG_GRID_S[at]) + offset, noise_nm / math.sqrt(float(curve[0]))
+
+
+def _actuation(record: Record) -> float:
+    """Return the delay that best aligns the integral of the sent speeds with the angle; nan without speeds."""
+    if record.sent_t_s.size < 2:
+        return math.nan
+    steps = np.diff(record.sent_t_s)
+    travelled = np.concatenate([[0.0], np.cumsum(record.sent_rad_per_s[:-1] * steps)])
+
+    # A thousand samples are enough, and the loop waits for the result.
+    some = slice(None, None, max(1, record.angle_t_s.size // 1000))
+    at_s, angle_rad = record.angle_t_s[some], record.angle_rad[some]
+
+    def misfit(delay_s: float) -> float:
+        difference = angle_rad - np.interp(at_s - delay_s, record.sent_t_s, travelled)
+        return float(np.var(difference))
+
+    return float(min(_ACTUATION_GRID_S, key=misfit))
+
+
+@checked_dataclass(frozen=True, slots=True, kw_only=True, config=ConfigDict(allow_inf_nan=False))
+class ExciteSettings:
+    """The identification's swings: between the first angle and `amplitude_rad` away (the sign gives the direction).
+
+    The first swing goes half as far. Ends when the stiffness is known to `stiffness_share`, and fails after
+    `most_cycles` without that.
+    """
+
+    amplitude_rad: float
+    sample_period_s: Positive
+    window_s: NotNegative
+    torque_limit_nm: Positive
+    stiffness_share: Positive = 0.03
+    worst_stiffness_share: Positive = 0.1
+    speed_rad_per_s: Positive
+    acceleration_rad_per_s2: Positive
+    bandwidth_per_s: Positive
+    dwell_s: Positive = 2.5
+    fewest_cycles: Annotated[int, Field(gt=0)] = 2
+    most_cycles: Annotated[int, Field(gt=0)] = 8
+
+    @model_validator(mode="after")
+    def _moves(self) -> "ExciteSettings":
+        if self.amplitude_rad == 0.0:
+            raise ValueError("amplitude_rad must not be 0")
+        return self
+
+
+class StiffnessExcitation:
+    """Twists the tool, records, and identifies it. Times are CLOCK_MONOTONIC ns; no I/O.
+
+    `command` returns the speed to send until `done`; then `result` has the tool model, or `failure` the reason.
+    """
+
+    def __init__(self, settings: ExciteSettings) -> None:
+        self.settings = settings
+        self.result: ToolModel | None = None
+        self.failure: str | None = None
+        self._origin_ns = 0
+        self._angles: list[tuple[float, float]] = []
+        self._sent: list[tuple[float, float]] = []
+        self._torques: list[tuple[float, float, float]] = []
+        self._latest: deque[float] = deque(maxlen=3)
+        self._leg = 0  # even: at the first angle; odd: away
+        self._arrived_s: float | None = None
+        self._speed = 0.0
+
+    @property
+    def done(self) -> bool:
+        """Whether the step has ended, with a result or a failure."""
+        return self.result is not None or self.failure is not None
+
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:
+        """Record a torque; missing, non-finite and out-of-order values are skipped."""
+        if torque_nm is None or not math.isfinite(torque_nm) or not self._angles:
+            return
+        t_mid_s = (t_mid_ns - self._origin_ns) / 1e9
+        if self._torques and t_mid_s <= self._torques[-1][0]:
+            return
+        self._torques.append((t_mid_s, (t_ns - self._origin_ns) / 1e9, torque_nm))
+        self._latest.append(torque_nm)
+        # The mean of three: the noise of one must not end the step.
+        mean = sum(self._latest) / len(self._latest)
+        if abs(mean) > self.settings.torque_limit_nm and len(self._latest) == self._latest.maxlen:
+            self.failure = (
+                f"identify: the torque has reached {mean:.3g} N·m and the limit of the step is "
+                f"{self.settings.torque_limit_nm:g} N·m; turn less than {self.settings.amplitude_rad:g} rad"
+            )
+
+    def command(self, t_ns: int, wrist_angle_rad: float) -> float:
+        """Return the wrist speed for now in rad/s; 0 once done, or while the angle is not a number."""
+        if self.done or not math.isfinite(wrist_angle_rad):
+            self._speed = 0.0
+            return 0.0
+        if not self._angles:
+            self._origin_ns = t_ns
+        now_s = (t_ns - self._origin_ns) / 1e9
+        elapsed_s = now_s - self._angles[-1][0] if self._angles else 0.0
+        if self._angles and elapsed_s <= 0.0:
+            return self._speed
+        self._angles.append((now_s, wrist_angle_rad))
+        self._speed = self._towards(self._goal_rad() - wrist_angle_rad, now_s, min(elapsed_s, 0.05))
+        self._sent.append((now_s, self._speed))
+        return self._speed
+
+    def sent(self, speed_rad_per_s: float) -> None:
+        """Correct the speed that was sent for the last command, after clipping."""
+        if self._sent and math.isfinite(speed_rad_per_s):
+            self._speed = speed_rad_per_s
+            self._sent[-1] = (self._sent[-1][0], speed_rad_per_s)
+
+    def _goal_rad(self) -> float:
+        first = self._angles[0][1]
+        if self._leg % 2 == 0:
+            return first
+        return first + self.settings.amplitude_rad * (0.5 if self._leg == 1 else 1.0)
+
+    def _towards(self, missing_rad: float, now_s: float, elapsed_s: float) -> float:
+        own = self.settings
+        if abs(missing_rad) < _ARRIVED_RAD:
+            if self._arrived_s is None:
+                self._arrived_s = now_s
+            # Dwells of different lengths sample the swings at different phases. The first one is twice as long: it is
+            # the reference for slip.
+            dwell_s = own.dwell_s * (1.0 if self._leg else 2.0) + (self._leg % 4) * 0.25 * own.sample_period_s
+            if now_s - self._arrived_s >= dwell_s:
+                self._end_leg()
+            return 0.0
+        speed = max(-own.speed_rad_per_s, min(own.speed_rad_per_s, own.bandwidth_per_s * missing_rad))
+        turning = abs(self._speed) if self._speed * speed > 0.0 else 0.0
+        return math.copysign(min(abs(speed), turning + own.acceleration_rad_per_s2 * elapsed_s), speed)
+
+    def _end_leg(self) -> None:
+        self._leg, self._arrived_s = self._leg + 1, None
+        cycles, rests = divmod(self._leg - 1, 2)
+        if self._leg % 2 == 0 or cycles < self.settings.fewest_cycles or rests:
+            return
+        last = cycles >= self.settings.most_cycles
+        share = self.settings.worst_stiffness_share if last else self.settings.stiffness_share
+        try:
+            self.result = identify(self.record(), self.settings.window_s, share)
+        except NotYetKnownError as error:
+            self.failure = str(error) if last else None
+        except IdentifyError as error:
+            self.failure = str(error)
+
+    def record(self) -> Record:
+        """Return the record so far."""
+        angles, sent = np.array(self._angles).reshape(-1, 2), np.array(self._sent).reshape(-1, 2)
+        torques = np.array(self._torques).reshape(-1, 3)
+        return Record(
+            angle_t_s=angles[:, 0],
+            angle_rad=angles[:, 1],
+            sent_t_s=sent[:, 0],
+            sent_rad_per_s=sent[:, 1],
+            t_mid_s=torques[:, 0],
+            t_s=torques[:, 1],
+            torque_nm=torques[:, 2],
+        )

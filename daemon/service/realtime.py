@@ -1,0 +1,68 @@
+"""Real-time options of the process: priority over other programs, and memory that is never swapped."""
+
+import contextlib
+import ctypes
+import os
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+from shearloop.daemon.errors import UserError
+
+# Before ordinary programs, behind the system's own.
+NICENESS = -10
+# With autogrouping the kernel compares niceness only within a session; the session has a niceness of its own.
+AUTOGROUP = Path("/proc/self/autogroup")
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
+
+
+@contextlib.contextmanager
+def high_priority() -> Iterator[bool]:
+    """Raise the priority of this process, its children and its session; yield whether the system allows it.
+
+    The session's priority is restored at the end, the process's is not.
+    """
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, min(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
+    except PermissionError:
+        yield False
+        return
+    before = _session_niceness()
+    try:
+        if before is not None:
+            _set_session_niceness(min(before, NICENESS))
+        yield True
+    finally:
+        if before is not None:
+            _set_session_niceness(before)
+
+
+def _session_niceness() -> int | None:
+    try:
+        # "/autogroup-3 nice 0"
+        return int(AUTOGROUP.read_text().split()[-1])
+    except (OSError, ValueError, IndexError):
+        return None
+
+
+def _set_session_niceness(niceness: int) -> None:
+    # Some kernels have no autogroups, and some containers forbid changing them.
+    with contextlib.suppress(OSError):
+        AUTOGROUP.write_text(str(niceness))
+
+
+def lock_memory() -> None:
+    """Lock all present and future memory of the process; raise UserError if the limit does not allow it."""
+    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if limit != resource.RLIM_INFINITY and os.geteuid() != 0:
+        # With a limit, locking succeeds now and allocations fail later, in the middle of the work.
+        raise UserError(
+            f"`lock_memory: true` needs an unlimited RLIMIT_MEMLOCK, and it is {limit / 1024:.0f} kB: run "
+            "`sudo shearloop install --real-time`, or remove `lock_memory` from the configuration"
+        )
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE) != 0:
+        raise UserError(
+            f"the system refused `lock_memory: true` ({os.strerror(ctypes.get_errno())}); "
+            "remove it from the configuration"
+        )

@@ -1,17 +1,15 @@
-"""How soon each fault ends in the safety table's response, whether the rig recovers, and the loop's jitter.
+"""How soon each fault ends in the safety table's response, and whether the rig recovers.
 
-    python -m benchmarks.rig_faults --bank run/demo.bank --calibration config/calibrations/rig.yaml --out DIR
+    python -m benchmarks.rig_faults --rig run --out run/rig_faults.json
 
-The real daemon in a process of its own, the real drivers, the rig emulated over its real ports. In the middle of a slow
-twist something fails; measured is the time until `loop.state` tells of it, in periods of the sensor or device that
-failed, what the operator reads, and whether the next experiment runs to its end after the fault has gone. Then the
-daemon is killed with SIGKILL in the middle of a twist, and the emulated robot says when it stood. Then the robot's
-states are timed as they arrive, while as many busy processes as there are processors compete with the loop.
-Writes rig_faults.json and rig_faults.png; `--only-draw` draws anew what the JSON says.
+The real daemon in its own process and the real drivers, with the rig emulated over its real ports. Something fails in
+the middle of a slow twist. Measured is the time until `loop.state` reports the response, in periods of the failed
+sensor's or device's topic, and whether the next experiment completes once the fault is gone. Finally the daemon is
+killed with SIGKILL in the middle of a fast twist, and the emulated robot reports when it stood still. `--rig` is the
+folder of `benchmarks.rig_twists`, with demo.bank and rig-right.cal.
 """
 
 import argparse
-import asyncio
 import json
 import os
 import select
@@ -26,35 +24,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 import zmq
-from numpy.typing import NDArray
 
-from benchmarks.rig_configuration import write_configuration
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.messaging.request import request
 from shearloop.daemon.messaging.topics import TOPICS
-from shearloop.daemon.service.realtime import high_priority
-from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.settings import UrSettings, read_settings
 
 DEADLINE_S = 90.0
-# A late machine's deadline; what is measured is told beside it.
-STOPPED_WITHIN_S = 0.2
-JITTER_S = 20.0
-# A program as any other, whatever the bench itself may ask for.
-BURN = "import os\nos.setpriority(os.PRIO_PROCESS, 0, 0)\nwhile True: pass"
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
-    """A line for the rig, what is then read, whose topic's period counts, and the line that ends it.
+class RigFault:
+    """A command to the rig, the expected part of the operator's sentence, the topic that counts, and the cure.
 
-    What `passes` is over before a hold becomes a stop: the experiment goes on by itself.
+    A fault that `passes` is over before the hold becomes a stop; the experiment then continues.
     """
 
-    line: str
+    command: str
     sentence: str
     topic: str
     cure: str
@@ -62,35 +49,36 @@ class Fault:
 
 
 FAULTS = (
-    Fault("protective-stop", "protective stop", "robot.state", ""),
-    Fault("emergency-stop", "emergency stop", "robot.state", "release"),
-    Fault("drop-rtde", "robot", "robot.state", ""),
-    Fault("unplug right", "no new torque", "eit.estimate", "replug right"),
-    Fault("silence right 3", "no new torque", "eit.estimate", "", passes=True),
-    Fault("unplug load", "no new torque", "load.torque", "replug load"),
-    Fault("silence load 3", "no new torque", "load.torque", "", passes=True),
-    Fault("gripper fault 14", "gripper reports a fault", "gripper.state", "gripper normal"),
-    Fault("gripper drop", "no longer holds an object", "gripper.state", "object 20"),
-    Fault("kick 0.4", "beyond its limit", "load.torque", ""),
+    RigFault("protective-stop", "protective stop", "robot.state", ""),
+    RigFault("emergency-stop", "emergency stop", "robot.state", "release"),
+    RigFault("drop-rtde", "robot", "robot.state", ""),
+    RigFault("unplug right", "no new torque", "eit.estimate", "replug right"),
+    RigFault("silence right 3", "no new torque", "eit.estimate", "", passes=True),
+    RigFault("unplug load", "no new torque", "load.torque", "replug load"),
+    RigFault("silence load 3", "no new torque", "load.torque", "", passes=True),
+    RigFault("gripper fault 14", "gripper reports a fault", "gripper.state", "gripper normal"),
+    RigFault("gripper drop", "no longer holds an object", "gripper.state", "object 20"),
+    RigFault("kick 0.4", "beyond its limit", "load.torque", ""),
 )
 
 
-class Bench:
-    """One rig and one daemon, and what both say."""
+class RunningRig:
+    """One emulated rig and one daemon in processes of their own."""
 
     def __init__(self, folder: Path, args: argparse.Namespace, stack: ExitStack) -> None:
+        """Start both."""
         self.folder = folder
+        bank = args.rig / "demo.bank"
         self._rig = stack.enter_context(
             _process(
-                *("emulate", "rig", "--bank", str(args.bank), "--run-dir", str(folder), "--host", args.host),
+                *("emulate", "rig", "--bank", str(bank), "--run-dir", str(folder), "--host", args.host),
                 *("--paper-sketch", "--unlock-wait-s", "0.5", "--power-on-s", "0.2"),
                 stdin=subprocess.PIPE,
             )
         )
         self._unread = b""
         self._events: list[dict[str, Any]] = []
-        config = write_configuration(folder, args.bank, args.calibration, args.host)
-        self.daemon = stack.enter_context(_process("run", str(config)))
+        self.daemon = stack.enter_context(_process("run", str(self._write_config(args))))
         context = stack.enter_context(zmq.Context())
         self._socket: zmq.Socket[bytes] = stack.enter_context(context.socket(zmq.SUB))
         self._socket.setsockopt(zmq.LINGER, 0)
@@ -98,26 +86,44 @@ class Bench:
         for topic in ("loop.state", "robot.state", "gripper.state"):
             self._socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
 
-    def say(self, line: str) -> int:
-        """Tell the rig something, and return when, in ns."""
+    def _write_config(self, args: argparse.Namespace) -> Path:
+        shipped = yaml.safe_load(Path("config/ur.yaml").read_text())
+        (self.folder / "ur.yaml").write_text(yaml.safe_dump({**shipped, "host": args.host}))
+        calibration = str((args.rig / "rig-right.cal").resolve())
+        content = {
+            "publish": f"ipc://{self.folder}/publish",
+            "commands": f"ipc://{self.folder}/commands",
+            "fingertips": {
+                "right": {"device": {"path": "eit-right"}, "estimator": "fused", "calibration": calibration}
+            },
+            "load_cell": {"device": {"path": "load-cell"}},
+            "robot": "ur.yaml",
+            "gripper": {"socket": {"host": args.host}},
+            # Estimates that disagree are no fault here.
+            "loop": {"disagreement_nm": 1.0, "jump_nm": 1.0},
+        }
+        path = self.folder / "config.yaml"
+        path.write_text(yaml.safe_dump(content))
+        return path
+
+    def tell_rig(self, command: str) -> int:
+        """Send the rig a command; return the time in ns."""
         if self._rig.stdin is None:
             raise RuntimeError("the rig has no input")
         now_ns = time.monotonic_ns()
-        self._rig.stdin.write(f"{line}\n".encode())
+        self._rig.stdin.write(f"{command}\n".encode())
         self._rig.stdin.flush()
         return now_ns
 
     def command(self, name: str, **arguments: Any) -> dict[str, Any]:
-        """Send a command to the daemon and return its reply."""
+        """Send the daemon a command; return its reply."""
         return request(f"ipc://{self.folder}/commands", {"command": name, **arguments}, DEADLINE_S)
 
-    def until(
-        self, topic: str, is_so: Callable[[dict[str, Any]], bool], within_s: float = DEADLINE_S
-    ) -> dict[str, Any]:
-        """Return the first message from now on of which something is so."""
+    def wait_for(self, topic: str, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
+        """Return the first new message of a topic that meets a condition."""
         while self._socket.poll(0):
             self._socket.recv_multipart()
-        end_s = time.monotonic() + within_s
+        end_s = time.monotonic() + DEADLINE_S
         loop: dict[str, Any] = {}
         while time.monotonic() < end_s and self.daemon.poll() is None:
             if self._socket.poll(100):
@@ -125,34 +131,30 @@ class Bench:
                 content = decode(payload)
                 if name == b"loop.state":
                     loop = content
-                if name.decode() == topic and is_so(content):
+                if name.decode() == topic and condition(content):
                     return content
-        if self.daemon.poll() is not None:
-            raise RuntimeError(f"the daemon has ended with status {self.daemon.poll()}; its last words are above")
-        said = ": ".join(filter(None, (loop.get("phase"), loop.get("doing"), loop.get("reasons"))))
-        raise RuntimeError(f"{topic} never said so within {within_s:g} s; the loop is {said or 'silent'}")
+        raise RuntimeError(f"no such {topic}; daemon's status {self.daemon.poll()}, latest loop.state {loop}")
 
-    def until_phase(self, phase: str) -> dict[str, Any]:
-        """Return the first state of the loop in a phase."""
-        return self.until("loop.state", lambda state: state["phase"] == phase)
+    def wait_for_phase(self, *phases: str) -> dict[str, Any]:
+        """Return the first loop state in one of these phases."""
+        return self.wait_for("loop.state", lambda state: state["phase"] in phases)
 
-    def event(self, name: str, since_ns: int, within_s: float = 5.0) -> dict[str, Any]:
-        """Return the first event of the robot of a name since a moment."""
+    def wait_for_event(self, name: str, since_ns: int) -> dict[str, Any]:
+        """Return the first event of the emulated robot with a name, since a moment."""
         out = self._rig.stdout
         if out is None:
             raise RuntimeError("the rig has no output")
-        end_s = time.monotonic() + within_s
         while True:
             for event in self._events:
                 if event["event"] == name and event["t_mono_ns"] >= since_ns:
                     return event
-            if time.monotonic() > end_s or not select.select([out], [], [], within_s)[0]:
-                raise RuntimeError(f"the robot never said {name}")
+            if not select.select([out], [], [], 5.0)[0]:
+                raise RuntimeError(f"no event {name} from the robot")
             *lines, self._unread = (self._unread + os.read(out.fileno(), 1 << 16)).split(b"\n")
             self._events += [json.loads(line) for line in lines if line.startswith(b"{")]
 
     def start(self, path: Path) -> None:
-        """Begin an experiment as soon as it can be begun; the operator unlocks what waits for it."""
+        """Start an experiment as soon as possible, unlocking as the operator does."""
         end_s = time.monotonic() + DEADLINE_S
         while not (reply := self.command("start", experiment=str(path)))["ok"]:
             if time.monotonic() > end_s:
@@ -163,21 +165,16 @@ class Bench:
 
 @contextmanager
 def _process(*arguments: str, **options: Any) -> Iterator["subprocess.Popen[bytes]"]:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "shearloop", *arguments], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, **options
-    )
-    if process.stdout is None:
-        raise RuntimeError("a process without an output")
-    if arguments[0] == "emulate" and not process.stdout.readline().startswith(b"rig ready"):
-        raise RuntimeError("the rig did not start")
-    try:
-        yield process
-    finally:
-        process.terminate()
-        process.wait(10)
-        for stream in (process.stdin, process.stdout):
-            if stream is not None:
-                stream.close()
+    command = [sys.executable, "-m", "shearloop", *arguments]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, **options) as process:
+        try:
+            if arguments[0] == "emulate" and (
+                process.stdout is None or not process.stdout.readline().startswith(b"rig ready")
+            ):
+                raise RuntimeError("the rig did not start")
+            yield process
+        finally:
+            process.terminate()
 
 
 def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
@@ -188,135 +185,75 @@ def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
     return path
 
 
-def measure_faults(bench: Bench) -> list[dict[str, Any]]:
-    """Let each fault befall a slow twist, end it, and carry a short experiment to its end."""
+def measure_faults(rig: RunningRig) -> list[dict[str, Any]]:
+    """Cause each fault in a slow twist, cure it, and run a short experiment."""
     slow = {"do": "twist", "angles_rad": [0.12], "speed_rad_per_s": 0.005, "hold_s": 60}
-    twist = _experiment(bench.folder, "twist", slow)
-    short = _experiment(bench.folder, "short", {"do": "wait", "wait_s": 0.2}, {"do": "release"})
+    twist = _experiment(rig.folder, "twist", slow)
+    short = _experiment(rig.folder, "short", {"do": "wait", "wait_s": 0.2}, {"do": "release"})
     found = []
     for fault in FAULTS:
-        bench.start(twist)
-        bench.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.003)
-        asked_ns = bench.say(fault.line)
+        rig.start(twist)
+        rig.wait_for("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.003)
+        began_ns = rig.tell_rig(fault.command)
 
-        def tells(state: dict[str, Any], sentence: str = fault.sentence) -> bool:
+        def reports(state: dict[str, Any], sentence: str = fault.sentence) -> bool:
             return sentence in state["reasons"] and state["phase"] in ("held", "stopped")
 
-        state = bench.until("loop.state", tells)
-        after_s = (state["t_mono_ns"] - asked_ns) / 1e9
-        period_s = 1.0 / (TOPICS[fault.topic].rate_hz or 1.0)
-        after = "running" if fault.passes else "stopped"
-        last = state if state["phase"] == after else bench.until_phase(after)
+        state = rig.wait_for("loop.state", reports)
+        after_s = (state["t_mono_ns"] - began_ns) / 1e9
+        then = "running" if fault.passes else "stopped"
+        last = state if state["phase"] == then else rig.wait_for_phase(then)
         if fault.passes:
-            bench.command("stop")
+            rig.command("stop")
         if fault.cure:
-            bench.say(fault.cure)
-        bench.start(short)
-        end = bench.until("loop.state", lambda s: s["experiment"] == "short" and s["phase"] in ("done", "stopped"))
-        found.append(
-            {
-                "fault": fault.line,
-                "after_s": after_s,
-                "periods": after_s / period_s,
-                "topic": fault.topic,
-                "response": state["response"],
-                "then": last["phase"],
-                "sentence": state["reasons"],
-                "next_experiment": end["phase"],
-                "next_doing": end["doing"],
-            }
-        )
-        print(f"{fault.line:18} {after_s * 1e3:7.0f} ms, {after_s / period_s:5.1f} periods of {fault.topic:14} "
-              f"{state['response']:20} then {end['phase']} {end['doing'][:160]}", flush=True)  # fmt: skip
+            rig.tell_rig(fault.cure)
+        rig.start(short)
+        end = rig.wait_for("loop.state", lambda s: s["experiment"] == "short" and s["phase"] in ("done", "stopped"))
+        row = {
+            "fault": fault.command,
+            "after_s": after_s,
+            "periods": after_s * (TOPICS[fault.topic].rate_hz or 1.0),
+            "topic": fault.topic,
+            "response": state["response"],
+            "then": last["phase"],
+            "sentence": state["reasons"],
+            "next_experiment": end["phase"],
+        }
+        found.append(row)
+        print(f"{fault.command:18} {after_s * 1e3:7.0f} ms, {row['periods']:5.1f} periods of {fault.topic:14} "
+              f"{state['response']:20} then {end['phase']}", flush=True)  # fmt: skip
     return found
 
 
-def measure_jitter(settings: UrSettings, busy: int) -> NDArray[np.float64]:
-    """Return the times (n,) in s between the states of a resting arm, two of five cycles, beside busy processes."""
-    burners = [subprocess.Popen([sys.executable, "-c", BURN]) for _ in range(busy)]
-    try:
-        return np.diff(asyncio.run(_arrivals(settings))) / 1e9
-    finally:
-        for burner in burners:
-            burner.kill()
-            burner.wait()
-
-
-async def _arrivals(settings: UrSettings) -> list[int]:
-    robot = UrRobot(settings)
-    task = asyncio.create_task(robot.run())
-    try:
-        while (await robot.next_state()).recovering:
-            pass
-        end_s, times = time.monotonic() + JITTER_S, []
-        while time.monotonic() < end_s:
-            await robot.next_state()
-            times.append(time.monotonic_ns())
-        return times
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-
-def measure_kill(bench: Bench) -> dict[str, Any]:
-    """Kill the daemon in the middle of a twist, and return when the robot stood."""
+def measure_kill(rig: RunningRig) -> float:
+    """Kill the daemon in the middle of a twist; return the seconds until the robot stood still."""
     fast = {"do": "twist", "angles_rad": [3.0], "speed_rad_per_s": 0.5, "hold_s": 1}
-    path = bench.folder / "fast.yaml"
+    path = rig.folder / "fast.yaml"
     path.write_text(yaml.safe_dump({"name": "fast", "drive": "load_cell", "steps": [fast]}))
-    bench.start(path)
-    bench.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.45)
+    rig.start(path)
+    rig.wait_for("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.45)
     killed_ns = time.monotonic_ns()
-    os.kill(bench.daemon.pid, signal.SIGKILL)
-    stopped = bench.event("motion-stopped", killed_ns)
-    return {"stopped_after_s": (stopped["t_mono_ns"] - killed_ns) / 1e9, "asked_s": STOPPED_WITHIN_S}
-
-
-def _draw(folder: Path) -> None:
-    # Not loaded beside what is timed.
-    from benchmarks.control_charts import draw_rig_faults
-
-    told = json.loads((folder / "rig_faults.json").read_text())
-    draw_rig_faults(folder / "rig_faults.png", told["faults"], told["gaps_ms"])
+    os.kill(rig.daemon.pid, signal.SIGKILL)
+    stopped_ns: int = rig.wait_for_event("motion-stopped", killed_ns)["t_mono_ns"]
+    return (stopped_ns - killed_ns) / 1e9
 
 
 def main() -> None:
-    """Measure, write the numbers, draw the chart."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--bank", type=Path)
-    parser.add_argument("--calibration", type=Path)
+    """Measure and write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rig", type=Path, required=True, help="folder with demo.bank and rig-right.cal")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--host", default="127.0.0.62")
-    parser.add_argument("--only-draw", action="store_true", help="measure nothing, draw what rig_faults.json says")
     args = parser.parse_args()
-    if args.only_draw:
-        _draw(args.out)
-        return
-    if args.bank is None or args.calibration is None:
-        parser.error("to measure, --bank and --calibration are needed")
-    args.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        bench = Bench(Path(folder), args, stack)
-        bench.until("robot.state", lambda _: True)
-        bench.until("gripper.state", lambda _: True)
-        faults = measure_faults(bench)
-        killed = measure_kill(bench)
-        settings, processors = read_settings(Path(folder) / "ur.yaml"), os.cpu_count() or 1
-        jitter = {
-            "computer as it was": measure_jitter(settings, 0),
-            "a busy process for each processor": measure_jitter(settings, processors),
-        }
-        with high_priority() as allowed:
-            if allowed:
-                jitter["the same, run first (as `shearloop run` asks)"] = measure_jitter(settings, processors)
-    quantiles = {
-        name: {f"p{q:g}_s": float(np.quantile(gaps, q / 100)) for q in (1, 50, 99, 99.9)} | {"n": len(gaps)}
-        for name, gaps in jitter.items()
-    }
-    gaps_ms = {name: (np.sort(gaps) * 1e3).round(3).tolist() for name, gaps in jitter.items()}
-    result = {"faults": faults, "between_states": quantiles, "sigkill": killed, "gaps_ms": gaps_ms}
-    (args.out / "rig_faults.json").write_text(json.dumps(result, ensure_ascii=False) + "\n")
-    _draw(args.out)
-    print(json.dumps({"between_states": quantiles, "sigkill": killed}, indent=2))
+        rig = RunningRig(Path(folder), args, stack)
+        rig.wait_for("robot.state", lambda _: True)
+        rig.wait_for("gripper.state", lambda _: True)
+        faults = measure_faults(rig)
+        stopped_s = measure_kill(rig)
+    print(f"SIGKILL: the robot stood still after {stopped_s:.3f} s")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps({"faults": faults, "sigkill_stopped_after_s": stopped_s}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -20,7 +20,6 @@ from shearloop.daemon.commands import Commands, needed
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
-from shearloop.daemon.ending_signals import ending_signals
 from shearloop.daemon.health import HealthReporter, TaskFacts
 from shearloop.daemon.links import log_link
 from shearloop.daemon.messaging.addresses import open_stop_address
@@ -41,6 +40,7 @@ from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
 from shearloop.daemon.sensing.torque_sources import torque_sources
 from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.raw_event import Tap, no_tap

@@ -200,13 +200,8 @@ class Calibration:
             ) from error
         return restored
 
-    def matcher(self, bank: Bank | None) -> BankMatcher | None:
-        """Return the matcher of an estimator that needs a bank, None for others.
-
-        Raises CalibrationError where the bank is missing or another one.
-        """
-        if self.estimator not in NEEDS_BANK:
-            return None
+    def check_bank(self, bank: Bank | None) -> Bank:
+        """Return the bank; raises CalibrationError where it is missing or not the calibration's."""
         if bank is None:
             raise CalibrationError(f"the estimator {self.estimator} needs its bank; name it with --bank")
         if bank.identity != self.bank_identity:
@@ -214,6 +209,13 @@ class Calibration:
                 f"the calibration was made with the bank {self.bank_identity[:12]}…, and {bank.path} is "
                 f"{bank.identity[:12]}…; name the bank it was made with, or calibrate again"
             )
+        return bank
+
+    def matcher(self, bank: Bank | None) -> BankMatcher | None:
+        """Return the matcher of an estimator that needs a bank, None for others; raises as `check_bank` does."""
+        if self.estimator not in NEEDS_BANK:
+            return None
+        bank = self.check_bank(bank)
         return PaperMatcher(bank) if self.estimator == "paper" else RefinedMatcher(bank, self.numbering)
 
     def features(

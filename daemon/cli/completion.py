@@ -1,8 +1,7 @@
-"""`shearloop completion`: what a shell needs to complete commands, options and file names."""
+"""`shearloop completion`: print a shell's script that completes commands, options and file names."""
 
 import argparse
 
-SHELLS = ("bash", "zsh", "tcsh")
 EPILOG = """bash: shearloop completion bash | sudo tee /etc/bash_completion.d/shearloop
 zsh:  shearloop completion zsh > ~/.zsh/completions/_shearloop   (a folder of your fpath)
 tcsh: shearloop completion tcsh | sudo tee /etc/profile.d/shearloop.csh
@@ -13,19 +12,19 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `completion`."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = EPILOG
-    parser.add_argument("shell", choices=SHELLS, help="the shell that is to complete")
+    parser.add_argument("shell", choices=("bash", "zsh", "tcsh"), help="the shell that completes")
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the shell's script."""
     import shtab
 
-    print(shtab.complete(whole_parser(), args.shell))
+    print(shtab.complete(full_parser(), args.shell))
     return 0
 
 
-def whole_parser() -> argparse.ArgumentParser:
-    """Return one parser of every command with all its options, which tells the shell where a file is meant."""
+def full_parser() -> argparse.ArgumentParser:
+    """Return one parser with every command and all its options."""
     import importlib
 
     from shearloop.daemon.cli import COMMANDS
@@ -34,24 +33,25 @@ def whole_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="store_true", help="show the version and exit")
     commands = parser.add_subparsers(dest="command")
     for name, command in COMMANDS.items():
-        own = commands.add_parser(name, help=command.summary)
-        importlib.import_module(command.module).configure(own)
-        _name_files(own)
+        subparser = commands.add_parser(name, help=command.summary)
+        importlib.import_module(command.module).configure(subparser)
+        _mark_files(subparser)
     return parser
 
 
-def _name_files(parser: argparse.ArgumentParser) -> None:
+def _mark_files(parser: argparse.ArgumentParser) -> None:
+    """Let the shell complete file names where an argument is a path."""
     from pathlib import Path
 
     import shtab
 
     for action in parser._actions:
         if isinstance(action, argparse._SubParsersAction):
-            for below in action.choices.values():
-                _name_files(below)
+            for subparser in action.choices.values():
+                _mark_files(subparser)
             continue
         if isinstance(action.choices, dict):
-            # shtab takes every table of choices for one of sub-commands.
+            # shtab would take a dictionary of choices for sub-commands.
             action.choices = list(action.choices)
         if action.type is Path:
             action.complete = shtab.DIR if action.metavar == "DIR" else shtab.FILE  # type: ignore[attr-defined]

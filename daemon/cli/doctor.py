@@ -1,4 +1,4 @@
-"""`shearloop doctor`: walks through everything that a person who is stuck would check."""
+"""`shearloop doctor`: check computer, files and devices, and name the next step for each fault."""
 
 import argparse
 from pathlib import Path
@@ -13,7 +13,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="?",
         metavar="CONFIG",
-        help="whose files and devices are looked at (default: none, this computer alone)",
+        help="check its files and devices too (default: none, this computer alone)",
     )
     parser.add_argument(
         "--seconds",
@@ -23,16 +23,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="how long to listen to the devices (default: %(default)s)",
     )
     parser.add_argument(
-        "--geometry", type=Path, metavar="FILE", help="the fingertip's geometry, to hold its bank against"
+        "--geometry", type=Path, metavar="FILE", help="the fingertip's geometry, to compare with its bank"
     )
     parser.add_argument("--json", action="store_true", help="print the findings as JSON")
-    parser.epilog = (
-        "Exit status: 0 nothing is wrong, 1 something is. docs/troubleshooting.md has what to do, by what is said."
-    )
+    parser.epilog = "Exit status: 0 nothing is wrong, 1 something is. See also docs/troubleshooting.md."
 
 
 def run(args: argparse.Namespace) -> int:
-    """Examine and tell; status 1 when something is wrong."""
+    """Print all findings; return 1 if something is wrong."""
     import json
     import logging
     import math
@@ -60,5 +58,5 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps([asdict(finding) for finding in findings], ensure_ascii=False))
     else:
         notes = sum(finding.state == "note" for finding in findings)
-        print(f"{len(findings)} things were looked at: {wrong} wrong, {notes} to note")
+        print(f"{len(findings)} checks: {wrong} wrong, {notes} to note")
     return 1 if wrong else 0

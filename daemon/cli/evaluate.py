@@ -5,7 +5,7 @@ import json
 import sys
 from pathlib import Path
 
-from shearloop.daemon.cli.cluster import add_cluster
+from shearloop.daemon.cli.options import add_cluster
 
 _FIGURES = (".png", ".svg", ".pdf")
 

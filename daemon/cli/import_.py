@@ -19,10 +19,10 @@ def run(args: argparse.Namespace) -> int:
 
     from mcap.writer import MCAP0_MAGIC
 
-    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.recording.importing import import_mat
 
-    check_writes_over(args.out, "a recording", MCAP0_MAGIC)
+    check_overwrite(args.out, "a recording", MCAP0_MAGIC)
     imported = import_mat(args.sources, args.out)
     if args.json:
         counted = {"path": str(args.out), "frames": imported.frames, "torques": imported.torques}

@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 
 from shearloop.daemon.cli.connection import own_key_folder
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result
 
 SERVER_FOLDER = Path("/etc/shearloop/keys")
 
@@ -54,7 +55,7 @@ def _server(args: argparse.Namespace) -> None:
         f"curve: {{server_key: {secret}, clients: {clients}}}",
     ]
     told = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
-    tell(told, sentences, as_json=args.json)
+    print_result(told, sentences, as_json=args.json)
 
 
 def _client(args: argparse.Namespace) -> None:
@@ -66,7 +67,7 @@ def _client(args: argparse.Namespace) -> None:
         f"{public}: bring this file to the daemon's machine, and there `sudo shearloop keys allow FILE --name YOU`",
         f"bring the daemon's server.key back, as {args.dir / 'server.key'}",
     ]
-    tell({"secret_file": str(secret), "public_file": str(public)}, sentences, as_json=args.json)
+    print_result({"secret_file": str(secret), "public_file": str(public)}, sentences, as_json=args.json)
 
 
 def _allow(args: argparse.Namespace) -> None:
@@ -87,7 +88,7 @@ def _allow(args: argparse.Namespace) -> None:
         ) from error
     except OSError as error:
         raise cannot_write(error) from error
-    tell({"allowed": name}, [f"{name} may connect from now on"], as_json=args.json)
+    print_result({"allowed": name}, [f"{name} may connect from now on"], as_json=args.json)
 
 
 def _revoke(args: argparse.Namespace) -> None:
@@ -104,7 +105,7 @@ def _revoke(args: argparse.Namespace) -> None:
     except OSError as error:
         raise cannot_write(error) from error
     sentence = f"{args.name} may connect no more; restart the daemon to end a connection that is open"
-    tell({"revoked": args.name}, [sentence], as_json=args.json)
+    print_result({"revoked": args.name}, [sentence], as_json=args.json)
 
 
 def _list(args: argparse.Namespace) -> None:
@@ -115,7 +116,7 @@ def _list(args: argparse.Namespace) -> None:
     sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items())]
     if not clients:
         sentences.append("nobody may connect yet; see `shearloop keys allow`")
-    tell({"server": server, "clients": clients}, sentences, as_json=args.json)
+    print_result({"server": server, "clients": clients}, sentences, as_json=args.json)
 
 
 def _check_name(name: str) -> None:

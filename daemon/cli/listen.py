@@ -5,8 +5,8 @@ import sys
 
 from shearloop.daemon.cli import EXIT_OK
 from shearloop.daemon.cli.connection import add_connection, client_keys
-from shearloop.daemon.cli.interruption import status_of
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
+from shearloop.daemon.signals import interrupt_status
 
 EPILOG = """
 examples:
@@ -32,7 +32,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print messages until interrupted, or until enough have come."""
-    from shearloop.daemon.cli.readable import as_json, as_line
+    from shearloop.daemon.cli.message_lines import message_json, message_line
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.messaging.subscriber import QUIET_S, checked_timeout_s, messages
     from shearloop.daemon.messaging.topics import TOPICS
@@ -44,7 +44,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--count {args.count} is not a number of messages; give 1 or more")
     if args.timeout is not None:
         checked_timeout_s(args.timeout)
-    write = as_json if args.json else as_line
+    write = message_json if args.json else message_line
 
     def tell_quiet() -> None:
         print(
@@ -62,5 +62,5 @@ def run(args: argparse.Namespace) -> int:
                 break
     except KeyboardInterrupt as interrupt:
         # That is how listening ends, and nothing to tell.
-        return status_of(interrupt)
+        return interrupt_status(interrupt)
     return EXIT_OK

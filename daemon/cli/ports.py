@@ -1,4 +1,4 @@
-"""`shearloop ports`: the serial ports of this computer, with the serial numbers that a configuration names them by."""
+"""`shearloop ports`: list the serial ports with their serial numbers."""
 
 import argparse
 
@@ -6,11 +6,11 @@ import argparse
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `ports`."""
     parser.add_argument("--json", action="store_true", help="print them as JSON")
-    parser.epilog = "Says of each what to write as `device` in the configuration, so that it is found in any socket."
+    parser.epilog = "Shows for each port the `device` for the configuration, which is found in any socket."
 
 
 def run(args: argparse.Namespace) -> int:
-    """List the ports; none is opened."""
+    """List the ports without opening them."""
     import json
     from dataclasses import asdict
 
@@ -21,12 +21,12 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps([{**asdict(port), "named_by": port.named_by} for port in ports], ensure_ascii=False))
         return 0
     if not ports:
-        print("no serial port is there: plug a board in; `sudo dmesg | tail` tells whether the system has noticed it")
+        print("there is no serial port: plug a board in, then look at `sudo dmesg | tail`")
     for port in ports:
         print(port.path, port.usb, port.likely or port.description, sep="  ")
         print(f"    device: {port.named_by}")
         if not port.serial_number:
-            print("    it has no serial number of its own: named like this, it must stay in the same socket")
+            print("    it has no serial number: leave it in the same socket")
         if port.trouble:
             print(f"    {port.trouble}")
     return 0

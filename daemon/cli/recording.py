@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.progress import progress_bar
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result, progress_bar
 
 if TYPE_CHECKING:
     from shearloop.daemon.recording.summary import Summary
@@ -105,19 +105,19 @@ def _repair(args: argparse.Namespace) -> int:
         "damaged_chunks": condition.damaged_chunks,
     }
     sentence = f"{repaired.path}: {repaired.messages} messages are safe; left out: {' and '.join(lost) or 'nothing'}."
-    tell(told, [sentence], as_json=args.json)
+    print_result(told, [sentence], as_json=args.json)
     return 0
 
 
 def _export(args: argparse.Namespace) -> int:
-    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.export import export, topics_of
 
     stem = args.recording.name.partition(".mcap")[0]
     out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")
     if args.format == "mat":
-        check_writes_over(out, "a MATLAB file", b"MATLAB")
+        check_overwrite(out, "a MATLAB file", b"MATLAB")
     there = topics_of(args.recording)
     unknown = [topic for topic in args.topic or () if topic not in there]
     if unknown:
@@ -132,5 +132,5 @@ def _export(args: argparse.Namespace) -> int:
             progress(done)
 
         written = export(args.recording, args.format, out, topics, count)
-    tell({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
+    print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
     return 0

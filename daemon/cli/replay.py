@@ -8,7 +8,8 @@ from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         print(line, file=sys.stderr)
     if args.json:
         counts = {"compared": dict(comparison.compared), "different": dict(comparison.different)}
-        tell(
+        print_result(
             {**counts, "unrecorded": comparison.unrecorded, "examples": comparison.examples, "same_code": same_code},
             (),
             as_json=True,
@@ -84,8 +85,8 @@ def parsed_speed(text: str) -> float:
 async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, args: argparse.Namespace) -> "Comparison":
     import zmq.asyncio
 
-    from shearloop.daemon.cli.progress import progress_bar
-    from shearloop.daemon.cli.run import Show
+    from shearloop.daemon.cli.message_lines import EstimatePrinter
+    from shearloop.daemon.cli.output import progress_bar
     from shearloop.daemon.messaging.publisher import Publisher
     from shearloop.daemon.recording.replay import Replay, ReplayClock
     from shearloop.daemon.recording.replay_pipeline import ReplayPipeline
@@ -96,7 +97,7 @@ async def _replayed(run: "RecordedRun", config: "DaemonConfig", speed: float, ar
         opened.callback(publisher.close)
         replay = Replay(run, ReplayPipeline(config, run.asides(), publisher), publisher, clock)
         if args.show:
-            publisher.listen(Show(sys.stdout))
+            publisher.listen(EstimatePrinter(sys.stdout))
         while args.wait and not publisher.subscribed:  # noqa: ASYNC110 - it is told when it is asked
             await asyncio.sleep(0.05)
         progress = opened.enter_context(progress_bar(run.path.name, run.messages, "message"))

@@ -1,16 +1,17 @@
-"""`shearloop reproduce`: compute the paper's numbers and figures anew from recorded slices."""
+"""`shearloop reproduce`: compute the paper's numbers and figures from recorded slices."""
 
 import argparse
 import os
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, Self
+from typing import TYPE_CHECKING
 
+from shearloop.daemon.cli.output import progress_bar
 from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
-    from tqdm import tqdm
-
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.daemon.analysis.reproduce.banks import Grid
     from shearloop.daemon.analysis.reproduce.report import Reproduction
@@ -29,14 +30,14 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="mesh (.npz, EIDORS .mat) or fingertip (.yaml); by default RECORDINGS/../reference/fingertip_mesh.npz, "
-        "or our own grid where that is not there",
+        "or a grid of our own if that file is missing",
     )
     geometry.add_argument("--bank-config", type=Path, metavar="FILE", help="a bank's configuration, for its geometry")
     parser.add_argument("--jobs", type=int, metavar="N", help="processors to use (default: all)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Reproduce, then write, print and draw."""
+    """Compute the numbers, then write, print and draw them."""
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
     if jobs < 1:
         raise UserError(f"--jobs must be 1 or more, not {jobs}")
@@ -77,70 +78,42 @@ def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict
     chosen = choose_mesh(args.recordings, args.mesh, args.bank_config)
     print(f"mesh: {chosen.origin}", file=sys.stderr)
     notes = list(inputs.notes)
-    with _Progress() as progress, fft.set_workers(jobs):
 
-        def built(name: str, grid: "Grid") -> "Bank":
-            return cached_bank(name, grid, chosen.mesh, args.out / "banks", jobs, progress.rows)
+    def build(name: str, grid: "Grid") -> "Bank":
+        with progress_bar(name, grid.k.size, "row") as show:
+            return cached_bank(name, grid, chosen.mesh, args.out / "banks", jobs, lambda _, done, __: show(done))
 
-        banks = {"wide": built("wide", GRIDS["wide"])}
+    with fft.set_workers(jobs):
+        banks = {"wide": build("wide", GRIDS["wide"])}
         torque = diameter = models = None
         if inputs.torque is not None:
             slices = inputs.torque.differences
-            progress.begin("matching", len(slices), "slice")
-            on_wide = match_slices(slices, banks["wide"], progress.advance)
+            with _matching(len(slices)) as advance:
+                on_wide = match_slices(slices, banks["wide"], advance)
             focus = focused_grid(on_wide.k, on_wide.sigma)
             if focus is not GRIDS["focused"]:
                 notes.append(moved_focus(focus))
-            banks["focused"] = built("focused", focus)
-            progress.begin("matching", len(slices), "slice")
-            on_focused = match_slices(slices, banks["focused"], progress.advance)
+            banks["focused"] = build("focused", focus)
+            with _matching(len(slices)) as advance:
+                on_focused = match_slices(slices, banks["focused"], advance)
             torque = analyse_torque(inputs.torque, on_focused, on_wide)
             models = score_models(inputs.torque, inputs.raw_difference, chosen.mesh)
         if inputs.diameter is not None:
-            progress.begin("matching", len(inputs.diameter.differences), "slice")
-            diameter = analyse_diameter(inputs.diameter, banks["wide"], progress.advance)
+            with _matching(len(inputs.diameter.differences)) as advance:
+                diameter = analyse_diameter(inputs.diameter, banks["wide"], advance)
     valid_cells = int(banks["wide"].valid.sum())
     return Reproduction(chosen.origin, valid_cells, torque, diameter, models, tuple(notes)), banks
 
 
-class _Progress:
-    """One bar after the other on stderr, where that is a terminal."""
+@contextmanager
+def _matching(total: int) -> Iterator[Callable[[int], None]]:
+    """Show a bar of matched slices; the yielded function takes how many more are done."""
+    with progress_bar("matching", total, "slice") as show:
+        done = 0
 
-    def __init__(self) -> None:
-        """Show nothing yet."""
-        self._bar: tqdm[NoReturn] | None = None
-        self._name = ""
+        def advance(count: int) -> None:
+            nonlocal done
+            done += count
+            show(done)
 
-    def __enter__(self) -> Self:
-        """Begin without a bar."""
-        return self
-
-    def begin(self, name: str, total: int, unit: str, done: int = 0) -> None:
-        """End the bar that is shown and show one for another piece of work."""
-        from tqdm import tqdm
-
-        self._close()
-        # tqdm's own watch on slow bars is a thread that outlives them.
-        tqdm.monitor_interval = 0
-        self._name = name
-        self._bar = tqdm(total=total, initial=done, unit=unit, desc=name, disable=None)
-
-    def advance(self, count: int) -> None:
-        """Count work that is done."""
-        if self._bar is not None:
-            self._bar.update(count)
-
-    def rows(self, name: str, done: int, total: int) -> None:
-        """Show that `done` of a bank's `total` rows are solved."""
-        if self._bar is None or self._name != name:
-            self.begin(name, total, "row", done)
-        elif self._bar is not None:
-            self._bar.update(done - self._bar.n)
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def __exit__(self, *_: object) -> None:
-        """End the last bar."""
-        self._close()
+        yield advance

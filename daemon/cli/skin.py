@@ -7,7 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result
 
 if TYPE_CHECKING:
     from shearloop.bank.skin.characterisation import Row
@@ -87,12 +88,12 @@ def _calibrate(args: argparse.Namespace) -> int:
     from shearloop.bank.errors import CalibrationError
     from shearloop.bank.skin.calibration_file import read_table, save_calibration
     from shearloop.bank.skin.calibration_fit import fit_calibration
-    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
 
     if args.friction is not None and not 0 <= args.friction <= 1:
         raise UserError(f"--friction is {args.friction}; a coefficient of friction lies between 0 and 1.")
-    check_writes_over(args.out, "a calibration file")
+    check_overwrite(args.out, "a calibration file")
     table = read_table(args.table)
     try:
         calibration = fit_calibration(table, friction=args.friction)
@@ -121,5 +122,5 @@ def _calibrate(args: argparse.Namespace) -> int:
         f"rows left out beyond the curve       {calibration.rows_beyond}",
         f"written: {args.out}",
     ]
-    tell(told, sentences, as_json=args.json)
+    print_result(told, sentences, as_json=args.json)
     return 0

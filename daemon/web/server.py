@@ -11,9 +11,9 @@ import zmq.asyncio
 from aiohttp import WSCloseCode, web
 
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.daemon.ending_signals import ending_signals
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, TOPICS, stale_after_s
+from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.web.access import host_allowed, origin_allowed, token_valid
 from shearloop.daemon.web.bridge import Bridge, BusyError, DaemonAddress
 from shearloop.daemon.web.latest import LatestMessages, fingertip_outline

@@ -23,8 +23,8 @@ from shearloop.bank.eit.models import MODELS
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank.build import MODELS as MODELS_IN_HELP
-from shearloop.daemon.cli.completion import whole_parser
-from shearloop.daemon.cli.readable import as_json, as_line
+from shearloop.daemon.cli.completion import full_parser
+from shearloop.daemon.cli.message_lines import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import decode, encode
@@ -56,7 +56,7 @@ def test_a_calibration_of_diameters_alone_is_no_torque_to_drive_by(
     Calibration.fit(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
     section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
     assert main(["check", str(config(fingertips=section))]) == 0
-    assert "without torque: its calibration is of diameters alone" in capsys.readouterr().out
+    assert "without torque: its calibration has diameters only" in capsys.readouterr().out
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
     steps = {"name": "one", "drive": "right", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
@@ -275,7 +275,7 @@ def test_every_argument_says_what_it_is_and_not_its_default_alone() -> None:
                 unsaid = action.help is None or action.help.startswith(("default", "(default"))
                 yield f"{parser.prog} {action.dest}" if unsaid else ""
 
-    assert list(filter(None, arguments(whole_parser()))) == []
+    assert list(filter(None, arguments(full_parser()))) == []
 
 
 def test_help_names_all_basis_models() -> None:
@@ -321,11 +321,11 @@ def test_messages_are_readable() -> None:
             }
         )
     )
-    line = as_line("eit.estimate", content)
+    line = message_line("eit.estimate", content)
     assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
-    assert as_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
+    assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
     invalid = {**content, "valid": False, "why": "no signal"}
-    assert as_line("eit.estimate", invalid).endswith("no estimate: no signal")
+    assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
 
 
 def test_an_emulator_or_a_recording_that_cannot_play_is_refused_before_anything_starts(

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.cli import COMMANDS, main
-from shearloop.daemon.cli.completion import whole_parser
+from shearloop.daemon.cli.completion import full_parser
 
 
 def completed(script: Path, *words: str) -> set[str]:
@@ -41,4 +41,4 @@ def test_where_a_file_is_meant_files_are_offered() -> None:
 
 
 def _command(name: str):  # type: ignore[no-untyped-def]
-    return next(action for action in whole_parser()._actions if action.dest == "command").choices[name]
+    return next(action for action in full_parser()._actions if action.dest == "command").choices[name]

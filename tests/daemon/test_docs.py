@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.cli import COMMANDS
-from shearloop.daemon.cli.completion import whole_parser
+from shearloop.daemon.cli.completion import full_parser
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -22,7 +22,7 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_commands_and_options_exist(page: Path) -> None:
-    parsers = next(action for action in whole_parser()._actions if action.dest == "command").choices
+    parsers = next(action for action in full_parser()._actions if action.dest == "command").choices
     assert parsers is not None
     for text in re.findall(r"(?:^ {4}|`)(?:sudo )?(?:[./\w-]*/)?shearloop ([^`\n]*)", page.read_text(), re.MULTILINE):
         words = shlex.split(text.split(" #")[0].split(";")[0], comments=False) if text.count("'") % 2 == 0 else []

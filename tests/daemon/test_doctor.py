@@ -193,7 +193,7 @@ def test_ports_are_listed_with_what_a_configuration_names_them_by(
     monkeypatch.setattr("shearloop.daemon.ports.sorted", lambda ports: ports, raising=False)
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: there)
     assert main(["ports"]) == 0
-    assert "no serial port is there" in capsys.readouterr().out
+    assert "there is no serial port" in capsys.readouterr().out
     there += [port(), port(serial_number=None, vid=0x1A86, pid=0x7523), port(device="/dev/ttyS0", vid=None, pid=None)]
     assert main(["ports", "--json"]) == 0
     first, second = json.loads(capsys.readouterr().out)

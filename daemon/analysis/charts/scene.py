@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from shearloop.bank.eit.design import ALLOWED, Choice, Design, Scene, designed
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.daemon.analysis.charts.picture import SHADES, figure, save
+from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save
 from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
 from shearloop.daemon.scene import choices_of, doubts, scene_of
 from shearloop.daemon.workers import Executor, in_order
@@ -19,13 +19,13 @@ _MESH_SIZE_CM = 0.07
 _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
 
 
-def chart(parts: Sequence[Split], out: Path, pool: Executor) -> list[Path]:
+def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
     """Design for the whole of each recording, draw and write; each recording is a task of its own.
 
     Why a design may not be worth building is told on stderr, as `bank design` tells it.
     """
     scenes = [scene_of(split.whole) for split in parts]
-    found = in_order(pool.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
+    found = in_order(executor.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
     written = []
     for split, design in zip(parts, found, strict=True):
         title = split.title.split(",", maxsplit=1)[0]

@@ -1,19 +1,29 @@
 """`shearloop chart speed-accuracy`: latency against torque error, time per cell against model error, and the loop."""
 
 import platform
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.estimation import Name, Physics
-from shearloop.daemon.analysis.charts.forwards import CELLS, Solved, forwards
-from shearloop.daemon.analysis.charts.methods import Measured, estimators, fewer_channels, matchers, measure
-from shearloop.daemon.analysis.charts.picture import (
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
+from shearloop.bank.errors import BankError
+from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit
+from shearloop.bank.estimation.bank_match import NOT_TURNED, NearestCell
+from shearloop.bank.estimation.fitting_regressor import fit_reader
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor
+from shearloop.bank.estimation.regressors import Ridge, ranked_channels
+from shearloop.daemon.analysis.charts.drawing import (
     LINES,
     MARKS,
     SHADES,
@@ -24,31 +34,202 @@ from shearloop.daemon.analysis.charts.picture import (
     save,
     write_names,
 )
+from shearloop.daemon.analysis.charts.forward_methods import CELLS, SolvedForward, forward_methods
+from shearloop.daemon.analysis.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors
 from shearloop.daemon.analysis.charts.sources import Split
-from shearloop.daemon.analysis.charts.windows import GAIN, LOOPS, Followed, followed
+from shearloop.daemon.analysis.evaluation import follow
+
+Single = NDArray[np.float32]
+RANKS = (4, 8, 16, 32, 64, 128)
+CHANNEL_COUNTS = (8, 16, 32, 64, 128, 272, 512)
+# The paper's polynomial needs no regularisation.
+_POLYNOMIAL = (1e-9,)
+_CHUNK = 512
+# The number of cells that determine the directions of a low-rank bank.
+_ENOUGH_CELLS = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueMethod:
+    """A way to a torque; `run()` returns the later frames' torques (n,) in N·m, NaN if invalid, and ms each."""
+
+    name: str
+    family: str
+    run: Callable[[], tuple[FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredMethod:
+    """A method's time and error: the median of the rounds' medians, and the fastest and slowest round."""
+
+    name: str
+    family: str
+    latency_ms: float
+    latency_low_ms: float
+    latency_high_ms: float
+    rmse_nm: float
+    r: float | None
+    valid_fraction: float
+
+
+def measure(methods: list[TorqueMethod], truth_nm: FloatArray, rounds: int) -> list[MeasuredMethod]:
+    """Run all methods in turn, `rounds` times, so that a busy moment of the machine affects all alike."""
+    times: dict[str, list[float]] = {method.name: [] for method in methods}
+    torques: dict[str, FloatArray] = {}
+    for _ in range(rounds):
+        for method in methods:
+            torques[method.name], latency_ms = method.run()
+            times[method.name].append(float(np.median(latency_ms)))
+    found = []
+    for method in methods:
+        valid = np.isfinite(torques[method.name])
+        judged = valid & np.isfinite(truth_nm)
+        if judged.sum() < 2:
+            continue
+        value, truth = torques[method.name][judged], truth_nm[judged]
+        varies = value.std() > 0 and truth.std() > 0
+        own = times[method.name]
+        found.append(
+            MeasuredMethod(
+                method.name, method.family, float(np.median(own)), min(own), max(own),
+                float(np.sqrt(((value - truth) ** 2).mean())),
+                float(np.corrcoef(value, truth)[0, 1]) if varies else None, float(valid.mean()),
+            )
+        )  # fmt: skip
+    return found
+
+
+def estimators(
+    split: Split, physics: Physics, names: tuple[Name, ...], sides: tuple[str, ...]
+) -> Iterator[TorqueMethod]:
+    """Yield the package's estimators on these sides as they run live; print why one cannot be fitted."""
+    past, future = split.past.of_sides(sides), split.future.of_sides(sides)
+    count = f", {sides[0] if len(sides) == 1 else 'both'}" if past.kind == "raw" else ""
+    for name in names:
+        try:
+            calibration = fit(name, [past], split.title, physics, timed_by=[split.past])
+        except BankError as error:
+            print(f"{split.title}: {name}{count} is left out: {error}")
+            continue
+
+        family = "estimator, two fingertips" if len(sides) > 1 else "estimator"
+        yield TorqueMethod(f"{name}{count}", family, partial(_run_estimator, calibration, future, physics.bank))
+
+
+def _run_estimator(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[FloatArray, FloatArray]:
+    track = follow(calibration, future, bank)
+    torque = [np.nan if one.torque_nm is None else one.torque_nm for one in track.estimates]
+    return np.array(torque), track.latency_ms
+
+
+def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
+    """Yield every way to find σ in the bank; the paper's parabola then turns σ into torque."""
+    sigma = bank.sigma_grid
+    for name, family, kind in (
+        ("paper: all lags, reference", "all lags", ReferenceMatcher),
+        ("all lags, fast and exact", "all lags", PrunedMatcher),
+        ("zero lag, reference", "zero lag", ZeroLagMatcher),
+        ("zero lag, fast and exact", "zero lag", PrunedZeroLagMatcher),
+    ):
+        yield _read_by(split, name, family, _sigma_by(kind.from_bank(bank)))
+    nearest = NearestCell(bank, NOT_TURNED)
+    yield _read_by(split, "zero lag, smoothed, sub-grid", "zero lag", lambda x: nearest.locate(x).sigma)
+    cells = np.flatnonzero(bank.valid)
+    shapes = np.abs(bank.signals.reshape(-1, bank.signals.shape[-1])[cells])
+    shapes /= np.linalg.norm(shapes, axis=1, keepdims=True)
+
+    def best_of(scores: Callable[[Single], Single]) -> Callable[[FloatArray], float]:
+        column = sigma[cells % len(sigma)]
+        return lambda x: float(column[np.argmax(scores((x / np.linalg.norm(x)).astype(np.float32)))])
+
+    yield _read_by(split, "zero lag, float32", "precision", best_of(partial(np.matmul, shapes)))
+    yield _read_by(split, "zero lag, float16", "precision", best_of(partial(_half_scores, shapes.astype(np.float16))))
+    basis = np.linalg.svd(shapes[:: max(1, len(shapes) // _ENOUGH_CELLS)], full_matrices=False)[2]
+    for rank in RANKS:
+        directions = np.ascontiguousarray(basis[:rank])
+        scores = partial(_compressed_scores, directions, np.ascontiguousarray(shapes @ directions.T))
+        yield _read_by(split, f"rank {rank}", "zero lag, bank of rank r", best_of(scores))
+
+
+def _sigma_by(matcher: Matcher) -> Callable[[FloatArray], float]:
+    if isinstance(matcher, PrunedMatcher | PrunedZeroLagMatcher):
+        return lambda x: matcher.match(x, runner_up=False).sigma
+    return lambda x: matcher.match(x).sigma
+
+
+def _compressed_scores(directions: Single, numbers: Single, frame: Single) -> Single:
+    return numbers @ (directions @ frame)
+
+
+def _half_scores(shapes: NDArray[np.float16], frame: Single) -> Single:
+    """Return the scores of float16 signals; the products are float32, for BLAS."""
+    parts = [shapes[i : i + _CHUNK].astype(np.float32) @ frame for i in range(0, len(shapes), _CHUNK)]
+    return np.concatenate(parts)
+
+
+def fewer_channels(split: Split) -> Iterator[TorqueMethod]:
+    """Yield regressions on the channels that correlate best with the past torque."""
+    differences, torque = np.abs(split.past.channels[:, 0]), split.past.torque_at_frames()
+    order = ranked_channels(differences, torque)
+    for count in CHANNEL_COUNTS:
+        best = order[:count]
+        reader = fit_reader(differences[:, best], torque, Ridge.fit)
+        yield TorqueMethod(
+            f"{count} channels",
+            "regression on the best n channels",
+            _timed(split, partial(_read_some, reader, best)),
+        )
+
+
+def _read_some(reader: IntervalRegressor, channels: NDArray[np.int64], difference: FloatArray) -> float:
+    return reader.read(difference[channels])[0]
+
+
+def _read_by(split: Split, name: str, family: str, locate: Callable[[FloatArray], float]) -> TorqueMethod:
+    def features(difference: FloatArray) -> FloatArray:
+        sigma = float(locate(difference))
+        return np.array([sigma, sigma**2])
+
+    past = np.array([features(frame) for frame in np.abs(split.past.channels[:, 0])])
+    reader = fit_reader(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=_POLYNOMIAL)
+    return TorqueMethod(name, family, _timed(split, lambda x: reader.read(features(x))[0]))
+
+
+def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tuple[FloatArray, FloatArray]]:
+    frames = np.abs(split.future.channels[:, 0])
+
+    def run() -> tuple[FloatArray, FloatArray]:
+        values, times = [], []
+        for frame in frames:
+            begun = time.perf_counter()
+            values.append(read(frame))
+            times.append(1e3 * (time.perf_counter() - begun))
+        return np.array(values), np.array(times)
+
+    return run
+
 
 Fill = Literal["none", "left", "full"]
-# Noise that the loop's identification copes with; a sensor worse than that never closes the loop.
+# The largest noise that the loop's identification tolerates.
 _LARGEST_LOOP_NOISE_NM = 0.02
 _SLICE_ESTIMATORS: tuple[Name, ...] = ("bank", "regression", "reconstruction", "fused")
-# An error is that of the frames called valid: of fewer than this share of what others call valid it is told beside the
-# name, and not compared with theirs.
+# Errors count valid frames only. A method below this share of the most valid one stays off the frontier.
 _OFTEN_VALID = 0.9
-# How the mark of a single window is filled, from the smallest noise to the largest.
+# Fill of a single window's mark, from the smallest noise to the largest.
 _FILLS: tuple[Fill, ...] = ("none", "left", "full")
-# Families whose points are one thing at several settings are joined by a line.
+# Families with one varying setting are joined by a line.
 _JOINED = {"zero lag, bank of rank r": "rank", "regression on the best n channels": "channels"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Compared:
-    """All methods on one split, in `rmse_nm` and `latency_ms`."""
+class MethodComparison:
+    """All methods on one split."""
 
     split: Split
-    methods: list[Measured]
+    methods: list[MeasuredMethod]
 
 
-def measured(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> Compared:
+def compare_methods(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> MethodComparison:
     """Return every method's time and error on a split."""
     physics, sides = Physics(bank, mesh), split.past.sides
     if split.past.kind == "difference":
@@ -61,22 +242,26 @@ def measured(split: Split, bank: Bank, mesh: Mesh, rounds: int) -> Compared:
             for some in dict.fromkeys((sides[:1], sides))
             for method in estimators(split, physics, _SLICE_ESTIMATORS, some)
         ]
-    return Compared(split, measure(methods, split.future.torque_at_frames(), rounds))
+    return MethodComparison(split, measure(methods, split.future.torque_at_frames(), rounds))
 
 
 def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, own_mesh: Mesh | None, out: Path, rounds: int) -> list[Path]:
-    """Measure, draw and write the chart; `own_mesh` is the user's, on which the forward methods are timed as well."""
-    compared = [one for one in (measured(split, bank, mesh, rounds) for split in parts) if one.methods]
+    """Measure, draw and write the chart; the forward methods are timed on the user's `own_mesh` too."""
+    compared = [one for one in (compare_methods(split, bank, mesh, rounds) for split in parts) if one.methods]
     best = [min(method.rmse_nm for method in one.methods) for one in compared]
     noises = sorted({round(min(rmse, _LARGEST_LOOP_NOISE_NM), 4) for rmse in [*best, _LARGEST_LOOP_NOISE_NM]})
-    loop = followed(noises[:1] + noises[1:][-2:], max(rounds // 2, 1))
-    return write(compared, forwards(rounds, own_mesh), loop, bank, out)
+    loop = tracking_errors(noises[:1] + noises[1:][-2:], max(rounds // 2, 1))
+    return write(compared, forward_methods(rounds, own_mesh), loop, bank, out)
 
 
 def write(
-    compared: Sequence[Compared], solved: Sequence[Solved], loop: Sequence[Followed], bank: Bank, out: Path
+    compared: Sequence[MethodComparison],
+    solved: Sequence[SolvedForward],
+    loop: Sequence[TrackingError],
+    bank: Bank,
+    out: Path,
 ) -> list[Path]:
-    """Draw what was measured, and write it."""
+    """Draw and write the measurements."""
     content = {
         "machine": f"{platform.machine()}, one thread",
         "bank": {"model": bank.model, "shape": list(bank.signals.shape), "identity": bank.identity},
@@ -106,13 +291,13 @@ def write(
     return save(made, content, out, "speed-accuracy")
 
 
-def _rows(methods: Sequence[Measured]) -> list[dict[str, Any]]:
-    """Return the methods' figures with their times as ratios to the first one's, the paper's where it was run."""
+def _rows(methods: Sequence[MeasuredMethod]) -> list[dict[str, Any]]:
+    """Return the methods' figures, with times relative to the first method (the paper's, where it was run)."""
     first = methods[0].latency_ms
     return [asdict(one) | {"latency_ratio": one.latency_ms / first} for one in methods]
 
 
-def _draw_methods(axes: Axes, compared: Compared) -> None:
+def _draw_methods(axes: Axes, compared: MethodComparison) -> None:
     methods = compared.methods
     plain_log(axes)
     often = often_valid(methods)
@@ -142,26 +327,26 @@ def _draw_methods(axes: Axes, compared: Compared) -> None:
         ylabel="torque error on later frames, RMS, N·m",
     )
     axes.grid(alpha=0.25, which="both")
-    # Room below the frontier for the legend.
+    # Leave room for the legend below the frontier.
     low, high = min(one.rmse_nm for one in methods), max(one.rmse_nm for one in methods)
     axes.set_ylim(low * (low / high) ** 0.55, high * 1.25)
     axes.legend(fontsize=8, loc="lower right", title="filled: on the frontier", title_fontsize=8, ncols=2)
 
 
-def often_valid(methods: Sequence[Measured]) -> list[int]:
-    """Return the numbers of the methods that call about as many frames valid as the one that calls most so."""
+def often_valid(methods: Sequence[MeasuredMethod]) -> list[int]:
+    """Return the numbers of the methods with about as many valid frames as the best one."""
     most = max(one.valid_fraction for one in methods)
     return [i for i, one in enumerate(methods) if one.valid_fraction >= _OFTEN_VALID * most]
 
 
-def _short(one: Measured, is_often_valid: bool) -> str:
-    """Return a label, with the valid share where that is clearly less than the others': the error is of those alone."""
+def _short(one: MeasuredMethod, is_often_valid: bool) -> str:
+    """Return a label, with the valid share where it is clearly below the others'."""
     short = one.name.removeprefix("rank ").removesuffix(" channels").replace("zero lag, ", "").replace("all lags, ", "")
     short = short.replace("paper: reference", "paper").replace("fast and exact", "fast").replace(", right", "")
     return short if is_often_valid else f"{short} ({one.valid_fraction:.0%} valid)"
 
 
-def _draw_forward(axes: Axes, solved: Sequence[Solved]) -> None:
+def _draw_forward(axes: Axes, solved: Sequence[SolvedForward]) -> None:
     plain_log(axes)
     known = [(one.cell_ms, one.error) for one in solved if one.error is not None]
     costs = [cost for cost, _ in known]
@@ -195,7 +380,7 @@ def _draw_forward(axes: Axes, solved: Sequence[Solved]) -> None:
     axes.legend(fontsize=7.5, loc="upper right")
 
 
-def _draw_loop(axes: Axes, loop: Sequence[Followed]) -> None:
+def _draw_loop(axes: Axes, loop: Sequence[TrackingError]) -> None:
     axes.set(yscale="log")
     noises = sorted({one.noise_nm for one in loop})
     for number, name in enumerate(LOOPS):
@@ -203,7 +388,7 @@ def _draw_loop(axes: Axes, loop: Sequence[Followed]) -> None:
             runs = [one for one in loop if one.loop == name and one.noise_nm == noise]
             rms = [one.rms_nm for one in runs]
             bars = [[one.rms_nm - one.rms_low_nm for one in runs], [one.rms_high_nm - one.rms_nm for one in runs]]
-            # What has no line to tell its noise by tells it by how its mark is filled.
+            # A single point has no line: its fill shows the noise.
             axes.errorbar(
                 [one.delay_s for one in runs], rms, yerr=bars, marker=MARKS[number], color=SHADES[number],
                 linestyle=line if len(runs) > 1 else "none", linewidth=1.2, elinewidth=0.7,

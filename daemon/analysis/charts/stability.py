@@ -1,193 +1,256 @@
-"""Estimators where methods fail: bias, spread, valid and false-valid share of each, as a fault grows."""
+"""`shearloop chart stability`: estimators under faults, checks of slices, the rim of the bank, the loop on the skin."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.errors import BankError
-from shearloop.bank.estimation import (
-    Calibration,
-    Estimate,
-    EstimatorSession,
-    FrameSeries,
-    Name,
-    Physics,
-    TactileFrame,
-    fit,
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.estimation import Name, Physics
+from shearloop.daemon.analysis.charts import skin_loop
+from shearloop.daemon.analysis.charts.drawing import SHADES, figure, look, save, slug
+from shearloop.daemon.analysis.charts.fault_sweeps import BROKEN_SHARE, FaultCurve, fitted, misaligned, sweeps
+from shearloop.daemon.analysis.charts.slice_stability import (
+    FOREIGN_SHARES,
+    STEPS,
+    ContinuityWalk,
+    Extrapolation,
+    ForeignMixture,
+    detect_mixtures,
+    extrapolate,
+    sweep_rims,
+    walks,
 )
-from shearloop.bank.estimation.fingertip_validator import channel_noise
-from shearloop.daemon.analysis.charts.faults import FAULTS, Fault, Scene, Spoilt, scene_of
-from shearloop.daemon.analysis.charts.sources import Split
-from shearloop.daemon.scene import residual_noise
-from shearloop.daemon.workers import Executor, in_order
+from shearloop.daemon.analysis.charts.sources import Split, splits
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.workers import Executor
 
-# Of valid estimates one in twenty may miss its 95 % interval; an estimator that is wrong so often says it is right
-# when it is not: it breaks silently.
-BROKEN_SHARE = 0.2
-# Frames of a stream that are judged: enough for a twist and a half.
-_MOST_FRAMES = 180
-_DRAWS = 3
-_LOADED_SHARE = 0.1
+SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
+STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "fused")
+SHIFTS_S = (-0.54, -0.27, -0.13, 0.0, 0.13, 0.27, 0.54, 1.08)
 
 
-@dataclass(frozen=True, slots=True)
-class Level:
-    """Errors at one strength of a fault: bias and spread in N·m of valid estimates, None without any; shares of all.
-
-    false_valid is the share of frames that are called valid although the truth is outside the 95 % interval.
-    """
-
-    level: float
-    bias_nm: float | None
-    spread_nm: float | None
-    valid: float
-    false_valid: float
-
-
-@dataclass(frozen=True, slots=True)
-class Curve:
-    """One estimator through one sweep; breaks_at is the mildest level at which it is silently wrong too often."""
-
-    fault: str
-    unit: str
-    estimator: str
-    levels: tuple[Level, ...]
-    breaks_at: float | None
+def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Path, executor: Executor) -> list[Path]:
+    """Measure, draw and write a chart per recording, the checks of slices, the bank's rim, and the loop on the skin."""
+    physics, written = Physics(bank, mesh), []
+    names = {"raw": STREAM_NAMES, "difference": SLICE_NAMES}
+    for split in parts:
+        curves = sweeps(split, names[split.past.kind], physics, bank, executor)
+        if split.past.kind == "raw":
+            curves += misaligned(split, STREAM_NAMES, physics, SHIFTS_S)
+        if not curves:
+            raise UserError(
+                f"{split.title}: no estimator can be calibrated on it (see above); chart a longer recording"
+            )
+        written += _written(f"stability-{slug(split.title)}", split.title, curves, out)
+        if split.past.kind == "difference":
+            written += _of_slices(split, bank, mesh, out, executor)
+    synthetic = next(one for one in splits([], 0.6, scratch) if one.past.kind == "difference")
+    curves = list(sweep_rims(fitted(synthetic, SLICE_NAMES, physics), bank, scratch))
+    written += _written("stability-rims", "the rim of the bank, on synthetic slices", curves, out)
+    return written + skin_loop.chart(out, executor)
 
 
-def curve(fault: str, unit: str, estimator: str, levels: Iterable[Level]) -> Curve:
-    """Return a sweep with its breaking point."""
-    found = tuple(levels)
-    broken = [one.level for one in found if one.false_valid > BROKEN_SHARE]
-    # Levels go from mild to grave, or, where a fault has two directions, through 0.
-    mildest = min(broken, key=abs, default=None) if any(one.level < 0 for one in found) else next(iter(broken), None)
-    return Curve(fault, unit, estimator, found, mildest)
+def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Executor) -> list[Path]:
+    """Write the charts of slices: continuity, torques beyond the calibrated ones, foreign frames."""
+    name, physics = slug(split.title), Physics(bank, mesh)
+    found = walks(split, bank, fitted(split, ("regression", "fused"), physics))
+    rows = [asdict(one) | {"largest_hop_nm": one.largest_hop_nm, "hops": one.hops} for one in found]
+    written = save(continuity_figure(split.title, found), {"steps": STEPS, "walks": rows}, out, f"continuity-{name}")
+    beyond = extrapolate(split, SLICE_NAMES, bank, mesh, executor)
+    content = {
+        "broken_share": BROKEN_SHARE,
+        "title": split.title,
+        "extrapolations": [asdict(one) | {"times_good": one.times_good} for one in beyond],
+    }
+    written += save(extrapolation_figure(split.title, beyond), content, out, f"extrapolation-{name}")
+    seen = detect_mixtures(split.whole)
+    return written + save(
+        detectability_figure(split.title.split(",", maxsplit=1)[0], seen),
+        {"mixtures": [asdict(one) for one in seen]}, out, f"detectability-{name}",
+    )  # fmt: skip
 
 
-def judged(estimates: Sequence[Estimate], truth_nm: FloatArray, level: float) -> Level:
-    """Return the figures of estimates against (n,) truths, of which only those that are known count."""
-    known = np.isfinite(truth_nm)
-    rows = [
-        (one.torque_nm - truth, one.torque_low_nm <= truth <= one.torque_high_nm)
-        for one, truth in zip(estimates, truth_nm, strict=True)
-        if one.valid
-        and np.isfinite(truth)
-        and one.torque_nm is not None and one.torque_low_nm is not None and one.torque_high_nm is not None
-    ]  # fmt: skip
-    if not rows:
-        return Level(level, None, None, 0.0, 0.0)
-    error, inside = np.array(rows, dtype=np.float64).T
-    n = int(known.sum())
-    return Level(level, float(error.mean()), float(error.std()), len(rows) / n, float((inside == 0).sum()) / n)
+def _written(name: str, title: str, curves: Sequence[FaultCurve], out: Path) -> list[Path]:
+    content = {"broken_share": BROKEN_SHARE, "title": title, "curves": [asdict(one) for one in curves]}
+    return save(sweeps_figure(title, curves), content, out, name)
 
 
-def estimates_of(tracker: EstimatorSession, spoilt: Spoilt) -> list[Estimate]:
-    """Return the estimates of spoilt frames, in order, as live, in a session of their own."""
-    tracker.tare()
-    found = []
-    for i, (t_s, channels) in enumerate(zip(spoilt.series.t_s, spoilt.series.channels, strict=True)):
-        usable = None if spoilt.usable is None else spoilt.usable[i]
-        found.append(tracker.estimate(TactileFrame.of(float(t_s), channels, usable)))
-    return found
+def sweeps_figure(title: str, curves: Sequence[FaultCurve]) -> Figure:
+    """Draw bias, valid and false-valid share of every estimator, one row per fault."""
+    faults = list(dict.fromkeys((one.fault, one.unit) for one in curves))
+    made = figure(15, 2.75 * len(faults) + 1.0)
+    axes = made.subplots(len(faults), 3, squeeze=False)
+    for row, fault in zip(axes, faults, strict=True):
+        _draw_fault(row, *fault, curves)
+    axes[0, 2].legend(fontsize=8, loc="upper left", handlelength=3.5)
+    made.suptitle(
+        f"Estimators under faults: {title}\n× breaks silently: more than {BROKEN_SHARE:.0%} of the frames are "
+        "called valid and miss their 95 % interval",
+        fontsize=12,
+    )  # fmt: skip
+    return made
 
 
-def truth_of(series: FrameSeries) -> FloatArray:
-    """Return the (n,) torques that a series is judged by, NaN where it is not."""
-    torque = series.torque_at_frames()
-    return balanced(torque) if series.kind == "raw" else torque
+def _draw_fault(row: Sequence[Axes], fault: str, unit: str, curves: Sequence[FaultCurve]) -> None:
+    """Draw one fault's curves into three panels: bias, valid and false-valid share."""
+    for panel, heading in zip(row, ("bias, and spread as bars, mN·m", "valid share", "FALSE-VALID share"), strict=True):
+        _label(panel, unit, heading)
+    row[0].set_title(fault, fontsize=10.5, loc="left", fontweight="bold")
+    row[0].axhline(0, color="#999999", linewidth=0.8)
+    names = list(dict.fromkeys(one.estimator for one in curves))
+    for number, name in enumerate(names):
+        for one in curves:
+            if one.fault == fault and one.estimator == name:
+                _draw_curve(row, one, number, len(names))
+    row[2].axhline(BROKEN_SHARE, color="#999999", linewidth=1.2, linestyle=(0, (1, 2)))
+    for panel in row[1:]:
+        panel.set_ylim(-0.04, 1.04)
 
 
-def balanced(truth_nm: FloatArray) -> FloatArray:
-    """Return (n,) truths of which as many are loaded as free of load, the rest NaN: most of a stream is free of load.
-
-    Zero is easily met; an estimator that always says so would look stable.
-    """
-    loaded = np.abs(truth_nm) > _LOADED_SHARE * np.nanmax(np.abs(truth_nm))
-    free = np.flatnonzero(np.isfinite(truth_nm) & ~loaded)
-    kept = free[np.linspace(0, len(free) - 1, min(len(free), int(loaded.sum()))).astype(int)] if len(free) else free
-    return np.where(loaded | np.isin(np.arange(len(truth_nm)), kept), truth_nm, np.nan)
+def _label(panel: Axes, unit: str, heading: str) -> None:
+    panel.set_ylabel(heading, fontsize=9)
+    panel.set_xlabel(unit, fontsize=9)
+    panel.grid(alpha=0.25)
 
 
-def sweep(tracker: EstimatorSession, scene: Scene, fault: Fault) -> Curve:
-    """Return an estimator through one fault; where chance decides which electrodes, several times."""
-    truth = truth_of(scene.series)
-    levels = []
-    for level in fault.levels:
-        estimates: list[Estimate] = []
-        draws = _DRAWS if level > fault.levels[0] and scene.series.kind == "difference" else 1
-        for draw in range(draws):
-            spoilt = fault.apply(scene, level, np.random.default_rng((5, draw)))
-            estimates += estimates_of(tracker, spoilt)
-        levels.append(judged(estimates, np.tile(truth, draws), level))
-    return curve(fault.name, fault.unit, tracker.calibration.estimator, levels)
+def _offset_places(count: int, number: int, of: int) -> NDArray[np.float64]:
+    """Return the x places of one curve's marks, offset so that curves do not cover each other."""
+    return np.arange(float(count)) + 0.12 * (number - (of - 1) / 2)
 
 
-def fitted(split: Split, names: Sequence[Name], physics: Physics) -> list[Calibration]:
-    """Return the estimators that the past determines; why one is missing is printed."""
-    found = []
-    for name in names:
-        try:
-            found.append(fit(name, [split.past], split.title, physics))
-        except BankError as error:
-            print(f"{split.title}: {name} is left out: {error}")
-    return found
+def _draw_curve(row: Sequence[Axes], one: FaultCurve, number: int, count: int) -> None:
+    style = look(number) | {"linewidth": 1.3, "markersize": 5}
+    labels = [f"{level.level:g}" for level in one.levels]
+    x = _offset_places(len(labels), number, count)
+    bias = np.array([np.nan if level.bias_nm is None else 1e3 * level.bias_nm for level in one.levels])
+    spread = np.array([np.nan if level.spread_nm is None else 1e3 * level.spread_nm for level in one.levels])
+    row[0].errorbar(x, bias, yerr=spread, elinewidth=0.8, **style)
+    row[1].plot(x, [level.valid for level in one.levels], **style)
+    false = [level.false_valid for level in one.levels]
+    row[2].plot(x, false, label=one.estimator, **style)
+    for i, level in enumerate(one.levels):
+        if level.level == one.breaks_at:
+            row[2].plot(x[i], false[i], "x", color="black", markersize=13, markeredgewidth=2.5, zorder=5)
+    for panel in row:
+        panel.set_xticks(range(len(labels)), labels, fontsize=8)
+        panel.set_xlim(-0.6, len(labels) - 0.4)
 
 
-def misaligned(split: Split, names: Sequence[Name], physics: Physics, shifts_s: Sequence[float]) -> list[Curve]:
-    """Return estimators whose calibration took each torque for one measured so much later, judged on the truth.
-
-    A calibration that is refused gives no valid estimate.
-    """
-    levels: dict[str, list[Level]] = {name: [] for name in names}
-    for shift in shifts_s:
-        past = split.past
-        late = replace(past, torque_t_s=past.torque_t_s + shift)
-        calibrated = {one.estimator: one for one in fitted(replace(split, past=late), names, physics)}
-        for name, found in levels.items():
-            estimates: list[Estimate] = []
-            if name in calibrated:
-                estimates = estimates_of(
-                    EstimatorSession(calibrated[name], physics.bank), Spoilt(shortened(split.future))
-                )
-            truth = truth_of(shortened(split.future)) if estimates else np.zeros(0)
-            found.append(judged(estimates, truth, shift))
-    return [curve("calibrated on misaligned times", "s", name, found) for name, found in levels.items()]
-
-
-def shortened(series: FrameSeries) -> FrameSeries:
-    """Return no more frames than are judged."""
-    return series.between(0, min(len(series.t_s), _MOST_FRAMES))
-
-
-def scene_for(split: Split, bank: Bank) -> Scene:
-    """Return what the faults are applied to: the later frames, with idle frames and noise of the earlier ones.
-
-    Slices have no idle frame: the bank's homogeneous voltages stand in, in volts as the board reads them on average.
-    """
-    series = shortened(split.future)
-    if series.kind == "difference":
-        idle = np.abs(bank.homogeneous) * (_MEAN_V / float(np.abs(bank.homogeneous).mean()))
-        noise = residual_noise(split.past.channels[:, 0])
-        return scene_of(series, np.tile(idle, (len(series.sides), 1)), noise)
-    idle = np.median(split.past.channels[:5], axis=0)
-    return scene_of(series, idle, float(np.median(channel_noise(split.past.channels[:, 0]))))
+def extrapolation_figure(title: str, found: Sequence[Extrapolation]) -> Figure:
+    """Draw the estimators beyond the torques they were calibrated on, and the width of their intervals."""
+    faults = list(dict.fromkeys((one.curve.fault, one.curve.unit) for one in found))
+    made = figure(19, 4.2 * len(faults) + 1.0)
+    axes = made.subplots(len(faults), 4, squeeze=False)
+    for row, (fault, unit) in zip(axes, faults, strict=True):
+        here = [one for one in found if one.curve.fault == fault]
+        _draw_fault(row[:3], fault, unit, [one.curve for one in here])
+        _label(row[3], unit, "median width, times that of good later slices")
+        row[3].axhline(1.0, color="#999999", linewidth=0.8)
+        for number, one in enumerate(here):
+            times = [np.nan if width is None else width for width in one.times_good]
+            row[3].plot(
+                _offset_places(len(times), number, len(here)), times, linewidth=1.3, markersize=5, **look(number)
+            )
+        row[3].set_ylim(bottom=0.0)
+        labels = [f"{level.level:.3f}\n{n}" for level, n in zip(here[0].curve.levels, here[0].slices, strict=True)]
+        for panel in row:
+            panel.set_xticks(range(len(labels)), ["all\n" + labels[0].split("\n")[1], *labels[1:]], fontsize=8)
+            panel.set_xlim(-0.6, len(labels) - 0.4)
+    # This panel has room for the names.
+    axes[0, 1].legend(*axes[0, 2].get_legend_handles_labels(), fontsize=8, handlelength=3.5)
+    made.suptitle(
+        f"Torques beyond the calibrated ones: {title}\nat “all”: calibrated on the earlier slices, judged on the later "
+        "ones; else all other slices are judged; below each limit: number of calibrated slices\n× breaks "
+        f"silently: more than {BROKEN_SHARE:.0%} of the slices are called valid and miss their 95 % interval",
+        fontsize=12,
+    )  # fmt: skip
+    return made
 
 
-_MEAN_V = 0.13
+def continuity_figure(title: str, walks: Sequence[ContinuityWalk]) -> Figure:
+    """Draw the estimates along a path through the frames, and the largest change of each within one small step."""
+    made = figure(15, 6.2)
+    way, bars = made.subplots(1, 2, gridspec_kw={"width_ratios": [2.3, 1]})
+    for number, walk in enumerate(walks):
+        style = look(number) | {"linewidth": 1.4, "markersize": 4}
+        at = np.arange(len(walk.torque_nm)) / STEPS
+        way.plot(at, walk.torque_nm, markevery=(2 * number, 40), label=walk.name, **style)
+        bars.barh(
+            number,
+            1e3 * walk.largest_hop_nm,
+            color="#d9d9d9",
+            edgecolor="black",
+            hatch=("/", "\\", "x", ".", "o")[number % 5],
+        )
+        bars.text(
+            1e3 * walk.largest_hop_nm,
+            number,
+            f"  {1e3 * walk.largest_hop_nm:.2f} ({walk.hops} hops)",
+            va="center",
+            fontsize=9,
+        )
+    bars.set_yticks(range(len(walks)), [walk.name.replace(": ", ":\n") for walk in walks], fontsize=8.5)
+    bars.invert_yaxis()
+    bars.margins(x=0.45)
+    bars.axvline(1e3 * walks[0].share_nm, color="black", linestyle=":", linewidth=1)
+    bars.set(
+        xlabel="largest change of the torque in one step, mN·m\n(dotted: a step's fair share of the path)",
+        title=f"in {STEPS} steps from one frame to the next",
+    )  # fmt: skip
+    way.set(
+        xlabel="frames of the later part by rising torque, joined by straight lines", ylabel="torque, N·m",
+        title="estimates along the path",
+    )  # fmt: skip
+    way.grid(alpha=0.25)
+    way.legend(fontsize=8.5)
+    made.suptitle(f"Continuity: how far the estimate jumps for a small change of the frame, {title}")
+    return made
 
 
-def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, pool: Executor) -> list[Curve]:
-    """Return all estimators through all faults on one split; each estimator is a task of its own."""
-    tasks = fitted(split, names, physics)
-    found = in_order(pool.map(swept, (scene_for(split, bank), str(bank.path.resolve())), tasks))
-    return [one for curves in found for one in curves]
-
-
-def swept(shared: tuple[Scene, str], calibration: Calibration) -> list[Curve]:
-    """Return one estimator through all faults; a worker has to reach the bank's file."""
-    scene, path = shared
-    tracker = EstimatorSession(calibration, Bank.open(path))
-    return [sweep(tracker, scene, fault) for fault in FAULTS]
+def detectability_figure(title: str, found: Sequence[ForeignMixture]) -> Figure:
+    """Draw the misfits of one origin, and the share that passes at all origins."""
+    made = figure(15, 6)
+    clouds, passing = made.subplots(1, 2, gridspec_kw={"width_ratios": [1, 1.15]})
+    kinds = list(dict.fromkeys(one.kind for one in found))
+    origins = list(dict.fromkeys(one.origin for one in found))
+    shown = min(origins, key=lambda one: abs(one - 0.6))
+    for one in found:
+        if one.origin == shown and one.kind == kinds[0]:
+            x = np.full(len(one.misfits), one.share) + np.linspace(-0.008, 0.008, len(one.misfits))
+            clouds.plot(x, one.misfits, "o", color=SHADES[1], markersize=4, alpha=0.7)
+    good = next(one for one in found if one.origin == shown and one.share == 0)
+    clouds.axhline(1.0, color="black", linewidth=1.4, label="limit of the validity check, from earlier slices")
+    clouds.axhline(
+        max(good.misfits), color="black", linestyle=":", linewidth=1.4, label="best limit: the worst good slice"
+    )
+    clouds.set(
+        xlabel=f"share of a foreign frame ({kinds[0]})", ylabel="misfit of each later slice's reciprocal channels",
+        title=f"calibrated on the first {shown:.0%}", yscale="log",
+    )  # fmt: skip
+    clouds.legend(fontsize=8.5, loc="upper left")
+    for number, (kind, name, label) in enumerate(
+        [(kind, name, label) for kind in kinds
+         for name, label in (("passing", "validity check"), ("passing_best", "best possible limit"))]
+    ):  # fmt: skip
+        rows = [
+            [getattr(one, name) for one in found if one.kind == kind and one.share == share] for share in FOREIGN_SHARES
+        ]
+        mean = [float(np.mean(row)) for row in rows]
+        bars = np.array([[m - min(row), max(row) - m] for m, row in zip(mean, rows, strict=True)]).T
+        x = np.array(FOREIGN_SHARES) + 0.003 * (number - 1.5)
+        passing.errorbar(x, mean, yerr=bars, linewidth=1.4, elinewidth=0.8, label=f"{kind}: {label}", **look(number))
+    passing.set(
+        xlabel="share of the foreign frame", ylabel="share of the slices that passes",
+        title=f"mean of {len(origins)} origins (bars: lowest and highest)", ylim=(-0.04, 1.04),
+    )  # fmt: skip
+    passing.legend(fontsize=8.5, loc="upper right")
+    for panel in (clouds, passing):
+        panel.grid(alpha=0.25)
+    made.suptitle(f"Detectable share of a foreign frame: {title}")
+    return made

@@ -7,9 +7,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, Self
 
-from shearloop.daemon.cli.cluster import add_cluster
-from shearloop.daemon.cli.interruption import ended
+from shearloop.daemon.cli.options import add_cluster
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.signals import report_interrupt
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         return _build(args)
     except KeyboardInterrupt as interrupt:
-        return ended(f"shearloop bank: interrupted: {_left(args.out, before)}", interrupt)
+        return report_interrupt(f"shearloop bank: interrupted: {_left(args.out, before)}", interrupt)
 
 
 def _version(path: Path) -> tuple[int, int] | None:
@@ -89,7 +89,7 @@ def _build(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.build import build_bank, solve_row
     from shearloop.bank.errors import EmptyBankError
     from shearloop.daemon.bank_config import load_bank_plans
-    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.workers import open_executor
 
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
@@ -100,7 +100,7 @@ def _build(args: argparse.Namespace) -> int:
     paths = _paths(args.out, list(plans))
     # In a folder the names are the banks' own, and what cannot be used of an earlier build is built anew.
     if paths == [args.out]:
-        check_writes_over(args.out, "a bank", BANK_MAGIC)
+        check_overwrite(args.out, "a bank", BANK_MAGIC)
     built = []
     with open_executor(args.cluster, jobs) as pool:
 

@@ -17,12 +17,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Design, and print or write what `bank build --config` takes."""
-    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.scene import design_yaml, designed_for, doubts
 
     if args.out is not None:
-        check_writes_over(args.out, "a configuration")
+        check_overwrite(args.out, "a configuration")
     fingertip, design = designed_for(args.recording, args.fingertip, args.side)
     text = design_yaml(design, fingertip, args.recording)
     for sentence in doubts(design):

@@ -29,10 +29,10 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.stored import replaced
     from shearloop.bank.errors import ConductivityError
     from shearloop.daemon.bank_config import load_geometry
-    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
 
-    check_writes_over(args.out, "an array of NumPy", np.lib.format.MAGIC_PREFIX)
+    check_overwrite(args.out, "an array of NumPy", np.lib.format.MAGIC_PREFIX)
     mesh = load_geometry(args.mesh)
     try:
         voltages = ForwardModel(mesh).voltages(conductivity(mesh, args.model, args.k, args.sigma))

@@ -46,7 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         importlib.import_module(module).configure(part)
 
 
-def spelled_out(arguments: Sequence[str]) -> list[str]:
+def expand_default_command(arguments: Sequence[str]) -> list[str]:
     """Return the arguments with the thing in front: where none is named they are recordings."""
     if not arguments or arguments[0] in (*THINGS, "-h", "--help"):
         return list(arguments)

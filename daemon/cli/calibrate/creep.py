@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -66,5 +67,5 @@ def run(args: argparse.Namespace) -> int:
         "Scale and zero are no creep, and the line above does not mend them: where they are far from 1 and 0, "
         "calibrate the estimator anew, and take the zero untouched.",
     ]
-    tell(told, sentences, as_json=args.json)
+    print_result(told, sentences, as_json=args.json)
     return 0

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.operator_input import Operator
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result
 
 if TYPE_CHECKING:
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -42,7 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Grip each object, and write the calibration."""
-    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
     from shearloop.drivers.calibration_file import save_calibration
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -55,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")
     if not args.out.parent.is_dir():
         raise UserError(f"--out {args.out} cannot be written: the folder {args.out.parent} does not exist")
-    check_writes_over(args.out, "a calibration file")
+    check_overwrite(args.out, "a calibration file")
     client: GripperClient
     if args.host is not None:
         client = SocketClient(args.host, args.socket_port)
@@ -77,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm.",
         f"Written to {args.out}.",
     ]
-    tell(told, sentences, as_json=args.json)
+    print_result(told, sentences, as_json=args.json)
     return 0
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.operator_input import Operator
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result
 
 if TYPE_CHECKING:
     from shearloop.drivers.hx711_calibration import LoadCalibrator
@@ -49,7 +50,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Ask for each load, measure it, and write the calibration."""
-    from shearloop.daemon.cli.writing_over import check_writes_over
+    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
     from shearloop.drivers.calibration_file import save_calibration
     from shearloop.drivers.hx711 import BAUD_RATE
@@ -60,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         raise UserError(f"--lever-arm-mm {args.lever_arm_mm:g} is no lever arm; give millimetres above 0")
     if not args.out.parent.is_dir():
         raise UserError(f"--out {args.out} cannot be written: the folder {args.out.parent} does not exist")
-    check_writes_over(args.out, "a calibration file")
+    check_overwrite(args.out, "a calibration file")
     calibrator = LoadCalibrator(args.mass_g, args.lever_arm_mm * 1e-3, -1 if args.reverse else 1)
     with SerialPort(find_port(serial_number=args.serial_number, path=args.port), BAUD_RATE) as port:
         asyncio.run(_measure(port, calibrator, Operator(stdout_is_for_json=args.json)))
@@ -73,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         "residual_nm": result.residual_nm,
         "remarks": list(result.sentences),
     }
-    tell(told, [*result.sentences, f"Written to {args.out}."], as_json=args.json)
+    print_result(told, [*result.sentences, f"Written to {args.out}."], as_json=args.json)
     return 0
 
 

@@ -3,7 +3,8 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.result import add_json, tell
+from shearloop.daemon.cli.options import add_json, check_overwrite
+from shearloop.daemon.cli.output import print_result
 
 # A larger delay belongs to another recording.
 _LARGEST_DELAY_S = 600.0
@@ -57,7 +58,6 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation.calibration import ARCHIVE_MAGIC
     from shearloop.daemon.analysis.calibrate import CalibrationOptions, calibrate
     from shearloop.daemon.cli.recorded import parsed_sides, parsed_time_range
-    from shearloop.daemon.cli.writing_over import check_writes_over
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.schema import LARGEST_DIAMETER_MM
 
@@ -75,12 +75,12 @@ def run(args: argparse.Namespace) -> int:
         )
     if tool_mm is not None and not 0 < tool_mm < LARGEST_DIAMETER_MM:
         raise UserError(f"--tool-mm must be above 0 and below {LARGEST_DIAMETER_MM:g} mm, not {tool_mm:g}")
-    check_writes_over(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
+    check_overwrite(args.out, "an estimator's calibration", ARCHIVE_MAGIC)
     physics = Physics(
         bank=Bank.open(args.bank) if args.bank else None, mesh=load_mesh(args.mesh) if args.mesh else None
     )
     report = calibrate(args.recordings, args.estimator, physics, options)
     report.calibration.save(args.out)
     sentences = [*report.sentences, f"Written to {args.out}."]
-    tell({"path": str(args.out), **report.result}, sentences, as_json=args.json)
+    print_result({"path": str(args.out), **report.result}, sentences, as_json=args.json)
     return 0

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable, Coroutine
 
-from shearloop.daemon.ending_signals import ending_signals
+from shearloop.daemon.signals import ending_signals
 
 STDIN = 0
 READ_BYTES = 4096

@@ -21,7 +21,7 @@ from shearloop.bank.estimation import alignment as alignments
 from shearloop.bank.estimation.alignment import alignment, doubt, is_filtered
 from shearloop.bank.estimation.bank_match import Registration
 from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.daemon.analysis.charts.stability import balanced
+from shearloop.daemon.analysis.charts.fault_sweeps import balanced
 from shearloop.daemon.analysis.evaluation import follow, judge
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli import main

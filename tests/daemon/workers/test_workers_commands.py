@@ -107,9 +107,8 @@ def test_a_chart_has_the_same_numbers_from_a_cluster_that_a_worker_is_killed_of(
     scheduler: str, killed: list[int], tmp_path: Path
 ) -> None:
     from shearloop.bank.estimation import Name, Physics
-    from shearloop.daemon.analysis.charts.faults import FAULTS
+    from shearloop.daemon.analysis.charts.fault_sweeps import FAULTS, sweeps
     from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, synthetic_slices
-    from shearloop.daemon.analysis.charts.stability import sweeps
     from shearloop.daemon.analysis.reproduce.banks import Grid
 
     bank = bank_of(None, own_fingertip(0.4).mesh(), tmp_path, Grid(np.linspace(3.0, 3.6, 5), np.linspace(1.0, 2.1, 8)))

@@ -10,7 +10,7 @@ from typing import TypeAlias
 
 import pytest
 
-from shearloop.daemon.cli.interruption import interrupts_heard
+from shearloop.daemon.signals import raise_ending_signals
 from shearloop.daemon.workers import ProcessExecutor
 
 # From a signal and what it interrupts to the process in which a task was.
@@ -45,7 +45,7 @@ def interrupted_once_it_works(tmp_path: Path) -> Iterator[Interrupted]:
     def during(number: signal.Signals, work: Callable[[], object]) -> int:
         thread = threading.Thread(target=interrupt, args=(number,))
         thread.start()
-        with pytest.raises(KeyboardInterrupt), interrupts_heard():
+        with pytest.raises(KeyboardInterrupt), raise_ending_signals():
             work()
         thread.join()
         return running[0]

@@ -1,0 +1,196 @@
+"""Accuracy of the estimators on frames later than their fit, on another day, and on other tools.
+
+    python -m benchmarks.estimator_accuracy RECORDINGS --bank run/demo.bank --mesh fingertip_mesh.npz --out DIR
+
+Three tables: every estimator fitted to the earlier part of each of the paper's recordings and judged on the later part;
+the default estimator fitted to one day's stream and judged on the other day's; and with `--rig` the default estimator
+on the emulated rig, calibrated on three to seven cylinders and judged on other tools. RECORDINGS holds torque_slices,
+diameter_slices and streams. Writes estimators.json, and the default's truth against estimate as estimators.png.
+"""
+
+import argparse
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from benchmarks.rig_twists import calibrate, record
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.mesh import load_mesh
+from shearloop.bank.errors import BankError
+from shearloop.bank.estimation import FrameSeries, Name, Physics, fit
+from shearloop.bank.estimation.ranking import accuracy_over_channels
+from shearloop.daemon.analysis.evaluation import EstimateTrack, follow, judge
+from shearloop.daemon.analysis.figure import draw
+from shearloop.daemon.analysis.series import part_of, read_series, series_of
+from shearloop.daemon.recording.importing import import_mat
+from shearloop.daemon.recording.reader import read_recording
+from shearloop.drivers.emulators.rig import SIDES
+
+Figures = dict[str, float | int | None]
+DEFAULT: Name = "fused"
+
+# Three and four of five repeats; about half of the cylinders' slices; five of ten twists.
+SLICE_SHARES = (0.592, 0.796)
+CYLINDER_SHARE = 0.62
+TWIST_SHARE = 0.457
+# Frames before the judged part that fill an estimator's memory.
+_WARM_UP = 0.015
+CHANNEL_COUNTS = (8, 16, 32, 64, 128, 272, 512, 896)
+STREAMS = {"3 December": "2024-12-03_16-09", "2 December": "20241202_153632"}
+FINGERTIPS: tuple[tuple[str, ...], ...] = (("right",), ("left",), ("right", "left"))
+# Sets of cylinders to calibrate on, and the tools to judge.
+CYLINDERS_MM = (
+    (10.0, 25.0, 40.0),
+    (10.0, 20.0, 30.0, 40.0),
+    (10.0, 17.5, 25.0, 32.5, 40.0),
+    (10.0, 15.0, 20.0, 25.0, 30.0, 35.0, 40.0),
+)
+TOOLS_MM = (12.0, 18.0, 22.0, 28.0, 38.0)
+
+
+@dataclass(frozen=True, slots=True)
+class AccuracySplit:
+    """The earlier and the later part of a recording; `timed_by` holds all sides of the earlier part."""
+
+    title: str
+    past: FrameSeries
+    future: FrameSeries
+    timed_by: tuple[FrameSeries, ...] = ()
+
+
+def imported_stream(recordings: Path, name: str, scratch: Path) -> Path:
+    """Import one of the paper's streams and return the recording's path."""
+    path = scratch / f"{STREAMS[name]}.mcap"
+    import_mat([recordings / "streams" / STREAMS[name]], path)
+    return path
+
+
+def splits(recordings: Path, scratch: Path) -> Iterator[AccuracySplit]:
+    """Yield the time-ordered splits of the paper's recordings."""
+    (torque,) = read_series(recordings / "torque_slices")
+    for share in SLICE_SHARES:
+        yield AccuracySplit(f"torque slices, first {share:.0%}", part_of(torque, 0, share), part_of(torque, share, 1))
+    (cylinders,) = read_series(recordings / "diameter_slices")
+    past, future = part_of(cylinders, 0, CYLINDER_SHARE), part_of(cylinders, CYLINDER_SHARE, 1)
+    yield AccuracySplit(f"cylinders, first {CYLINDER_SHARE:.0%}", past, future)
+    recording = read_recording(imported_stream(recordings, "3 December", scratch))
+    whole = series_of(recording, None)
+    for sides in FINGERTIPS:
+        twists = series_of(recording, sides)
+        yield AccuracySplit(
+            f"stream, {' and '.join(sides)}, first {TWIST_SHARE:.0%}",
+            part_of(twists, 0, TWIST_SHARE),
+            part_of(twists, TWIST_SHARE - _WARM_UP, 1),
+            (part_of(whole, 0, TWIST_SHARE),),
+        )
+
+
+def later_frames(
+    recordings: Path, scratch: Path, names: list[Name], physics: Physics
+) -> Iterator[tuple[str, Name, EstimateTrack]]:
+    """Yield the estimates of every estimator on every split; print why one cannot be fitted."""
+    for split in splits(recordings, scratch):
+        for name in names:
+            # A heatmap over all lags takes most of a second: the paper's method is judged on slices alone.
+            if name == "paper" and split.past.kind == "raw":
+                continue
+            try:
+                calibration = fit(name, [split.past], split.title, physics, timed_by=split.timed_by)
+            except BankError as error:
+                print(f"{split.title}, {name}: {error}")
+                continue
+            yield split.title, name, follow(calibration, split.future, physics.bank)
+
+
+def other_day(recordings: Path, scratch: Path) -> Iterator[tuple[str, Figures | str]]:
+    """Yield the default estimator's figures on the other day's stream, or the reason of a refused calibration.
+
+    The fingertips changed sides between the days, so the other day's sides are exchanged.
+    """
+    streams = {name: series_of(read_recording(imported_stream(recordings, name, scratch))) for name in STREAMS}
+    for name, series in streams.items():
+        (other,) = (each for each in streams if each != name)
+        exchanged = replace(streams[other], channels=streams[other].channels[:, ::-1].copy())
+        for sides in FINGERTIPS:
+            title = f"{name}, {' and '.join(sides)}"
+            try:
+                calibration = fit(DEFAULT, [series.of_sides(sides)], name, timed_by=[series])
+            except BankError as error:
+                yield title, str(error)
+                continue
+            yield title, judge([follow(calibration, exchanged.of_sides(sides))])
+
+
+def other_tools(bank: Path, seed: int, repeats: int) -> Iterator[tuple[int, tuple[str, ...], Figures]]:
+    """Yield the number of cylinders, the fingertips, and the figures on the emulated rig's other tools."""
+    tools = [one.series(mm) for mm, one in record(bank, seed, TOOLS_MM)]
+    for number, cylinders_mm in enumerate(CYLINDERS_MM):
+        seeds = [seed + 1000 * (1 + number) + 100 * i for i in range(repeats)]
+        known = [[one.series(mm) for mm, one in record(bank, each, cylinders_mm)] for each in seeds]
+        for sides in (tuple(SIDES), *((side,) for side in SIDES)):
+            tracks = [follow(calibrate(one, sides), tool) for one in known for tool in tools]
+            yield len(cylinders_mm), sides, judge(tracks)
+
+
+def over_channels(torque: FrameSeries) -> dict[int, float]:
+    """Return r on the later slices by number of channels, ranked on the earlier ones (the paper's figure 3b)."""
+    past, future = part_of(torque, 0, SLICE_SHARES[0]), part_of(torque, SLICE_SHARES[0], 1)
+    pair = [(one.channels[:, 0], one.torque_at_frames()) for one in (past, future)]
+    return accuracy_over_channels(pair[0], pair[1], CHANNEL_COUNTS)
+
+
+def table_row(*cells: str | float | None) -> str:
+    """Return a Markdown row; numbers get four digits."""
+    return f"| {' | '.join('–' if c is None else c if isinstance(c, str) else f'{c:.4g}' for c in cells)} |"
+
+
+def main() -> None:
+    """Measure, print, write, draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recordings", type=Path, help="folder with torque_slices, diameter_slices and streams")
+    parser.add_argument("--bank", type=Path, required=True, help="bank for the estimators paper and bank")
+    parser.add_argument("--mesh", type=Path, required=True, help="mesh for the estimator reconstruction")
+    parser.add_argument("--rig", action="store_true", help="judge tools on the emulated rig too; --bank is the rig's")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    physics = Physics(Bank.open(args.bank), load_mesh(args.mesh))
+    names: list[Name] = ["paper", "bank", "regression", DEFAULT, "reconstruction"]
+    found: dict[str, dict[str, Figures]] = {}
+    tracks: dict[str, EstimateTrack] = {}
+    print(
+        "| fitted to | estimator | r | RMSE, N·m or mm | bias, N·m | coverage | valid |\n|---|---|---|---|---|---|---|"
+    )
+    for title, name, track in later_frames(args.recordings, args.out, names, physics):
+        figures = judge([track])
+        found.setdefault(title, {})[name] = figures
+        rmse = figures.get("diameter_rmse_mm", figures["rmse_nm"])
+        columns = figures["r"], rmse, figures["bias_nm"], figures["coverage_95"], figures["valid_fraction"]
+        print(table_row(title, name, *columns), flush=True)
+        if name == DEFAULT:
+            tracks[title] = track
+    print("\n| fitted to | r on the other day | RMSE, N·m | coverage | valid |\n|---|---|---|---|---|")
+    for title, result in other_day(args.recordings, args.out):
+        if isinstance(result, str):
+            print(table_row(title, result, None, None, None))
+            continue
+        found[f"{title}, other day"] = {DEFAULT: result}
+        print(table_row(title, *(result[key] for key in ("r", "rmse_nm", "coverage_95", "valid_fraction"))))
+    (torque,) = read_series(args.recordings / "torque_slices")
+    print("\n| best channels | r on later slices |\n|---|---|")
+    for count, r in over_channels(torque).items():
+        print(table_row(count, r))
+    if args.rig:
+        print("\n| cylinders | fingertips | diameter RMSE, mm | coverage |\n|---|---|---|---|")
+        for count, sides, figures in other_tools(args.bank, 5000, 4):
+            found.setdefault(f"{count} cylinders", {})[" and ".join(sides)] = figures
+            rmse_mm, coverage = figures["diameter_rmse_mm"], figures["diameter_coverage_95"]
+            print(table_row(count, " and ".join(sides), rmse_mm, coverage), flush=True)
+    (args.out / "estimators.json").write_text(json.dumps(found, indent=1) + "\n")
+    title = f"{DEFAULT}, on frames later than its fit"
+    draw(list(tracks.values()), [f"fitted to {name}" for name in tracks], title, args.out / "estimators.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,335 @@
+"""Sweeps: how each estimator behaves as a fault grows from mild to grave."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from shearloop.bank.errors import BankError
+from shearloop.bank.estimation import (
+    Calibration,
+    Estimate,
+    EstimatorSession,
+    FrameSeries,
+    Name,
+    Physics,
+    TactileFrame,
+    fit,
+)
+from shearloop.bank.estimation.bank_match import Registration
+from shearloop.bank.estimation.fingertip_validator import channel_noise
+from shearloop.daemon.analysis.charts.sources import Split
+from shearloop.daemon.scene import residual_noise
+from shearloop.daemon.workers import Executor, in_order
+from shearloop.drivers.eit_format import ADC_STEP_V
+
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaultScene:
+    """Frames of a recording, the idle fingertips' voltages `idle` (m, 896), and another fingertip's frame `foreign`."""
+
+    series: FrameSeries
+    idle: FloatArray
+    noise_v: float
+    foreign: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FaultyFrames:
+    """Frames with a fault; `usable` (n, m, 896) is False where the board reports a dead channel, or None."""
+
+    series: FrameSeries
+    usable: Mask | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FrameFault:
+    """One sweep: `apply(scene, level, rng)` returns faulty frames; the first level is no fault."""
+
+    name: str
+    unit: str
+    levels: tuple[float, ...]
+    apply: Callable[[FaultScene, float, np.random.Generator], FaultyFrames]
+
+
+def _with_channels(scene: FaultScene, channels: FloatArray) -> FrameSeries:
+    """Return the frames with other channels; differences are magnitudes."""
+    return replace(scene.series, channels=np.abs(channels) if scene.series.kind == "difference" else channels)
+
+
+def _noise(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+    channels = scene.series.channels
+    return FaultyFrames(_with_channels(scene, channels + rng.normal(0.0, 1.0, channels.shape) * level * scene.noise_v))
+
+
+def lost_channels(electrodes: NDArray[np.int64]) -> Mask:
+    """Return the (896,) channels that inject or measure at one of these electrodes."""
+    return np.asarray(np.isin(CHANNELS, electrodes).any(axis=1))
+
+
+def _lose_electrodes(scene: FaultScene, level: float, rng: np.random.Generator) -> tuple[FrameSeries, Mask]:
+    """Return frames with electrodes that read one ADC step, and the mask (896,) of their channels."""
+    lost = lost_channels(rng.choice(N_ELECTRODES, int(level), replace=False))
+    channels = scene.series.channels.copy()
+    dead = ADC_STEP_V - scene.idle[:, lost] if scene.series.kind == "difference" else ADC_STEP_V
+    channels[:, :, lost] = dead
+    return _with_channels(scene, channels), lost
+
+
+def _lost_unreported(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+    return FaultyFrames(_lose_electrodes(scene, level, rng)[0])
+
+
+def _lost_reported(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+    series, lost = _lose_electrodes(scene, level, rng)
+    return FaultyFrames(series, np.broadcast_to(~lost, series.channels.shape))
+
+
+def _saturated(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
+    """Clip the amplifier's readings so that this share of the idle frame's channels is at its rail."""
+    channels = scene.series.channels
+    if not level:
+        return FaultyFrames(scene.series)
+    rail = np.quantile(scene.idle, 1.0 - level)
+    if scene.series.kind == "raw":
+        return FaultyFrames(_with_channels(scene, np.minimum(channels, rail)))
+    # Differences have lost their sign: let half of the channels rise.
+    signs = np.where(np.arange(N_CHANNELS) % 2, -1.0, 1.0)
+    read = np.minimum(scene.idle + signs * channels, rail)
+    return FaultyFrames(_with_channels(scene, read - np.minimum(scene.idle, rail)))
+
+
+def _drift(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+    """Move the baseline over the recording by a random pattern of RMS `level` of the idle frame."""
+    channels = scene.series.channels
+    pattern = rng.normal(0.0, 1.0, channels.shape[1:]) * scene.idle * level
+    share = np.linspace(0.5, 1.0, len(channels))[:, None, None]
+    if scene.series.kind == "difference":
+        return FaultyFrames(_with_channels(scene, channels + pattern))
+    return FaultyFrames(_with_channels(scene, channels + share * pattern))
+
+
+def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
+    """Raise all channels by this share, as when the gel dries or the current source drifts."""
+    channels = scene.series.channels
+    moved = level * scene.idle if scene.series.kind == "difference" else level * channels
+    return FaultyFrames(_with_channels(scene, channels + moved))
+
+
+def _turned(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
+    order = Registration(int(level), reflected=False, score=1.0, runner_up=0.0).model_channels()
+    return FaultyFrames(_with_channels(scene, scene.series.channels[:, :, order]))
+
+
+def _swapped(scene: FaultScene, level: float, rng: np.random.Generator) -> FaultyFrames:
+    """Exchange the wires of pairs of electrodes; a channel that no longer exists keeps its value."""
+    wires = np.arange(N_ELECTRODES)
+    chosen = rng.choice(N_ELECTRODES, 2 * int(level), replace=False)
+    wires[chosen[::2]], wires[chosen[1::2]] = chosen[1::2], chosen[::2]
+    place = {(sink, positive): i for i, (sink, _, positive, _) in enumerate(CHANNELS.tolist())}
+    order = np.array(
+        [place.get((wires[sink], wires[positive]), i) for i, (sink, _, positive, _) in enumerate(CHANNELS.tolist())]
+    )
+    return FaultyFrames(_with_channels(scene, scene.series.channels[:, :, order]))
+
+
+def _foreign(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
+    return FaultyFrames(_with_channels(scene, (1.0 - level) * scene.series.channels + level * scene.foreign))
+
+
+FAULTS = (
+    FrameFault("noise added", "times the measured noise", (0, 0.5, 1, 2, 4, 8, 16, 32), _noise),
+    FrameFault("lost electrodes, reported by the board", "electrodes", (0, 1, 2, 4, 6, 8, 12, 16), _lost_reported),
+    FrameFault("lost electrodes, unreported", "electrodes", (0, 1, 2, 4, 6, 8, 12, 16), _lost_unreported),
+    FrameFault(
+        "saturation, unreported", "share of the channels at the rail", (0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.7), _saturated
+    ),
+    FrameFault(
+        "baseline drift, a pattern", "RMS share of the idle frame", (0, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1), _drift
+    ),
+    FrameFault("baseline drift, gain", "share", (0, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2), _gain),
+    FrameFault("electrodes numbered from elsewhere", "electrodes of turn", (0, 1, 2, 4, 8, 16), _turned),
+    FrameFault("pairs of electrodes exchanged", "pairs", (0, 1, 2, 4, 8, 16), _swapped),
+    FrameFault("a foreign frame mixed in", "share of the foreign frame", (0, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0), _foreign),
+)
+
+
+def scene_of(series: FrameSeries, idle: FloatArray, noise_v: float, seed: int = 7) -> FaultScene:
+    """Return a scene; its foreign frame has the mean frame's voltages at shuffled channels."""
+    rng = np.random.default_rng(seed)
+    mean = series.channels.mean(axis=0)
+    foreign = np.array([layer[rng.permutation(N_CHANNELS)] for layer in mean])
+    return FaultScene(series, idle, noise_v, foreign)
+
+
+# An estimator breaks silently where more frames than this are false-valid; one in twenty is the promise.
+BROKEN_SHARE = 0.2
+# Judged frames of a stream: enough for a twist and a half.
+_MOST_FRAMES = 180
+_DRAWS = 3
+# The board's mean voltage.
+_MEAN_V = 0.13
+_LOADED_SHARE = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class FaultLevel:
+    """Errors at one level of a fault: bias and spread of valid estimates in N·m, and shares of all frames.
+
+    `false_valid` is the share of frames called valid although the truth is outside the 95 % interval.
+    """
+
+    level: float
+    bias_nm: float | None
+    spread_nm: float | None
+    valid: float
+    false_valid: float
+
+
+@dataclass(frozen=True, slots=True)
+class FaultCurve:
+    """One estimator through one sweep; it breaks silently from the level `breaks_at` on."""
+
+    fault: str
+    unit: str
+    estimator: str
+    levels: tuple[FaultLevel, ...]
+    breaks_at: float | None
+
+
+def fault_curve(fault: str, unit: str, estimator: str, levels: Iterable[FaultLevel]) -> FaultCurve:
+    """Return a curve with its breaking point."""
+    found = tuple(levels)
+    broken = [one.level for one in found if one.false_valid > BROKEN_SHARE]
+    # Levels go from mild to grave, or through 0 for a fault with two directions.
+    mildest = min(broken, key=abs, default=None) if any(one.level < 0 for one in found) else next(iter(broken), None)
+    return FaultCurve(fault, unit, estimator, found, mildest)
+
+
+def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: float) -> FaultLevel:
+    """Return the figures of estimates against (n,) truths; NaN truths do not count."""
+    known = np.isfinite(truth_nm)
+    rows = [
+        (one.torque_nm - truth, one.torque_low_nm <= truth <= one.torque_high_nm)
+        for one, truth in zip(estimates, truth_nm, strict=True)
+        if one.valid
+        and np.isfinite(truth)
+        and one.torque_nm is not None and one.torque_low_nm is not None and one.torque_high_nm is not None
+    ]  # fmt: skip
+    if not rows:
+        return FaultLevel(level, None, None, 0.0, 0.0)
+    error, inside = np.array(rows, dtype=np.float64).T
+    n = int(known.sum())
+    return FaultLevel(level, float(error.mean()), float(error.std()), len(rows) / n, float((inside == 0).sum()) / n)
+
+
+def estimate_frames(tracker: EstimatorSession, faulty: FaultyFrames) -> list[Estimate]:
+    """Return the estimates of faulty frames in order, as in a live session that starts with them."""
+    tracker.tare()
+    found = []
+    for i, (t_s, channels) in enumerate(zip(faulty.series.t_s, faulty.series.channels, strict=True)):
+        usable = None if faulty.usable is None else faulty.usable[i]
+        found.append(tracker.estimate(TactileFrame.of(float(t_s), channels, usable)))
+    return found
+
+
+def true_torques(series: FrameSeries) -> FloatArray:
+    """Return the (n,) true torques of a series, NaN for frames that do not count."""
+    torque = series.torque_at_frames()
+    return balanced(torque) if series.kind == "raw" else torque
+
+
+def balanced(truth_nm: FloatArray) -> FloatArray:
+    """Return (n,) truths with as many loaded frames as free ones, the rest NaN.
+
+    Most of a stream is free of load: an estimator that always says zero would look stable.
+    """
+    loaded = np.abs(truth_nm) > _LOADED_SHARE * np.nanmax(np.abs(truth_nm))
+    free = np.flatnonzero(np.isfinite(truth_nm) & ~loaded)
+    kept = free[np.linspace(0, len(free) - 1, min(len(free), int(loaded.sum()))).astype(int)] if len(free) else free
+    return np.where(loaded | np.isin(np.arange(len(truth_nm)), kept), truth_nm, np.nan)
+
+
+def sweep(tracker: EstimatorSession, scene: FaultScene, fault: FrameFault) -> FaultCurve:
+    """Return an estimator's curve through one fault; slices are drawn several times, as chance picks electrodes."""
+    truth = true_torques(scene.series)
+    levels = []
+    for level in fault.levels:
+        estimates: list[Estimate] = []
+        draws = _DRAWS if level > fault.levels[0] and scene.series.kind == "difference" else 1
+        for draw in range(draws):
+            faulty = fault.apply(scene, level, np.random.default_rng((5, draw)))
+            estimates += estimate_frames(tracker, faulty)
+        levels.append(judge_level(estimates, np.tile(truth, draws), level))
+    return fault_curve(fault.name, fault.unit, tracker.calibration.estimator, levels)
+
+
+def fitted(split: Split, names: Sequence[Name], physics: Physics) -> list[Calibration]:
+    """Return the calibrations that the past allows; print the reason for each missing one."""
+    found = []
+    for name in names:
+        try:
+            found.append(fit(name, [split.past], split.title, physics))
+        except BankError as error:
+            print(f"{split.title}: {name} is left out: {error}")
+    return found
+
+
+def misaligned(split: Split, names: Sequence[Name], physics: Physics, shifts_s: Sequence[float]) -> list[FaultCurve]:
+    """Return curves of estimators calibrated on torques stamped too late by each shift.
+
+    A refused calibration gives no valid estimate.
+    """
+    levels: dict[str, list[FaultLevel]] = {name: [] for name in names}
+    for shift in shifts_s:
+        past = split.past
+        late = replace(past, torque_t_s=past.torque_t_s + shift)
+        calibrated = {one.estimator: one for one in fitted(replace(split, past=late), names, physics)}
+        for name, found in levels.items():
+            estimates: list[Estimate] = []
+            if name in calibrated:
+                estimates = estimate_frames(
+                    EstimatorSession(calibrated[name], physics.bank), FaultyFrames(shortened(split.future))
+                )
+            truth = true_torques(shortened(split.future)) if estimates else np.zeros(0)
+            found.append(judge_level(estimates, truth, shift))
+    return [fault_curve("calibrated on misaligned times", "s", name, found) for name, found in levels.items()]
+
+
+def shortened(series: FrameSeries) -> FrameSeries:
+    """Return the first frames, as many as are judged."""
+    return series.between(0, min(len(series.t_s), _MOST_FRAMES))
+
+
+def scene_for(split: Split, bank: Bank) -> FaultScene:
+    """Return the later frames with idle frame and noise of the earlier ones.
+
+    Slices have no idle frame: the bank's homogeneous voltages take its place, scaled to the board's mean voltage.
+    """
+    series = shortened(split.future)
+    if series.kind == "difference":
+        idle = np.abs(bank.homogeneous) * (_MEAN_V / float(np.abs(bank.homogeneous).mean()))
+        noise = residual_noise(split.past.channels[:, 0])
+        return scene_of(series, np.tile(idle, (len(series.sides), 1)), noise)
+    idle = np.median(split.past.channels[:5], axis=0)
+    return scene_of(series, idle, float(np.median(channel_noise(split.past.channels[:, 0]))))
+
+
+def sweeps(split: Split, names: Sequence[Name], physics: Physics, bank: Bank, executor: Executor) -> list[FaultCurve]:
+    """Return the curves of all estimators through all faults; each estimator is one task for the workers."""
+    tasks = fitted(split, names, physics)
+    found = in_order(executor.map(sweep_estimator, (scene_for(split, bank), str(bank.path.resolve())), tasks))
+    return [one for curves in found for one in curves]
+
+
+def sweep_estimator(shared: tuple[FaultScene, str], calibration: Calibration) -> list[FaultCurve]:
+    """Return one estimator's curves through all faults; a worker opens the bank's file by its path."""
+    scene, path = shared
+    tracker = EstimatorSession(calibration, Bank.open(path))
+    return [sweep(tracker, scene, fault) for fault in FAULTS]

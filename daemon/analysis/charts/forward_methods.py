@@ -1,0 +1,176 @@
+"""Forward methods: time per cell of a bank against error to a converged mesh."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.eit.batch_forward import BatchForwardModel
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.models import Conductivities, conductivity
+from shearloop.daemon.analysis.charts.sources import own_fingertip
+
+MODEL = "gaussian_derivative"
+# Cells all over the valid part of the paper's grid.
+CELLS = ((3.2, 1.2), (3.3, 1.9), (2.2, 1.0), (1.4, 1.4), (0.8, 2.5), (4.0, 3.5))
+DIRECT_SIZES_CM = (0.4, 0.2, 0.1, 0.05)
+# Errors fall in proportion to the mesh size: two fine meshes give the limit (Richardson extrapolation).
+CONVERGED_SIZES_CM = (0.04, 0.025)
+BATCH, BATCHES = "batch of cells", 8
+# The mesh of the cited times. The direct solve agrees with EIDORS' voltages on it to 1e-9.
+PAPER_TRIANGLES = 4882
+# EIDORS 3.10 with warm caches on that mesh, in seconds; it needs MATLAB or Octave, so it is cited.
+EIDORS_CELL_S = 0.034
+# pyEIT with warm caches on that mesh, cited where it is not installed.
+PYEIT_CELL_S = 0.244
+
+
+@dataclass(frozen=True, slots=True)
+class SolvedForward:
+    """A forward method: ms per cell (median, fastest and slowest round), and the signals' relative L2 error.
+
+    `cited` times were not measured here. The error is None where it is unknown, or where the model is another one.
+    """
+
+    name: str
+    family: str
+    triangles: int
+    cell_ms: float
+    cell_low_ms: float
+    cell_high_ms: float
+    error: float | None
+    cited: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Solver:
+    name: str
+    family: str
+    mesh: Mesh
+    solve: Callable[[], object]
+    # None where another model is solved.
+    truth: FloatArray | None
+
+    @property
+    def times(self) -> int:
+        """The number of times that one call solves all cells."""
+        return BATCHES if self.family.startswith(BATCH) else 1
+
+
+def forward_methods(
+    rounds: int,
+    mesh: Mesh | None,
+    sizes_cm: Sequence[float] = DIRECT_SIZES_CM,
+    converged_cm: tuple[float, float] = CONVERGED_SIZES_CM,
+) -> list[SolvedForward]:
+    """Return all forward methods: direct and batched solves on ever finer meshes and on `mesh`, and the peers.
+
+    Methods take turns, so that a busy moment of the machine affects all alike. pyEIT solves on the mesh with the number
+    of triangles closest to the paper's, and is cited where it is not installed. EIDORS is always cited.
+    """
+    coarse, fine = (own_fingertip(size).mesh() for size in converged_cm)
+    truth = converged(coarse, fine, converged_cm[0] / converged_cm[1])
+    solvers = []
+    for size in sizes_cm:
+        own = own_fingertip(size).mesh()
+        solvers.append(_Solver(f"direct, {size:g} cm", "direct", own, direct(own), truth))
+        solvers.append(_Solver(f"batch, {size:g} cm", BATCH, own, batch(own), truth))
+    if mesh is not None:
+        once = mesh.refined()
+        given = converged(once, once.refined(), 2.0)
+        solvers.append(_Solver("direct, --mesh", "direct, the given mesh", mesh, direct(mesh), given))
+        solvers.append(_Solver("batch, --mesh", f"{BATCH}, the given mesh", mesh, batch(mesh), given))
+    alike = min((one.mesh for one in solvers), key=lambda mesh: abs(len(mesh.triangles) - PAPER_TRIANGLES))
+    solve = pyeit(alike)
+    if solve is not None:
+        solvers.append(_Solver("pyEIT", "pyEIT", alike, solve, None))
+    times: dict[str, list[float]] = {one.name: [] for one in solvers}
+    found = []
+    for turn in range(rounds):
+        for one in solvers:
+            begun = time.perf_counter()
+            signals = one.solve()
+            times[one.name].append(1e3 * (time.perf_counter() - begun) / (len(CELLS) * one.times))
+            if turn == rounds - 1:
+                own_ms = times[one.name]
+                found.append(
+                    SolvedForward(
+                        one.name, one.family, len(one.mesh.triangles), float(np.median(own_ms)), min(own_ms),
+                        max(own_ms), None if one.truth is None else error_of(np.asarray(signals), one.truth),
+                    )
+                )  # fmt: skip
+    # EIDORS' error is known only where the paper's mesh was given.
+    error = next((one.error for one in found if one.triangles == PAPER_TRIANGLES), None)
+    found.append(_cited("EIDORS 3.10", "EIDORS", EIDORS_CELL_S, error))
+    return found if solve is not None else [*found, _cited("pyEIT", "pyEIT", PYEIT_CELL_S, None)]
+
+
+def _cited(name: str, family: str, cell_s: float, error: float | None) -> SolvedForward:
+    cell_ms = 1e3 * cell_s
+    return SolvedForward(f"{name} (cited)", family, PAPER_TRIANGLES, cell_ms, cell_ms, cell_ms, error, cited=True)
+
+
+def pyeit(mesh: Mesh) -> Callable[[], object] | None:
+    """Return a function that solves the cells by pyEIT, with point electrodes; None where it is not installed."""
+    solve = pyeit_solver(mesh)
+    if solve is None:
+        return None
+    of = Conductivities(mesh)
+    cells = [of.of(MODEL, k, s) for k, s in CELLS]
+    return lambda: [solve(cell) for cell in cells]
+
+
+def pyeit_solver(mesh: Mesh) -> Callable[[FloatArray], object] | None:
+    """Return pyEIT's forward solve of the same patterns on the same mesh, or None where it is not installed."""
+    try:
+        from pyeit.eit.fem import EITForward
+        from pyeit.eit.protocol import PyEITProtocol
+        from pyeit.mesh import PyEITMesh
+    except ImportError:
+        return None
+    nodes = np.column_stack([mesh.nodes, np.zeros(len(mesh.nodes))])
+    middles = [mesh.electrode_edges[mesh.electrode_of_edge == e][0, 0] for e in range(N_ELECTRODES)]
+    free = int(np.setdiff1d(np.arange(len(mesh.nodes)), mesh.electrode_edges)[0])
+    body = PyEITMesh(node=nodes, element=np.asarray(mesh.triangles), el_pos=np.array(middles), ref_node=free)
+    injections = CHANNELS.reshape(N_ELECTRODES, -1, 4)
+    protocol = PyEITProtocol(
+        injections[:, 0, [1, 0]].copy(), injections[:, :, 2:].copy(), np.ones(N_CHANNELS, dtype=bool)
+    )
+    solver = EITForward(body, protocol)
+
+    def solve(conductivity: FloatArray) -> object:
+        return solver.solve_eit(perm=conductivity)
+
+    return solve
+
+
+def batch(mesh: Mesh) -> Callable[[], FloatArray]:
+    """Return a function that solves the same signals in one batch, as `bank build` does."""
+    model, of = BatchForwardModel(mesh), Conductivities(mesh)
+    (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
+    # The elimination takes several cells at once; six alone would leave lanes empty.
+    cells = np.array([of.of(MODEL, k, s) for k, s in CELLS])
+    many = np.resize(np.arange(len(CELLS)), BATCHES * len(CELLS))
+    return lambda: (model.voltages(cells[many]) - homogeneous)[: len(CELLS)]
+
+
+def direct(mesh: Mesh) -> Callable[[], FloatArray]:
+    """Return a function that solves the cells' (m, 896) difference signals one by one."""
+    model = ForwardModel(mesh)
+    homogeneous = model.homogeneous()
+    return lambda: np.array([model.voltages(conductivity(mesh, MODEL, k, s)) - homogeneous for k, s in CELLS])
+
+
+def converged(coarse: Mesh, fine: Mesh, ratio: float) -> FloatArray:
+    """Return the extrapolated signals of two meshes, the first `ratio` times as coarse, for an error of first order."""
+    first, second = direct(coarse)(), direct(fine)()
+    return np.asarray(second + (second - first) / (ratio - 1.0))
+
+
+def error_of(signals: FloatArray, truth: FloatArray) -> float:
+    """Return the median over the cells of ‖signal − truth‖ / ‖truth‖."""
+    return float(np.median(np.linalg.norm(signals - truth, axis=1) / np.linalg.norm(truth, axis=1)))

@@ -1,0 +1,425 @@
+"""Simulates the twist loop: a tool in a soft grip on a turning wrist, and a torque sensor that reads it late.
+
+    wrist speed → actuation delay → angle → relaxing spring that may slip → torque → sensor that averages, lags and errs
+
+Simulated time only, in s from 0. Angle and true torque are 0 at the start. All randomness comes from the generator.
+"""
+
+import copy
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.daemon.control.controller import TwistController, WristCommand
+from shearloop.daemon.control.identification import ExciteSettings, StiffnessExcitation, ToolModel
+from shearloop.daemon.control.margins import gain_for_noise, integral_gain
+from shearloop.daemon.control.settings import ControllerSettings
+from shearloop.drivers.eit_format import FRAME_PERIOD_S
+
+PERIOD_S = 0.008
+# The standard deviation of torque that noise may cause; it sets the gain.
+ALLOWED_NOISE_NM = 0.0018
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulatedTool:
+    """The gripped tool. At a fixed angle its torque relaxes by `relaxing_share` with time constant `relaxing_s`."""
+
+    stiffness_nm_per_rad: float = 0.25
+    relaxing_share: float = 0.06
+    relaxing_s: float = 5.0
+    slip_nm: float = np.inf
+    actuation_s: float = 0.02
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SimulatedSensor:
+    """Measures the mean torque of a window once a period; the value is known `transfer_s` after the window's end.
+
+    Under constant torque the reading falls by `relaxing_share`, and it has play.
+    """
+
+    period_s: float
+    window_s: float
+    transfer_s: float
+    jitter_s: float = 0.0
+    noise_nm: float = 0.0
+    relaxing_share: float = 0.0
+    relaxing_s: float = 20.0
+    play_nm: float = 0.0
+
+
+EIT = SimulatedSensor(
+    period_s=FRAME_PERIOD_S, window_s=FRAME_PERIOD_S, transfer_s=0.05, jitter_s=0.02, noise_nm=0.012,
+    relaxing_share=0.03, play_nm=0.002,
+)  # fmt: skip
+LOAD_CELL = SimulatedSensor(period_s=1 / 10.9, window_s=1 / 10.9, transfer_s=0.01, jitter_s=0.005, noise_nm=0.0005)
+
+
+@dataclass(frozen=True, slots=True)
+class PlantSample:
+    """One measurement: the torque, the middle of its window, and when it is known."""
+
+    torque_nm: float
+    t_mid_s: float
+    t_s: float
+
+
+@dataclass(slots=True)
+class Plant:
+    """Advances by one command period at a time and measures on the way."""
+
+    tool: SimulatedTool
+    sensor: SimulatedSensor
+    rng: np.random.Generator
+    period_s: float = PERIOD_S
+    disturbance_nm: float = 0.0
+    t_s: float = 0.0
+    angle_rad: float = 0.0
+    torque_nm: float = 0.0
+    _speeds: list[float] = field(default_factory=list)
+    _relaxed_nm: float = 0.0
+    _slipped_rad: float = 0.0
+    _read_relaxed_nm: float = 0.0
+    _read_nm: float = 0.0
+    _window_integral: float = 0.0
+    _next_end_s: float = 0.0
+    _samples: list[PlantSample] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        """Start the sensor at a random moment of its period, and fill the actuation delay."""
+        self._next_end_s = self.sensor.window_s + self.rng.uniform(0.0, self.sensor.period_s)
+        self._speeds = [0.0] * (int(self.tool.actuation_s / self.period_s) + 1)
+
+    @property
+    def stiffness_nm_per_rad(self) -> float:
+        """The true stiffness between wrist and base."""
+        return self.tool.stiffness_nm_per_rad
+
+    def step(self, speed_rad_per_s: float) -> None:
+        """Send a wrist speed and let one command period pass."""
+        part = self.tool.actuation_s / self.period_s % 1.0
+        self._speeds.append(speed_rad_per_s)
+        earlier = self._speeds.pop(0)
+        self.angle_rad += self.period_s * ((1.0 - part) * self._speeds[0] + part * earlier)
+        self._update_torque()
+        self._measure()
+
+    def collect(self) -> list[PlantSample]:
+        """Return the measurements that have become known, each once."""
+        known = [sample for sample in self._samples if sample.t_s <= self.t_s]
+        if known:
+            self._samples = [sample for sample in self._samples if sample.t_s > self.t_s]
+        return known
+
+    def _update_torque(self) -> None:
+        tool = self.tool
+        elastic = tool.stiffness_nm_per_rad * (self.angle_rad - self._slipped_rad)
+        self._relaxed_nm += (tool.relaxing_share * elastic - self._relaxed_nm) * self.period_s / tool.relaxing_s
+        torque = elastic - self._relaxed_nm
+        if abs(torque) > tool.slip_nm:
+            excess = float(torque - np.sign(torque) * tool.slip_nm)
+            self._slipped_rad += excess / tool.stiffness_nm_per_rad
+            torque -= excess
+        self.torque_nm = torque + self.disturbance_nm
+
+    def _update_reading(self) -> None:
+        """Apply the sensor's play and relaxation to the present torque."""
+        sensor, half_play = self.sensor, 0.5 * self.sensor.play_nm
+        self._read_nm = min(max(self._read_nm, self.torque_nm - half_play), self.torque_nm + half_play)
+        towards = sensor.relaxing_share * self._read_nm - self._read_relaxed_nm
+        self._read_relaxed_nm += towards * self.period_s / sensor.relaxing_s
+
+    def _measure(self) -> None:
+        before_nm = self._read_nm - self._read_relaxed_nm
+        self._update_reading()
+        after_nm = self._read_nm - self._read_relaxed_nm
+        start_s, self.t_s = self.t_s, self.t_s + self.period_s
+        while True:
+            opens_s, ends_s = self._next_end_s - self.sensor.window_s, self._next_end_s
+            self._window_integral += _overlap(start_s, self.t_s, before_nm, after_nm, opens_s, ends_s)
+            if ends_s > self.t_s:
+                return
+            self._finish_window(after_nm)
+
+    def _finish_window(self, latest_nm: float) -> None:
+        sensor, end_s = self.sensor, self._next_end_s
+        mean = self._window_integral / sensor.window_s if sensor.window_s else latest_nm
+        noise, late_s = self.rng.normal(0.0, 1.0) * sensor.noise_nm, self.rng.uniform(0.0, 1.0) * sensor.jitter_s
+        known_s = end_s + sensor.transfer_s + late_s
+        self._samples.append(PlantSample(mean + noise, end_s - 0.5 * sensor.window_s, known_s))
+        self._window_integral = 0.0
+        self._next_end_s += sensor.period_s
+
+
+def _overlap(start_s: float, end_s: float, first: float, last: float, low_s: float, high_s: float) -> float:
+    """Return the integral, over the part of a step inside a window, of a value that goes from `first` to `last`."""
+    low, high = max(start_s, low_s), min(end_s, high_s)
+    if high <= low:
+        return 0.0
+    middle = (0.5 * (low + high) - start_s) / (end_s - start_s)
+    return (first + (last - first) * middle) * (high - low)
+
+
+class LoopController(Protocol):
+    """The common part of the twist controller and the controllers it is compared with."""
+
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> object:
+        """Process a torque."""
+
+    def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
+        """Return the wrist speed to send now."""
+
+
+@dataclass(slots=True, kw_only=True)
+class UncompensatedController:
+    """The twist controller without its delay compensator: it takes each torque for the present one."""
+
+    stiffness_nm_per_rad: float
+    kp: float
+    ki: float = 0.0
+    wrist_bandwidth_per_s: float = 5.0
+    ramp_nm_per_s: float = float("inf")
+    speed_limit_rad_per_s: float = float("inf")
+    set_point_nm: float = 0.0
+    _ramp_nm: float = 0.0
+    _offset_nm: float = 0.0
+    _creep_nm: float = 0.0
+    _origin_rad: float | None = None
+    _t_ns: int = 0
+
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:  # noqa: ARG002 - the controller's
+        """Correct the offset by the difference from the present ramp."""
+        if torque_nm is None:
+            return
+        excess = torque_nm - self._ramp_nm
+        self._creep_nm += self.ki * excess
+        self._offset_nm += self.kp * excess + self._creep_nm
+
+    def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
+        """Return the speed towards the corrected angle."""
+        if self._origin_rad is None:
+            self._origin_rad, self._t_ns = wrist_angle_rad, t_ns
+        most = self.ramp_nm_per_s * (t_ns - self._t_ns) / 1e9 if t_ns > self._t_ns else 0.0
+        self._t_ns = t_ns
+        self._ramp_nm += max(-most, min(most, self.set_point_nm - self._ramp_nm))
+        goal = self._origin_rad + (self._ramp_nm - self._offset_nm) / self.stiffness_nm_per_rad
+        speed = self.wrist_bandwidth_per_s * (goal - wrist_angle_rad)
+        return WristCommand(max(-self.speed_limit_rad_per_s, min(self.speed_limit_rad_per_s, speed)))
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """A run, one row per command period: time, true torque, wrist angle (n,), and whether the wrist was held."""
+
+    t_s: FloatArray
+    torque_nm: FloatArray
+    angle_rad: FloatArray
+    held: NDArray[np.bool_]
+
+
+def nanoseconds(time_s: float) -> int:
+    """Return a simulated time in the controller's unit."""
+    return round(time_s * 1e9)
+
+
+def run(
+    plant: Plant,
+    controller: LoopController,
+    duration_s: float,
+    keep: Callable[[int], bool] = lambda _: True,
+    bound_nm: float = np.inf,
+) -> Trace:
+    """Close the loop for a time, or until the torque leaves the bound; `keep` drops measurements by their number."""
+    rows = []
+    end_s, count = plant.t_s + duration_s, 0
+    while plant.t_s < end_s and abs(plant.torque_nm) <= bound_nm:
+        now_ns = nanoseconds(plant.t_s)
+        for sample in plant.collect():
+            if keep(count):
+                controller.measure(sample.torque_nm, nanoseconds(sample.t_mid_s), now_ns)
+            count += 1
+        command = controller.command(now_ns, plant.angle_rad)
+        plant.step(command.speed_rad_per_s)
+        rows.append((plant.t_s, plant.torque_nm, plant.angle_rad, command.holds))
+    table = np.array(rows, dtype=float)
+    return Trace(table[:, 0], table[:, 1], table[:, 2], table[:, 3].astype(bool))
+
+
+@dataclass(frozen=True, slots=True)
+class LoopScenario:
+    """A torque that drives the loop, and the settings and requirements of a step with it."""
+
+    name: str
+    sensor: SimulatedSensor
+    settled_s: float
+    ramp_nm_per_s: float
+    wrist_bandwidth_per_s: float
+    excite: ExciteSettings
+    hold_s: float
+
+
+def _excite(sensor: SimulatedSensor, dwell_s: float, share: float) -> ExciteSettings:
+    return ExciteSettings(
+        amplitude_rad=0.35, sample_period_s=sensor.period_s, window_s=sensor.window_s, torque_limit_nm=0.17,
+        stiffness_share=share,
+        speed_rad_per_s=0.5,
+        acceleration_rad_per_s2=2.0,
+        bandwidth_per_s=5.0, dwell_s=dwell_s,
+    )  # fmt: skip
+
+
+SCENARIOS = (
+    LoopScenario("eit", EIT, 6.0, 0.035, 4.0, _excite(EIT, 2.5, 0.04), 40.0),
+    LoopScenario("load_cell", LOAD_CELL, 2.0, 0.1, 6.0, _excite(LOAD_CELL, 0.8, 0.02), 15.0),
+)
+
+
+def random_tool(rng: np.random.Generator) -> SimulatedTool:
+    """Return a tool of random stiffness."""
+    return SimulatedTool(stiffness_nm_per_rad=float(rng.uniform(0.2, 0.35)))
+
+
+def identified(plant: Plant, scenario: LoopScenario) -> ToolModel:
+    """Return the tool model that the identification step finds; raises RuntimeError where it fails."""
+    step = StiffnessExcitation(scenario.excite)
+    while not step.done:
+        now_ns = nanoseconds(plant.t_s)
+        for sample in plant.collect():
+            step.measure(sample.torque_nm, nanoseconds(sample.t_mid_s), now_ns)
+        plant.step(step.command(now_ns, plant.angle_rad))
+    if step.result is None:
+        raise RuntimeError(step.failure)
+    return step.result
+
+
+def settings_for(found: ToolModel, scenario: LoopScenario) -> ControllerSettings:
+    """Return the controller's settings for an identified tool."""
+    kp = gain_for_noise(found.noise_nm, ALLOWED_NOISE_NM)
+    return ControllerSettings(
+        stiffness_nm_per_rad=found.stiffness_nm_per_rad, sample_period_s=found.sample_period_s,
+        window_s=scenario.sensor.window_s, lag_s=max(found.significant_lag_s, 0.0), kp=kp, ki=integral_gain(kp),
+        wrist_bandwidth_per_s=scenario.wrist_bandwidth_per_s, ramp_nm_per_s=scenario.ramp_nm_per_s,
+        noise_nm=found.noise_nm, deadband_nm=0.001, innovation_limit_nm=max(3.0 * found.noise_nm, 0.01),
+        creep_limit_nm_per_s=0.005, offset_limit_nm=0.06, torque_limit_nm=0.2, speed_limit_rad_per_s=0.8,
+        acceleration_limit_rad_per_s2=3.0, travel_limit_rad=1.5,
+    )  # fmt: skip
+
+
+def started_controller(plant: Plant, found: ToolModel, settings: ControllerSettings) -> TwistController:
+    """Return a twist controller that starts at the plant's present angle."""
+    controller = TwistController(settings)
+    torque = found.torque_nm + found.stiffness_nm_per_rad * (plant.angle_rad - found.angle_rad)
+    controller.start(nanoseconds(plant.t_s), plant.angle_rad, torque, found.known_measurements)
+    return controller
+
+
+# The chart's loop panel: how closely the torque follows over how many frames are averaged.
+WINDOWS = (1, 2, 3, 4, 6, 9)
+# All smoothing is in the window: each mean corrects by this share. The tuned controller beside it takes single frames.
+GAIN = 0.5
+LOOPS = ("twist controller", "no delay compensator", "twist controller, gain tuned to the noise")
+# The set point wanders and an unknown load comes and goes; only measurements reveal the load.
+_TARGET_NM, _SWING_NM, _SWING_PERIOD_S = 0.10, 0.02, 40.0
+_LOAD_NM, _LOAD_PERIOD_S = 0.02, 30.0
+_RUN_S, _SETTLING_S, _CHUNK_S, _COMMAND_PERIOD_S = 90.0, 15.0, 0.25, 0.016
+
+
+@dataclass(frozen=True, slots=True)
+class TrackingError:
+    """One loop, noise of a frame and window: the delay of the mean, and the RMS of torque − set point in N·m."""
+
+    loop: str
+    noise_nm: float
+    frames: int
+    delay_s: float
+    rms_nm: float
+    rms_low_nm: float
+    rms_high_nm: float
+
+
+@dataclass(slots=True)
+class _AveragedLoop:
+    """A controller fed with the mean of the latest frames, stamped with the mean of their times."""
+
+    controller: LoopController
+    latest: deque[tuple[float, int]]
+
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:
+        """Process one frame's torque."""
+        if torque_nm is None:
+            return
+        self.latest.append((torque_nm, t_mid_ns))
+        torques, times = zip(*self.latest, strict=True)
+        self.controller.measure(float(np.mean(torques)), round(float(np.mean(times))), t_ns)
+
+    def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:
+        """Return the wrist speed to send now."""
+        return self.controller.command(t_ns, wrist_angle_rad)
+
+
+def tracking_errors(noises_nm: Sequence[float], seeds: int, windows: Sequence[int] = WINDOWS) -> list[TrackingError]:
+    """Return the tracking error of every loop and window, for every noise of a single frame."""
+    rms: dict[tuple[str, float, int], list[float]] = {}
+    for noise in noises_nm:
+        scenario = replace(SCENARIOS[0], sensor=replace(EIT, noise_nm=noise))
+        for seed in range(seeds):
+            rng = np.random.default_rng((31, seed))
+            gripped = Plant(random_tool(rng), scenario.sensor, rng, period_s=_COMMAND_PERIOD_S)
+            found = identified(gripped, scenario)
+            for name in LOOPS:
+                for frames in windows if name != LOOPS[2] else (1,):
+                    plant = copy.deepcopy(gripped)
+                    loop = _averaged_loop(name, frames, plant, found, settings_for(found, scenario))
+                    rms.setdefault((name, noise, frames), []).append(_rms_error(plant, loop))
+    return [
+        TrackingError(name, noise, frames, _delay_s(frames), float(np.median(errors)), min(errors), max(errors))
+        for (name, noise, frames), errors in rms.items()
+    ]
+
+
+def _delay_s(frames: int) -> float:
+    """Return the time from the middle of a mean of EIT frames until it is known."""
+    return 0.5 * EIT.window_s + 0.5 * (frames - 1) * EIT.period_s + EIT.transfer_s
+
+
+def _averaged_loop(
+    name: str, frames: int, plant: Plant, found: ToolModel, settings: ControllerSettings
+) -> _AveragedLoop:
+    latest: deque[tuple[float, int]] = deque(maxlen=frames)
+    if name != LOOPS[2]:
+        settings = replace(
+            settings, kp=GAIN, ki=integral_gain(GAIN), noise_nm=settings.noise_nm / float(np.sqrt(frames)),
+            window_s=settings.window_s + (frames - 1) * found.sample_period_s,
+            age_limit_s=settings.age_limit_s + frames * found.sample_period_s,
+        )  # fmt: skip
+    if name == LOOPS[1]:
+        late = UncompensatedController(
+            stiffness_nm_per_rad=settings.stiffness_nm_per_rad, kp=settings.kp, ki=settings.ki,
+            wrist_bandwidth_per_s=settings.wrist_bandwidth_per_s, ramp_nm_per_s=settings.ramp_nm_per_s,
+            speed_limit_rad_per_s=settings.speed_limit_rad_per_s,
+        )  # fmt: skip
+        return _AveragedLoop(late, latest)
+    return _AveragedLoop(started_controller(plant, found, settings), latest)
+
+
+def _rms_error(plant: Plant, loop: _AveragedLoop) -> float:
+    """Return the RMS of true torque − set point in N·m, after settling."""
+    begun, squares, n = plant.t_s, 0.0, 0
+    while plant.t_s - begun < _RUN_S:
+        t_s = plant.t_s - begun
+        wanted = _TARGET_NM + _SWING_NM * float(np.sin(2 * np.pi * t_s / _SWING_PERIOD_S))
+        plant.disturbance_nm = _LOAD_NM * float(np.sin(2 * np.pi * t_s / _LOAD_PERIOD_S))
+        if isinstance(loop.controller, TwistController):
+            loop.controller.set_point(wanted)
+        elif isinstance(loop.controller, UncompensatedController):
+            loop.controller.set_point_nm = wanted
+        torque = run(plant, loop, _CHUNK_S).torque_nm
+        if t_s >= _SETTLING_S:
+            squares, n = squares + float(((torque - wanted) ** 2).sum()), n + len(torque)
+    return float(np.sqrt(squares / n))

@@ -1,0 +1,305 @@
+"""The loop that holds a shear force on the emulated skin, through friction: limit cycle and offset over gain and delay.
+
+The daemon's own loop (identification, controller, estimator) loads 1 N, unloads to 0.6 N and loads again, in virtual
+time. The width of the true force over each hold's end is compared with 2 μFₙ, the width of friction's own band.
+"""
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.skin.calibration import SkinCalibration
+from shearloop.bank.skin.calibration_file import load_calibration
+from shearloop.daemon.analysis.charts.drawing import figure, look, save
+from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
+from shearloop.daemon.control.settings import LoopConfig
+from shearloop.daemon.control.step_runner import Action, ExperimentPhase, Tare
+from shearloop.daemon.sensing.skin_estimator import SkinEstimator
+from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
+from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
+from shearloop.daemon.workers import Executor, in_order
+from shearloop.drivers.shear_skin.judge import SkinSample
+
+TICK_S, SAMPLE_TICKS = 0.008, 12.5
+# From the middle of a conversion to the controller; and from a speed command to the wrist.
+AGE_S, ACTUATION_TICKS = 0.06, 2
+# At 0.25 s a reading is stale and the loop holds.
+AGES_S = (0.02, 0.06, 0.1, 0.15, 0.2)
+RADIUS_MM, SET_POINTS_N = 15.0, (1.0, 0.6, 1.0)
+# Noise of one resistance, as in the emulated DAQ: 1.6 mN of shear force over both gauges.
+RELATIVE_NOISE = 0.0016 * 0.088 / 2**0.5
+CALIBRATION = Path(str(resources.files("shearloop"))) / "config" / "calibrations" / "skin_demo.yaml"
+SOURCE = TorqueSource(name=SKIN, period_s=SAMPLE_TICKS * TICK_S, has_friction_band=True)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SkinLoopCase:
+    """One run: gain, deadband, and the true and the configured normal force."""
+
+    name: str
+    kp: float = 0.5
+    normal_n: float = 1.0
+    configured_n: float | None = None
+    deadband_nm: float = 0.0003
+    # Whether the estimator removes friction, and whether the loop gets the band that friction leaves.
+    knows_friction: bool = True
+    band: bool = True
+    age_s: float = AGE_S
+    seed: int = 0
+    # The last three fifths of each hold are judged.
+    hold_s: float = 20.0
+
+
+@dataclass(frozen=True, slots=True)
+class SkinHold:
+    """The result in N: the widest remaining oscillation, and the largest mean distance from a set point."""
+
+    case: SkinLoopCase
+    width_n: float
+    offset_n: float
+    bound_n: float
+    phase: str
+
+
+class SkinLoop:
+    """The daemon's loop around the emulated skin, tick by tick in virtual time."""
+
+    def __init__(self, case: SkinLoopCase, calibration: SkinCalibration) -> None:
+        """Put the tool on the skin, at rest."""
+        self._random = np.random.default_rng(case.seed)
+        settings = SyntheticSkinSettings(radius_mm=RADIUS_MM, normal_n=case.normal_n)
+        self.skin = SyntheticSkin(settings, seed=case.seed)
+        configured_n = case.normal_n if case.configured_n is None else case.configured_n
+        if not case.knows_friction:
+            calibration = replace(calibration, friction=0.0)
+        self.estimator = SkinEstimator(calibration, normal_n=configured_n)
+        # The chart looks for the boundary, so every margin is allowed.
+        config = LoopConfig.model_validate(
+            {
+                **{"kp": case.kp, "deadband_nm": case.deadband_nm, "jump_nm": 0.006, "slip_nm": 0.006},
+                **{"gain_margin": 1.0, "phase_margin_deg": 0.0},
+            }
+        )
+        self._band, self._hold_s, self._age_s = case.band, case.hold_s, case.age_s
+        self.brain = ControlLoop(config, {SKIN: replace(SOURCE, has_friction_band=case.band)}, ())
+        self._speeds = deque([0.0] * ACTUATION_TICKS)
+        self._angle_rad = 0.0
+        self._tick = self._samples = 0
+        self._due: list[tuple[int, TorqueSample]] = []
+        self._zero_begun = False
+        self.truth_n: list[float] = []
+        self.estimate_n: list[float] = []
+        self.set_point_n: list[float] = []
+
+    @property
+    def t_ns(self) -> int:
+        """The virtual time."""
+        return round(self._tick * TICK_S * 1e9)
+
+    def run(self, most_s: float) -> str:
+        """Run the experiment to its end; return how it ended."""
+        for _ in range(50):
+            self._step()
+        why = self.brain.start(_experiment(self._hold_s), self.t_ns)
+        if why:
+            raise RuntimeError(why)
+        experiment = self.brain.experiment
+        while experiment is not None and experiment.running and self._tick * TICK_S < most_s:
+            self._step()
+        if experiment is None:
+            raise RuntimeError("no experiment was begun")
+        return (
+            experiment.phase.value
+            if experiment.phase is ExperimentPhase.DONE
+            else f"{experiment.phase.value}: {experiment.stop_reason}"
+        )
+
+    def _step(self) -> None:
+        self._tick += 1
+        self._angle_rad += self._speeds.popleft() * TICK_S
+        self.skin.turn(self._angle_rad)
+        if self._tick * TICK_S >= self._samples * SOURCE.period_s:
+            self._samples += 1
+            self._measure()
+        while self._due and self._due[0][0] <= self.t_ns:
+            torque = self._due.pop(0)[1]
+            self.brain.on_torque(torque)
+            if self._zero_begun and self.estimator.zero is not None:
+                self._zero_begun = False
+                self.brain.on_action_ended()
+        self.brain.inputs.arm = ArmStatus(self._angle_rad, self.t_ns)
+        orders = self.brain.tick(self.t_ns)
+        speed = 0.0 if orders.stop else orders.wrist_rad_per_s
+        self.brain.on_speed_sent(speed)
+        self._speeds.append(speed)
+        self._begin(orders.action)
+        controller = self.brain.controller
+        wanted_nm = controller.state.set_point_nm if controller is not None else None
+        self.truth_n.append(self.skin.shear_n)
+        self.set_point_n.append(math.nan if wanted_nm is None else wanted_nm / RADIUS_MM * 1e3)
+
+    def _begin(self, action: Action | None) -> None:
+        if isinstance(action, Tare):
+            self.estimator.tare()
+            self._zero_begun = True
+
+    def _measure(self) -> None:
+        self.skin.rest(SOURCE.period_s)
+        noise = self._random.normal(0.0, RELATIVE_NOISE, 2)
+        r1, r2 = (ohm * (1.0 + error) for ohm, error in zip(self.skin.resistances_ohm(), noise, strict=True))
+        now_ns, known_ns = self.t_ns, self.t_ns + round(self._age_s * 1e9)
+        reading = self.estimator.update(SkinSample(r1, r2, 0.0, 0.0, 5e-3, now_ns, known_ns, self._samples))
+        torque = skin_torque(reading, RADIUS_MM * 1e-3, now_ns, known_ns)
+        if not self._band:
+            torque = replace(torque, low_nm=None, high_nm=None)
+        self._due.append((known_ns, torque))
+        self.estimate_n += [math.nan if reading.shear_n is None else reading.shear_n] * round(
+            self._tick - len(self.estimate_n)
+        )
+
+
+def _experiment(hold_s: float) -> ExperimentFile:
+    holds = [
+        {"do": "hold_torque", "torque_nm": n * RADIUS_MM * 1e-3, "ramp_nm_per_s": 0.005, "hold_s": hold_s}
+        for n in SET_POINTS_N
+    ]
+    steps = [{"do": "tare"}, {"do": "identify", "amplitude_rad": 0.1}, *holds]
+    return ExperimentFile.model_validate({"name": "bench", "drive": "skin", "steps": steps, "limits": {"angle_rad": 1}})
+
+
+def holds_of(loop: SkinLoop, settled_s: float) -> list[FloatArray]:
+    """Return the true force over the settled end of each hold, in order."""
+    set_points, truth = np.array(loop.set_point_n), np.array(loop.truth_n)
+    set_points = np.round(set_points, 6)
+    changes = np.flatnonzero(np.diff(np.nan_to_num(set_points, nan=-1.0))) + 1
+    ends = [*changes.tolist(), len(truth)]
+    settled = round(settled_s / TICK_S)
+    return [truth[end - settled : end] for begin, end in pairwise(ends) if np.isfinite(set_points[begin])]
+
+
+def judge(case: SkinLoopCase, calibration: SkinCalibration) -> tuple[SkinHold, SkinLoop]:
+    """Run one case."""
+    loop = SkinLoop(case, calibration)
+    phase = loop.run(200.0)
+    bound_n = 2.0 * loop.skin.membrane.friction * case.normal_n
+    found = holds_of(loop, 0.6 * case.hold_s)
+    if phase != ExperimentPhase.DONE.value or len(found) != len(SET_POINTS_N):
+        return SkinHold(case, math.nan, math.nan, bound_n, phase), loop
+    width_n = max(float(np.ptp(truth)) for truth in found)
+    offset_n = max(abs(float(truth.mean()) - wanted) for truth, wanted in zip(found, SET_POINTS_N, strict=True))
+    return SkinHold(case, width_n, offset_n, bound_n, phase), loop
+
+
+# The range of the configuration; at 1 the loop believes each reading fully.
+GAINS = (0.05, 0.15, 0.5, 1.0)
+NORMALS_N = (0.5, 1.0, 2.0)
+SEEDS = 3
+KINDS = (
+    *(SkinLoopCase(name=f"Fn = {n:g} N", normal_n=n) for n in NORMALS_N),
+    SkinLoopCase(name="Fn = 1 N, no deadband", deadband_nm=0.0),
+    SkinLoopCase(name="Fn = 2 N, configured as 1 N", normal_n=2.0, configured_n=1.0),
+    SkinLoopCase(name="Fn = 1 N, loop without the band", band=False),
+    SkinLoopCase(name="Fn = 1 N, friction ignored", knows_friction=False, band=False),
+)
+
+
+def over_gains() -> list[SkinLoopCase]:
+    """Return all kinds of cases at all gains."""
+    return [replace(kind, kp=kp, seed=10 * seed) for seed, kind in enumerate(KINDS) for kp in GAINS]
+
+
+def over_delays() -> list[SkinLoopCase]:
+    """Return loops with and without the band, at the usual and the highest gain, with ever older readings."""
+    with_band = SkinLoopCase(name="with the band")
+    without_band = SkinLoopCase(name="without the band", band=False)
+    return [
+        replace(kind, name=f"{kind.name}, kp = {kp:g}", kp=kp, age_s=age_s)
+        for kind in (with_band, without_band)
+        for kp in (0.5, 1.0)
+        for age_s in AGES_S
+    ]
+
+
+def worst(calibration: SkinCalibration, case: SkinLoopCase) -> SkinHold:
+    """Return the widest oscillation and the largest offset over several noises, or the run that broke off."""
+    found = [judge(replace(case, seed=case.seed + seed), calibration)[0] for seed in range(SEEDS)]
+    broken = next((held for held in found if math.isnan(held.width_n)), None)
+    if broken is not None:
+        return broken
+    width_n, offset_n = max(held.width_n for held in found), max(held.offset_n for held in found)
+    return replace(found[0], width_n=width_n, offset_n=offset_n)
+
+
+def chart(out: Path, executor: Executor) -> list[Path]:
+    """Measure all cases, draw and write `stability-skin`."""
+    calibration = load_calibration(CALIBRATION)
+    gains, delays = over_gains(), over_delays()
+    found = in_order(executor.map(worst, calibration, [*gains, *delays]))
+    shown = judge(SkinLoopCase(name="shown"), calibration)[1]
+    made = limit_cycle_figure(found[: len(gains)], found[len(gains) :], shown)
+    return save(made, {"held": [asdict(held) for held in found]}, out, "stability-skin")
+
+
+def limit_cycle_figure(gains: Sequence[SkinHold], delays: Sequence[SkinHold], loop: SkinLoop) -> Figure:
+    """Draw one run, then width and offset of all cases over the gain, and the width over the delay."""
+    made = figure(12.0, 7.5)
+    grid = made.add_gridspec(2, 3, height_ratios=(1.0, 1.3))
+    over = made.add_subplot(grid[0, :])
+    width, offset, delay = (made.add_subplot(grid[1, i]) for i in range(3))
+    _draw_run(over, loop)
+    bound = "2 μFn"
+    _draw_curves(width, gains, lambda case: case.kp, lambda held: held.width_n / held.bound_n)
+    width.set(title="Limit cycle over the gain", xlabel="gain kp", ylabel=f"peak to peak / {bound}")
+    _draw_curves(offset, gains, lambda case: case.kp, lambda held: held.offset_n / held.bound_n)
+    offset.set(title="Accuracy over the gain", xlabel="gain kp", ylabel=f"mean distance from the set point / {bound}")
+    for axes in (width, offset):
+        axes.set_xscale("log")
+        axes.set_xticks(GAINS, [f"{kp:g}" for kp in GAINS])
+        axes.minorticks_off()
+    _draw_curves(delay, delays, lambda case: case.age_s, lambda held: held.width_n / held.bound_n)
+    delay.set_xticks(AGES_S, [f"{age_s:g}" for age_s in AGES_S])
+    delay.set(title="Limit cycle over the delay", xlabel="age of a reading, s", ylabel=f"peak to peak / {bound}")
+    for axes in (width, delay, offset):
+        axes.set_ylim(-0.05, max(1.2, axes.get_ylim()[1]))
+        axes.axhline(1.0, color="black", lw=1, ls=":")
+    for axes in (width, delay):
+        axes.axhspan(-0.05, 1.0, color="#55a868", alpha=0.08, lw=0)
+        axes.annotate(f"allowed: up to {bound}", (0.02, 0.96), xycoords=("axes fraction", "data"), fontsize=8, va="top")
+    handles, labels = width.get_legend_handles_labels()
+    made.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=8)
+    delay.legend(fontsize=8)
+    for axes in (over, width, offset, delay):
+        axes.grid(alpha=0.25)
+    return made
+
+
+def _draw_run(axes: Axes, loop: SkinLoop) -> None:
+    time_s = np.arange(len(loop.truth_n)) * TICK_S
+    estimate = np.array(loop.estimate_n[: len(time_s)])
+    axes.plot(time_s, loop.truth_n, color="#1f4e79", lw=1.2, label="true shear force")
+    axes.plot(time_s[: len(estimate)], estimate, color="#c44e52", lw=0.9, label="estimate")
+    axes.plot(time_s, loop.set_point_n, color="#888888", lw=1, ls="--", label="set point")
+    axes.set(
+        title="Zero, identification, and three holds (Fn = 1 N, kp = 0.5)", xlabel="time, s", ylabel="shear force, N"
+    )
+    axes.legend(loc="upper left", fontsize=8)
+
+
+def _draw_curves(
+    axes: Axes, found: Sequence[SkinHold], over: Callable[[SkinLoopCase], float], value: Callable[[SkinHold], float]
+) -> None:
+    for number, name in enumerate(dict.fromkeys(held.case.name for held in found)):
+        mine = [held for held in found if held.case.name == name]
+        style = look(number) | {"markersize": 5, "linewidth": 1.2}
+        axes.plot([over(held.case) for held in mine], [value(held) for held in mine], label=name, **style)

@@ -1,0 +1,363 @@
+"""Stability checks of slices: continuity, torques beyond the calibrated ones, foreign frames, the rim of the bank."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.eit.models import conductivity
+from shearloop.bank.errors import BankError
+from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, Name, Physics, TactileFrame, fit
+from shearloop.bank.estimation.bank_match import NOT_TURNED, BankMatcher, BestCell, NearestCell, Registration
+from shearloop.bank.estimation.fitting_regressor import fit_reader
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.reciprocity import ReciprocityCheck
+from shearloop.bank.estimation.regressors import Ridge
+from shearloop.daemon.analysis.charts.fault_sweeps import (
+    FaultCurve,
+    FaultLevel,
+    FaultyFrames,
+    estimate_frames,
+    fault_curve,
+    judge_level,
+)
+from shearloop.daemon.analysis.charts.sources import (
+    PLAYED_MESH_SIZE_CM,
+    Split,
+    homogeneous_of,
+    mean_frame,
+    own_fingertip,
+    played_bank,
+    torque_of,
+)
+from shearloop.daemon.synthetic import Synthesiser
+from shearloop.daemon.workers import Executor, in_order
+
+STEPS = 25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContinuityWalk:
+    """Torques (n,) in N·m along a path through frames, NaN where not valid; `share_nm` is the fair share of a step."""
+
+    name: str
+    torque_nm: FloatArray
+    share_nm: float
+
+    @property
+    def largest_hop_nm(self) -> float:
+        """The largest change within one step, 0 where nothing was valid."""
+        hops = np.abs(np.diff(self.torque_nm))
+        return float(np.nanmax(hops)) if np.isfinite(hops).any() else 0.0
+
+    @property
+    def hops(self) -> int:
+        """The number of steps that changed it by more than ten fair shares."""
+        return int(np.count_nonzero(np.nan_to_num(np.abs(np.diff(self.torque_nm))) > 10 * self.share_nm))
+
+
+def path_through(split: Split) -> tuple[FloatArray, float]:
+    """Return (n, 896) differences from the smallest to the largest later torque, and a step's fair share in N·m."""
+    torque = split.future.torque_at_frames()
+    frames = np.abs(split.future.channels[np.argsort(torque), 0])
+    shares = np.linspace(0.0, 1.0, STEPS, endpoint=False)[:, None]
+    steps = [(1 - shares) * one + shares * other for one, other in pairwise(frames)]
+    path = np.concatenate([*steps, frames[-1:]])
+    return path, float(np.ptp(torque)) / len(path)
+
+
+def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[ContinuityWalk]:
+    """Return the torques of each estimator along the path; the first three differ only in the cell they choose."""
+    path, share = path_through(split)
+    locators: dict[str, BankMatcher] = {
+        "paper: the maximum of all lags": BestCell(bank),
+        "zero lag: the maximum, refined": NearestCell(bank, NOT_TURNED, mean_of_alike=False),
+        "zero lag: mean of the cells alike (the fix)": NearestCell(bank, NOT_TURNED),
+    }
+    found = [ContinuityWalk(name, _read(split, locator, path), share) for name, locator in locators.items()]
+    for calibration in calibrations:
+        if calibration.estimator in ("regression", "fused"):
+            tracker = EstimatorSession(calibration, bank)
+            torque = [tracker.estimate(TactileFrame.of(0.0, one[None])).torque_nm for one in path]
+            found.append(
+                ContinuityWalk(calibration.estimator, np.array([np.nan if t is None else t for t in torque]), share)
+            )
+    return found
+
+
+def _read(split: Split, locator: BankMatcher, path: FloatArray) -> FloatArray:
+    def features(frames: FloatArray) -> FloatArray:
+        sigma = np.array([locator.locate(one).sigma for one in frames])
+        return np.column_stack([sigma, sigma**2])
+
+    past = features(np.abs(split.past.channels[:, 0]))
+    reader = fit_reader(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=(1e-9,))
+    read: Callable[[FloatArray], float] = lambda one: reader.read(one)[0]  # noqa: E731
+    return np.array([read(one) for one in features(path)])
+
+
+Rows = NDArray[np.int64]
+# Shares of the slices to calibrate on, from the smallest torques or from the largest.
+CALIBRATED_SHARES = (0.8, 0.65, 0.5, 0.4, 0.3)
+SMALLER = "calibrated on the smaller torques alone"
+LARGER = "calibrated on the larger torques alone"
+UNITS = {SMALLER: "largest torque calibrated on, N·m", LARGER: "smallest torque calibrated on, N·m"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationPart:
+    """The slices to calibrate on, up to a torque or from one on, and the others to judge."""
+
+    limit_nm: float
+    fitted: Rows
+    others: Rows
+
+
+@dataclass(frozen=True, slots=True)
+class Extrapolation:
+    """One estimator calibrated on ever fewer of the torques; the first level has all, and judges later slices.
+
+    For each level `slices` counts those calibrated on, and `width_nm` is the median width of valid 95 % intervals.
+    """
+
+    curve: FaultCurve
+    slices: tuple[int, ...]
+    width_nm: tuple[float | None, ...]
+
+    @property
+    def times_good(self) -> tuple[float | None, ...]:
+        """The widths relative to the first level's, None where either is unknown."""
+        good = self.width_nm[0]
+        return tuple(None if good is None or width is None else width / good for width in self.width_nm)
+
+
+def calibration_parts(torque_nm: FloatArray) -> dict[str, list[CalibrationPart]]:
+    """Return the parts of (n,) torques by direction, with ever fewer torques; limits are quantiles.
+
+    A limit that leaves no slice to judge is left out.
+    """
+    found = {}
+    for which, beyond in ((SMALLER, np.greater), (LARGER, np.less)):
+        quantiles = np.array(CALIBRATED_SHARES) if which == SMALLER else 1.0 - np.array(CALIBRATED_SHARES)
+        limits = np.quantile(torque_nm, quantiles, method="nearest").tolist()
+        masks = [(limit, beyond(torque_nm, limit)) for limit in dict.fromkeys(limits)]
+        found[which] = [
+            CalibrationPart(limit, np.flatnonzero(~mask), np.flatnonzero(mask)) for limit, mask in masks if mask.any()
+        ]
+    return found
+
+
+def extrapolate(
+    split: Split, names: Sequence[Name], bank: Bank, mesh: Mesh | None, executor: Executor
+) -> list[Extrapolation]:
+    """Return each estimator beyond the torques it was calibrated on; each calibration is one task for the workers.
+
+    A refused calibration gives no valid estimate; its reason is printed.
+    """
+    known = select_rows(split.whole, np.flatnonzero(np.isfinite(split.whole.torque_at_frames())))
+    rows, n_earlier = np.arange(len(known.t_s)), int((known.t_s <= split.past.t_s[-1]).sum())
+    earlier = {
+        which: CalibrationPart(float(extreme(known.torque_nm[:n_earlier])), rows[:n_earlier], rows[n_earlier:])
+        for which, extreme in ((SMALLER, np.max), (LARGER, np.min))
+    }
+    shared, beyond = (known, str(bank.path.resolve()), mesh), calibration_parts(known.torque_nm)
+    tasks = [(name, part) for name in names for part in (earlier[SMALLER], *beyond[SMALLER], *beyond[LARGER])]
+    outcomes = dict(zip(tasks, in_order(executor.map(judge_others, shared, tasks)), strict=True))
+    found = []
+    for which, some in beyond.items():
+        for name in names:
+            steps = [(earlier[which], outcomes[name, earlier[SMALLER]])]
+            steps += [(part, outcomes[name, part]) for part in some]
+            found.append(_extrapolation(split.title, which, name, steps))
+    return found
+
+
+def select_rows(series: FrameSeries, rows: Rows) -> FrameSeries:
+    """Return these frames of a series with their own torques only."""
+    t_s = series.t_s[rows]
+    return replace(
+        series, t_s=t_s, channels=series.channels[rows], torque_t_s=t_s, torque_nm=series.torque_at_frames()[rows],
+        diameter_mm=series.diameter_mm[rows],
+    )  # fmt: skip
+
+
+Outcome = tuple[FaultLevel, float | None] | str
+
+
+def judge_others(shared: tuple[FrameSeries, str, Mesh | None], task: tuple[Name, CalibrationPart]) -> Outcome:
+    """Return the figures and the median width of a part's judged slices, or the reason of a refused calibration."""
+    (series, path, mesh), (name, part) = shared, task
+    bank = Bank.open(path)
+    try:
+        calibration = fit(name, [select_rows(series, part.fitted)], "some torques", Physics(bank, mesh))
+    except BankError as error:
+        return str(error)
+    others = select_rows(series, part.others)
+    estimates = estimate_frames(EstimatorSession(calibration, bank), FaultyFrames(others))
+    widths = [
+        one.torque_high_nm - one.torque_low_nm
+        for one in estimates
+        if one.torque_low_nm is not None and one.torque_high_nm is not None
+    ]
+    return judge_level(estimates, others.torque_nm, part.limit_nm), float(np.median(widths)) if widths else None
+
+
+def _extrapolation(
+    title: str, which: str, name: Name, steps: Sequence[tuple[CalibrationPart, Outcome]]
+) -> Extrapolation:
+    levels: list[FaultLevel] = []
+    widths: list[float | None] = []
+    for part, outcome in steps:
+        if isinstance(outcome, str):
+            print(f"{title}: {name}, {which} ({part.limit_nm:.3f} N·m), is left out: {outcome}")
+            level, width = FaultLevel(part.limit_nm, None, None, 0.0, 0.0), None
+        else:
+            # The calibration on all earlier slices serves both directions.
+            level, width = replace(outcome[0], level=part.limit_nm), outcome[1]
+        levels.append(level)
+        widths.append(width)
+    slices = tuple(len(part.fitted) for part, _ in steps)
+    return Extrapolation(fault_curve(which, UNITS[which], name, levels), slices, tuple(widths))
+
+
+FOREIGN_SHARES = (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
+ORIGINS = (0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+_TURNED_ELECTRODES = 5
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignMixture:
+    """Misfits of later slices, in units of their limit, for one origin, kind and share of a foreign frame.
+
+    The misfit is that of reciprocal channels. `passing` is the share that the validity check accepts, `passing_best`
+    the best limit's; `auc` is how often a mixed slice has a larger misfit than a good one.
+    """
+
+    origin: float
+    kind: str
+    share: float
+    misfits: tuple[float, ...]
+    passing: float
+    passing_best: float
+    auc: float
+
+
+def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, seed: int = 7) -> list[ForeignMixture]:
+    """Return how each share of a foreign frame looks to a validity check fitted to the slices before each origin.
+
+    The best limit is the lowest that refuses no good later slice; no rule on the misfit can refuse more mixtures.
+    """
+    frames = np.abs(series.channels[:, 0])
+    usable = np.ones(N_CHANNELS, dtype=np.bool_)
+    turned = Registration(_TURNED_ELECTRODES, reflected=False, score=1.0, runner_up=0.0).model_channels()
+    found = []
+    for origin in origins:
+        n = round(origin * len(frames))
+        guard, later = NoveltyDetector.fit(frames[:n]), frames[n:]
+        mean = later.mean(axis=0)
+        foreign = {
+            "another fingertip": mean[np.random.default_rng(seed).permutation(N_CHANNELS)],
+            f"turned by {_TURNED_ELECTRODES} electrodes": mean[turned],
+        }
+        twins = ReciprocityCheck.fit(frames[:n])
+        good = _misfits(twins, later)
+        for kind, one in foreign.items():
+            for share in FOREIGN_SHARES:
+                mixed = (1 - share) * later + share * one
+                misfits = _misfits(twins, mixed)
+                found.append(
+                    ForeignMixture(
+                        origin, kind, share, tuple(misfits),
+                        float(np.mean([not guard.judge(frame, usable).why for frame in mixed])),
+                        float((misfits <= good.max()).mean()),
+                        float((misfits[:, None] > good).mean() + 0.5 * (misfits[:, None] == good).mean()),
+                    )
+                )  # fmt: skip
+    return found
+
+
+def _misfits(twins: ReciprocityCheck, frames: FloatArray) -> FloatArray:
+    usable = np.ones(N_CHANNELS, dtype=np.bool_)
+    return np.array([twins.misfit(one, usable) for one in frames]) / twins.largest_misfit
+
+
+MODEL = "gaussian_derivative"
+_K, _SIGMA = 3.2, 1.5
+_FRAMES = 6
+_STEEPEST = float(np.exp(-0.5))
+
+
+@dataclass(frozen=True, slots=True)
+class BankRim:
+    """A path that leaves the bank's grid: the cells (k, σ) in cm of each level."""
+
+    name: str
+    unit: str
+    levels: tuple[float, ...]
+    places: tuple[tuple[float, float], ...]
+
+
+def rims(bank: Bank) -> list[BankRim]:
+    """Return the paths for this bank's grid."""
+    lowest = (0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
+    k_end, sigma_end = float(bank.k_grid[-1]), float(bank.sigma_grid[-1])
+    ks = (_K, *(round(k_end + step, 3) for step in (-0.3, -0.1, 0.0, 0.1, 0.2)))
+    sigmas = (_SIGMA, *(round(sigma_end + step, 3) for step in (-0.3, -0.1, 0.0, 0.2, 0.5, 1.0)))
+    return [
+        # The steepest fall of the Gaussian derivative is exp(−1/2)/σ below 1.
+        BankRim("conductivity near zero", "smallest conductivity (homogeneous = 1)", lowest,
+            tuple((_K, _STEEPEST / (1.0 - least)) for least in lowest)),
+        BankRim(f"k at the rim of the grid ({k_end:g} cm) and beyond", "k, cm", ks, tuple((k, _SIGMA) for k in ks)),
+        BankRim(f"σ at the rim of the grid ({sigma_end:g} cm) and beyond", "σ, cm", sigmas,
+            tuple((_K, sigma) for sigma in sigmas)),
+    ]  # fmt: skip
+
+
+class _SolvedFrames(Synthesiser):
+    """Makes frames of any k and σ by solving for them, inside and outside of the grid."""
+
+    def __init__(self, bank: Bank, seed: int) -> None:
+        super().__init__(bank, seed=seed)
+        self._forward = ForwardModel(own_fingertip(PLAYED_MESH_SIZE_CM).mesh())
+        self._homogeneous = self._forward.homogeneous()
+        self._solved: dict[tuple[float, float], FloatArray] = {}
+
+    def signal(self, k: float, sigma: float | FloatArray) -> FloatArray:
+        """Return the (896,) difference signal of one k and σ, solved once."""
+        place = k, float(np.mean(sigma))
+        if place not in self._solved:
+            cell = conductivity(self._forward.mesh, MODEL, *place)
+            self._solved[place] = self._forward.voltages(cell) - self._homogeneous
+        return self._solved[place]
+
+
+def sweep_rims(calibrations: Sequence[Calibration], bank: Bank, scratch: Path) -> Iterable[FaultCurve]:
+    """Return the curves of estimators calibrated on synthetic slices along the paths out of the bank."""
+    # The same homogeneous frame as the slices': its noise is in every difference.
+    synthesiser = _SolvedFrames(played_bank(scratch), 0)
+    homogeneous = homogeneous_of(synthesiser)
+    trackers = [EstimatorSession(calibration, bank) for calibration in calibrations]
+    for rim in rims(bank):
+        series = [_series(synthesiser, homogeneous, k, sigma) for k, sigma in rim.places]
+        for tracker in trackers:
+            levels = [
+                judge_level(estimate_frames(tracker, FaultyFrames(one)), one.torque_nm, level)
+                for level, one in zip(rim.levels, series, strict=True)
+            ]
+            yield fault_curve(rim.name, rim.unit, tracker.calibration.estimator, levels)
+
+
+def _series(synthesiser: Synthesiser, homogeneous: FloatArray, k: float, sigma: float) -> FrameSeries:
+    frames = np.array([np.abs(mean_frame(synthesiser, k, sigma, 1.0) - homogeneous) for _ in range(_FRAMES)])[:, None]
+    t_s = np.arange(float(_FRAMES))
+    return FrameSeries(
+        "difference", ("right",), t_s, frames, t_s, np.full(_FRAMES, torque_of(sigma)), np.full(_FRAMES, np.nan)
+    )

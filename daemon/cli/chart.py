@@ -1,0 +1,90 @@
+"""`shearloop chart NAME [RECORDING…] --out DIR`: measure, and draw as JSON, SVG and PNG."""
+
+import argparse
+from pathlib import Path
+
+from shearloop.daemon.cli.options import add_cluster
+
+NAMES = {
+    "speed-accuracy": "latency against torque error of every estimator, forward methods, and the loop's window",
+    "stability": "every estimator as faults grow (bias, spread, valid, false-valid), continuity, the loop on the skin",
+    "scene": "how much model, bank and board the recording's noise asks for",
+}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    listing = "; ".join(f"{name}: {content}" for name, content in NAMES.items())
+    parser.add_argument("name", choices=NAMES, metavar="NAME", help=listing)
+    parser.add_argument(
+        "recordings", nargs="*", default=[], type=Path, metavar="REC",
+        help="recordings (.mcap) or folders of slices (default: synthetic frames)",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the chart and its numbers")
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="bank to match with (default: a small one, built)")
+    parser.add_argument(
+        "--mesh", type=Path, metavar="FILE", help="mesh or fingertip to reconstruct and solve on (default: our own)"
+    )
+    parser.add_argument(
+        "--split", type=float, default=0.6, metavar="SHARE", help="earlier part, for the fit (default: 0.6)"
+    )
+    add_cluster(parser)
+    parser.add_argument(
+        "--jobs", type=int, metavar="N", help="processes or local workers (default: 1; --cluster alone: one per core)"
+    )
+    parser.add_argument("--rounds", type=int, default=5, metavar="N", help="rounds of timing (default: 5)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Draw one chart and print its paths."""
+    from shearloop.daemon.errors import UserError
+
+    _check_arguments(args)
+    try:
+        import matplotlib as _  # noqa: F401 - its absence is reported before anything is measured
+    except ModuleNotFoundError as error:
+        raise UserError("charts need matplotlib: `pip install 'shearloop[plot]'`") from error
+    from shearloop.daemon.analysis.charts.drawing import check_takes_pictures, remove_empty_folders
+    from shearloop.daemon.analysis.charts.sources import bank_of, mesh_of, splits
+    from shearloop.daemon.workers import open_executor
+
+    check_takes_pictures(args.out)
+    scratch = args.out / "banks"
+    with remove_empty_folders(scratch):
+        parts = splits(args.recordings, args.split, scratch)
+        if args.name == "scene":
+            from shearloop.daemon.analysis.charts import scene
+
+            with open_executor(args.cluster, args.jobs) as executor:
+                paths = scene.chart(parts, args.out, executor)
+        else:
+            mesh = mesh_of(args.mesh)
+            bank = bank_of(args.bank, mesh, scratch)
+            if args.name == "speed-accuracy":
+                from shearloop.daemon.analysis.charts import speed_accuracy
+
+                own_mesh = mesh if args.mesh else None
+                paths = speed_accuracy.chart(parts, bank, mesh, own_mesh, args.out, args.rounds)
+            else:
+                from shearloop.daemon.analysis.charts import stability
+
+                with open_executor(args.cluster, args.jobs) as executor:
+                    paths = stability.chart(parts, bank, mesh, scratch, args.out, executor)
+    for path in paths:
+        print(path)
+    return 0
+
+
+def _check_arguments(args: argparse.Namespace) -> None:
+    from shearloop.daemon.errors import UserError
+
+    if not 0.1 <= args.split <= 0.9:
+        raise UserError(f"--split must be a share from 0.1 to 0.9, not {args.split:g}")
+    if args.rounds < 1:
+        raise UserError(f"--rounds must be 1 or more, not {args.rounds}")
+    if args.jobs is not None and args.jobs < 1:
+        raise UserError(f"--jobs must be 1 or more, not {args.jobs}")
+    if args.name == "speed-accuracy" and (args.cluster is not None or args.jobs not in (None, 1)):
+        raise UserError("speed-accuracy measures times, one thread on this machine: leave out --cluster and --jobs")
+    if args.name == "scene" and (args.bank is not None or args.mesh is not None):
+        raise UserError("scene chooses mesh and bank itself, on the paper's fingertip: leave out --bank and --mesh")

@@ -1,0 +1,67 @@
+"""The bench of matching_speed: what it compares agrees, and ratios are of one turn."""
+
+import numpy as np
+import pytest
+
+from benchmarks import matching_speed
+from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
+from tests.bank.conftest import small_fingertip
+
+
+@pytest.fixture(scope="module")
+def bank(tmp_path_factory: pytest.TempPathFactory) -> Bank:
+    path = tmp_path_factory.mktemp("bank") / "a.bank"
+    random, grid = np.random.default_rng(1), np.linspace(1.0, 2.0, 8)
+    signals = random.normal(0.0, 0.05, (8, 8, 896)).astype(np.float32)
+    definition = BankDefinition("ab" * 32, "gaussian_derivative", grid, grid)
+    write_bank(path, definition, signals[0, 0], np.ones((8, 8)), np.ones((8, 8), bool), signals)
+    return Bank.open(path)
+
+
+def test_ratios_are_taken_turn_by_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matching_speed, "RATIOS", {"own": ("peer", "absent")})
+    seconds = {"own": [1.0, 2.0, 4.0], "peer": [3.0, 6.0, 12.0], "other": [1.0, 1.0, 1.0]}
+    assert matching_speed.ratios(seconds) == {"peer / own": {"median": 3.0, "low": 3.0, "high": 3.0}}
+
+
+def test_methods_take_turns() -> None:
+    calls: list[str] = []
+    methods = {name: (lambda name=name: calls.append(name), 1) for name in ("a", "b")}
+    found = matching_speed.take_turns(methods, 3)
+    assert calls == ["a", "b"] * 4, "once to warm up, then in turns"
+    assert {name: len(each) for name, each in found.items()} == {"a": 3, "b": 3}
+
+
+def test_fast_solvers_and_matchers_agree_with_slow_ones(bank: Bank, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(matching_speed, "N_CELLS", 20)
+    methods, error = matching_speed.cell_methods(small_fingertip())
+    assert 0 < error < 1e-9
+    one, two = methods["batch, one thread"][0](), np.vstack(methods["batch, two threads"][0]())
+    np.testing.assert_array_equal(one, two)
+    frames = np.random.default_rng(1).normal(0.0, 0.05, (10, 896))
+    matches = matching_speed.match_methods(bank, frames)
+    quick, plain = (matches[name][0]() for name in ("zero lag, fast", "zero lag, numpy float32"))
+    assert [bank.signals.shape[1] * each.cell[0] + each.cell[1] for each in quick] == plain
+    for found in matching_speed.compare_with_reference(bank, [frames[:4], frames[4:]]).values():
+        assert found["same"] == found["frames"] == 10
+        assert found["largest_score_difference"] < 1e-12
+
+
+def test_the_caches_are_overwritten_before_each_cold_match(bank: Bank, monkeypatch: pytest.MonkeyPatch) -> None:
+    happened: list[str] = []
+
+    class Memory:
+        def __iadd__(self, _: float) -> "Memory":
+            happened.append("memory")
+            return self
+
+    class Matcher:
+        def match(self, _: object) -> None:
+            happened.append("match")
+
+    for kind in (matching_speed.PrunedMatcher, matching_speed.PrunedZeroLagMatcher):
+        monkeypatch.setattr(kind, "from_bank", lambda _: Matcher())
+    monkeypatch.setattr(matching_speed.np, "zeros", lambda _: Memory())
+    found = matching_speed.cold_seconds(bank, np.ones((3, 896)), turns=2)
+    assert [len(each) for each in found.values()] == [2] * 2
+    assert happened == ["memory", "match"] * (2 * 2 * 3)

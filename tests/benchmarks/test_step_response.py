@@ -1,0 +1,82 @@
+"""The step benchmark: on the small plant, on the rig's physics, and with the default estimator in the loop."""
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import step_response
+from benchmarks.step_response import TARGET_NM, estimator_in_the_loop, rig_calibration
+from shearloop.bank.eit.bank_file import BankDefinition, write_bank
+from shearloop.daemon.analysis.charts.simulated_loop import (
+    PERIOD_S,
+    SCENARIOS,
+    LoopScenario,
+    Plant,
+    SimulatedSensor,
+    random_tool,
+)
+
+
+@pytest.fixture(scope="module")
+def bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bank whose signals are smooth in k and sigma."""
+    path = tmp_path_factory.mktemp("bank") / "smooth.bank"
+    random = np.random.default_rng(3)
+    k_grid, sigma_grid = np.linspace(3.2, 4.0, 6), np.linspace(0.6, 3.0, 25)
+    # A grip moves the frame further than a twist does.
+    shapes = random.normal(0.0, 1.0, (4, 896)) * np.array([0.03, 0.02, 0.015, 0.003])[:, None]
+    k, sigma = np.meshgrid(k_grid - 3.6, sigma_grid - 1.8, indexing="ij")
+    signals = np.einsum("jkl,jc->klc", np.array([np.ones_like(k), k, sigma, sigma**2]), shapes)
+    valid = np.ones(k.shape, bool)
+    homogeneous = random.uniform(0.1, 0.5, 896)
+    definition = BankDefinition("ab" * 32, "gaussian_derivative", k_grid, sigma_grid)
+    write_bank(path, definition, homogeneous, np.ones(k.shape), valid, signals.astype(np.float32))
+    return path
+
+
+def small_plant(sensor: SimulatedSensor, rng: np.random.Generator) -> Plant:
+    return Plant(random_tool(rng), sensor, rng)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda scenario: scenario.name)
+def test_a_step_meets_its_requirements(scenario: LoopScenario) -> None:
+    _, figures = step_response.steps(scenario, 3, small_plant)
+    assert figures["in_band_at_settling_time_share"] == 1.0
+    assert figures["time_in_band_worst_seed"] >= 0.95
+    assert figures["overshoot_worst_seed"] <= 0.15
+    assert abs(figures["mean_error"]) < 0.03
+    assert figures["refused_by_margins"] == 0
+
+
+def test_the_step_on_the_rigs_physics_is_held_and_a_screw_ends_at_its_target() -> None:
+    numbers, tables, beyond, allowed = step_response.measure(2)
+    assert numbers["eit"]["time_in_band_mean"] > 0.95
+    assert numbers["load_cell"]["in_band_at_settling_time_share"] == 1.0
+    assert abs(tables["load_cell"][:, -1] - 0.1).max() < 0.002
+    assert (abs(beyond) <= allowed).all()
+    creep = step_response.calibrated_creep()
+    assert (creep.share, creep.time_s) == (pytest.approx(0.08, abs=0.02), pytest.approx(20.0, rel=0.5))
+
+
+@pytest.mark.usefixtures("fonts")
+def test_the_benchmark_writes_numbers_and_a_chart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["step_response", "--out", str(tmp_path), "--seeds", "2"])
+    shorter = tuple(replace(scenario, hold_s=12.0) for scenario in step_response.TWIN_SCENARIOS)
+    monkeypatch.setattr(step_response, "TWIN_SCENARIOS", shorter)
+    step_response.main()
+    figures = json.loads((tmp_path / "step_response.json").read_text())
+    assert set(figures) == {"eit", "load_cell", "tighten"}
+    assert (tmp_path / "step_response.png").stat().st_size > 10_000
+
+
+def test_the_default_estimator_holds_a_torque_on_both_fingertips(bank: Path) -> None:
+    table, figures = estimator_in_the_loop(bank, rig_calibration(bank, 7), (0, 1))
+    late = table[:, round(SCENARIOS[0].settled_s / PERIOD_S) :]
+    assert np.abs(late - TARGET_NM).max() < 0.1 * TARGET_NM
+    assert table.max() < 1.2 * TARGET_NM
+    assert figures["not_valid_share"] < 0.02
+    assert figures["coverage_95"] > 0.9

@@ -1,0 +1,72 @@
+"""The simulated plant, and the twist controller on it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shearloop.daemon.analysis.charts.simulated_loop import (
+    LOAD_CELL,
+    SCENARIOS,
+    Plant,
+    SimulatedSensor,
+    SimulatedTool,
+    identified,
+    nanoseconds,
+    run,
+    settings_for,
+    started_controller,
+)
+from shearloop.daemon.control.controller import WristCommand
+
+
+class FixedSpeed:
+    """Turns at one speed for a while, and keeps the measurements."""
+
+    def __init__(self, speed: float, until_s: float) -> None:
+        self.speed, self.until_ns = speed, nanoseconds(until_s)
+        self.seen: list[tuple[float, int, int]] = []
+
+    def measure(self, torque_nm: float | None, t_mid_ns: int, t_ns: int) -> None:
+        assert torque_nm is not None
+        self.seen.append((torque_nm, t_mid_ns, t_ns))
+
+    def command(self, t_ns: int, wrist_angle_rad: float) -> WristCommand:  # noqa: ARG002
+        return WristCommand(self.speed if t_ns < self.until_ns else 0.0)
+
+
+def test_the_plant_measures_the_mean_of_its_window_and_reports_it_late() -> None:
+    sensor = SimulatedSensor(period_s=0.5, window_s=0.5, transfer_s=0.1)
+    tool = SimulatedTool(relaxing_share=0.0, actuation_s=0.0)
+    loop = FixedSpeed(0.2, until_s=1e9)
+    run(Plant(tool, sensor, np.random.default_rng(0)), loop, 6.0)
+    assert len(loop.seen) >= 10
+    for torque, mid_ns, now_ns in loop.seen:
+        assert torque == pytest.approx(0.25 * 0.2 * mid_ns / 1e9, abs=1e-9)
+        assert 0.35 <= (now_ns - mid_ns) / 1e9 <= 0.36
+
+
+def test_the_plant_relaxes_and_slips() -> None:
+    tool = SimulatedTool(relaxing_share=0.1, relaxing_s=2.0)
+    plant = Plant(tool, LOAD_CELL, np.random.default_rng(0))
+    run(plant, FixedSpeed(0.5, until_s=0.8), 20.0)
+    assert plant.torque_nm == pytest.approx(0.9 * 0.25 * plant.angle_rad, rel=1e-3)
+    slipping = Plant(SimulatedTool(slip_nm=0.05), LOAD_CELL, np.random.default_rng(0))
+    run(slipping, FixedSpeed(0.5, until_s=2.0), 2.0)
+    assert slipping.torque_nm == pytest.approx(0.05)
+    run(slipping, FixedSpeed(-0.5, until_s=1e9), 0.1)
+    assert slipping.torque_nm < 0.04
+
+
+def test_a_slipping_grip_ends_in_a_held_wrist() -> None:
+    scenario = SCENARIOS[0]
+    plant = Plant(SimulatedTool(), scenario.sensor, np.random.default_rng(22))
+    found = identified(plant, scenario)
+    plant.tool = replace(plant.tool, slip_nm=0.06)
+    controller = started_controller(plant, found, settings_for(found, scenario))
+    while controller.state.innovation_nm is None:
+        run(plant, controller, plant.period_s)
+    controller.set_point(0.10)
+    trace = run(plant, controller, scenario.hold_s)
+    assert trace.held[-1]
+    assert np.ptp(trace.angle_rad) < (0.1 + 0.06 + 0.01) / 0.2

@@ -1,0 +1,94 @@
+"""The loop around the emulated skin, in virtual time: what the bench measures, held to what it has to be."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from shearloop.bank.skin.calibration import SkinCalibration
+from shearloop.bank.skin.calibration_file import load_calibration
+from shearloop.daemon.analysis.charts import skin_loop
+from shearloop.daemon.analysis.charts.skin_loop import CALIBRATION, SkinLoop, SkinLoopCase, judge
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.control.experiment_schema import ExperimentFile, HoldTorqueStep
+from shearloop.daemon.control.step_runner import ExperimentPhase
+from shearloop.daemon.workers import SerialExecutor
+
+CONFIG = Path(__file__).parents[3] / "config"
+
+
+@pytest.fixture(scope="module")
+def calibration() -> SkinCalibration:
+    return load_calibration(CALIBRATION)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        SkinLoopCase(name="Fn = 1 N", hold_s=6.0),
+        SkinLoopCase(name="Fn = 2 N", normal_n=2.0, deadband_nm=0.0, kp=0.15, hold_s=6.0),
+    ],
+)
+def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(
+    case: SkinLoopCase, calibration: SkinCalibration
+) -> None:
+    held, _ = judge(case, calibration)
+    assert held.phase == "done"
+    assert held.bound_n == pytest.approx(2 * 0.04 * case.normal_n)
+    assert held.width_n <= held.bound_n / 4
+    assert held.offset_n <= 0.02
+
+
+def test_the_band_is_what_does_it(calibration: SkinCalibration) -> None:
+    held, _ = judge(SkinLoopCase(name="not told the band", band=False, seed=5, kp=0.15, hold_s=12.0), calibration)
+    assert held.width_n > held.bound_n
+
+
+def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_push(
+    calibration: SkinCalibration,
+) -> None:
+    loop = SkinLoop(SkinLoopCase(name="drift"), calibration)
+    begin = []
+    measured = loop.skin.resistances_ohm
+
+    def drifting() -> tuple[float, float]:
+        r1, r2 = measured()
+        controller = loop.brain.controller
+        if controller is not None and not begin:
+            begin.append(loop.t_ns)
+        seconds = (loop.t_ns - begin[0]) / 1e9 - 8.0 if begin else 0.0
+        return r1 * (1 - 0.01 * max(seconds, 0.0)), r2
+
+    loop.skin.resistances_ohm = drifting  # type: ignore[method-assign]
+    said = loop.run(60.0)
+    assert said.startswith(ExperimentPhase.STOPPED.value)
+    assert max(loop.truth_n) < 2.0, "half of what the drift would have had it push by then"
+
+
+@pytest.mark.usefixtures("fonts")
+def test_the_stability_chart_shows_the_limit_cycle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = SkinLoopCase(name="told the band", hold_s=4.0)
+    monkeypatch.setattr(skin_loop, "over_gains", lambda: [case])
+    monkeypatch.setattr(skin_loop, "over_delays", lambda: [replace(case, name="not told", band=False)])
+    monkeypatch.setattr(skin_loop, "SEEDS", 1)
+    paths = skin_loop.chart(tmp_path, SerialExecutor())
+    assert [path.name for path in paths] == ["stability-skin.json", "stability-skin.svg", "stability-skin.png"]
+    told, not_told = json.loads(paths[0].read_text())["held"]
+    assert told["width_n"] <= told["bound_n"] == pytest.approx(0.08)
+    assert not_told["case"]["band"] is False
+    assert paths[2].stat().st_size > 20_000
+
+
+def test_the_demo_holds_the_force_that_it_says() -> None:
+    config = load_daemon_config(CONFIG / "skin_demo.yaml")
+    assert config.skin is not None
+    assert config.experiment is not None
+    assert config.skin.tool_radius_mm is not None
+    file = load_yaml_model(config.experiment, ExperimentFile)
+    (hold,) = [step for step in file.steps if isinstance(step, HoldTorqueStep)]
+    assert file.drive == "skin"
+    assert hold.torque_nm / config.skin.tool_radius_mm * 1e3 == pytest.approx(1.0)
+    assert [step.do for step in file.steps] == ["tare", "identify", "hold_torque"]
+    assert all(step.timeout_s for step in file.steps), "none may last for ever"

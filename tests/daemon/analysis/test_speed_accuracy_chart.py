@@ -1,0 +1,261 @@
+"""The charts on small synthetic recordings: what they are drawn from, and that a user's mistakes are sentences."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import NoReturn
+
+import numpy as np
+import pytest
+from matplotlib.text import Annotation, Text
+
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.estimation import FrameSeries
+from shearloop.daemon.analysis.charts import scene
+from shearloop.daemon.analysis.charts.drawing import (
+    check_takes_pictures,
+    figure,
+    frontier,
+    lay_out,
+    plain_log,
+    write_names,
+)
+from shearloop.daemon.analysis.charts.forward_methods import CELLS, converged, direct, error_of, forward_methods
+from shearloop.daemon.analysis.charts.simulated_loop import LOOPS, TrackingError, tracking_errors
+from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits, synthetic_stream
+from shearloop.daemon.analysis.charts.speed_accuracy import (
+    MeasuredMethod,
+    MethodComparison,
+    _draw_loop,
+    _draw_methods,
+    _short,
+    compare_methods,
+    often_valid,
+    write,
+)
+from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.cli import main
+from shearloop.daemon.cli.chart import NAMES
+from shearloop.daemon.workers import SerialExecutor
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("charts")
+
+
+def test_the_frontier_is_what_nothing_beats_in_both() -> None:
+    costs, errors = [1.0, 2.0, 3.0, 4.0, 2.5], [9.0, 5.0, 6.0, 1.0, 5.0]
+    assert frontier(costs, errors) == [0, 1, 3]
+
+
+def test_of_equally_fast_points_the_more_accurate_is_on_the_frontier() -> None:
+    assert frontier([1.0, 1.0], [2.0, 1.0]) == [1]
+
+
+def test_what_calls_few_frames_valid_is_not_on_the_frontier_however_fast_and_exact(scratch: Path) -> None:
+    split = splits([], 0.6, scratch)[0]
+    methods = [
+        MeasuredMethod(name, name, cost, cost, cost, error, None, valid)
+        for name, cost, error, valid in (
+            ("rare", 1.0, 0.001, 0.32),
+            ("often", 2.0, 0.01, 0.60),
+            ("most", 3.0, 0.005, 0.65),
+        )
+    ]
+    axes = figure(5, 5).add_subplot()
+    _draw_methods(axes, MethodComparison(split, methods))
+    filled = [mark.lines[0].get_markerfacecolor() != "white" for mark in axes.containers]
+    assert filled == [False, True, True]
+    assert [_short(one, i in often_valid(methods)) for i, one in enumerate(methods)] == [
+        "rare (32% valid)",
+        "often",
+        "most",
+    ]
+
+
+def test_loops_at_one_window_tell_their_noises_apart_by_their_marks() -> None:
+    axes = figure(5, 5).add_subplot()
+    runs = [(loop, noise, n) for loop in LOOPS[:2] for noise in (0.002, 0.01, 0.02) for n in (1, 2)]
+    runs += [(LOOPS[2], noise, 1) for noise in (0.002, 0.01, 0.02)]
+    _draw_loop(axes, [TrackingError(loop, noise, n, n, noise, noise, noise) for loop, noise, n in runs])
+    looks = [
+        (line.get_marker(), line.get_linestyle() if len(line.get_xdata()) > 1 else "", line.get_fillstyle())
+        for line in (mark.lines[0] for mark in axes.containers)
+    ]
+    assert len(looks) == len(set(looks)) == 9
+
+
+def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch: Path) -> None:
+    slices, stream = splits([], 0.6, scratch)
+    assert slices.past.t_s[-1] < slices.future.t_s[0]
+    assert len(slices.past.t_s) + len(slices.future.t_s) == 49
+    # The judged part of a stream begins with frames that only fill the memory.
+    assert stream.future.t_s[0] < stream.past.t_s[-1]
+    again = synthetic_stream(scratch)
+    np.testing.assert_array_equal(again.channels[: len(stream.past.t_s)], stream.past.channels)
+
+
+def test_errors_fall_in_proportion_to_the_mesh_size_towards_what_two_meshes_foretell() -> None:
+    meshes = [own_fingertip(size).mesh() for size in (0.2, 0.1, 0.05)]
+    truth = converged(meshes[1], meshes[2], 2.0)
+    errors = [error_of(direct(mesh)(), truth) for mesh in meshes]
+    assert errors[0] > 1.5 * errors[1] > 2.0 * errors[2] > 0
+
+
+@pytest.mark.usefixtures("fonts", "few_mixtures")
+def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Path, tmp_path: Path) -> None:
+    mesh = own_fingertip(0.4).mesh()
+    bank = bank_of(None, mesh, scratch, Grid(np.linspace(3.0, 3.6, 7), np.linspace(1.0, 2.1, 12)))
+    compared = [compare_methods(split, bank, mesh, 1) for split in splits([], 0.6, scratch)]
+    solved, loop = forward_methods(1, None, (0.4, 0.2), (0.2, 0.1)), tracking_errors((0.004,), 1, (1, 3))
+    written = write(compared, solved, loop, bank, tmp_path)
+    assert [path.suffix for path in written] == [".json", ".svg", ".png"]
+    assert all(path.stat().st_size > 1000 for path in written)
+    content = json.loads(written[0].read_text())
+    slices, stream = content["methods"].values()
+    by_name = {row["name"]: row for row in slices}
+    paper, fast = by_name["paper: all lags, reference"], by_name["all lags, fast and exact"]
+    # The same maximum: the same torques.
+    assert fast["rmse_nm"] == paper["rmse_nm"]
+    assert fast["latency_ratio"] == fast["latency_ms"] / paper["latency_ms"]
+    assert {"rank 8", "zero lag, float16", "64 channels", "fused"} <= set(by_name)
+    assert {"fused, right", "fused, both"} <= {row["name"] for row in stream}
+    errors = {row["name"]: row["error"] for row in content["forward"]}
+    assert errors["direct, 0.4 cm"] > errors["direct, 0.2 cm"] > 0
+    assert errors["batch, 0.2 cm"] == pytest.approx(errors["direct, 0.2 cm"], rel=1e-6)
+    compensated, late = (
+        next(run["rms_nm"] for run in content["loop"]["runs"] if run["loop"] == name and run["frames"] == 1)
+        for name in ("twist controller", "no delay compensator")
+    )
+    assert 0 < compensated < 0.02 > late > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--split", "0.95"], "--split must be a share from 0.1 to 0.9"),
+        (["--rounds", "0"], "--rounds must be 1 or more"),
+        (["no-such.mcap"], "no-such.mcap"),
+    ],
+)
+@pytest.mark.parametrize("name", NAMES)
+def test_a_mistake_is_one_sentence_and_leaves_no_folder(
+    name: str, arguments: list[str], complaint: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["chart", name, *arguments, "--out", str(tmp_path / "some" / "out")]) == 2
+    said = capsys.readouterr().err
+    assert complaint in said
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_chart_that_is_interrupted_leaves_no_empty_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(_: object, __: object, scratch: Path) -> NoReturn:
+        scratch.mkdir(parents=True)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.splits", interrupted)
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.mesh_of", lambda _: None)
+    assert main(["chart", name, "--out", str(tmp_path / "some" / "out")]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_was_there_is_left_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "out").mkdir()
+    check_takes_pictures(tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_a_place_that_takes_no_chart_is_told_before_anything_is_measured(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # Were anything read, it would be what fails.
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.sources.splits", None)
+    for name in NAMES:
+        assert main(["chart", name, "--out", "/dev/null"]) == 2
+        said = capsys.readouterr().err
+        assert said == "shearloop chart: /dev/null: the chart cannot be written: File exists; choose another --out\n"
+
+
+def test_why_a_design_may_not_be_worth_building_is_told_with_the_chart_of_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 0.01, (12, 1, N_CHANNELS))
+    series = FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan))
+    parts = [Split(f"{name}, slices, first 60%", series, series, series) for name in ("good", "bad")]
+    # Each recording is designed for in turn; of a design its doubts ask no more.
+    found = iter([(0.6, 0.16), (0.9, 0.5)])
+
+    def designed_on(*_: object) -> SimpleNamespace:
+        penalised, noise = next(found)
+        return SimpleNamespace(models=[SimpleNamespace(penalised=penalised)], relative_noise=noise)
+
+    monkeypatch.setattr(scene, "designed_on", designed_on)
+    monkeypatch.setattr(scene, "write", lambda title, _, out: [out / title])
+    assert scene.chart(parts, tmp_path, SerialExecutor()) == [tmp_path / "good", tmp_path / "bad"]
+    first, second = capsys.readouterr().err.splitlines()
+    assert first.startswith("shearloop chart: bad: even the best model leaves 90.0% of a frame unexplained")
+    assert second.startswith("shearloop chart: bad: the noise is 50.0% of a difference frame")
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(
+    there: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solved: list[int] = []
+
+    def solver(mesh: Mesh) -> Callable[[object], object] | None:
+        return (lambda _: solved.append(len(mesh.triangles))) if there else None
+
+    monkeypatch.setattr("shearloop.daemon.analysis.charts.forward_methods.pyeit_solver", solver)
+    rows = forward_methods(2, None, (0.4, 0.2), (0.2, 0.1))
+    (pyeit,) = (row for row in rows if row.family == "pyEIT")
+    assert (pyeit.name, pyeit.cited) == (("pyEIT", False) if there else ("pyEIT (cited)", True))
+    assert pyeit.error is None
+    # Twice all cells, on the mesh that has about as many triangles as the paper's.
+    assert solved == ([rows[2].triangles] * 2 * len(CELLS) if there else [])
+    assert (pyeit.triangles == rows[2].triangles) == there
+    assert pyeit.cell_low_ms <= pyeit.cell_ms <= pyeit.cell_high_ms
+    (eidors,) = (row for row in rows if row.family == "EIDORS")
+    # Its time is that of the paper's mesh, which is not here.
+    assert (eidors.cited, eidors.error) == (True, None)
+    if not there:
+        monkeypatch.setattr("shearloop.daemon.analysis.charts.forward_methods.PAPER_TRIANGLES", rows[2].triangles)
+        again = forward_methods(1, None, (0.4, 0.2), (0.2, 0.1))
+        assert [row.error for row in again if row.family == "EIDORS"] == [rows[2].error]
+
+
+CROWD = [(1.0, 1.0, "one"), (1.05, 1.0, "another"), (1.0, 1.04, "a third"), (1.1, 1.0, "a fourth")]
+# Side by side, as methods of the same error are.
+ROW = [(each, 1.0, f"some method,\n{number} triangles") for number, each in enumerate((0.75, 0.79, 0.9, 1.34, 1.4))]
+
+
+@pytest.mark.usefixtures("fonts")
+@pytest.mark.parametrize("points", [CROWD, ROW])
+def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark(points: list[tuple[float, float, str]]) -> None:
+    made = figure(6, 4)
+    axes = made.subplots()
+    plain_log(axes)
+    axes.plot(*zip(*[point[:2] for point in points], strict=True), "o")
+    axes.set(xlim=(0.5, 2), ylim=(0.5, 2))
+    lay_out(made)
+    write_names(axes, points)
+    made.draw_without_rendering()
+    # Two that stand closer together read as one. Of a text alone, without the line that leads to it.
+    boxes = [Text.get_window_extent(note).padded(1.9) for note in axes.texts]
+    assert sorted(note.get_text() for note in axes.texts) == sorted(name for *_, name in points)
+    for i, box in enumerate(boxes):
+        assert not any(box.overlaps(other) for other in boxes[:i])
+        assert not any(box.contains(*axes.transData.transform(point[:2])) for point in points)
+        assert axes.get_window_extent().containsx(box.x0)
+        assert axes.get_window_extent().containsx(box.x1)
+    # One that does not stand next to its own is led to it.
+    led = [isinstance(note, Annotation) and note.arrow_patch is not None for note in axes.texts]
+    assert led == [max(map(abs, note.get_position())) > 7 for note in axes.texts]
+    assert any(led) == (points is ROW)

@@ -1,0 +1,170 @@
+"""Sweeps of faults: their first level is no fault, they know what breaks silently, and the fix of the hops holds."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import mannwhitneyu
+
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import CHANNELS
+from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics
+from shearloop.bank.estimation.reciprocity import ReciprocityCheck
+from shearloop.daemon.analysis.charts.fault_sweeps import (
+    FAULTS,
+    FaultLevel,
+    balanced,
+    fault_curve,
+    fitted,
+    judge_level,
+    lost_channels,
+    scene_for,
+    sweep,
+)
+from shearloop.daemon.analysis.charts.slice_stability import detect_mixtures, sweep_rims, walks
+from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
+from shearloop.daemon.analysis.charts.stability import chart, continuity_figure, detectability_figure, sweeps_figure
+from shearloop.daemon.analysis.reproduce.banks import Grid
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.workers import SerialExecutor
+
+
+@pytest.fixture(scope="module")
+def scratch(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("stability")
+
+
+@pytest.fixture(scope="module")
+def parts(scratch: Path) -> list[Split]:
+    return splits([], 0.6, scratch)
+
+
+@pytest.fixture(scope="module")
+def bank(scratch: Path) -> Bank:
+    grid = Grid(np.linspace(3.0, 3.6, 13), np.linspace(1.0, 2.1, 30))
+    return bank_of(None, own_fingertip(0.4).mesh(), scratch, grid)
+
+
+def estimate(torque: float, half: float = 0.01) -> Estimate:
+    return Estimate(valid=True, torque_nm=torque, torque_low_nm=torque - half, torque_high_nm=torque + half)
+
+
+def test_figures_count_what_is_valid_and_wrong() -> None:
+    truth = np.array([0.1, 0.1, 0.1, 0.1, np.nan])
+    found = judge_level(
+        [estimate(0.105), estimate(0.145), Estimate(valid=False), estimate(0.1), estimate(9.0)], truth, 2.0
+    )
+    assert found.valid == 0.75
+    assert found.false_valid == 0.25
+    assert found.bias_nm == pytest.approx(0.05 / 3)
+    assert fault_curve("fault", "unit", "fused", [judge_level([estimate(0.1)], truth[:1], 0.0), found]).breaks_at == 2.0
+
+
+@pytest.mark.parametrize(
+    ("levels", "expected"), [((-0.5, -0.2, 0.0, 0.1, 0.5), 0.1), ((0.6, 0.4, 0.2), 0.6), ((1.0, 2.0), 1.0)]
+)
+def test_an_estimator_breaks_at_the_mildest_level_in_either_direction(levels, expected) -> None:
+    wrong = [FaultLevel(level, 0.0, 0.0, 1.0, 0.5 if level else 0.0) for level in levels]
+    assert fault_curve("fault", "unit", "fused", wrong).breaks_at == expected
+
+
+def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones() -> None:
+    truth = np.r_[np.zeros(90), np.full(10, 0.1)]
+    kept = balanced(truth)
+    assert np.isfinite(kept).sum() == 20
+    assert np.isfinite(kept[90:]).all()
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+@pytest.mark.parametrize("kind", ["difference", "raw"])
+def test_every_sweep_begins_with_no_fault_and_then_changes_the_frames(fault, kind, parts, bank) -> None:
+    scene = scene_for(next(one for one in parts if one.past.kind == kind), bank)
+    none, most = (fault.apply(scene, level, np.random.default_rng(1)) for level in (fault.levels[0], fault.levels[-1]))
+    np.testing.assert_array_equal(none.series.channels, scene.series.channels)
+    assert not np.array_equal(most.series.channels, scene.series.channels)
+    if kind == "difference":
+        assert (most.series.channels >= 0).all()
+
+
+def test_an_electrode_touches_its_own_injections_and_pairs() -> None:
+    assert 28 * 2 < lost_channels(np.array([3])).sum() < 28 * 5
+
+
+def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts, bank) -> None:
+    stream = next(one for one in parts if one.past.kind == "raw")
+    (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
+    scene = scene_for(stream, bank)
+    lost = next(fault for fault in FAULTS if fault.name == "lost electrodes, unreported")
+    found = sweep(EstimatorSession(calibration, bank), scene, lost)
+    assert found.levels[0].valid > 0.7
+    assert found.breaks_at is None
+    assert found.levels[-1].valid == 0.0
+
+
+@pytest.mark.usefixtures("fonts", "few_mixtures")
+def test_the_mean_of_cells_alike_does_not_hop_and_the_rims_are_walked(parts, bank, scratch) -> None:
+    slices = parts[0]
+    calibrations = fitted(slices, ("bank", "fused"), Physics(bank, None))
+    found = walks(slices, bank, calibrations)
+    paper, alone, mean = (one.largest_hop_nm for one in found[:3])
+    assert mean < 0.5 * min(paper, alone)
+    rims = list(sweep_rims(calibrations, bank, scratch))
+    assert {one.estimator for one in rims} == {"bank", "fused"}
+    assert all(one.levels[0].valid > 0.5 for one in rims)
+    for figure in (sweeps_figure("rims", rims), continuity_figure("slices", found)):
+        assert len(figure.axes) >= 2
+    assert json.dumps([one.hops for one in found])
+
+
+def drifting(n: int, seed: int) -> FrameSeries:
+    """Return slices that lie along two directions about a mean, with noise: what they leave of another is known."""
+    rng = np.random.default_rng(seed)
+    mean = rng.uniform(0.02, 0.1, 896)
+    frames = mean + rng.normal(size=(n, 2)) @ (0.004 * rng.normal(size=(2, 896))) + rng.normal(0.0, 0.004, (n, 896))
+    t_s = np.arange(float(n))
+    return FrameSeries(
+        "difference", ("right",), t_s, np.abs(frames)[:, None], t_s, np.linspace(0, 0.1, n), np.full(n, np.nan)
+    )
+
+
+@pytest.mark.usefixtures("fonts")
+def test_the_share_of_a_foreign_frame_that_passes_is_the_one_that_its_size_allows() -> None:
+    """Off the slices' directions nothing but the foreign part stands out: its square adds to that of the noise."""
+    series = drifting(100, 4)
+    found = detect_mixtures(series, origins=(0.6,))
+    past, later = series.channels[:60, 0], series.channels[60:, 0]
+    opposite = CHANNELS[:, 0] >= 16
+    order = np.lexsort((CHANNELS[:, 2], CHANNELS[:, 0] % 16, opposite)).reshape(2, 448)
+    pairs, foreign = past[:, order].mean(axis=1), later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
+    spread = np.sqrt(0.5 * pairs.var(axis=0) + 0.5 * np.median(pairs.var(axis=0)))
+    directions = np.linalg.svd((pairs - pairs.mean(axis=0)) / spread, full_matrices=False)[2][:12]
+
+    def off(frames: np.ndarray) -> np.ndarray:
+        scaled = (frames[..., order].mean(axis=-2) - pairs.mean(axis=0)) / spread
+        return scaled - scaled @ directions.T @ directions
+
+    limit = ReciprocityCheck.fit(past).largest_misfit
+    own = [one for one in found if one.kind == "another fingertip"]
+    # What is off adds channel by channel: the two, in their shares.
+    expected = [
+        np.median(((1 - one.share) * off(later) + one.share * off(foreign)) ** 2, axis=1) / limit for one in own
+    ]
+    for one, misfits in zip(own, expected, strict=True):
+        np.testing.assert_allclose(one.misfits, misfits, rtol=1e-6)
+        assert one.auc == pytest.approx(mannwhitneyu(misfits, expected[0]).statistic / len(later) ** 2)
+        assert one.passing <= (misfits <= 1.0).mean()
+    assert own[0].passing == 1.0
+    assert {one.passing for one in own if one.share >= 0.2} == {0.0}
+    assert {one.passing_best for one in own if one.share >= 0.2} == {0.0}
+    assert len(detectability_figure("slices", found).axes) == 2
+
+
+def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
+    bank: Bank, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slices = next(one for one in splits([], 0.6, tmp_path) if one.past.kind == "difference")
+    one = Split(slices.title, slices.past.between(0, 1), slices.future, slices.whole)
+    with pytest.raises(UserError, match="no estimator can be calibrated on it"):
+        chart([one], bank, own_fingertip(0.4).mesh(), tmp_path, tmp_path, SerialExecutor())
+    assert "fused is left out" in capsys.readouterr().out

@@ -1,0 +1,81 @@
+"""Which signals end a process in order."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from shearloop.daemon import gc_control as collector
+from shearloop.daemon.cli import main, run
+from shearloop.daemon.signals import ending_signals
+from tests.daemon.conftest import DEADLINE_S
+
+
+@pytest.fixture
+def as_it_was() -> Iterator[None]:
+    """Put back what is done at SIGHUP."""
+    before = signal.getsignal(signal.SIGHUP)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
+@pytest.mark.usefixtures("as_it_was")
+def test_a_closed_terminal_ends_what_was_not_told_to_outlive_it() -> None:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    assert ending_signals() == (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    # As `nohup` leaves it.
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert ending_signals() == (signal.SIGINT, signal.SIGTERM)
+
+
+@pytest.fixture
+def heard_anew() -> Iterator[None]:
+    """SIGTERM and SIGHUP do what they do in a new process, and what they did here afterwards."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("heard_anew")
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_what_ends_a_daemon_does_nothing_more_when_it_comes_again(
+    number: signal.Signals, config: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It killed the process, as soon as the event loop was closed, before all was written that there was to show."""
+    came = []
+
+    @contextmanager
+    def emulators(*_: object) -> Iterator[list[object]]:
+        yield []
+        assert signal.getsignal(number) is not signal.SIG_DFL, "this process would be killed"
+        signal.raise_signal(number)
+        came.append("again")
+
+    monkeypatch.setattr(run, "_run_emulators", emulators)
+    monkeypatch.setattr(
+        collector, "kept_from_lasting_objects", lambda: nullcontext(partial(os.kill, os.getpid(), number))
+    )
+    assert main(["run", str(config())]) == 0
+    assert came == ["again"]
+    assert signal.getsignal(number) is signal.SIG_DFL, "as before the command"
+
+
+def test_a_command_runs_in_any_thread_and_hears_no_signals_there(
+    config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ready = threading.Event()
+    monkeypatch.setattr(collector, "kept_from_lasting_objects", lambda: nullcontext(ready.set))
+    with ThreadPoolExecutor() as pool:
+        assert pool.submit(ending_signals).result() == ()
+        daemon = pool.submit(main, ["run", str(config())])
+        assert ready.wait(DEADLINE_S)
+        assert main(["command", "stop", "--connect", f"ipc://{tmp_path}/commands"]) == 0
+        assert daemon.result(DEADLINE_S) == 0
+    assert "stop: done" in capsys.readouterr().out

@@ -11,9 +11,8 @@ from random import Random
 import numpy as np
 
 from shearloop.bank.skin.calibration import CalibrationTable
-from shearloop.bank.skin.membrane import UNSTRETCHED, Membrane, paper_membrane
-from shearloop.bank.skin.section import PAPER_SECTION
-from shearloop.bank.skin.synthetic import loop
+from shearloop.bank.skin.membrane import PAPER_SECTION, UNSTRETCHED, Membrane, paper_membrane
+from shearloop.bank.skin.statistics import loop
 
 # Two gauges as they come off the wafer: never quite alike, which tells them apart.
 REST_OHM = (24.6, 25.3)

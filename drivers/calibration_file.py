@@ -1,7 +1,5 @@
 """Calibration files: YAML with units in the keys, checked on the way in, replaced whole on the way out."""
 
-import os
-import tempfile
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -9,6 +7,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from shearloop.drivers.errors import DriverError
+from shearloop.files import replace_file
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -48,14 +47,7 @@ def save_calibration(path: Path, calibration: CalibrationModel) -> None:
     """Write the calibration; a reader sees the old file or the new one, never half of one."""
     text = yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     try:
-        with tempfile.NamedTemporaryFile(
-            "w", encoding="utf-8", dir=path.parent, prefix=path.name, delete=False
-        ) as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        # A temporary file is private to its maker; a calibration is for everyone who runs the daemon.
-        os.chmod(file.name, 0o644)
-        os.replace(file.name, path)
+        with replace_file(path) as file:
+            file.write(text.encode())
     except OSError as error:
         raise CalibrationError(f"{path}: cannot be written ({error.strerror})") from error

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS, STIMULATION_CURRENT
 from shearloop.bank.eit.models import MODELS, PLAIN, Variation, model_named
-from shearloop.bank.eit.stored import replaced
 from shearloop.bank.errors import BankFileError, ModelError
+from shearloop.files import replace_file
 
 FORMAT_VERSION = 1
 # A signal with a smaller norm than this (in the units of the homogeneous voltages, whose norm is about 20) has no
@@ -209,7 +209,7 @@ def write_bank(
     header, offsets = _layout(definition, stored)
     preamble = _PREAMBLE.pack(BANK_MAGIC, FORMAT_VERSION, hashlib.sha256(header).digest())
     try:
-        with replaced(path) as file:
+        with replace_file(path) as file:
             file.write(preamble + header)
             for key, array in stored.items():
                 file.write(b"\0" * (offsets[key] - file.tell()))

@@ -14,8 +14,9 @@ import yaml
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
 from shearloop.bank.eit.polynomial import Interval, Polynomial
-from shearloop.bank.eit.stored import check_made_with, check_version, replaced
+from shearloop.bank.eit.stored import check_made_with, check_version
 from shearloop.bank.errors import CalibrationError
+from shearloop.files import replace_file
 
 FORMAT_VERSION = 1
 TORQUE_DEGREE, DIAMETER_DEGREE = 2, 1
@@ -89,7 +90,7 @@ class Calibration:
         body = self._body()
         text = _HEAD + _yaml(body | {"checksum": _checksum(body)})
         try:
-            with replaced(path) as file:
+            with replace_file(path) as file:
                 file.write(text.encode())
         except OSError as error:
             raise CalibrationError(

@@ -1,49 +1,10 @@
-"""What stored files have in common: written whole or not at all, and looked at before anything of them is believed."""
+"""Checks of a stored calibration's header."""
 
-import os
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 from shearloop.bank.errors import CalibrationError
-
-
-@contextmanager
-def replaced(path: Path) -> Iterator[BinaryIO]:
-    """Yield a file `PATH.tmp`, which takes the place of `path` when it is on the disk, and is removed on failure.
-
-    What was there before is whole until then. Raises OSError where it cannot be written.
-    """
-    if path.exists() and not path.is_file():
-        # A pipe or /dev/stdout is written to, and not replaced; a folder says that it is one.
-        with path.open("wb") as there:
-            yield there
-        return
-    # What a link points to is replaced, and the link stays.
-    path = path.resolve()
-    # A fixed name, so that what was left by a writer that was killed is used up by the next one.
-    temporary = path.with_name(f"{path.name}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        sync_directory(path.parent)
-    except BaseException:
-        with suppress(OSError):
-            temporary.unlink()
-        raise
-
-
-def sync_directory(directory: Path) -> None:
-    """Flush a directory's entries to the disk, so that a rename in it outlives a loss of power."""
-    handle = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def check_version(path: Path, header: Mapping[str, Any], version: int) -> None:

@@ -1,22 +1,54 @@
-"""From a response to a shear force: friction, and one rising curve from tension at the gauges to response.
+"""A skin's calibration: friction, and one rising curve from tension at the gauges to response.
 
-The curve is a straight line through the origin up to 1.2 N; beyond it, to 5 N and more, as many straight pieces as
-the recorded data bear (`calibration_fit`). Straight pieces that rise can be read backwards without iteration.
+The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
+the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
+resistances and forces: the membrane's two plays turn the forces into the tension at the gauges, friction included, and
+leave the coefficient of friction and the curve to be fitted.
 """
 
+import csv
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from scipy.optimize import minimize_scalar, nnls
+from scipy.stats import t as student
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.skin.membrane import Direction, Membrane, ShearInterval
+from shearloop.bank.skin.membrane import (
+    PAPER_SECTION,
+    UNSTRETCHED,
+    Direction,
+    Membrane,
+    ShearInterval,
+    measured_response,
+)
+from shearloop.files import replace_file
+
+FORMAT = "shearloop skin calibration 1"
+COLUMNS = ("r1_ohm", "r2_ohm", "shear_n", "normal_n")
+# A load cell at rest may read slightly negative; a skin cannot be pulled off its core.
+MAX_PULL_N = 0.05
+# The paper's response is straight up to here and rises faster beyond.
+LINEAR_TO_N = 1.2
+UNLOADED_BELOW_N = 0.02
+MAX_FRICTION = 0.5
+# A table that leaves the friction coefficient less certain than this does not determine it.
+FRICTION_STD = 0.02
+MIN_ROWS_PER_PIECE, MAX_PIECES = 8, 6
+NOT_RISING = (
+    "The response does not rise with the shear force everywhere; check that R1 is the gauge stretched by a positive "
+    "shear force, and that no gauge is broken."
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibrationTable:
-    """Recorded rows in the order in which they were recorded: resistances in Ω, forces in N, each (rows,)."""
+    """Recorded rows in the order of recording: resistances in Ω, forces in N, each (rows,)."""
 
     r1_ohm: FloatArray
     r2_ohm: FloatArray
@@ -28,9 +60,8 @@ class CalibrationTable:
 class SkinCalibration:
     """Friction, and the curve from net tension at the gauges (N) to response, both rising.
 
-    `response_half_width` is the 95 % prediction interval of one response. `rows` were fitted; `rows_beyond` lie
-    outside the curve, where they were too few for a piece of their own. `rest_ohm` is what R₁ and R₂ were without load,
-    by which a later zero is judged.
+    `response_half_width` is the 95 % prediction interval of one response. `rows` were fitted; `rows_beyond` lie outside
+    the curve, too few for a piece of their own. `rest_ohm` are R₁ and R₂ without load, to judge a later zero by.
     """
 
     friction: float
@@ -44,7 +75,7 @@ class SkinCalibration:
     rest_ohm: tuple[float, float]
 
     def __post_init__(self) -> None:
-        """Refuse a curve that cannot be read backwards."""
+        """Refuse a curve that cannot be inverted."""
         if len(self.tension_n) != len(self.response) or len(self.tension_n) < 2:
             raise CalibrationError("The calibration's tension_n and response must be two lists of the same length.")
         for name, values in (("tension_n", self.tension_n), ("response", self.response)):
@@ -69,7 +100,7 @@ class SkinCalibration:
         return self.response_half_width / self.slope_per_n * capstan
 
     def band(self, response: float, normal_n: float, direction: Direction = Direction.UNKNOWN) -> ShearInterval:
-        """Return the shear forces (N) that friction leaves open for a response that is taken to be exact.
+        """Return the shear forces (N) that friction leaves open for an exact response.
 
         Beyond the calibrated curve it is the band of the curve's end.
         """
@@ -79,11 +110,10 @@ class SkinCalibration:
     def shear_from_response(
         self, response: float, normal_n: float, direction: Direction = Direction.UNKNOWN, wider: float = 0.0
     ) -> ShearInterval:
-        """Return the shear force (N) and the interval that holds it with 95 % and whatever friction leaves open.
+        """Return the shear force (N) and its 95 % interval, which includes what friction leaves open.
 
-        The deadband is taken out where the direction of loading is known and added to the interval where it is not.
-        An end beyond the calibrated curve is infinite: such a force is not to be relied upon. `wider` is by how much
-        more the response itself is uncertain, either way.
+        A known direction of loading takes the deadband out; an unknown one adds it to the interval. An end beyond the
+        calibrated curve is infinite. `wider` is a further uncertainty of the response, either way.
         """
         half = self.response_half_width + wider
         low, high = response - half, response + half
@@ -97,3 +127,263 @@ class SkinCalibration:
     @property
     def _membrane(self) -> Membrane:
         return Membrane(1.0, self.friction, math.radians(self.gauge_angle_deg), 1.0)
+
+
+def read_table(path: Path) -> CalibrationTable:
+    """Return the rows of a CSV file with the columns r1_ohm, r2_ohm, shear_n, normal_n, in the order of recording.
+
+    Raises CalibrationError with the file, and the line and column at fault.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if sorted(reader.fieldnames or ()) != sorted(COLUMNS):
+                raise CalibrationError(
+                    f"{path}: the first line is {','.join(reader.fieldnames or ())!r}; "
+                    f"the columns must be {', '.join(COLUMNS)}."
+                )
+            rows = [_numbers(path, reader.line_num, row) for row in reader]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise CalibrationError(f"{path}: the table cannot be read: {error}.") from error
+    if not rows:
+        raise CalibrationError(f"{path}: the table has no rows.")
+    return CalibrationTable(*np.array(rows).T)
+
+
+def _numbers(path: Path, line: int, row: dict[str | None, str]) -> list[float]:
+    if None in row:
+        raise CalibrationError(f"{path}, line {line}: there are more values than columns.")
+    numbers = []
+    for column in COLUMNS:
+        try:
+            number = float(row[column] or "")
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number) or (column.endswith("_ohm") and number <= 0):
+            raise CalibrationError(f"{path}, line {line}: {column} is {row[column]!r}, not a usable number.")
+        if column == "normal_n" and number < -MAX_PULL_N:
+            raise CalibrationError(
+                f"{path}, line {line}: normal_n is {row[column]}; a force that presses on the skin is positive."
+            )
+        numbers.append(number)
+    return numbers
+
+
+class _CalibrationFile(BaseModel):
+    """The content of a calibration file."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    format: str = Field(pattern=f"^{FORMAT}$")
+    friction: float = Field(ge=0, le=1)
+    gauge_angle_deg: float = Field(gt=0, lt=90)
+    linear_to_n: float = Field(gt=0)
+    tension_n: list[float] = Field(min_length=2)
+    response: list[float] = Field(min_length=2)
+    response_half_width: float = Field(ge=0)
+    rows: int = Field(ge=1)
+    rows_beyond: int = Field(ge=0)
+    rest_ohm: list[float] = Field(min_length=2, max_length=2)
+
+
+def save_calibration(calibration: SkinCalibration, path: Path) -> None:
+    """Write a calibration as YAML, replacing the file at once."""
+    lists = {name: list(getattr(calibration, name)) for name in ("tension_n", "response", "rest_ohm")}
+    document = {"format": FORMAT, **asdict(calibration), **lists}
+    try:
+        with replace_file(path) as file:
+            file.write(yaml.safe_dump(document, sort_keys=False).encode())
+    except OSError as error:
+        raise CalibrationError(f"{path}: the calibration cannot be written: {error}.") from error
+
+
+def load_calibration(path: Path) -> SkinCalibration:
+    """Return the calibration in a YAML file; raises CalibrationError naming the file and every wrong key."""
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+        values = _CalibrationFile.model_validate(document).model_dump(exclude={"format"})
+        lists = {name: tuple(values[name]) for name in ("tension_n", "response", "rest_ohm")}
+        return SkinCalibration(**values | lists)
+    except OSError as error:
+        raise CalibrationError(
+            f"{path}: the calibration cannot be read: {error.strerror}; make it with `shearloop skin calibrate`."
+        ) from error
+    except (UnicodeDecodeError, yaml.YAMLError) as error:
+        raise CalibrationError(f"{path}: the calibration cannot be read: {' '.join(str(error).split())}.") from error
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in error.errors())
+        if not (isinstance(document, dict) and "format" in document):
+            wrong = f"it has no `format: {FORMAT}`"
+        raise CalibrationError(
+            f"{path} is not a calibration as `shearloop skin calibrate` writes it: {wrong}."
+        ) from error
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from error
+
+
+def responses_of_table(
+    table: CalibrationTable, unloaded_below_n: float = UNLOADED_BELOW_N
+) -> tuple[FloatArray, IntArray]:
+    """Return the (rows,) responses and each row's loading, counted from 1; 0 for rows without load.
+
+    Each loading begins with rows without load; their mean resistances normalise it, as in the paper.
+    """
+    idle = (abs(table.shear_n) <= unloaded_below_n) & (abs(table.normal_n) <= unloaded_below_n)
+    if not idle.size or not idle[0]:
+        raise CalibrationError(
+            f"The table must begin with a row without load (both forces below {unloaded_below_n} N): "
+            "it gives the resistances at rest."
+        )
+    loading = np.cumsum(idle & ~np.concatenate([[False], idle[:-1]]))
+    response = np.empty(len(idle))
+    for number in range(1, loading[-1] + 1):
+        rows = loading == number
+        at_rest = rows & idle
+        r1_at_rest, r2_at_rest = float(table.r1_ohm[at_rest].mean()), float(table.r2_ohm[at_rest].mean())
+        response[rows] = measured_response(table.r1_ohm[rows], table.r2_ohm[rows], r1_at_rest, r2_at_rest)
+    return response, np.where(idle, 0, loading)
+
+
+def fit_calibration(
+    table: CalibrationTable,
+    *,
+    friction: float | None = None,
+    gauge_angle_deg: float = math.degrees(PAPER_SECTION.gauge_angle_rad),
+    linear_to_n: float = LINEAR_TO_N,
+    unloaded_below_n: float = UNLOADED_BELOW_N,
+) -> SkinCalibration:
+    """Return the least-squares calibration of a table; friction is fitted too unless given.
+
+    Raises CalibrationError where the table has too few rows, no row at rest or does not determine friction, and where
+    the response does not rise with the force.
+    """
+    response, loading = responses_of_table(table, unloaded_below_n)
+    rows = _LoadedRows(table, response, loading, math.radians(gauge_angle_deg))
+    start = PAPER_SECTION.friction if friction is None else friction
+    nominal = rows.tensions(start)
+    upper, lower = _knots(nominal, linear_to_n), _knots(-nominal, linear_to_n)
+    kept = (len(upper) > 0) | (nominal <= linear_to_n)
+    kept &= (len(lower) > 0) | (-nominal <= linear_to_n)
+    curve = _CurveFit(rows, kept, linear_to_n, upper, lower)
+    if curve.rows < curve.pieces + 3:
+        raise CalibrationError(
+            f"{curve.rows} rows under load cannot carry {curve.pieces} pieces of curve and an interval; record more."
+        )
+    if not curve.rises(start):
+        raise CalibrationError(NOT_RISING)
+    if friction is None:
+        friction = _fit_friction(curve)
+    idle = loading == 0
+    rest_ohm = float(table.r1_ohm[idle].mean()), float(table.r2_ohm[idle].mean())
+    return curve.calibration(friction, int((~kept).sum()), rest_ohm)
+
+
+class _LoadedRows:
+    """The rows under load, and the tension that the membrane gives each of them."""
+
+    def __init__(
+        self, table: CalibrationTable, response: FloatArray, loading: IntArray, gauge_angle_rad: float
+    ) -> None:
+        used = loading > 0
+        self.response = response[used]
+        self.gauge_angle_rad = gauge_angle_rad
+        self._forces = list(
+            zip(loading[used].tolist(), table.shear_n[used].tolist(), table.normal_n[used].tolist(), strict=True)
+        )
+
+    def tensions(self, friction: float) -> FloatArray:
+        """Return the net tension (rows,) at the gauges, in N; each loading starts from the unstretched skin."""
+        membrane = Membrane(1.0, friction, self.gauge_angle_rad, 1.0)
+        state, current, found = UNSTRETCHED, 0, []
+        for loading, shear_n, normal_n in self._forces:
+            if loading != current:
+                state, current = UNSTRETCHED, loading
+            state = membrane.step(state, shear_n, normal_n)
+            found.append(state.gauge_tension_1_n - state.gauge_tension_2_n)
+        return np.array(found)
+
+
+class _CurveFit:
+    """Response against tension in straight pieces: one through the origin, others beyond its ends."""
+
+    def __init__(
+        self, rows: _LoadedRows, kept: BoolArray, linear_to_n: float, upper: FloatArray, lower: FloatArray
+    ) -> None:
+        self._rows, self._kept, self._response = rows, kept, rows.response[kept]
+        self._linear_to_n, self._upper, self._lower = linear_to_n, upper, lower
+        self.rows = int(kept.sum())
+        self.pieces = 1 + len(upper) + len(lower)
+        self.total_squares = float(self._response @ self._response)
+
+    def squares(self, friction: float) -> float:
+        """Return the sum of squared residuals with the best curve for this friction."""
+        return float(nnls(self._design(self._tensions(friction)), self._response)[1] ** 2)
+
+    def rises(self, friction: float) -> bool:
+        """Return whether the response goes with the tension, not against it."""
+        return float(self._tensions(friction) @ self._response) > 0.0
+
+    def calibration(self, friction: float, rows_beyond: int, rest_ohm: tuple[float, float]) -> SkinCalibration:
+        """Return the calibration with the best curve for this friction."""
+        tension = self._tensions(friction)
+        design = self._design(tension)
+        slopes, distance = nnls(design, self._response)
+        ends = min(float(tension.min()), 0.0), max(float(tension.max()), 0.0)
+        knots = np.concatenate([[ends[0]], -self._lower[::-1], self._upper, [ends[1]]])
+        if not (slopes > 0).all() or not (np.diff(knots) > 0).all():
+            raise CalibrationError(NOT_RISING)
+        leverage = (np.linalg.qr(design).Q ** 2).sum(axis=1).max()
+        freedom = self.rows - self.pieces
+        scatter = distance / math.sqrt(freedom)
+        return SkinCalibration(
+            friction=friction,
+            gauge_angle_deg=math.degrees(self._rows.gauge_angle_rad),
+            linear_to_n=self._linear_to_n,
+            tension_n=tuple(knots.tolist()),
+            response=tuple((self._design(knots) @ slopes).tolist()),
+            response_half_width=float(student.ppf(0.975, freedom)) * scatter * math.sqrt(1 + leverage),
+            rows=self.rows,
+            rows_beyond=rows_beyond,
+            rest_ohm=rest_ohm,
+        )
+
+    def _tensions(self, friction: float) -> FloatArray:
+        return self._rows.tensions(friction)[self._kept]
+
+    def _design(self, tension: FloatArray) -> FloatArray:
+        columns = [np.clip(tension, -self._linear_to_n, self._linear_to_n)]
+        columns += _hinges(tension, self._upper) + [-column for column in _hinges(-tension, self._lower)]
+        return np.column_stack(columns)
+
+
+def _hinges(tension: FloatArray, knots: FloatArray) -> list[FloatArray]:
+    """Return the part of the tension within each piece; the last piece is open."""
+    widths = np.append(np.diff(knots), math.inf)
+    return [np.clip(tension - knot, 0.0, width) for knot, width in zip(knots, widths, strict=False)]
+
+
+def _knots(tension: FloatArray, linear_to_n: float) -> FloatArray:
+    """Return where the pieces beyond the straight one begin: as many as the rows support, with equal shares."""
+    beyond = np.sort(tension[tension > linear_to_n])
+    pieces = min(MAX_PIECES, len(beyond) // MIN_ROWS_PER_PIECE)
+    if not pieces:
+        return np.empty(0)
+    begins = beyond[np.arange(1, pieces) * len(beyond) // pieces]
+    return np.unique(np.append(linear_to_n, begins))
+
+
+def _fit_friction(curve: _CurveFit) -> float:
+    coarse = np.linspace(0.0, MAX_FRICTION, 26)
+    best = coarse[int(np.argmin([curve.squares(mu) for mu in coarse]))]
+    bounds = max(best - coarse[1], 0.0), min(best + coarse[1], MAX_FRICTION)
+    friction = float(minimize_scalar(curve.squares, bounds=bounds, method="bounded", options={"xatol": 1e-6}).x)
+    # A wrong friction must make the fit visibly worse.
+    least = curve.squares(friction)
+    neighbours = [mu for mu in (friction - FRICTION_STD, friction + FRICTION_STD) if mu >= 0]
+    worse = min(map(curve.squares, neighbours)) - least
+    if worse <= max(least / max(curve.rows - curve.pieces, 1), 1e-9 * curve.total_squares):
+        raise CalibrationError(
+            "The table does not determine the friction of the skin; load it under more normal force, load and "
+            "unload it, or give the coefficient (--friction)."
+        )
+    return friction

@@ -1,7 +1,7 @@
-"""The paper's figures of merit beside what the models give and what the estimators find: one table, three curves.
+"""The paper's figures of merit next to those of the models and estimators: one table and three figures' curves.
 
-A model answers what it can; noise, drift and temperature are properties of a made skin, so for those the table shows
-what the estimators find in synthetic recordings into which the paper's figure was put.
+Noise, drift and temperature are properties of a made skin. For those the table shows estimates from synthetic
+recordings with the paper's figure as the true one.
 """
 
 from collections.abc import Callable
@@ -10,13 +10,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin import closed_form, statistics
-from shearloop.bank.skin.annulus import CondensedSkin, condense
-from shearloop.bank.skin.contact import ContactState, follow, gauge_strains, load, midline_strain, unloaded
-from shearloop.bank.skin.gauge import Gauge, response_of_strains
-from shearloop.bank.skin.membrane import Membrane, paper_membrane
-from shearloop.bank.skin.section import PAPER_SECTION, Section
-from shearloop.bank.skin.synthetic import Figures, loading, loop, recover, responses
+from shearloop.bank.skin import membrane, statistics
+from shearloop.bank.skin.membrane import PAPER_SECTION, Gauge, Section, response_of_strains
+from shearloop.bank.skin.plane_strain import (
+    ContactState,
+    apply_load,
+    condense,
+    gauge_strains,
+    midline_strain,
+    states_along,
+    unloaded,
+)
+from shearloop.bank.skin.statistics import loading, loop, responses
 
 NORMAL_FORCES_N = (0.5, 1.0, 1.5, 2.0)
 FULL_RANGE_N = 5.0
@@ -24,8 +29,8 @@ PAPER_MEASURED_SENSITIVITY = {0.5: "0.078", 1.0: "0.076", 1.5: "0.080", 2.0: "0.
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
-    """One quantity: what the paper computed and measured, in its words, and what each model or estimator gives."""
+class FigureOfMerit:
+    """One quantity: the paper's computed and measured values, as printed, and that of each model or estimator."""
 
     quantity: str
     unit: str
@@ -38,7 +43,7 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curve:
+class ResponseCurve:
     """Responses (n,) of both models along shear forces (n,) in N, and of the two-dimensional one without friction."""
 
     shear_n: FloatArray
@@ -49,25 +54,25 @@ class Curve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Characterisation:
-    """The table, and what figures 5 to 7 are drawn from.
+    """The table, and the data of figures 5 to 7.
 
     `strain_profiles` is (11, m): ε_θθ at `midline_deg` under 1 N of normal force and 0, 0.1, … 1 N of shear.
     `near_zero` and `wide` are loadings from zero under 1 N; `wide_by_normal` by normal force, up to 1.6 N.
     """
 
-    rows: tuple[Row, ...]
+    rows: tuple[FigureOfMerit, ...]
     midline_deg: FloatArray
     strain_profiles: FloatArray
-    near_zero: Curve
-    wide: Curve
-    wide_by_normal: dict[float, Curve]
+    near_zero: ResponseCurve
+    wide: ResponseCurve
+    wide_by_normal: dict[float, ResponseCurve]
 
 
 def characterise(rng: np.random.Generator, section: Section = PAPER_SECTION) -> Characterisation:
-    """Return everything the paper's table 1 and figures 5 to 7 show, from the models; takes a few seconds."""
+    """Return the contents of the paper's table 1 and figures 5 to 7, from the models; takes a few seconds."""
     models = _Models(section)
-    pressed = load(models.skin, unloaded(models.skin), 1.0, 0.0)
-    profiles = [pressed, *follow(models.skin, 1.0, loading(1.0))]
+    pressed = apply_load(models.skin, unloaded(models.skin), 1.0, 0.0)
+    profiles = [pressed, *states_along(models.skin, 1.0, loading(1.0))]
     return Characterisation(
         rows=(*_model_rows(models, profiles[-1]), *_gauge_rows(), *_estimator_rows(models, rng)),
         midline_deg=models.skin.midline_deg,
@@ -83,43 +88,39 @@ class _Models:
 
     def __init__(self, section: Section) -> None:
         self.section = section
-        self.membrane: Membrane = paper_membrane(section)
-        self.skin: CondensedSkin = condense(section)
+        self.membrane = membrane.paper_membrane(section)
+        self.skin = condense(section)
 
     def in_closed_form(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
-        return np.array([closed_form.loading_response(self.section, normal_n, float(s)) for s in shear_n])
+        return np.array([membrane.loading_response(self.section, normal_n, float(s)) for s in shear_n])
 
     def in_1d(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
         return responses(self.membrane, shear_n.tolist(), normal_n)
 
-    def in_2d(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
-        return self._response(follow(self.skin, normal_n, shear_n.tolist()))
-
-    def in_2d_slippery(self, shear_n: FloatArray, normal_n: float) -> FloatArray:
-        state, states = unloaded(self.skin), []
-        for shear in (0.0, *shear_n.tolist()):
-            state = load(self.skin, state, normal_n, shear, friction=0.0)
-            states.append(state)
-        return self._response(states[1:])
-
-    def curve(self, shear_n: FloatArray, normal_n: float) -> Curve:
-        models = (self.in_1d, self.in_2d, self.in_2d_slippery)
-        return Curve(shear_n, *(model(shear_n, normal_n) for model in models))
-
-    def _response(self, states: list[ContactState]) -> FloatArray:
+    def in_2d(self, shear_n: FloatArray, normal_n: float, friction: float | None = None) -> FloatArray:
+        states = states_along(self.skin, normal_n, shear_n.tolist(), friction=friction)
         return response_of_strains(*gauge_strains(self.skin, states).T)
 
+    def curve(self, shear_n: FloatArray, normal_n: float) -> ResponseCurve:
+        return ResponseCurve(
+            shear_n,
+            self.in_1d(shear_n, normal_n),
+            self.in_2d(shear_n, normal_n),
+            self.in_2d(shear_n, normal_n, friction=0.0),
+        )
 
-def _model_rows(models: _Models, fully_loaded: ContactState) -> list[Row]:
+
+def _model_rows(models: _Models, fully_loaded: ContactState) -> list[FigureOfMerit]:
     section, skin = models.section, models.skin
-    all_three = (models.in_closed_form, models.in_1d, models.in_2d)
 
     def each(estimate: Callable[[FloatArray, FloatArray], float], normal_n: float) -> list[float]:
         shear_n = loading(normal_n)
-        return [estimate(shear_n, model(shear_n, normal_n)) for model in all_three]
+        return [
+            estimate(shear_n, model(shear_n, normal_n)) for model in (models.in_closed_form, models.in_1d, models.in_2d)
+        ]
 
     rows = [
-        Row(
+        FigureOfMerit(
             f"sensitivity, fit through origin, Fn = {normal_n} N",
             "1/N",
             "0.078",
@@ -132,18 +133,20 @@ def _model_rows(models: _Models, fully_loaded: ContactState) -> list[Row]:
     flank = strain[(skin.midline_deg > 15) & (skin.midline_deg < 75)]
     falls = 100 * (1 - float(np.exp(-section.friction * np.radians(60))))
     strain_1, strain_2 = skin.gauge_weights @ strain
-    without = replace(section, friction=0.0)
-    no_friction = statistics.origin_slope(loading(1.0), models.in_2d_slippery(loading(1.0), 1.0))
+    without = membrane.sensitivity_per_n(replace(section, friction=0.0))
+    no_friction = statistics.origin_slope(loading(1.0), models.in_2d(loading(1.0), 1.0, friction=0.0))
     pressed = models.in_2d(np.zeros(1), 2.0)[0]
     given = models.membrane.gauge_factor / models.membrane.axial_stiffness_n
     return [
         *rows,
-        Row("slope beyond the deadband, Fn = 1 N", "1/N", "", "", *each(_slope, 1.0)),
-        Row("slope without friction", "1/N", "0.088", "", closed_form.sensitivity_per_n(without), given, no_friction),
-        Row("deadband, Fn = 1 N", "N", "0.04", "0.04", *each(_kink, 1.0)),
-        Row("fall of tension between 75° and 15°", "%", "< 4", "", falls, falls, 100 * np.ptp(flank) / flank.max()),
-        Row("|ε₂/ε₁|, Fn = Ft = 1 N", "", "much lower", "much lower", 0.0, 0.0, abs(strain_2 / strain_1)),
-        Row("response to 2 N of normal force alone", "", "", "< 1.24e-4", 0.0, 0.0, abs(pressed)),
+        FigureOfMerit("slope beyond the deadband, Fn = 1 N", "1/N", "", "", *each(_slope, 1.0)),
+        FigureOfMerit("slope without friction", "1/N", "0.088", "", without, given, no_friction),
+        FigureOfMerit("deadband, Fn = 1 N", "N", "0.04", "0.04", *each(_kink, 1.0)),
+        FigureOfMerit(
+            "fall of tension between 75° and 15°", "%", "< 4", "", falls, falls, 100 * np.ptp(flank) / flank.max()
+        ),
+        FigureOfMerit("|ε₂/ε₁|, Fn = Ft = 1 N", "", "much lower", "much lower", 0.0, 0.0, abs(strain_2 / strain_1)),
+        FigureOfMerit("response to 2 N of normal force alone", "", "", "< 1.24e-4", 0.0, 0.0, abs(pressed)),
     ]
 
 
@@ -156,17 +159,17 @@ def _kink(shear_n: FloatArray, response: FloatArray) -> float:
     return -line.offset / line.slope_per_n
 
 
-def _gauge_rows() -> list[Row]:
+def _gauge_rows() -> list[FigureOfMerit]:
     gauge = Gauge()
     return [
-        Row("gauge resistance", "Ω", "25", "25", gauge.resistance_ohm),
-        Row("power of a gauge at 5 mA", "mW", "", "", 1e3 * gauge.power_at_current_w()),
-        Row("Joule heating at 5 mA", "K", "< 5", "", gauge.joule_heating_k()),
+        FigureOfMerit("gauge resistance", "Ω", "25", "25", gauge.resistance_ohm),
+        FigureOfMerit("power of a gauge at 5 mA", "mW", "", "", 1e3 * gauge.power_at_current_w()),
+        FigureOfMerit("Joule heating at 5 mA", "K", "< 5", "", gauge.joule_heating_k()),
     ]
 
 
-def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[Row]:
-    found = recover(models.membrane, Figures(), rng)
+def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[FigureOfMerit]:
+    found = statistics.estimated_figures(models.membrane, statistics.SkinFigures(), rng)
     bits = statistics.dynamic_range_bits(FULL_RANGE_N, found.noise_floor_n)
     up, around = loading(1.0), loop(1.0)
 
@@ -177,12 +180,12 @@ def _estimator_rows(models: _Models, rng: np.random.Generator) -> list[Row]:
     loaded = [half_width(both_ways, np.concatenate([-y, y])) for y in (models.in_1d(up, 1.0), models.in_2d(up, 1.0))]
     cycled = [half_width(around, model(around, 1.0)) for model in (models.in_1d, models.in_2d)]
     return [
-        Row("noise floor", "N", "", "0.0016", synthetic=found.noise_floor_n),
-        Row("dynamic range to 5 N", "bit", "", "> 10", synthetic=bits),
-        Row("95 % prediction interval", "± N", "", "0.0802", synthetic=found.prediction_half_width_n),
-        Row("  from friction alone, loading ± 1 N", "± N", "", "", None, *loaded),
-        Row("  from friction alone, whole loop ± 1 N", "± N", "", "", None, *cycled),
-        Row("drift over an hour, std of the response", "", "", "1.48e-4", synthetic=found.drift_std),
-        Row("crosstalk, response to 2 N of normal force", "", "", "< 1.24e-4", synthetic=found.crosstalk),
-        Row("change of sensitivity over 15 K", "%", "", "< 2", synthetic=100 * 15 * found.sensitivity_per_k),
+        FigureOfMerit("noise floor", "N", "", "0.0016", synthetic=found.noise_floor_n),
+        FigureOfMerit("dynamic range to 5 N", "bit", "", "> 10", synthetic=bits),
+        FigureOfMerit("95 % prediction interval", "± N", "", "0.0802", synthetic=found.prediction_half_width_n),
+        FigureOfMerit("  from friction alone, loading ± 1 N", "± N", "", "", None, *loaded),
+        FigureOfMerit("  from friction alone, whole loop ± 1 N", "± N", "", "", None, *cycled),
+        FigureOfMerit("drift over an hour, std of the response", "", "", "1.48e-4", synthetic=found.drift_std),
+        FigureOfMerit("crosstalk, response to 2 N of normal force", "", "", "< 1.24e-4", synthetic=found.crosstalk),
+        FigureOfMerit("change of sensitivity over 15 K", "%", "", "< 2", synthetic=100 * 15 * found.sensitivity_per_k),
     ]

@@ -1,9 +1,8 @@
-"""The run-time model of the shear skin and its inverse: a membrane over a rigid core.
+"""The skin in one dimension: cross-section, gauges, closed-form response, and the membrane model used at run time.
 
-Tension only (the compressed side buckles away from the core and carries nothing), Coulomb friction μF_n under the
-load and capstan friction along the arc. Friction makes it a hysteresis of two plays: the tension under the load
-follows the shear force within ±μF_n, and the tension at a gauge follows that one within factors e^(±μφ). Slip starts
-at the load and runs outwards, so the clipping below is the exact solution of the belt, not a time step.
+Yin, Santos, Posner, "Bioinspired flexible microfluidic shear force sensor skin", Sensors and Actuators A 264 (2017).
+The angle θ is the paper's: 0° and 180° at the brackets, 90° under the load. A positive shear force pulls towards
+larger θ and stretches the skin below 90°.
 """
 
 import math
@@ -11,13 +10,176 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import NamedTuple
 
-from shearloop.bank.errors import CalibrationError
-from shearloop.bank.skin.closed_form import gauge_angle_rad, sensitivity_per_n
-from shearloop.bank.skin.gauge import gauge_factor
-from shearloop.bank.skin.section import PAPER_SECTION, Section
+import numpy as np
 
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.errors import CalibrationError, GeometryError
+
+EXCITATION_A = 5e-3
+# Eutectic gallium indium at room temperature.
+EGAIN_RESISTIVITY_OHM_M = 29.4e-8
+# One gauge, 7 mm by 3 mm.
+SENSOR_AREA_M2 = 7e-3 * 3e-3
 # The paper's own estimate of F/(EA); its E and width would make the skin 0.88 mm thick.
 PAPER_SENSITIVITY_PER_N = 0.088
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """Half an annulus of skin around a rigid core; lengths in mm, modulus in MPa (N/mm²), angles in degrees.
+
+    The paper's load coordinates, (0, −6.35) on the outer surface and (0, −6) on the mid-line, give the radii. They
+    contradict its fabrication text (mid-line at 6.3 mm, 0.6 mm thick), but its computed results belong to them. The
+    width is that of the sheet, 20 mm, loaded evenly. The gauge strips are 3 mm long, 28.65° on the mid-line. The paper
+    places them "adjacent to the nail bed"; here they begin at 15°, two thicknesses clear of the bracket.
+    """
+
+    mid_radius_mm: float = 6.0
+    thickness_mm: float = 0.70
+    width_mm: float = 20.0
+    young_mpa: float = 1.292
+    poisson_ratio: float = 0.49
+    friction: float = 0.04
+    gauge_from_deg: float = 15.0
+    gauge_to_deg: float = 43.65
+    load_arc_deg: float = 5.0
+
+    def __post_init__(self) -> None:
+        """Refuse a section that cannot exist, naming the value."""
+        for name in ("mid_radius_mm", "thickness_mm", "width_mm", "young_mpa", "load_arc_deg"):
+            if not getattr(self, name) > 0:
+                raise GeometryError(f"The skin's {name} is {getattr(self, name)!r}; give a positive number.")
+        if self.thickness_mm >= 2 * self.mid_radius_mm:
+            raise GeometryError(
+                f"The skin's thickness_mm {self.thickness_mm} leaves no core inside mid_radius_mm {self.mid_radius_mm}."
+            )
+        if not 0 <= self.poisson_ratio < 0.5:
+            raise GeometryError(f"The skin's poisson_ratio is {self.poisson_ratio!r}; it must lie in [0, 0.5).")
+        if not 0 <= self.friction <= 1:
+            raise GeometryError(f"The skin's friction is {self.friction!r}; it must lie in [0, 1].")
+        if not 0 < self.gauge_from_deg < self.gauge_to_deg < 90 - self.load_arc_deg / 2:
+            raise GeometryError(
+                f"The gauge from {self.gauge_from_deg}° to {self.gauge_to_deg}° must lie between bracket (0°) and load."
+            )
+
+    @property
+    def inner_radius_mm(self) -> float:
+        """Radius of the rigid core."""
+        return self.mid_radius_mm - self.thickness_mm / 2
+
+    @property
+    def outer_radius_mm(self) -> float:
+        """Radius at which the load acts."""
+        return self.mid_radius_mm + self.thickness_mm / 2
+
+    @property
+    def gauge_angle_rad(self) -> float:
+        """φ, the angle from the load to the middle of a gauge."""
+        return math.radians(90 - (self.gauge_from_deg + self.gauge_to_deg) / 2)
+
+
+PAPER_SECTION = Section()
+
+
+@dataclass(frozen=True, slots=True)
+class Gauge:
+    """A serpentine of N strips, without the turns between them, as in the paper (N ≫ 1; its section 2)."""
+
+    strips: int = 70
+    strip_length_m: float = 3e-3
+    channel_width_m: float = 50e-6
+    channel_height_m: float = 50e-6
+    resistivity_ohm_m: float = EGAIN_RESISTIVITY_OHM_M
+    sensor_area_m2: float = SENSOR_AREA_M2
+
+    @property
+    def resistance_ohm(self) -> float:
+        """ρ N L / (w h), unloaded."""
+        length_m = self.strips * self.strip_length_m
+        return self.resistivity_ohm_m * length_m / (self.channel_width_m * self.channel_height_m)
+
+    def power_w(self, voltage_v: float) -> float:
+        """Return the heat V² w h / (ρ N L)."""
+        return voltage_v**2 / self.resistance_ohm
+
+    def power_at_current_w(self, current_a: float = EXCITATION_A) -> float:
+        """Return the heat where a current source feeds the gauge, 5 mA in the paper."""
+        return self.power_w(current_a * self.resistance_ohm)
+
+    def joule_heating_k(self, current_a: float = EXCITATION_A) -> float:
+        """Return the steady temperature rise of the gauge's area in still air."""
+        return joule_heating_k(self.power_at_current_w(current_a), self.sensor_area_m2)
+
+
+def joule_heating_k(power_w: float, area_m2: float = SENSOR_AREA_M2, convection_w_m2_k: float = 10.0) -> float:
+    """Return the steady temperature rise of an area in air, one side cooled: P / (h A).
+
+    10 W/(m² K) is usual for still air. Conduction into skin and core is neglected, so the true rise is smaller; the
+    paper gives at most 5 K.
+    """
+    return power_w / (convection_w_m2_k * area_m2)
+
+
+def gauge_factor(poisson_ratio: float = 0.5) -> float:
+    """Return 1 + 2ν, the change of resistance per strain at small strain; 2 for an incompressible elastomer."""
+    return 1 + 2 * poisson_ratio
+
+
+def resistance_change(strain: FloatArray, poisson_ratio: float = 0.5) -> FloatArray:
+    """Return ΔR/R₀ of a channel stretched along itself, (1+ε)/(1−νε)² − 1; gauge_factor · ε to first order."""
+    change: FloatArray = (1 + strain) / (1 - poisson_ratio * strain) ** 2 - 1
+    return change
+
+
+def measured_response(
+    r1_ohm: FloatArray, r2_ohm: FloatArray, r1_unloaded_ohm: float, r2_unloaded_ohm: float
+) -> FloatArray:
+    """Return the normalised response ΔR₁/R₁₀ − ΔR₂/R₂₀ = F (ε₁ − ε₂), the measured side of equation (1).
+
+    Raises CalibrationError where an unloaded resistance is not a positive number.
+    """
+    for name, unloaded in (("R1", r1_unloaded_ohm), ("R2", r2_unloaded_ohm)):
+        if not (np.isfinite(unloaded) and unloaded > 0):
+            raise CalibrationError(
+                f"The unloaded resistance of {name} is {unloaded} Ω; measure it again with the skin at rest."
+            )
+    ratio: FloatArray = r1_ohm / r1_unloaded_ohm - r2_ohm / r2_unloaded_ohm
+    return ratio
+
+
+def response_of_strains(strain_1: FloatArray, strain_2: FloatArray, factor: float = 2.0) -> FloatArray:
+    """Return F (ε₁ − ε₂), the modelled side of equation (1)."""
+    modelled: FloatArray = factor * (strain_1 - strain_2)
+    return modelled
+
+
+# The closed form balances moments about the core's centre. The tension at mid-thickness, N = F_t R_out/R, is shared by
+# the two sides, and ε₁ − ε₂ does not depend on how. Plane strain and the core's pressure, −σ_r ≈ N/(2 R w) at
+# mid-thickness, turn N into strain. Friction takes e^(−μφ) on the way to the gauge and μ F_n R_in/R_out at the load.
+
+
+def sensitivity_per_n(section: Section, factor: float | None = None) -> float:
+    """Return S = F (1−ν²)/(E w t) · (1 + ν/(1−ν) · t/2R) · (R_out/R) · e^(−μφ), beyond the deadband, in 1/N.
+
+    F is that of an incompressible elastomer, 2, unless given.
+    """
+    nu, radius, thickness = section.poisson_ratio, section.mid_radius_mm, section.thickness_mm
+    flat = (1 - nu**2) / (section.young_mpa * section.width_mm * thickness)
+    pressed = 1 + nu / (1 - nu) * thickness / (2 * radius)
+    lever = section.outer_radius_mm / radius
+    capstan = math.exp(-section.friction * section.gauge_angle_rad)
+    return (gauge_factor() if factor is None else factor) * flat * pressed * lever * capstan
+
+
+def deadband_n(section: Section, normal_n: float) -> float:
+    """Return the shear force at which the skin under the load begins to slip, μ F_n R_in/R_out."""
+    return section.friction * normal_n * section.inner_radius_mm / section.outer_radius_mm
+
+
+def loading_response(section: Section, normal_n: float, shear_n: float) -> float:
+    """Return the closed-form response while a shear force rises from zero."""
+    beyond = max(abs(shear_n) - deadband_n(section, normal_n), 0.0)
+    return math.copysign(sensitivity_per_n(section) * beyond, shear_n)
 
 
 class Direction(Enum):
@@ -29,7 +191,7 @@ class Direction(Enum):
 
 
 class ShearInterval(NamedTuple):
-    """A shear force with the interval that holds it, in N; an infinite end is beyond what was calibrated."""
+    """A shear force with the interval that holds it, in N; an infinite end lies beyond the calibrated range."""
 
     shear_n: float
     low_n: float
@@ -37,7 +199,7 @@ class ShearInterval(NamedTuple):
 
     @property
     def in_deadband(self) -> bool:
-        """Whether the response does not tell the force from none."""
+        """Whether the force may be zero."""
         return self.low_n <= 0 <= self.high_n
 
 
@@ -57,7 +219,13 @@ UNSTRETCHED = MembraneState()
 
 @dataclass(frozen=True, slots=True)
 class Membrane:
-    """EA in N, the friction coefficient μ, the angle φ from load to gauge, the gauge factor F."""
+    """A membrane over a rigid core: EA in N, friction coefficient μ, angle φ from load to gauge, gauge factor F.
+
+    It carries tension only: the compressed side buckles. Coulomb friction μF_n acts under the load, capstan friction
+    along the arc. This is a hysteresis of two plays: the tension under the load follows the shear force within ±μF_n,
+    and the tension at a gauge follows that one within factors e^(±μφ). Slip starts at the load and runs outwards, so
+    `step` is the exact solution of the belt, not a time step.
+    """
 
     axial_stiffness_n: float
     friction: float
@@ -65,12 +233,12 @@ class Membrane:
     gauge_factor: float = gauge_factor()
 
     def __post_init__(self) -> None:
-        """Refuse what no belt can have."""
+        """Refuse values that no belt has."""
         if not (self.axial_stiffness_n > 0 and self.friction >= 0 and self.gauge_angle_rad >= 0):
             raise CalibrationError(f"{self}: the stiffness must be positive, friction and angle must not be negative.")
 
     def step(self, state: MembraneState, shear_n: float, normal_n: float) -> MembraneState:
-        """Return the state after the forces (N) have gone straight to these values; ε₁ and ε₂ stand in it."""
+        """Return the state after the forces (N) have gone straight to these values."""
         hold = self.friction * max(normal_n, 0.0)
         net = _clip(state.net_tension_n, shear_n - hold, shear_n + hold)
         up = math.exp(self.friction * self.gauge_angle_rad)
@@ -86,11 +254,10 @@ class Membrane:
     def shear_from_response(
         self, response: float, normal_n: float, direction: Direction = Direction.UNKNOWN
     ) -> ShearInterval:
-        """Return the shear force (N) that belongs to a response, with the interval that friction leaves open.
+        """Return the shear force (N) of a response, with the interval that friction leaves open.
 
-        Where the response rises or falls in magnitude, the skin slips all the way to the gauge, and the force is
-        one number. Where the direction is not known it is anything between the two; without response, anything
-        within the deadband.
+        While the magnitude of the response rises or falls, the skin slips all the way to the gauge, and the force is
+        one number. In an unknown direction it lies between the two; without response, within the deadband.
         """
         tension = response * self.axial_stiffness_n / self.gauge_factor
         return self.shear_from_tensions(tension, tension, tension, normal_n, direction)
@@ -98,7 +265,7 @@ class Membrane:
     def shear_from_tensions(
         self, low_n: float, tension_n: float, high_n: float, normal_n: float, direction: Direction
     ) -> ShearInterval:
-        """Return the shear force for a net tension at the gauges (N) that is known to lie within low and high."""
+        """Return the shear force for a net tension at the gauges (N) that lies between low and high."""
         low, high = self._bounds(low_n, normal_n, direction)[0], self._bounds(high_n, normal_n, direction)[1]
         if low_n <= 0 <= high_n:
             slack = self._bounds(0.0, normal_n, direction)
@@ -121,9 +288,9 @@ class Membrane:
 
 
 def direction_of(before: float, now: float, noise: float) -> Direction:
-    """Return the direction of loading that two responses tell: neither, unless they differ by more than the noise.
+    """Return the direction of loading that two responses prove; UNKNOWN where they differ by no more than the noise.
 
-    A response that rises in magnitude proves slip at the gauge, hence loading; one that stays proves nothing.
+    A response of rising magnitude proves slip at the gauge, hence loading. A constant one proves nothing.
     """
     change = abs(now) - abs(before)
     if before * now < 0 or abs(change) <= noise:
@@ -133,14 +300,13 @@ def direction_of(before: float, now: float, noise: float) -> Direction:
 
 def paper_membrane(section: Section = PAPER_SECTION) -> Membrane:
     """Return the membrane with the paper's own F/(EA) = 0.088 1/N."""
-    return Membrane(gauge_factor() / PAPER_SENSITIVITY_PER_N, section.friction, gauge_angle_rad(section))
+    return Membrane(gauge_factor() / PAPER_SENSITIVITY_PER_N, section.friction, section.gauge_angle_rad)
 
 
 def section_membrane(section: Section = PAPER_SECTION) -> Membrane:
-    """Return the membrane with the stiffness that modulus and cross-section give in plane strain (`closed_form`)."""
-    without_friction = replace(section, friction=0.0)
-    stiffness = gauge_factor() / sensitivity_per_n(without_friction)
-    return Membrane(stiffness, section.friction, gauge_angle_rad(section))
+    """Return the membrane with the stiffness that modulus and cross-section give in plane strain."""
+    stiffness = gauge_factor() / sensitivity_per_n(replace(section, friction=0.0))
+    return Membrane(stiffness, section.friction, section.gauge_angle_rad)
 
 
 def _clip(value: float, low: float, high: float) -> float:

@@ -92,7 +92,7 @@ def _clients(curve: "CurveConfig") -> str:
 def _skin(config: "SkinConfig") -> str:
     import math
 
-    from shearloop.bank.skin.calibration_file import load_calibration
+    from shearloop.bank.skin.calibration import load_calibration
     from shearloop.daemon.sensing.skin_setup import check_circuit
     from shearloop.daemon.sensing.skin_zero import MOST_CHANGE
 

@@ -11,7 +11,7 @@ from shearloop.daemon.cli.options import add_json
 from shearloop.daemon.cli.output import print_result
 
 if TYPE_CHECKING:
-    from shearloop.bank.skin.characterisation import Row
+    from shearloop.bank.skin.characterisation import FigureOfMerit
 
 SEED = 2017
 COLUMNS = ("quantity", "unit", "paper: computed", "measured", "closed form", "1-D", "2-D", "synthetic")
@@ -66,7 +66,7 @@ def _characterise(out: Path | None, as_json: bool) -> int:
     return 0
 
 
-def _table(rows: "tuple[Row, ...]") -> str:
+def _table(rows: "tuple[FigureOfMerit, ...]") -> str:
     lines = [COLUMNS, *(tuple(_cell(value) for value in asdict(row).values()) for row in rows)]
     widths = [max(len(line[i]) for line in lines) for i in range(len(COLUMNS))]
     printed = [
@@ -86,8 +86,7 @@ def _cell(value: str | float | None) -> str:
 
 def _calibrate(args: argparse.Namespace) -> int:
     from shearloop.bank.errors import CalibrationError
-    from shearloop.bank.skin.calibration_file import read_table, save_calibration
-    from shearloop.bank.skin.calibration_fit import fit_calibration
+    from shearloop.bank.skin.calibration import fit_calibration, read_table, save_calibration
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
 

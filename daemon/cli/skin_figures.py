@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin.characterisation import Characterisation, Curve
-from shearloop.bank.skin.section import PAPER_SECTION
+from shearloop.bank.skin.characterisation import Characterisation, ResponseCurve
+from shearloop.bank.skin.membrane import PAPER_SECTION
 from shearloop.daemon.errors import UserError
 
 try:
@@ -70,7 +70,7 @@ def _figure_5(found: Characterisation) -> Figure:
     return figure
 
 
-def _both_sides(curve: Curve, response: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _both_sides(curve: ResponseCurve, response: FloatArray) -> tuple[FloatArray, FloatArray]:
     """A loading and its mirror image, each from zero: the skin is symmetrical."""
     shear = np.concatenate([-curve.shear_n[::-1], [0.0], curve.shear_n])
     return shear, np.concatenate([-response[::-1], [0.0], response])

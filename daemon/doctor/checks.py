@@ -230,7 +230,7 @@ def _check_combined(combined: CombinedConfig, fingertips: dict[str, FingertipCon
 
 
 def _check_skin(path: Path) -> Finding:
-    from shearloop.bank.skin.calibration_file import load_calibration
+    from shearloop.bank.skin.calibration import load_calibration
 
     try:
         calibration = load_calibration(path)

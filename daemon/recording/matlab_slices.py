@@ -21,9 +21,9 @@ from scipy.io import savemat
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import channels_of_line
-from shearloop.bank.eit.stored import replaced
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import Scalar
+from shearloop.files import replace_file
 
 # The paper's smoothing: nine frames, with a standard deviation of a fifth of that.
 WINDOW_FRAMES, STD_FRAMES = 9, 9 / 5
@@ -240,7 +240,7 @@ def _save(path: Path, **arrays: Any) -> None:
     """Write a MATLAB file, whole or not at all; raises OSError where it cannot be."""
     content = io.BytesIO()
     savemat(content, arrays)  # type: ignore[arg-type]  # any file will do
-    with replaced(path) as file:
+    with replace_file(path) as file:
         file.write(content.getbuffer())
 
 

@@ -9,8 +9,8 @@ from typing import IO, cast
 
 from mcap.writer import CompressionType, Writer
 
-from shearloop.bank.eit.stored import sync_directory
 from shearloop.daemon.recording.schema import PROFILE, schema_of, schemas
+from shearloop.files import sync_directory
 
 PARTIAL = ".partial"
 # Far above what comes between two flushes: chunks end where a flush ends them.

@@ -11,10 +11,10 @@ from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
-from shearloop.bank.eit.stored import replaced
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording.mcap_file import PARTIAL
 from shearloop.daemon.recording.schema import PROFILE
+from shearloop.files import replace_file
 
 _LARGEST_RECORD_BYTES = 1 << 30
 Progress = Callable[[int], None]
@@ -87,7 +87,7 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         raise UserError(f"{out} is there already; move it away, or name another file with --out")
     condition = condition_of(source)
     try:
-        with replaced(out) as file:
+        with replace_file(out) as file:
             writer = Writer(file, compression=CompressionType.ZSTD)
             writer.start(profile=PROFILE, library="shearloop")
             copied = _Copied()

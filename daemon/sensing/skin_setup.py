@@ -3,9 +3,8 @@
 from collections.abc import Callable
 from functools import partial
 
-from shearloop.bank.skin.calibration import SkinCalibration
-from shearloop.bank.skin.calibration_file import load_calibration
-from shearloop.bank.skin.gauge import joule_heating_k
+from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
+from shearloop.bank.skin.membrane import joule_heating_k
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig, SkinDaqConfig, SkinSourceConfig
 from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource

@@ -1,5 +1,6 @@
 """The pages name only commands, options, files and pages that there are."""
 
+import ast
 import re
 import shlex
 from pathlib import Path
@@ -39,6 +40,35 @@ def test_what_the_readme_records_is_ignored_by_git() -> None:
     folders = {Path(one).parts[0] for one in re.findall(r"--record (\S+)", (ROOT / "README.md").read_text())}
     assert folders
     assert {f"/{folder}/" for folder in folders} <= set((ROOT / ".gitignore").read_text().splitlines())
+
+
+def program_texts() -> list[str]:
+    """Return the string literals of the code, with `…` in place of each formatted value."""
+
+    def text(node: ast.AST) -> str:
+        match node:
+            case ast.Constant(value=str(value)):
+                return re.sub(r"\{\w+\}", "…", value)
+            case ast.JoinedStr(values=parts):
+                return "".join(text(part) for part in parts)
+            case _:
+                return "…"
+
+    return [
+        text(node)
+        for folder in ("bank", "drivers", "daemon")
+        for path in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+    ]
+
+
+def test_every_message_of_the_troubleshooting_page_exists_in_the_code() -> None:
+    quoted = re.findall(r'^\| "(.*?)" \||\("(.*?)"\)', (ROOT / "docs/troubleshooting.md").read_text(), re.MULTILINE)
+    messages = ["".join(pair) for pair in quoted]
+    texts = program_texts()
+    assert len(messages) >= 30
+    assert [message for message in messages if not any(message in text for text in texts)] == []
 
 
 def _options(parser) -> set[str]:  # type: ignore[no-untyped-def]

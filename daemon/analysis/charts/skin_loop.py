@@ -17,8 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin.calibration import SkinCalibration
-from shearloop.bank.skin.calibration_file import load_calibration
+from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.daemon.analysis.charts.drawing import figure, look, save
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.experiment_schema import ExperimentFile

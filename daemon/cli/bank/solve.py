@@ -26,11 +26,11 @@ def run(args: argparse.Namespace) -> int:
 
     from shearloop.bank.eit.forward import ForwardModel
     from shearloop.bank.eit.models import conductivity
-    from shearloop.bank.eit.stored import replaced
     from shearloop.bank.errors import ConductivityError
     from shearloop.daemon.bank_config import load_geometry
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
+    from shearloop.files import replace_file
 
     check_overwrite(args.out, "an array of NumPy", np.lib.format.MAGIC_PREFIX)
     mesh = load_geometry(args.mesh)
@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
     except ConductivityError as error:
         raise UserError(f"--model {args.model} --k {args.k:g} --sigma {args.sigma:g}: {error}") from error
     try:
-        with replaced(args.out) as file:
+        with replace_file(args.out) as file:
             np.save(file, voltages)
     except OSError as error:
         raise UserError(

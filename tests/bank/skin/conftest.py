@@ -1,7 +1,7 @@
 import pytest
 
-from shearloop.bank.skin.annulus import MESH_112, CondensedSkin, condense
-from shearloop.bank.skin.section import PAPER_SECTION
+from shearloop.bank.skin.membrane import PAPER_SECTION
+from shearloop.bank.skin.plane_strain import MESH_112, CondensedSkin, condense
 
 
 @pytest.fixture(scope="session")

@@ -8,11 +8,16 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration
-from shearloop.bank.skin.calibration_file import load_calibration, read_table, save_calibration
-from shearloop.bank.skin.calibration_fit import fit_calibration
+from shearloop.bank.skin.calibration import (
+    CalibrationTable,
+    SkinCalibration,
+    fit_calibration,
+    load_calibration,
+    read_table,
+    save_calibration,
+)
 from shearloop.bank.skin.membrane import UNSTRETCHED, Direction, Membrane, paper_membrane
-from shearloop.bank.skin.synthetic import loading, loop
+from shearloop.bank.skin.statistics import loading, loop
 
 MEMBRANE = paper_membrane()
 R1, R2 = 24.6, 25.3

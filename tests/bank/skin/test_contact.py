@@ -6,24 +6,23 @@ import numpy as np
 import pytest
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.skin import closed_form
-from shearloop.bank.skin.annulus import CondensedSkin, MeshSize, condense
-from shearloop.bank.skin.contact import (
+from shearloop.bank.skin import membrane as membrane_model
+from shearloop.bank.skin.membrane import PAPER_SECTION as SECTION
+from shearloop.bank.skin.membrane import UNSTRETCHED, Section, gauge_factor, response_of_strains, section_membrane
+from shearloop.bank.skin.plane_strain import (
+    CondensedSkin,
     ContactError,
     ContactState,
-    follow,
+    MeshSize,
+    apply_load,
+    condense,
     gauge_strains,
-    load,
     midline_strain,
     solve_contact,
+    states_along,
     unloaded,
 )
-from shearloop.bank.skin.gauge import gauge_factor, response_of_strains
-from shearloop.bank.skin.membrane import UNSTRETCHED, section_membrane
-from shearloop.bank.skin.section import PAPER_SECTION as SECTION
-from shearloop.bank.skin.section import Section
-from shearloop.bank.skin.statistics import fit_line, origin_slope
-from shearloop.bank.skin.synthetic import loading, loop
+from shearloop.bank.skin.statistics import fit_line, loading, loop, origin_slope
 
 NORMAL_FORCES = (0.5, 1.0, 1.5, 2.0)
 
@@ -31,7 +30,7 @@ NORMAL_FORCES = (0.5, 1.0, 1.5, 2.0)
 @pytest.fixture(scope="session")
 def loadings(skin_112: CondensedSkin) -> dict[float, list[ContactState]]:
     """The paper's four cases: normal force first, then shear in 0.1 N steps up to it."""
-    return {normal_n: follow(skin_112, normal_n, loading(normal_n)) for normal_n in NORMAL_FORCES}
+    return {normal_n: states_along(skin_112, normal_n, loading(normal_n)) for normal_n in NORMAL_FORCES}
 
 
 def responses_of(skin: CondensedSkin, states: list[ContactState]) -> FloatArray:
@@ -66,10 +65,10 @@ def test_it_begins_to_respond_at_the_paper_s_0_04_newton(
     line = fit_line(shears(loadings[1.0]), responses_of(skin_112, loadings[1.0]))
     kink_n = -line.offset / line.slope_per_n
     assert kink_n == pytest.approx(0.040, abs=0.005)
-    assert kink_n == pytest.approx(closed_form.deadband_n(SECTION, 1.0), rel=0.02)
+    assert kink_n == pytest.approx(membrane_model.deadband_n(SECTION, 1.0), rel=0.02)
     # And seen from near by: before it only the loaded patch itself gives way, behind it is the full slope.
     fine = np.arange(1, 13) * 0.01
-    response = responses_of(skin_112, follow(skin_112, 1.0, fine))
+    response = responses_of(skin_112, states_along(skin_112, 1.0, fine))
     slopes = np.diff(response) / 0.01 / line.slope_per_n
     assert abs(slopes[fine[1:] < 0.0301]).max() < 0.1
     assert slopes[fine[1:] > 0.0499] == pytest.approx(1.0, abs=0.03)
@@ -99,7 +98,7 @@ def test_the_compressed_side_lifts_off_and_hardly_responds(
 
 def test_there_is_no_response_to_normal_force_alone(skin_112: CondensedSkin) -> None:
     for normal_n in NORMAL_FORCES:
-        pressed = load(skin_112, unloaded(skin_112), normal_n, 0.0)
+        pressed = apply_load(skin_112, unloaded(skin_112), normal_n, 0.0)
         assert abs(responses_of(skin_112, [pressed])).max() < 1e-6
         under_load = abs(skin_112.midline_deg - 90) < 5
         strain = abs(midline_strain(skin_112, pressed))
@@ -120,9 +119,9 @@ def test_there_is_no_response_to_normal_force_alone(skin_112: CondensedSkin) -> 
 def test_it_agrees_with_the_closed_form_within_one_percent(changed: dict[str, float], tolerance: float) -> None:
     section = replace(SECTION, **changed)
     skin = condense(section)
-    states = follow(skin, 1.0, loading(1.0))
+    states = states_along(skin, 1.0, loading(1.0))
     slope = fit_line(shears(states), responses_of(skin, states)).slope_per_n
-    assert slope == pytest.approx(closed_form.sensitivity_per_n(section), rel=tolerance)
+    assert slope == pytest.approx(membrane_model.sensitivity_per_n(section), rel=tolerance)
 
 
 @pytest.mark.parametrize(("friction", "within"), [(0.1, 0.006), (0.2, 0.004)])
@@ -133,13 +132,13 @@ def test_beyond_the_paper_s_friction_the_closed_form_holds_with_friction_where_i
     section = replace(SECTION, friction=friction)
     skin = condense(section)
     # From half of the load on, well beyond the deadband.
-    states = follow(skin, 1.0, loading(1.0))[5:]
+    states = states_along(skin, 1.0, loading(1.0))[5:]
     both = fit_line(shears(states), responses_of(skin, states)).slope_per_n
     slack = -2 * fit_line(shears(states), gauge_strains(skin, states)[:, 1]).slope_per_n
-    smooth = closed_form.sensitivity_per_n(replace(section, friction=0.0))
-    on_core = friction * closed_form.gauge_angle_rad(section) * section.inner_radius_mm / section.mid_radius_mm
+    smooth = membrane_model.sensitivity_per_n(replace(section, friction=0.0))
+    on_core = friction * section.gauge_angle_rad * section.inner_radius_mm / section.mid_radius_mm
     assert both == pytest.approx((smooth - slack) * np.exp(-on_core) + slack, rel=within)
-    assert abs(closed_form.sensitivity_per_n(section) / both - 1) > 0.01
+    assert abs(membrane_model.sensitivity_per_n(section) / both - 1) > 0.01
 
 
 def ring_sensitivity(section: Section) -> float:
@@ -169,7 +168,7 @@ def ring_sensitivity(section: Section) -> float:
 @pytest.mark.parametrize("thickness_mm", [0.1, 0.4, 0.7])
 def test_the_closed_form_is_that_of_a_ring_stretched_on_a_smooth_core(thickness_mm: float) -> None:
     section = replace(SECTION, thickness_mm=thickness_mm, friction=0.0)
-    assert closed_form.sensitivity_per_n(section) == pytest.approx(ring_sensitivity(section), rel=1e-3)
+    assert membrane_model.sensitivity_per_n(section) == pytest.approx(ring_sensitivity(section), rel=1e-3)
 
 
 def test_the_contact_conditions_hold_at_every_node(
@@ -217,7 +216,7 @@ def test_a_slow_solver_finds_the_same_forces(friction: float) -> None:
     for normal_n, shear_n in [(1.0, 0.0), (1.0, 0.5), (1.0, 1.0), (1.0, 0.3), (0.5, -0.2)]:
         free = skin.load_displacement @ (normal_n, shear_n)
         slow = projected_gauss_seidel(skin.compliance, free, state.along_mm, friction)
-        state = load(skin, state, normal_n, shear_n, friction=friction)
+        state = apply_load(skin, state, normal_n, shear_n, friction=friction)
         assert abs(slow - state.contact_force_n).max() < 1e-8
         assert abs(slow).max() > 0.01
 
@@ -228,7 +227,7 @@ def test_it_converges_from_random_starts_and_in_one_jump(skin_112: CondensedSkin
     n = len(skin_112.contact_deg)
     for normal_n, shear_n in [(1.0, 0.0), (1.0, 1.0), (2.0, -1.5), (0.5, 3.0)]:
         jumps = [
-            load(skin_112, unloaded(skin_112), normal_n, shear_n, friction=friction, start_force_n=start)
+            apply_load(skin_112, unloaded(skin_112), normal_n, shear_n, friction=friction, start_force_n=start)
             for start in [np.zeros(2 * n), *rng.normal(0, (0.01, 1, 10), (2 * n, 3)).T]
         ]
         for jump in jumps[1:]:
@@ -238,8 +237,8 @@ def test_it_converges_from_random_starts_and_in_one_jump(skin_112: CondensedSkin
 def test_one_jump_ends_where_small_steps_do_while_the_load_only_rises(
     skin_112: CondensedSkin, loadings: dict[float, list[ContactState]]
 ) -> None:
-    pressed = load(skin_112, unloaded(skin_112), 1.0, 0.0)
-    jump = load(skin_112, pressed, 1.0, 1.0)
+    pressed = apply_load(skin_112, unloaded(skin_112), 1.0, 0.0)
+    jump = apply_load(skin_112, pressed, 1.0, 1.0)
     found = responses_of(skin_112, [jump, loadings[1.0][-1]])
     assert found[0] == pytest.approx(found[1], rel=1e-6)
 
@@ -272,7 +271,7 @@ def test_a_loop_is_followed_far_from_the_paper_s_section(
     """In the first two a guess leads round in a circle, and only another start leads out of it."""
     skin = condense(replace(SECTION, **changed, friction=friction))
     n = len(skin.contact_deg)
-    states = follow(skin, normal_n, loop(1.0)[:13])
+    states = states_along(skin, normal_n, loop(1.0)[:13])
     for state in states:
         free = skin.load_displacement @ (state.normal_n, state.shear_n)
         gap = (skin.compliance @ state.contact_force_n + free)[:n]
@@ -284,8 +283,8 @@ def test_a_loop_is_followed_far_from_the_paper_s_section(
 
 
 def test_numbers_that_are_none_are_refused_not_returned(skin_112: CondensedSkin) -> None:
-    with pytest.raises(ContactError, match="what is no number"):
-        load(skin_112, unloaded(skin_112), float("nan"), 0.0)
+    with pytest.raises(ContactError, match="is not a number"):
+        apply_load(skin_112, unloaded(skin_112), float("nan"), 0.0)
 
 
 def test_the_load_s_movement_converges_from_below_at_the_rate_of_the_clamps_corners() -> None:
@@ -293,7 +292,7 @@ def test_the_load_s_movement_converges_from_below_at_the_rate_of_the_clamps_corn
     moved = []
     for times in (1, 2, 4):
         skin = condense(SECTION, MeshSize(2, 3, 4, 1, 2).refined(times))
-        state = follow(skin, 1.0, loading(1.0))[-1]
+        state = states_along(skin, 1.0, loading(1.0))[-1]
         moved.append(skin.load_movement_mm(state.contact_force_n, 1.0, 1.0))
     steps = np.diff(moved, axis=0)
     assert (steps > 0).all(), "a coarser skin is a stiffer one"
@@ -304,13 +303,13 @@ def test_the_load_s_movement_converges_from_below_at_the_rate_of_the_clamps_corn
 def test_the_response_converges_long_before_the_corners_do(skin_112: CondensedSkin) -> None:
     fine = condense(SECTION, MeshSize(10, 18, 26, 4, 4))
     path = loading(1.0)[2::3]  # growing loads need no steps in between
-    found = [responses_of(skin, follow(skin, 1.0, path)) for skin in (skin_112, fine)]
+    found = [responses_of(skin, states_along(skin, 1.0, path)) for skin in (skin_112, fine)]
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3, atol=1e-5)
 
 
 def test_its_hysteresis_is_that_of_the_membrane(skin_112: CondensedSkin) -> None:
     path = loop(1.0)
-    two = responses_of(skin_112, follow(skin_112, 1.0, path))
+    two = responses_of(skin_112, states_along(skin_112, 1.0, path))
     membrane, state, one = section_membrane(), UNSTRETCHED, []
     for shear_n in path:
         state = membrane.step(state, float(shear_n), 1.0)

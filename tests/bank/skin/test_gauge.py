@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError, GeometryError
-from shearloop.bank.skin import gauge
-from shearloop.bank.skin.section import Section
+from shearloop.bank.skin import membrane
+from shearloop.bank.skin.membrane import Section
 
 
 def test_the_paper_s_gauge_has_25_ohm_and_stays_within_5_kelvin() -> None:
-    channel = gauge.Gauge()
+    channel = membrane.Gauge()
     assert channel.resistance_ohm == pytest.approx(25.0, rel=0.02)
     assert channel.power_at_current_w(5e-3) == pytest.approx(5e-3**2 * channel.resistance_ohm)
     assert channel.power_w(1.0) == pytest.approx(1 / channel.resistance_ohm)
@@ -18,24 +18,24 @@ def test_resistance_follows_the_channel_s_own_geometry() -> None:
     # A channel of an incompressible elastomer keeps its volume: R grows with the square of its length.
     strain = np.array([-0.05, 0.0, 0.02, 0.09])
     kept_volume = (1 + strain) ** 2 - 1
-    np.testing.assert_allclose(gauge.resistance_change(strain), kept_volume, atol=0.02)
+    np.testing.assert_allclose(membrane.resistance_change(strain), kept_volume, atol=0.02)
     tiny = np.array([1e-6])
     for nu in (0.0, 0.3, 0.49, 0.5):
-        np.testing.assert_allclose(gauge.resistance_change(tiny, nu) / tiny, gauge.gauge_factor(nu), rtol=1e-5)
-    assert gauge.gauge_factor() == 2.0
+        np.testing.assert_allclose(membrane.resistance_change(tiny, nu) / tiny, membrane.gauge_factor(nu), rtol=1e-5)
+    assert membrane.gauge_factor() == 2.0
 
 
 def test_equation_1_takes_resistances_to_the_difference_of_strains() -> None:
     strain_1, strain_2 = np.array([0.03, 0.0]), np.array([-0.002, 0.01])
     r1, r2 = 24.0 * (1 + 2 * strain_1), 26.0 * (1 + 2 * strain_2)
-    measured = gauge.response(r1, r2, 24.0, 26.0)
-    np.testing.assert_allclose(measured, gauge.response_of_strains(strain_1, strain_2), atol=1e-15)
+    measured = membrane.measured_response(r1, r2, 24.0, 26.0)
+    np.testing.assert_allclose(measured, membrane.response_of_strains(strain_1, strain_2), atol=1e-15)
 
 
 @pytest.mark.parametrize("unloaded", [(0.0, 25.0), (25.0, -1.0), (float("nan"), 25.0)])
 def test_an_unloaded_resistance_that_cannot_be_is_refused(unloaded: tuple[float, float]) -> None:
     with pytest.raises(CalibrationError, match=r"unloaded resistance of R[12]"):
-        gauge.response(np.ones(1), np.ones(1), *unloaded)
+        membrane.measured_response(np.ones(1), np.ones(1), *unloaded)
 
 
 @pytest.mark.parametrize(

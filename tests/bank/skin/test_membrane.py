@@ -16,8 +16,7 @@ from shearloop.bank.skin.membrane import (
     paper_membrane,
     section_membrane,
 )
-from shearloop.bank.skin.statistics import origin_slope
-from shearloop.bank.skin.synthetic import loading, responses
+from shearloop.bank.skin.statistics import loading, origin_slope, responses
 
 MEMBRANE = paper_membrane()
 CAPSTAN = math.exp(-MEMBRANE.friction * MEMBRANE.gauge_angle_rad)

@@ -8,7 +8,7 @@ import pytest
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.skin import statistics
 from shearloop.bank.skin.membrane import paper_membrane
-from shearloop.bank.skin.synthetic import Figures, loading, loop, recover, responses
+from shearloop.bank.skin.statistics import SkinFigures, estimated_figures, loading, loop, responses
 
 RNG_SEED = 20
 
@@ -81,9 +81,9 @@ def test_temperature_sensitivity_is_the_change_of_slope_and_not_of_offset() -> N
         statistics.temperature_sensitivity_per_k(cold, hot, 25.0, 25.0)
 
 
-@pytest.mark.parametrize("put_in", [Figures(), Figures(0.004, 0.05, 4e-4, 3e-4, -0.003)])
-def test_what_is_put_into_a_synthetic_skin_is_found_again(put_in: Figures) -> None:
-    found = [recover(paper_membrane(), put_in, np.random.default_rng(seed)) for seed in range(20)]
+@pytest.mark.parametrize("put_in", [SkinFigures(), SkinFigures(0.004, 0.05, 4e-4, 3e-4, -0.003)])
+def test_what_is_put_into_a_synthetic_skin_is_found_again(put_in: SkinFigures) -> None:
+    found = [estimated_figures(paper_membrane(), put_in, np.random.default_rng(seed)) for seed in range(20)]
     noise = put_in.noise_floor_n * 0.088
     for name, spread in {
         "noise_floor_n": 0.01,

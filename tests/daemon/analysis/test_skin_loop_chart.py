@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.bank.skin.calibration import SkinCalibration
-from shearloop.bank.skin.calibration_file import load_calibration
+from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.daemon.analysis.charts import skin_loop
 from shearloop.daemon.analysis.charts.skin_loop import CALIBRATION, SkinLoop, SkinLoopCase, judge
 from shearloop.daemon.config import load_daemon_config

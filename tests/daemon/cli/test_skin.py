@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from shearloop.bank.skin.calibration_file import load_calibration
-from shearloop.bank.skin.characterisation import Row
+from shearloop.bank.skin.calibration import load_calibration
+from shearloop.bank.skin.characterisation import FigureOfMerit
 from shearloop.bank.skin.membrane import paper_membrane
-from shearloop.bank.skin.synthetic import loop, responses
+from shearloop.bank.skin.statistics import loop, responses
 from shearloop.daemon.cli import main
 from shearloop.daemon.cli.skin import _table
 
@@ -49,7 +49,7 @@ def test_characterise_holds_the_models_against_the_paper_and_draws_its_figures(
     assert all(path.stat().st_size > 10_000 for path in drawn)
     assert printed.err.count("drawn: ") == 6
 
-    table = _table(tuple(Row(**row) for row in rows.values()))
+    table = _table(tuple(FigureOfMerit(**row) for row in rows.values()))
     assert len(table.splitlines()[1:]) > len(rows)
     assert max(map(len, table.splitlines())) < 130
     assert "0.0802" in table

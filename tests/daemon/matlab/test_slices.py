@@ -244,7 +244,7 @@ def unwritable(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
         def full(_descriptor: int) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-        monkeypatch.setattr("shearloop.bank.eit.stored.os.fsync", full)
+        monkeypatch.setattr("shearloop.files.os.fsync", full)
     return tmp_path
 
 

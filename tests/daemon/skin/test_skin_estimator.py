@@ -7,9 +7,7 @@ from random import Random
 
 import pytest
 
-from shearloop.bank.skin.calibration import SkinCalibration
-from shearloop.bank.skin.calibration_file import load_calibration
-from shearloop.bank.skin.calibration_fit import fit_calibration
+from shearloop.bank.skin.calibration import SkinCalibration, fit_calibration, load_calibration
 from shearloop.bank.skin.membrane import Direction
 from shearloop.daemon.sensing.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
 from shearloop.daemon.synthetic_skin import REST_OHM, SyntheticSkin, SyntheticSkinSettings, calibration_table

@@ -1,4 +1,4 @@
-"""The generated pages: `docs/messages.md`, and the safety table in `docs/safety.md`."""
+"""Writes the generated pages: `docs/messages.md`, and the safety table in `docs/safety.md` (`make docs`)."""
 
 import dataclasses
 import re
@@ -15,14 +15,14 @@ from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRES
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, TOPICS
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = Path("docs/examples")
 RESPONSES = {
-    Response.NOTE: "told, nothing else",
-    Response.REFUSE_START: "no experiment is begun; what runs goes on",
-    Response.HOLD: "the wrist stands still until it is over",
-    Response.STOP_AND_KEEP_GRIP: "stopped, the tool stays gripped",
-    Response.STOP_AND_RELEASE: "stopped, the gripper opens",
+    Response.NOTE: "reported only",
+    Response.REFUSE_START: "no experiment starts; a running one continues",
+    Response.HOLD: "the wrist holds until the fault is gone",
+    Response.STOP_AND_KEEP_GRIP: "stop, the tool stays gripped",
+    Response.STOP_AND_RELEASE: "stop, the gripper opens",
 }
 _ENVELOPE = ("source", "t_mono_ns")
 _LANGUAGES = (
@@ -33,15 +33,15 @@ _LANGUAGES = (
 
 
 def messages_page(root: Path) -> str:
-    """Return the page; the subscribers are read from the folder of examples below `root`."""
+    """Return the page, with the example programs below `root`."""
     parts = [_introduction()]
     for topic, kind in TOPICS.items():
         rate = "on change" if kind.rate_hz is None else f"{kind.rate_hz:g} a second"
         parts.append(
             f"### `{topic}`, {rate}\n\n{kind.__doc__}\n\n{table(('key', 'type', 'unit', 'meaning'), _keys(kind))}"
         )
-    parts.append(_commands())
-    parts.append("## Subscribers\n\nEach is a whole program; the files are in `docs/examples/`.")
+    parts.append(_commands().rstrip())
+    parts.append("## Subscribers\n\nEach is a complete program from `docs/examples/`.")
     for language, name, fence in _LANGUAGES:
         text = (root / EXAMPLES / name).read_text(encoding="utf-8").strip()
         parts.append(f"### {language}\n\n```{fence}\n{text}\n```")
@@ -53,17 +53,15 @@ def _introduction() -> str:
 
 Written by `make docs` from `daemon/messaging/messages.py`; change it there.
 
-The daemon publishes on a ZeroMQ PUB socket (`publish`, by default `{PUBLISH_ADDRESS}`). A message is exactly two
-frames: the topic, and a [msgpack](https://msgpack.org) map with text keys. Numbers, truth values and texts are plain
-keys; an absent value is nil. An array is msgpack `bin`, little-endian float32 in C order, and its shape is in a key of
-its own, `NAME_shape`; plotting tools pass over both. `shearloop listen TOPIC --json` shows the same as JSON, a message
-a line.
+The daemon publishes on a ZeroMQ PUB socket (`publish`, by default `{PUBLISH_ADDRESS}`). A message has two frames:
+the topic, and a [msgpack](https://msgpack.org) map with text keys. Numbers, booleans and texts are plain keys. A missing
+value is nil. An array is msgpack `bin`: little-endian float32 in C order, with its shape in `NAME_shape`. Plotting tools
+ignore both. `shearloop listen TOPIC --json` prints one message per line as JSON.
 
-PlotJuggler: Streaming → ZMQ Subscriber, `tcp://`, 127.0.0.1, port 7761, protocol MessagePack, topics empty or a
-beginning such as `eit.`; let it take the time from the field `timestamp`.
+PlotJuggler: see [live-view.md](live-view.md#plotjuggler).
 
-What is older than {STALE_AFTER_PERIODS:g} periods of its topic is out of date. A subscriber that does not keep up loses
-messages, and sees it by a gap in `seq`. Beyond this machine connections need keys: [security.md](security.md).
+A message is stale after {STALE_AFTER_PERIODS:g} periods of its topic. A slow subscriber loses messages: `seq` then has
+a gap. Connections from other computers need keys: [security.md](security.md).
 
 ## Topics
 
@@ -73,14 +71,14 @@ Every message has these keys:
 
 
 def _envelope() -> Iterator[tuple[str, ...]]:
-    yield "`timestamp`", "number", "s", "Unix time of what the message speaks of"
-    yield "`t_mono_ns`", "integer", "ns", "the same on CLOCK_MONOTONIC of the daemon's computer"
+    yield "`timestamp`", "number", "s", "Unix time of the measurement or event"
+    yield "`t_mono_ns`", "integer", "ns", "the same time on CLOCK_MONOTONIC of the daemon's computer"
     yield "`seq`", "integer", "", "number of the message of this topic and source, without gaps"
     yield (
         "`source`",
         "text",
         "",
-        "who says it: a fingertip's name, `skin`, `load_cell`, `robot`, `gripper`, `loop`, `daemon`",
+        "a fingertip's name, `skin`, `load_cell`, `robot`, `gripper`, `loop` or `daemon`",
     )
 
 
@@ -99,7 +97,7 @@ def _type_name(hint: Any) -> str:
         return " or ".join([*dict.fromkeys(names), *(["nil"] if type(None) in get_args(hint) else [])])
     if origin in (np.ndarray, tuple) or hint is np.ndarray:
         return "array"
-    plain: dict[Any, str] = {float: "number", int: "integer", bool: "truth value", str: "text"}
+    plain: dict[Any, str] = {float: "number", int: "integer", bool: "boolean", str: "text"}
     return plain.get(hint, "map")
 
 
@@ -107,16 +105,20 @@ def _commands() -> str:
     rows = [(f"`{name}`", what) for name, what in COMMANDS.items()]
     return f"""## Commands
 
-The daemon answers on a ZeroMQ ROUTER socket (`commands`, by default `{COMMAND_ADDRESS}`); a REQ or DEALER socket asks.
-A request is one msgpack map, `{{"command": NAME}}` with what the command takes beside it. Each is answered once, with
-`{{"ok": true, …}}` or `{{"ok": false, "why": SENTENCE}}`. Limits are in [security.md](security.md);
-`shearloop command NAME --json` does the same from a shell.
+The daemon answers on a ZeroMQ ROUTER socket (`commands`, by default `{COMMAND_ADDRESS}`). Use a REQ or DEALER socket.
+A request is a msgpack map: `{{"command": NAME}}` and the command's arguments. Each gets one reply:
+`{{"ok": true, …}}` or `{{"ok": false, "why": REASON}}`. Limits are in [security.md](security.md).
+`shearloop command NAME --json` sends a command from a shell.
 
 {table(("command", "what it does"), rows)}
 
-`start` takes `experiment`, the path of a file on the daemon's computer, or starts what the configuration names; `tare`
-takes `source`, one sensor's name, or tares all; `set` takes `heatmap` (`always` or
-`on_request`) and `source`, one fingertip's name, or sets all."""
+| argument | of | meaning |
+|---|---|---|
+| `experiment` | `start` | path of a file on the daemon's computer; default: the configured experiment |
+| `source` | `tare` | one sensor's name; default: all |
+| `heatmap` | `set` | `always` or `on_request` |
+| `source` | `set` | one fingertip's name; default: all |
+"""
 
 
 def safety_table() -> str:
@@ -125,9 +127,9 @@ def safety_table() -> str:
     for event, rule in TABLE.items():
         response = RESPONSES[rule.response]
         if rule.hold_at_most_s is not None:
-            response += f"; stopped after {rule.hold_at_most_s:g} s"
+            response += f"; stop after {rule.hold_at_most_s:g} s"
         rows.append((event.value, response, rule.sentence.format(detail="…").replace("….", "…"), rule.cure))
-    return table(("event", "response", "what is said", "what to do"), rows)
+    return table(("fault", "response", "message", "what to do"), rows)
 
 
 def pages(root: Path) -> dict[Path, str]:
@@ -149,3 +151,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     escaped = [[cell.replace("|", "\\|").replace("\n", " ") for cell in cells] for cells in (head, *rows)]
     head_row, *body = [f"| {' | '.join(cells)} |" for cells in escaped]
     return "\n".join([head_row, "|---" * len(head) + "|", *body])
+
+
+if __name__ == "__main__":
+    for path, text in pages(ROOT).items():
+        path.write_text(text, encoding="utf-8")
+        print(path.relative_to(ROOT))

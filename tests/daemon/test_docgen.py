@@ -1,4 +1,4 @@
-"""The generated pages say what the code says, and the programs in them run."""
+"""The generated pages match the code, and their programs run."""
 
 import asyncio
 import dataclasses
@@ -12,7 +12,7 @@ import zmq
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.safety import TABLE
-from shearloop.daemon.docgen.pages import ROOT, pages
+from shearloop.daemon.docgen import ROOT, pages
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
 from shearloop.daemon.messaging.messages import EitEstimate, EitFrame
 from shearloop.daemon.messaging.publisher import Publisher
@@ -23,18 +23,18 @@ from tests.daemon.sample_messages import sample
 
 @pytest.fixture(scope="module")
 def written() -> dict[str, str]:
-    """Return the generated pages by name; reading all of the code for them takes a second."""
+    """Return the generated pages by name."""
     return {path.name: text for path, text in pages(ROOT).items()}
 
 
 @pytest.mark.parametrize("name", ["messages.md", "safety.md"])
-def test_a_page_is_what_the_code_says(written: dict[str, str], name: str) -> None:
+def test_a_page_is_up_to_date(written: dict[str, str], name: str) -> None:
     assert len(written) == 2
     found = (ROOT / "docs" / name).read_text(encoding="utf-8")
     assert found == written[name], f"docs/{name} is out of date: run `make docs` and commit it"
 
 
-def test_every_topic_and_key_is_told_of(written: dict[str, str]) -> None:
+def test_every_topic_and_key_is_listed(written: dict[str, str]) -> None:
     for topic, kind in TOPICS.items():
         assert f"### `{topic}`" in written["messages.md"]
         for key in (item.name for item in dataclasses.fields(kind)):

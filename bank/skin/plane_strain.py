@@ -1,0 +1,426 @@
+"""The skin in two dimensions: plane strain, small strain, quadratic quadrilaterals, contact with Coulomb friction.
+
+With C the nodes on the core, λ the contact forces there and f the load, the skin is linear in them:
+u_C = W λ + w f and ε = V λ + v f. `condense` computes these matrices once per mesh, exactly; it only eliminates
+unknowns without contact force. With u = W λ + u₀ at n contact nodes (radial components first, then circumferential)
+the contact conditions are
+
+    radial:           0 ≤ λ_n,  0 ≤ u_n,  λ_n u_n = 0
+    circumferential:  |λ_t| ≤ μ λ_n,  λ_t = −μ λ_n sign(u_t − u_t,before) where that difference is not 0.
+
+Both are one piecewise linear equation Φ(λ) = 0 (Alart & Curnier 1991; Hüeber, Stadler & Wohlmuth, SIAM J. Sci. Comput.
+30 (2008)), solved by a semismooth Newton method: each step guesses which nodes are apart, stick or slip, solves the
+linear system of that guess, and goes along it as far as Φ falls.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import skfem
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import splu
+from skfem.helpers import grad
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.errors import BankError, GeometryError
+from shearloop.bank.skin.membrane import Section
+
+# Random starts at a friction of 1 take up to about 45 steps, a step of loading 3 to 25.
+MAX_STEPS = 200
+# Thick skins, nearly incompressible ones and a friction of 1 sometimes need another start.
+RESTARTS = 6
+# Rounds of relaxation before a restart; each costs as much as one or two Newton steps.
+SWEEPS = 20
+# Relative to the largest contact force: about a thousand roundings.
+TOLERANCE = 1e-11
+# Below this fraction of a step Φ does not fall: the step alternates between two pieces of Φ.
+SHORTEST_STEP = 1e-2
+# The whole step is then taken, and Φ weighs displacement against force differently, which moves its pieces' borders.
+WEIGHTS = (1.0, 3.0, 0.3)
+
+
+class ContactError(BankError):
+    """The contact conditions could not be met."""
+
+
+@dataclass(frozen=True, slots=True)
+class MeshSize:
+    """Elements from bracket to gauge, along the gauge, from gauge to load, under the load, and through the skin."""
+
+    bracket: int = 5
+    gauge: int = 9
+    flank: int = 13
+    load: int = 2
+    layers: int = 2
+
+    def __post_init__(self) -> None:
+        """Refuse a mesh without elements or without nodes and facets at mid-thickness."""
+        if min(self.bracket, self.gauge, self.flank, self.load) < 1 or self.layers < 2 or self.layers % 2:
+            raise GeometryError(f"{self} needs at least one element per stretch and an even number of layers.")
+
+    def refined(self, times: int) -> "MeshSize":
+        """Return the size with every element cut into times × times."""
+        return MeshSize(
+            times * self.bracket, times * self.gauge, times * self.flank, times * self.load, times * self.layers
+        )
+
+    @property
+    def elements(self) -> int:
+        """Number of quadrilaterals."""
+        return (2 * (self.bracket + self.gauge + self.flank) + self.load) * self.layers
+
+
+MESH_56 = MeshSize(3, 4, 6, 2, 2)
+MESH_112 = MeshSize()
+MESH_448 = MESH_112.refined(2)
+MESH_1792 = MESH_112.refined(4)
+
+
+def annulus_mesh(section: Section, size: MeshSize = MESH_112) -> skfem.MeshQuad2:
+    """Return the half annulus as curved nine-node quadrilaterals, x = −r cos θ, y = −r sin θ, in mm.
+
+    Element edges fall on the ends of the gauges and of the loaded arc.
+    """
+    radii = np.linspace(section.inner_radius_mm, section.outer_radius_mm, size.layers + 1)
+    load_from = 90 - section.load_arc_deg / 2
+    ends = [0.0, section.gauge_from_deg, section.gauge_to_deg, load_from]
+    ends += [180 - end for end in reversed(ends)]
+    side = [size.bracket, size.gauge, size.flank]
+    counts = [*side, size.load, *reversed(side)]
+    stretches = [
+        np.linspace(begin, end, n, endpoint=False) for begin, end, n in zip(ends[:-1], ends[1:], counts, strict=True)
+    ]
+    angles = np.radians(np.append(np.concatenate(stretches), 180.0))
+    flat = skfem.MeshQuad2.from_mesh(skfem.MeshQuad.init_tensor(radii, angles))
+    r, theta = flat.doflocs
+    return skfem.MeshQuad2(np.vstack([-r * np.cos(theta), -r * np.sin(theta)]), flat.t)
+
+
+def plane_strain_stiffness(basis: skfem.Basis, young_mpa: float, poisson_ratio: float) -> csc_matrix:
+    """Return the stiffness per millimetre of width, N/mm²."""
+    form = linear_elasticity(*lame_parameters(young_mpa, poisson_ratio))
+    return csc_matrix(form.assemble(basis))
+
+
+@dataclass(frozen=True, slots=True)
+class CondensedSkin:
+    """The skin as seen from its n contact nodes and m mid-line facets; forces in N, displacements in mm.
+
+    `compliance` is (2n, 2n), radial components first. `load_displacement` (2n, 2) and `load_strain` (m, 2) answer a
+    unit normal force (towards the core) and a unit shear force; `load_compliance` (2, 2) is the movement of the loaded
+    arc itself. `strain_of_contact` is (m, 2n). `gauge_weights` (2, m) average over each gauge.
+    """
+
+    section: Section
+    contact_deg: FloatArray
+    compliance: FloatArray
+    load_displacement: FloatArray
+    load_compliance: FloatArray
+    midline_deg: FloatArray
+    strain_of_contact: FloatArray
+    load_strain: FloatArray
+    gauge_weights: FloatArray
+
+    def load_movement_mm(self, contact_force_n: FloatArray, normal_n: float, shear_n: float) -> FloatArray:
+        """Return the mean movement (2,) of the loaded arc: towards the core and along the shear force."""
+        moved: FloatArray = self.load_displacement.T @ contact_force_n + self.load_compliance @ (normal_n, shear_n)
+        return moved
+
+
+def condense(section: Section, size: MeshSize = MESH_112) -> CondensedSkin:
+    """Return the skin condensed to its contact nodes: clamped at both brackets, loaded evenly on the load's arc."""
+    return _Assembly(section, size).condensed()
+
+
+class _Assembly:
+    def __init__(self, section: Section, size: MeshSize) -> None:
+        self.section = section
+        self.mesh = annulus_mesh(section, size)
+        self.element = skfem.ElementVector(skfem.ElementQuad2())
+        self.basis = skfem.Basis(self.mesh, self.element, intorder=4)
+
+    def condensed(self) -> CondensedSkin:
+        contact, contact_deg = self._contact_rotation()
+        strain, midline_deg, weights = self._midline_strain()
+        load = self._load()
+        free = self.basis.complement_dofs(self._clamped())
+        stiffness = self.section.width_mm * plane_strain_stiffness(
+            self.basis, self.section.young_mpa, self.section.poisson_ratio
+        )
+        factor = splu(stiffness[free][:, free].tocsc())
+        contact, strain, load = contact[:, free], strain[:, free], load[free]
+        by_load, by_contact = factor.solve(load), factor.solve(contact.T.toarray())
+        return CondensedSkin(
+            section=self.section,
+            contact_deg=contact_deg,
+            compliance=contact @ by_contact,
+            load_displacement=contact @ by_load,
+            load_compliance=load.T @ by_load,
+            midline_deg=midline_deg,
+            strain_of_contact=strain @ by_contact,
+            load_strain=strain @ by_load,
+            gauge_weights=weights,
+        )
+
+    def _facets_at(self, radius_mm: float) -> IntArray:
+        """Return the facets along a circle; all three nodes of such a curved facet lie on it."""
+        r = np.hypot(*self.mesh.p[:, self.mesh.facets])
+        on_circle = (abs(r - radius_mm) < 1e-9 * radius_mm).all(axis=0)
+        return np.flatnonzero(on_circle)
+
+    def _clamped(self) -> IntArray:
+        facets = self.mesh.facets_satisfying(lambda x: abs(x[1]) < 1e-9, boundaries_only=True)
+        clamped: IntArray = self.basis.get_dofs(facets).flatten()
+        return clamped
+
+    def _contact_rotation(self) -> tuple[csc_matrix, FloatArray]:
+        """Return the (2n, dofs) matrix of radial and circumferential displacement of the contact nodes, and their θ."""
+        facets = self._facets_at(self.section.inner_radius_mm)
+        nodes = np.unique(self.mesh.facets[:, facets])
+        pairs = np.hstack([self.basis.nodal_dofs[:, nodes], self.basis.facet_dofs[:, facets]])
+        theta = _angle(self.basis.doflocs[:, pairs[0]])
+        kept = (theta > 1e-9) & (theta < np.pi - 1e-9)
+        order = np.flatnonzero(kept)[np.argsort(theta[kept])]
+        pairs, theta = pairs[:, order], theta[order]
+        n = len(theta)
+        radial, along = np.array([-np.cos(theta), -np.sin(theta)]), _along(theta)
+        rows = np.concatenate([np.arange(n), np.arange(n), n + np.arange(n), n + np.arange(n)])
+        columns = np.concatenate([pairs[0], pairs[1], pairs[0], pairs[1]])
+        values = np.concatenate([*radial, *along])
+        return csc_matrix((values, (rows, columns)), shape=(2 * n, self.basis.N)), np.degrees(theta)
+
+    def _midline_strain(self) -> tuple[csc_matrix, FloatArray, FloatArray]:
+        """Return the (m, dofs) matrix of facet means of ε_θθ, the facets' angles, and the gauges' weights on them."""
+        facets = self._facets_at(self.section.mid_radius_mm)
+        theta = _angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
+        facets, theta = facets[np.argsort(theta)], np.sort(theta)
+        basis = skfem.InteriorFacetBasis(self.mesh, self.element, facets=facets, side=0, intorder=5)
+        dofs, values = [], []
+        lengths = basis.dx.sum(axis=1)
+        along = _along(_angle(np.asarray(basis.global_coordinates())))
+        for i in range(basis.Nbfun):
+            gradient = grad(basis.basis[i][0])
+            strain = np.einsum("i...,ij...,j...->...", along, gradient, along)
+            values.append((strain * basis.dx).sum(axis=1) / lengths)
+            dofs.append(basis.element_dofs[i])
+        m = len(facets)
+        rows = np.tile(np.arange(m), basis.Nbfun)
+        matrix = csc_matrix((np.concatenate(values), (rows, np.concatenate(dofs))), shape=(m, self.basis.N))
+        degrees = np.degrees(theta)
+        in_gauge = (degrees > self.section.gauge_from_deg) & (degrees < self.section.gauge_to_deg)
+        weights = np.array([in_gauge * lengths, in_gauge[::-1] * lengths])
+        return matrix, degrees, weights / weights.sum(axis=1, keepdims=True)
+
+    def _load(self) -> FloatArray:
+        """Return the (dofs, 2) nodal forces of 1 N towards the core and of 1 N of shear, even over the loaded arc."""
+        facets = self._facets_at(self.section.outer_radius_mm)
+        theta = _angle(self.mesh.p[:, self.mesh.facets[:, facets]].mean(axis=1))
+        facets = facets[abs(np.degrees(theta) - 90) < self.section.load_arc_deg / 2]
+        basis = skfem.FacetBasis(self.mesh, self.element, facets=facets, intorder=5)
+        length = basis.dx.sum()
+        normal = skfem.LinearForm(lambda v, _: v[1] / length).assemble(basis)
+        shear = skfem.LinearForm(lambda v, _: v[0] / length).assemble(basis)
+        return np.column_stack([normal, shear])
+
+
+def _angle(points: FloatArray) -> FloatArray:
+    theta: FloatArray = np.arctan2(-points[1], -points[0])
+    return theta
+
+
+def _along(theta: FloatArray) -> FloatArray:
+    return np.array([np.sin(theta), -np.cos(theta)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContactState:
+    """The skin at rest under a load: contact forces (2n,) in N, circumferential displacements (n,) in mm."""
+
+    normal_n: float
+    shear_n: float
+    contact_force_n: FloatArray
+    along_mm: FloatArray
+    newton_steps: int = 0
+
+    @property
+    def touching(self) -> BoolArray:
+        """The (n,) nodes that press on the core; the others have lifted off."""
+        pressing: BoolArray = self.contact_force_n[: len(self.along_mm)] > 0
+        return pressing
+
+
+def unloaded(skin: CondensedSkin) -> ContactState:
+    """Return the skin as it is mounted: without load, without contact force."""
+    n = len(skin.contact_deg)
+    return ContactState(0.0, 0.0, np.zeros(2 * n), np.zeros(n))
+
+
+def apply_load(
+    skin: CondensedSkin,
+    before: ContactState,
+    normal_n: float,
+    shear_n: float,
+    *,
+    friction: float | None = None,
+    start_force_n: FloatArray | None = None,
+) -> ContactState:
+    """Return the state after one increment of load (N) from `before`; friction is the section's unless given.
+
+    The Newton iteration starts from the contact forces `start_force_n` (2n,), by default those of `before`. Raises
+    ContactError where it does not converge.
+    """
+    friction = skin.section.friction if friction is None else friction
+    start = before.contact_force_n if start_force_n is None else start_force_n
+    free = skin.load_displacement @ (normal_n, shear_n)
+    force, steps = solve_contact(skin.compliance, free, before.along_mm, friction, start)
+    n = len(before.along_mm)
+    return ContactState(normal_n, shear_n, force, skin.compliance[n:] @ force + free[n:], steps)
+
+
+def states_along(
+    skin: CondensedSkin, normal_n: float, shear_n: Iterable[float], *, friction: float | None = None
+) -> list[ContactState]:
+    """Return one state per shear force along a path; the normal force is applied first, to the unloaded skin.
+
+    Friction depends on the path: the paper's steps are 0.1 N.
+    """
+    state = apply_load(skin, unloaded(skin), normal_n, 0.0, friction=friction)
+    states = []
+    for shear in shear_n:
+        state = apply_load(skin, state, normal_n, float(shear), friction=friction)
+        states.append(state)
+    return states
+
+
+def midline_strain(skin: CondensedSkin, state: ContactState) -> FloatArray:
+    """Return the (m,) circumferential strain at mid-thickness, at the angles `skin.midline_deg`."""
+    strain: FloatArray = skin.strain_of_contact @ state.contact_force_n
+    strain += skin.load_strain @ (state.normal_n, state.shear_n)
+    return strain
+
+
+def gauge_strains(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatArray:
+    """Return the (states, 2) mean circumferential strains of the two gauges."""
+    return np.array([skin.gauge_weights @ midline_strain(skin, state) for state in states])
+
+
+def solve_contact(
+    compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float, start: FloatArray
+) -> tuple[FloatArray, int]:
+    """Return the contact forces (2n,) in N of one increment, and the number of Newton steps.
+
+    `compliance` (2n, 2n) mm/N, `displacement` (2n,) mm without contact, `along_before` (n,) mm at the previous
+    increment, `start` (2n,) N. Raises ContactError where no solution is found.
+    """
+    if not (np.isfinite(displacement).all() and np.isfinite(start).all()):
+        raise ContactError("The skin's load is not a number; give its normal and shear force in N.")
+    problem = _Problem(compliance, displacement, along_before, friction)
+    rng = np.random.default_rng(0)
+    force, steps, found = _newton(problem, start)
+    for attempt in range(RESTARTS):
+        if found:
+            break
+        # The guesses repeat: restart where each node meets its own conditions, or at random.
+        start = rng.normal(0.0, abs(force).max(), len(force)) if attempt % 2 else problem.relaxed(force)
+        force, more, found = _newton(problem, start)
+        steps += more
+    if not found:
+        raise ContactError(
+            f"The contact of the skin did not converge in {steps} steps at a friction of {friction}; "
+            "apply the load in smaller steps."
+        )
+    return force, steps
+
+
+def _newton(problem: "_Problem", force: FloatArray) -> tuple[FloatArray, int, bool]:
+    """Return the forces reached from one start, the number of steps, and whether they meet the conditions."""
+    weight = 0
+    residual, guess = problem.residual(force, WEIGHTS[weight])
+    smallest = np.finfo(np.float64).tiny
+    for step in range(MAX_STEPS):
+        size = np.linalg.norm(residual)
+        if size <= max(TOLERANCE * abs(force).max(), smallest):
+            return force, step, True
+        towards = problem.solve(guess) - force
+        length = 1.0
+        while length >= SHORTEST_STEP:
+            new_residual, new_guess = problem.residual(force + length * towards, WEIGHTS[weight])
+            if np.linalg.norm(new_residual) <= (1 - 1e-4 * length) * size:
+                break
+            length /= 2
+        else:
+            length, weight = 1.0, (weight + 1) % len(WEIGHTS)
+            new_residual, new_guess = problem.residual(force + towards, WEIGHTS[weight])
+        force, residual, guess = force + length * towards, new_residual, new_guess
+    return force, MAX_STEPS, False
+
+
+class _Guess(NamedTuple):
+    touching: BoolArray
+    # Sign of λ_t where a node slips, 0 where it sticks; meaningless at a node that does not touch.
+    slipping: FloatArray
+
+
+class _Problem:
+    def __init__(
+        self, compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float
+    ) -> None:
+        self.n = len(along_before)
+        self.compliance = compliance
+        self.displacement = displacement
+        self.along_before = along_before
+        self.friction = friction
+        # Scales displacements to forces; any positive number gives the same solution.
+        self.stiffness = 1 / np.diag(compliance)
+
+    def residual(self, force: FloatArray, weight: float) -> tuple[FloatArray, _Guess]:
+        """Return Φ (2n,) in N, and the piece of Φ that contains the forces."""
+        n = self.n
+        moved = self.compliance @ force + self.displacement
+        moved[n:] -= self.along_before
+        trial = force - weight * self.stiffness * moved
+        pressing = np.maximum(trial[:n], 0.0)
+        bound = self.friction * pressing
+        wanted = np.concatenate([pressing, np.clip(trial[n:], -bound, bound)])
+        slipping = np.sign(trial[n:]) * (abs(trial[n:]) >= bound)
+        return force - wanted, _Guess(trial[:n] > 0, slipping)
+
+    def relaxed(self, force: FloatArray) -> FloatArray:
+        """Return the forces after some rounds in which each node in turn meets its own conditions (Gauss-Seidel)."""
+        n, force = self.n, force.copy()
+        for _ in range(SWEEPS):
+            for node in range(n):
+                force[node] = max(self._alone(force, node, 0.0), 0.0)
+                bound = self.friction * force[node]
+                force[n + node] = min(max(self._alone(force, n + node, self.along_before[node]), -bound), bound)
+        return force
+
+    def _alone(self, force: FloatArray, row: int, before_mm: float) -> float:
+        """Return the force component that, with all others fixed, moves its node back to its previous place."""
+        moved_mm = self.compliance[row] @ force + self.displacement[row] - before_mm
+        return float(force[row] - self.stiffness[row] * moved_mm)
+
+    def solve(self, guess: _Guess) -> FloatArray:
+        """Return the forces of a guess: u_n = 0 where touching; there u_t as before or λ_t = ±μ λ_n."""
+        n, nodes = self.n, np.flatnonzero(guess.touching)
+        sticking = n + nodes[guess.slipping[nodes] == 0]
+        slip = self.friction * guess.slipping[nodes]
+        rows = np.concatenate([nodes, sticking])
+        by_pressing = self.compliance[np.ix_(rows, nodes)] + self.compliance[np.ix_(rows, n + nodes)] * slip
+        matrix = np.hstack([by_pressing, self.compliance[np.ix_(rows, sticking)]])
+        wanted = -self.displacement[rows]
+        wanted[len(nodes) :] += self.along_before[sticking - n]
+        try:
+            solution = np.linalg.solve(matrix, wanted)
+        except np.linalg.LinAlgError as error:
+            raise ContactError(
+                f"At a friction of {self.friction} the sliding skin wedges: its equations are singular."
+            ) from error
+        force = np.zeros(2 * n)
+        force[nodes] = solution[: len(nodes)]
+        force[n + nodes] = slip * force[nodes]
+        force[sticking] = solution[len(nodes) :]
+        return force

@@ -33,7 +33,7 @@ from shearloop.bank.eit.channels import line_of_channels
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.messaging.request import request
 from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
 from shearloop.drivers.eit_line import TRANSFER_NS
 
@@ -232,7 +232,7 @@ def estimator_latency(rig: Path, sides: Sequence[str], n_frames: int, pause_s: f
     recorded = read_recording(rig / RIG_RECORDING).sides
     frames = slice(FIRST_FRAME, FIRST_VALID_FRAME + n_frames)
     lines = {side: [line_text(one) for one in recorded[side].lines[frames]] for side in sides}
-    taken: dict[str, list[float]] = {source: [] for source in ((*sides, BOTH) if len(sides) > 1 else sides)}
+    taken: dict[str, list[float]] = {source: [] for source in ((*sides, COMBINED) if len(sides) > 1 else sides)}
     missed = dict.fromkeys(taken, 0)
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
@@ -251,7 +251,7 @@ def estimator_latency(rig: Path, sides: Sequence[str], n_frames: int, pause_s: f
             }
         }
         if len(sides) > 1:
-            content[BOTH] = {"calibration": str((rig / RIG_BOTH_CALIBRATION).resolve())}
+            content[COMBINED] = {"calibration": str((rig / RIG_BOTH_CALIBRATION).resolve())}
         opened.enter_context(running_daemon(write_config(folder, **content)))
         estimates = opened.enter_context(subscription(folder, "eit.estimate"))
         estimates.setsockopt(zmq.RCVTIMEO, 1000)
@@ -263,7 +263,7 @@ def estimator_latency(rig: Path, sides: Sequence[str], n_frames: int, pause_s: f
                 # Two boards do not keep step.
                 time.sleep(0.5 * pause_s / len(sides))
                 sent_ns = board.send_in_packets(lines[side][number])
-                awaited = {side, BOTH} if side == sides[-1] and len(sides) > 1 else {side}
+                awaited = {side, COMBINED} if side == sides[-1] and len(sides) > 1 else {side}
                 while awaited:
                     try:
                         arrived_ns, estimate = receive(estimates)

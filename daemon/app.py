@@ -30,16 +30,12 @@ from shearloop.daemon.recording.identity import Attached, identity_of, notes_of
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import Rig, make_load_cell
 from shearloop.daemon.rig_check import checked_experiment
-from shearloop.daemon.sensing.both import BOTH, CombinedFingertipTask
-from shearloop.daemon.sensing.estimation import EstimatorTask
-from shearloop.daemon.sensing.fingertip import FingertipTask
+from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator, torque_sources
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertipTask, EstimatorTask, FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
-from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
 from shearloop.daemon.sensing.skin_setup import make_skin
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
-from shearloop.daemon.sensing.torque_sources import torque_sources
-from shearloop.daemon.sensing.tracking import TrackedEstimator
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
 from shearloop.drivers.eit_kit import EitKit
@@ -59,8 +55,8 @@ class Daemon:
         self._rig: Rig | None = None
         self._experiment: ConfiguredExperiment | None = None
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
-        both = open_both(config.both, config.fingertips) if config.both is not None else None
-        sources = torque_sources(config, estimators, both)
+        combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
+        sources = torque_sources(config, estimators, combined)
         checked_experiment(config, sources)
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
@@ -73,7 +69,7 @@ class Daemon:
             self._recorder = _recorder(config, self.publisher, self._clock, self._busy, self._recording_failed)
             if self._recorder is not None:
                 opened.callback(self._recorder.close)
-            self._wire(estimators, both, sources)
+            self._wire(estimators, combined, sources)
             self.health = self._make_health()
             commands = self._make_commands()
             self._commands = CommandServer(context, config.commands, commands.handlers(), keys)
@@ -86,7 +82,10 @@ class Daemon:
             self._close = opened.pop_all().close
 
     def _wire(
-        self, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None, sources: Mapping[str, TorqueSource]
+        self,
+        estimators: Mapping[str, LiveEstimator],
+        combined: LiveEstimator | None,
+        sources: Mapping[str, TorqueSource],
     ) -> None:
         """Make the task of every device and of every estimator; none is opened yet."""
         config = self._config
@@ -112,40 +111,47 @@ class Daemon:
         self._skin: SkinTask | None = None
         if config.skin is not None:
             self._skin = make_skin(config.skin, self.publisher, self._clock, hear, self._tap)
-        diameters = FingertipDiameters(BOTH)
+        diameters = FingertipDiameters(COMBINED)
         if self._rig is not None and self._rig.gripper is not None:
-            self._rig.gripper.fingertips_say = diameters.at
+            self._rig.gripper.fingertips_say = diameters.latest
 
-        def estimation(name: str, estimator: AnyEstimator, period_s: Callable[[], float]) -> EstimatorTask:
-            made = EstimatorTask(
-                name, estimator, self.publisher, self._clock, period_s, hear, diameters.hear, self._tap(name)
+        gripper = self._rig.gripper if self._rig is not None else None
+
+        def estimator_task(name: str, estimator: LiveEstimator, period_s: Callable[[], float]) -> EstimatorTask:
+            return EstimatorTask(
+                name,
+                estimator,
+                self.publisher,
+                self._clock,
+                period_s=period_s,
+                on_torque=hear,
+                on_diameter=diameters.update,
+                held_tool=gripper.held_tool if gripper is not None else lambda _: None,
+                on_raw=self._tap(name),
             )
-            if self._rig is not None and self._rig.gripper is not None:
-                made.held_tool = self._rig.gripper.held_tool
-            return made
 
-        self._both: CombinedFingertipTask | None = None
-        if both is not None:
-            period_s = config.fingertips[both.sides[0]].frame_period_s
-            self._both = CombinedFingertipTask(estimation(BOTH, both, lambda: period_s), both.sides, period_s)
+        self._combined: CombinedFingertipTask | None = None
+        if combined is not None:
+            period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
+            self._combined = CombinedFingertipTask(estimator_task(COMBINED, combined, lambda: period_s), period_s)
 
-        def fingertip(name: str, estimator: AnyEstimator) -> FingertipTask:
-            board = _board(config.fingertips[name], name, self._link_of(name), self._tap(name), self._both)
+        def fingertip(name: str, estimator: LiveEstimator) -> FingertipTask:
+            board = _board(config.fingertips[name], name, self._link_of(name), self._tap(name), self._combined)
             return FingertipTask(
                 board,
-                estimation(name, estimator, lambda: board.period_s),
+                estimator_task(name, estimator, lambda: board.period_s),
                 self.publisher,
-                **({"room": self._both.room} if self._both is not None and name in self._both.sides else {}),
+                self._combined,
                 always_heatmap=config.fingertips[name].heatmap == "always",
             )
 
         self._fingertips = {name: fingertip(name, estimator) for name, estimator in estimators.items()}
-        self._estimations = {name: task.estimation for name, task in self._fingertips.items()}
-        if self._both is not None:
-            self._estimations[BOTH] = self._both.estimation
+        self._estimators = {name: task.estimator_task for name, task in self._fingertips.items()}
+        if self._combined is not None:
+            self._estimators[COMBINED] = self._combined.estimator_task
 
     def _make_commands(self) -> Commands:
-        tares: dict[str, Callable[[], None]] = {name: one.tare for name, one in self._estimations.items()}
+        tares: dict[str, Callable[[], None]] = {name: one.tare for name, one in self._estimators.items()}
         if self._skin is not None:
             tares[SKIN] = self._skin.tare
         if self._load_cell is not None:
@@ -165,8 +171,8 @@ class Daemon:
         health = HealthReporter(self.publisher, self.supervisor, self._clock)
         for name, task in self._fingertips.items():
             health.add(name, task.facts)
-        if self._both is not None:
-            health.add(BOTH, self._both.facts)
+        if self._combined is not None:
+            health.add(COMBINED, self._combined.facts)
         if self._skin is not None:
             health.add(SKIN, self._skin.facts)
             health.add(SKIN_SOURCE, self._skin.source_facts)
@@ -238,8 +244,8 @@ class Daemon:
         for name, task in self._fingertips.items():
             yield supervised(name, task.read)
             yield supervised(f"{name}.estimator", task.estimate)
-        if self._both is not None:
-            yield supervised(BOTH, self._both.estimate)
+        if self._combined is not None:
+            yield supervised(COMBINED, self._combined.estimator_task.run)
         if self._skin is not None:
             yield supervised(SKIN, self._skin.read)
             yield supervised(SKIN_SOURCE, self._skin.watch_source)
@@ -314,7 +320,7 @@ class Daemon:
         return {"errors": dict(refused)}
 
     async def _tare_to_the_end(self) -> str:
-        tares = [one.tare_to_the_end() for one in self._estimations.values()]
+        tares = [one.tare_and_wait() for one in self._estimators.values()]
         if self._skin is not None:
             tares.append(self._skin.zero())
         return " ".join(filter(None, await asyncio.gather(*tares)))
@@ -340,7 +346,7 @@ def _board(
     name: str,
     on_event: Callable[[LinkEvent], None],
     tap: Tap,
-    both: CombinedFingertipTask | None,
+    combined: CombinedFingertipTask | None,
 ) -> EitKit:
     return EitKit(
         path=config.device.path,
@@ -349,7 +355,7 @@ def _board(
         frame_period_s=config.frame_period_s,
         on_event=on_event,
         tap=tap,
-        **({"on_frame": partial(both.take, name)} if both is not None else {}),
+        **({"on_frame": partial(combined.on_frame, name)} if combined is not None else {}),
     )
 
 

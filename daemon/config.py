@@ -22,7 +22,7 @@ from shearloop.daemon.messaging.addresses import (
 # for it: its torque for the load cell's that supervises it, its zero for the other's.
 TAKEN_NAMES = frozenset(
     (
-        *("load_cell", "wrench", "skin", "both", "robot", "gripper", "loop", "experiment", "recording", "slices"),
+        *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording", "slices"),
         *("commands", "open_stop", "keys", "health", "log", "shown", "daemon", "clock"),
     )
 )
@@ -59,7 +59,7 @@ class SerialDevice(ConfigModel):
         return self
 
 
-EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "fused"]
+EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "motion_regression"]
 
 
 class CreepConfig(ConfigModel):
@@ -238,8 +238,8 @@ class DaemonConfig(ConfigModel):
     fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], FingertipConfig] = Field(
         default_factory=dict
     )
-    both: CombinedConfig | None = Field(
-        None, description="an estimate from both fingertips together, published as `both`"
+    combined: CombinedConfig | None = Field(
+        None, description="an estimate from both fingertips together, published as `combined`"
     )
     skin: SkinConfig | None = None
     load_cell: LoadCellConfig | None = None
@@ -262,8 +262,8 @@ class DaemonConfig(ConfigModel):
             raise ValueError(
                 f"a fingertip cannot be named {taken[0]!r}, as another part of the daemon is: try right or left"
             )
-        if self.both is not None and len(self.fingertips) < 2:
-            raise ValueError("`both` needs two `fingertips`, named as the sides of its calibration: right and left")
+        if self.combined is not None and len(self.fingertips) < 2:
+            raise ValueError("`combined` needs two `fingertips`, named as the sides of its calibration: right and left")
         for key, address in self.network_addresses.items():
             if self.curve is None:
                 raise ValueError(open_to_the_network(address, key))

@@ -14,7 +14,7 @@ from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_so
 from shearloop.daemon.links import log_event, log_link
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.rig_check import read_experiment
-from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.drivers.calibration_file import load_calibration
 from shearloop.drivers.hx711 import LoadCalibration
@@ -121,7 +121,11 @@ class Rig:
         robot = read_settings(config.robot)
         sources[WRENCH] = wrench_source(robot.rate_hz)
         required = ("robot", "gripper") if config.gripper is not None else ("robot",)
-        creep = {name: tip.creep for name, tip in (*config.fingertips.items(), (BOTH, config.both)) if tip is not None}
+        creep = {
+            name: tip.creep
+            for name, tip in (*config.fingertips.items(), (COMBINED, config.combined))
+            if tip is not None
+        }
         gels = {name: Creep(own.share, own.time_s) for name, own in creep.items() if own is not None}
         self.brain = ControlLoop(config.loop, sources, required, gels)
         self.gripper = None

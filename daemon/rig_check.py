@@ -17,7 +17,7 @@ from shearloop.daemon.control.experiment_schema import (
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 from shearloop.daemon.sensing.skin_task import SKIN
 
@@ -78,7 +78,7 @@ def _held_unknown(file: ExperimentFile) -> int | None:
 def _why_not(drive: str, config: DaemonConfig) -> str:
     if drive in config.fingertips and config.fingertips[drive].calibration is None:
         return "is a fingertip without a calibration, which has no torque: add `calibration`, or take another"
-    if drive in config.fingertips or (drive == BOTH and config.both is not None):
+    if drive in config.fingertips or (drive == COMBINED and config.combined is not None):
         return (
             "has a calibration of diameters alone: calibrate on a recording of one tool with the load cell beside, or "
             "take another"

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.design import ALLOWED, Choice, Design, Scene, designed
 from shearloop.bank.estimation.fingertip_validator import channel_noise
-from shearloop.bank.estimation.grip_segmentation import gripped_part
+from shearloop.bank.estimation.grip_segmentation import segment_grip
 from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
 from shearloop.daemon.analysis.series import read_series
@@ -34,7 +34,7 @@ def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> t
     if not series:
         raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
     # Slices do not tell their side, and are not asked for it above.
-    one = series[0] if sides is None else series[0].of_sides(sides)
+    one = series[0] if sides is None else series[0].select_sides(sides)
     return path, designed(scene_of(one), load_yaml_model(path, FingertipGeometryConfig).fingertip())
 
 
@@ -44,7 +44,7 @@ def scene_of(series: FrameSeries) -> Scene:
     if series.kind == "difference":
         frames = series.channels[:, 0]
         return Scene(frames, residual_noise(frames), torque if np.isfinite(torque).all() else None)
-    idle, gripped, _ = gripped_part(series)
+    idle, gripped, _ = segment_grip(series)
     frames = series.channels[gripped, 0]
     # A recording that begins gripped has no idle frame: its first frame stands in.
     before = series.channels[idle, 0] if idle.stop > 0 else series.channels[:1, 0]

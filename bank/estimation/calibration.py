@@ -20,7 +20,7 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.eit.polynomial import Polynomial
-from shearloop.bank.eit.stored import check_made_with, check_version, replaced
+from shearloop.bank.eit.stored import check_made_with, check_version
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
@@ -36,6 +36,7 @@ from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import ChannelImputer
 from shearloop.bank.estimation.session_state import TemporalFeatures
 from shearloop.bank.estimation.values import Kind
+from shearloop.files import replace_file
 
 FORMAT_VERSION = 4
 # First bytes of a zip that is not empty.
@@ -56,7 +57,7 @@ _ASSUMPTION_TEXTS: dict[Assumption, str] = {
 }
 # Columns of the paper's features (k, sigma, sigma²).
 PAPER_COLUMNS: dict[Quantity, slice] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
-_TORQUE_DEGREE, _DIAMETER_DEGREE = 2, 1
+TORQUE_DEGREE, DIAMETER_DEGREE = 2, 1
 # Two cells of the paper's bank.
 _LEAST_MARGIN_K_CM = 0.05
 # A tool whose diameter differs by a larger share is another tool.
@@ -142,7 +143,7 @@ class Calibration:
 
         return cls(
             "paper", "raw", (), source, bank_identity, np.ones((1, N_CHANNELS)),
-            torque=model("sigma", _TORQUE_DEGREE, torque), diameter=model("k", _DIAMETER_DEGREE, diameter),
+            torque=model("sigma", TORQUE_DEGREE, torque), diameter=model("k", DIAMETER_DEGREE, diameter),
         )  # fmt: skip
 
     @property
@@ -170,7 +171,7 @@ class Calibration:
         }
         text = yaml.safe_dump(header, sort_keys=False, allow_unicode=True, width=120).encode()
         try:
-            with replaced(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+            with replace_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
                 for name, data in {_HEADER: text, **members}.items():
                     archive.writestr(zipfile.ZipInfo(name, _DATE), data)
         except OSError as error:

@@ -193,12 +193,8 @@ def _report_timing(
     doubts = [
         f"{name}: {why}" for name, one in named if one in references and (why := load_delay_warning(one, find_delay))
     ]
-    report.sentences += [f"Warning: {doubt}." for doubt in doubts]
-    report.result |= {
-        "load_cell_delay_s": delays_s,
-        "load_cell_warnings": doubts,
-        "timing_uncertainty_s": uncertainty_s,
-    }
+    report.sentences.extend(f"Warning: {doubt}." for doubt in doubts)
+    report.result.update(load_cell_delay_s=delays_s, load_cell_warnings=doubts, timing_uncertainty_s=uncertainty_s)
     torque = report.calibration.torque
     if torque is not None and uncertainty_s and isinstance(torque.regressor, IntervalRegressor):
         report.result["widening"] = widening = round(torque.regressor.timing_widening, 2)

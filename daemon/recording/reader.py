@@ -25,7 +25,7 @@ from shearloop.daemon.recording.schema import (
     METADATA,
     input_topic,
 )
-from shearloop.daemon.sensing.tool_diameter import from_text
+from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
 from shearloop.drivers.raw_event import InputKind
 
 # What every recording says of itself, beside the notes of this one.
@@ -110,7 +110,7 @@ def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel
                 side = channel.topic.removeprefix(f"{FRAME_TOPIC}.")
                 frames.setdefault(side, []).append((message.log_time, int(content["arrival_unix_ns"]), line))
             else:
-                tools.append((message.log_time, from_text(input_of(content).data)[1]))
+                tools.append((message.log_time, tool_from_bytes(input_of(content).data)[1]))
         except (KeyError, TypeError, ValueError) as error:
             raise _unusable(path, f"a message on {channel.topic} is not what its schema says ({error!r})") from error
     torques.sort(key=lambda pair: pair[0])

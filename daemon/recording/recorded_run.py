@@ -29,7 +29,7 @@ from shearloop.daemon.recording.schema import (
     input_topic,
     schema_of,
 )
-from shearloop.daemon.sensing.tool_diameter import from_text
+from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
 from shearloop.drivers.raw_event import InputKind, RawEvent
 
 Model = TypeVar("Model", bound=ConfigModel)
@@ -52,7 +52,7 @@ class ReplayEvents:
         if told.kind is InputKind.TARE and told.data.isdigit():
             self.tares.setdefault(source, set()).add(int(told.data))
         elif told.kind is InputKind.TOOL:
-            frame, tool = from_text(told.data)
+            frame, tool = tool_from_bytes(told.data)
             self.tools.setdefault(source, {})[frame] = tool
 
     def note_frame(self, source: str, content: Mapping[str, Any]) -> None:

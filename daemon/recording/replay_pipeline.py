@@ -4,17 +4,14 @@ import asyncio
 from dataclasses import replace
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
-from shearloop.bank.estimation.pairing import Pairing
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, LoadTorque, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording.recorded_run import ReplayEvents
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.sensing.both import BOTH
-from shearloop.daemon.sensing.estimation import estimate_message
-from shearloop.daemon.sensing.fingertip import frame_message
+from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.fingertip_task import FramePairing, estimate_message, frame_message
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
-from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
 from shearloop.daemon.sensing.skin_setup import RecordedSkin
 from shearloop.daemon.sensing.skin_task import SKIN
 from shearloop.drivers.eit_line import Frame, FrameParser
@@ -35,13 +32,14 @@ class ReplayPipeline:
         # By how much the numbers of a source's frames are higher than counted here, and up to which tools were told.
         self._before: dict[str, int] = {}
         self._told: dict[str, int] = {}
-        self._estimators: dict[str, AnyEstimator] = {
+        self._estimators: dict[str, LiveEstimator] = {
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
-        self._pairing: Pairing[Frame] | None = None
-        if config.both is not None:
-            self._estimators[BOTH] = both = open_both(config.both, config.fingertips)
-            self._pairing = Pairing(both.sides, round(config.fingertips[both.sides[0]].frame_period_s * 1e9))
+        self._pairing: FramePairing[Frame] | None = None
+        if config.combined is not None:
+            self._estimators[COMBINED] = combined = open_combined(config.combined, config.fingertips)
+            sides = combined.calibration.sides
+            self._pairing = FramePairing(sides, round(config.fingertips[sides[0]].frame_period_s * 1e9))
         self._lines = {
             name: FrameParser(ZERO_SLOTS, nominal_period_ns=round(fingertip.frame_period_s * 1e9))
             for name, fingertip in config.fingertips.items()
@@ -69,9 +67,9 @@ class ReplayPipeline:
             for frame in self._as_numbered(source, self._lines[source].take(told)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
-                pair = self._pairing.take(source, frame.t_mid_ns, frame) if self._pairing is not None else None
+                pair = self._pairing.add(source, frame.t_mid_ns, frame) if self._pairing is not None else None
                 if pair is not None:
-                    await self._estimate(BOTH, *pair[1])
+                    await self._estimate(COMBINED, *pair[1])
         elif source == LOAD_CELL and self._load is not None:
             for sample in self._load.take(told):
                 self._publisher.publish(load_message(sample))
@@ -95,9 +93,9 @@ class ReplayPipeline:
         tools = self._asides.tools.get(source, {})
         due = [first for first in tools if self._told.get(source, -1) < first <= number]
         if due:
-            estimator.hold(tools[max(due)])
+            estimator.set_tool(tools[max(due)])
         self._told[source] = number
-        reading = await asyncio.to_thread(estimator.update, *frames)  # type: ignore[arg-type]  # one a side
+        estimate = await asyncio.to_thread(estimator.estimate, *frames)
         # The recording's own time: how long it took then is in the recording, and here it took none of it.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)
-        self._publisher.publish(estimate_message(source, frames, reading, arrival_ns))
+        self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))

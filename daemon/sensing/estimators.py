@@ -1,6 +1,5 @@
 """Estimators of the daemon: opened from the configuration, and run on the boards' frames. No I/O but the files."""
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -63,6 +62,12 @@ class LiveEstimator:
     def measures_torque(self) -> bool:
         """Whether it gives torques, and not only diameters or the bank match."""
         return self.calibration.torque is not None
+
+    @property
+    def assumptions(self) -> str:
+        """The user's guarantees behind the calibration as the end of a sentence, empty without any."""
+        text = self.calibration.assumption_text
+        return f", assuming that {text}" if text else ""
 
     @property
     def grids(self) -> tuple[FloatArray, FloatArray] | None:

@@ -142,9 +142,7 @@ class EstimatorTask:
         now_ns = self._clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
         lag_ns = round(1e9 * estimate.lag_s)
-        self._on_torque(
-            TorqueSample(self.name, estimate.torque_nm, message.why, message.t_mono_ns - lag_ns, now_ns)
-        )
+        self._on_torque(TorqueSample(self.name, estimate.torque_nm, message.why, message.t_mono_ns - lag_ns, now_ns))
         if self._on_diameter is not None:
             self._on_diameter(self.name, _diameter(estimate), now_ns)
         self._publisher.publish(message)

@@ -7,10 +7,10 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
 from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import Calibration
 
 BANK = "ab" * 32
 SIGMA, K = np.linspace(1.2, 1.9, 30), np.linspace(3.4, 3.8, 12)

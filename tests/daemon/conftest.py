@@ -13,7 +13,7 @@ import yaml
 import zmq
 
 from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
-from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.estimation import Calibration
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60

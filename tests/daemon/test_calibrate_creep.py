@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import Estimate, FrameSeries
-from shearloop.daemon.analysis.evaluation import EstimateTrack
-from shearloop.daemon.analysis.grips import grips_of
+from shearloop.daemon.analysis.evaluate import EstimateTrack, grips_of
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import CreepConfig
 from tests.daemon.control.test_creep import twisted

@@ -18,8 +18,8 @@ import yaml
 import zmq.asyncio
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.models import MODELS
+from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank.build import MODELS as MODELS_IN_HELP
@@ -28,7 +28,7 @@ from shearloop.daemon.cli.message_lines import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.sensing.both import BOTH
+from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 
 Write = Callable[..., Path]
@@ -107,7 +107,7 @@ async def test_no_fingertip_bears_the_name_of_another_part(config: Write, tmp_pa
         daemon.stop()
         await daemon.run()
     assert {"right", "right.estimator", "robot", "gripper", "loop", "load_cell", "recording", "health"} <= names
-    assert (names | {BOTH, SKIN, WRENCH}) - TAKEN_NAMES == {"right", "right.estimator"}
+    assert (names | {COMBINED, SKIN, WRENCH}) - TAKEN_NAMES == {"right", "right.estimator"}
 
 
 def fingertip(**changes: Any) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def test_a_calibration_of_another_bank_is_refused_by_name(
 ) -> None:
     import numpy as np
 
-    from shearloop.bank.eit.calibration import Calibration
+    from shearloop.bank.estimation import Calibration
 
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)

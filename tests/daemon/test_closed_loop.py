@@ -14,7 +14,7 @@ import zmq.asyncio
 from aiohttp import web
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.request import request

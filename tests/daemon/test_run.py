@@ -221,7 +221,7 @@ async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_h
 async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
     config: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from shearloop.daemon.sensing.estimator import Estimator
+    from shearloop.daemon.sensing.estimators import Estimator
 
     quickly = Estimator.quickly
     deaths = iter([True])

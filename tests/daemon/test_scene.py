@@ -13,7 +13,7 @@ from shearloop.bank.eit.design import Scene, designed
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.bank_match import NOT_TURNED, NearestCell
+from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
 from shearloop.daemon.bank_config import FingertipGeometryConfig, load_bank_plan, load_geometry
@@ -59,7 +59,7 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Pat
     assert plan.model == "step"
     assert len(plan.sigma_grid) == 1
     build_bank(plan.mesh, plan.model, plan.k_grid, plan.sigma_grid, tmp_path / "step.bank")
-    place = NearestCell(Bank.open(tmp_path / "step.bank"), NOT_TURNED).locate(frames[4])
+    place = RefinedMatcher(Bank.open(tmp_path / "step.bank"), NOT_TURNED).locate(frames[4])
     assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.k_grid)[0]
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
 from shearloop.bank.eit.channels import smoothed_along_channels
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.grouping import group_means, kmeans_groups, place_in_series
@@ -27,6 +26,7 @@ from shearloop.bank.eit.model_scores import (
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError, MatchingError
+from shearloop.bank.estimation.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
 from shearloop.daemon.recording.matlab_streams import DiameterSlices, TorqueSlices
 
 # Called with how many slices have been matched since the last call.

@@ -7,9 +7,9 @@ from typing import Any
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import Calibration
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, ModelScores, TorqueResult, all_notes
 from shearloop.daemon.analysis.reproduce.banks import Grid
 
@@ -157,10 +157,10 @@ def save_calibrations(found: Reproduction, banks: dict[str, Bank], recordings: P
     for name, (bank, points) in fits.items():
         source = f"{name.split('_')[0]} slices of {recordings.name}, on the {bank} bank"
         try:
-            calibration = Calibration.fit(banks[bank].identity, source, **points)
+            calibration = Calibration.from_matches(banks[bank].identity, source, **points)
         except CalibrationError:  # told in the notes already
             continue
-        written.append(folder / f"calibration_{name}.yaml")
+        written.append(folder / f"calibration_{name}.cal")
         calibration.save(written[-1])
     return written
 

@@ -1,4 +1,4 @@
-"""`shearloop calibrate creep REC… --calibration CAL`: what a gel's torque loses under a held twist."""
+"""`shearloop calibrate creep REC… --calibration CAL`: fit the gel's creep under a held twist."""
 
 import argparse
 from pathlib import Path
@@ -10,32 +10,22 @@ from shearloop.daemon.cli.output import print_result
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument(
-        "recordings",
-        nargs="+",
-        type=Path,
-        metavar="REC",
-        help="recordings (.mcap) of twists that are held; best of ten twists",
+        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) of held twists, best ten"
     )
     parser.add_argument(
-        "--calibration",
-        type=Path,
-        required=True,
-        metavar="CAL",
-        help="calibration of the estimator that is to drive the loop",
+        "--calibration", type=Path, required=True, metavar="CAL", help="calibration of the estimator for the loop"
     )
-    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank the calibration was made with, if any")
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank of the calibration, if any")
     add_json(parser)
-    parser.epilog = "Prints the line `creep:` for the fingertip, or for `both`, in the configuration."
+    parser.epilog = "Prints the line `creep:` for the fingertip, or for `combined`, in the configuration."
 
 
 def run(args: argparse.Namespace) -> int:
-    """Estimate every frame, fit, and say what to write into the configuration."""
+    """Estimate every frame, fit, and print the line for the configuration."""
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.bank.estimation import Calibration
-    from shearloop.daemon.analysis.copies import check_no_copies, check_paths_differ
-    from shearloop.daemon.analysis.evaluation import follow
-    from shearloop.daemon.analysis.grips import grips_of
-    from shearloop.daemon.analysis.series import read_series
+    from shearloop.daemon.analysis.evaluate import estimate_series, grips_of
+    from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, read_series
     from shearloop.daemon.cli.recorded import check_kind
     from shearloop.daemon.control.creep import fit_creep
 
@@ -46,10 +36,10 @@ def run(args: argparse.Namespace) -> int:
     series = [one for _, one in named]
     check_kind(args.calibration, calibration, series)
     check_no_copies(named)
-    grips = [grip for one in series for grip in grips_of(follow(calibration, one, bank))]
+    grips = [grip for one in series for grip in grips_of(estimate_series(calibration, one, bank))]
     found = fit_creep(grips)
     share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
-    told = {
+    result = {
         "share": share,
         "time_s": time_s,
         "grips": len(grips),
@@ -61,11 +51,11 @@ def run(args: argparse.Namespace) -> int:
     }
     sentences = [
         f"creep: {{share: {share:g}, time_s: {time_s:g}}}",
-        f"From {told['frames']} frames of {len(grips)} grips: estimates, times {found.scale:.3f} and "
-        f"{1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} mN·m instead of "
+        f"From {result['frames']} frames of {len(grips)} grips: the estimates, scaled by {found.scale:.3f} and shifted "
+        f"by {1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} mN·m instead of "
         f"{1e3 * found.before_nm:.1f} (standard deviation).",
-        "Scale and zero are no creep, and the line above does not mend them: where they are far from 1 and 0, "
-        "calibrate the estimator anew, and take the zero untouched.",
+        "The line above does not correct scale and zero. If the scale is far from 1, calibrate the estimator again; if "
+        "the shift is far from 0, tare untouched.",
     ]
-    print_result(told, sentences, as_json=args.json)
+    print_result(result, sentences, as_json=args.json)
     return 0

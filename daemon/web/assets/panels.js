@@ -27,13 +27,13 @@ export function markAge(panel, link, message) {
 // The sources of estimates, the one that drives the loop first, then the one of both fingertips.
 export function estimatesFirst(link) {
   const driving = link.get("loop.state")?.content.driving;
-  const rank = (source) => (source === driving ? 0 : source === "both" ? 1 : 2);
+  const rank = (source) => (source === driving ? 0 : source === "combined" ? 1 : 2);
   return link.sources("eit.estimate").sort((one, other) => rank(one) - rank(other));
 }
 
 // Whether an estimate is of one fingertip with a gel to draw, and not of two together.
 export function isFingertip(link, source) {
-  return source !== "both" || link.get("eit.heatmap", source) !== undefined;
+  return source !== "combined" || link.get("eit.heatmap", source) !== undefined;
 }
 
 // Torque, what is wanted, load cell and diameter. The estimate that drives the loop comes first.

@@ -8,25 +8,25 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import alignment as alignments
+from shearloop.bank.estimation import find_load_delay as alignments
 from shearloop.bank.estimation import fit
-from shearloop.bank.estimation.alignment import (
-    Alignment,
-    alignment,
-    check_alignment,
-    doubt,
+from shearloop.bank.estimation.grip_segmentation import segment_grip
+from shearloop.bank.estimation.interval_regressor import student_inflation
+from shearloop.bank.estimation.load_delay import (
+    LoadDelay,
+    check_load_delay,
+    find_load_delay,
     is_filtered,
-    telling,
-    torque_within,
-    unchecked_s,
+    load_delay_warning,
+    timing_references,
+    timing_uncertainty_s,
+    torque_bounds,
 )
-from shearloop.bank.estimation.grip_segmentation import gripped_part
-from shearloop.bank.estimation.intervals import for_few
 
 
 @pytest.mark.parametrize("late_s", [-2.0, -0.5, 0.0, 0.3, 1.0, 4.0])
 def test_lateness_is_measured_far_finer_than_a_frame(recorded, late_s):
-    found = alignment(replace(recorded, torque_t_s=recorded.torque_t_s + late_s))
+    found = find_load_delay(replace(recorded, torque_t_s=recorded.torque_t_s + late_s))
     assert found is not None
     assert found.late_s == pytest.approx(late_s, abs=0.03)
     assert 0 < found.error_s < 0.03
@@ -79,44 +79,44 @@ def test_what_is_late_depends_on_the_load_cell(recorded, taps, late_s, sound):
         torque_nm=recorded.torque_nm + noise(recorded.torque_nm, taps),
     )
     with nullcontext() if sound else pytest.raises(CalibrationError, match="by itself"):
-        check_alignment([late])
+        check_load_delay([late])
 
 
 def test_lateness_that_is_uncertain_is_not_refused(recorded, monkeypatch):
     late = replace(recorded, torque_t_s=recorded.torque_t_s + 0.4)
-    monkeypatch.setattr(alignments, "_of_side", lambda *_: Alignment(0.4, 0.1, 0.5))
-    check_alignment([late])
-    monkeypatch.setattr(alignments, "_of_side", lambda *_: Alignment(0.4, 0.02, 0.5))
+    monkeypatch.setattr(alignments, "_of_side", lambda *_: LoadDelay(0.4, 0.1, 0.5))
+    check_load_delay([late])
+    monkeypatch.setattr(alignments, "_of_side", lambda *_: LoadDelay(0.4, 0.02, 0.5))
     with pytest.raises(CalibrationError, match=r"0\.40 ± 0\.02 s before the load .* --load-late 0\.32"):
-        check_alignment([late])
+        check_load_delay([late])
 
 
 def test_nothing_is_said_where_no_load_changes_the_frames(recorded):
     noise = np.random.default_rng(0).normal(0, 1e-3, recorded.channels.shape)
-    assert alignment(replace(recorded, channels=recorded.channels[50] + noise)) is None
+    assert find_load_delay(replace(recorded, channels=recorded.channels[50] + noise)) is None
 
 
 def test_a_knocked_frame_does_not_hide_the_rest(recorded):
     knocked = recorded.channels.copy()
     knocked[[90, 140]] *= 1.5
-    found = alignment(replace(recorded, channels=knocked))
+    found = find_load_delay(replace(recorded, channels=knocked))
     assert found is not None
     assert abs(found.late_s) < 0.2
 
 
 def test_what_would_be_refused_is_doubted_and_so_is_a_clear_peak_of_few_frames(recorded, monkeypatch):
-    assert doubt(recorded) == ""
-    assert doubt(replace(recorded, torque_nm=0.0 * recorded.torque_nm)) == ""
+    assert load_delay_warning(recorded) == ""
+    assert load_delay_warning(replace(recorded, torque_nm=0.0 * recorded.torque_nm)) == ""
     late = replace(recorded, torque_t_s=recorded.torque_t_s + 0.8)
-    assert "s before the load that moves them is stamped" in doubt(late)
-    assert "too few" not in doubt(late)
-    gripped = len(recorded.t_s[gripped_part(recorded)[1]])
+    assert "s before the load that moves them is stamped" in load_delay_warning(late)
+    assert "too few" not in load_delay_warning(late)
+    gripped = len(recorded.t_s[segment_grip(recorded)[1]])
     monkeypatch.setattr(alignments, "_SURE_FRAMES", gripped + 1)
-    assert alignment(late) is None
-    check_alignment([late])
-    assert f"though {gripped} gripped frames are too few to be sure" in doubt(late)
+    assert find_load_delay(late) is None
+    check_load_delay([late])
+    assert f"though {gripped} gripped frames are too few to be sure" in load_delay_warning(late)
     monkeypatch.setattr(alignments, "_SUSPECT_EXPLAINED", 1.0)
-    assert doubt(late) == "", "a peak that is less high may be chance"
+    assert load_delay_warning(late) == "", "a peak that is less high may be chance"
 
 
 def unmoved(recorded):
@@ -126,12 +126,12 @@ def unmoved(recorded):
 
 
 def test_times_are_unchecked_where_no_recording_tells_or_only_roughly(recorded, monkeypatch):
-    assert unchecked_s([recorded]) == 0.0
-    assert unchecked_s([unmoved(recorded)]) == 0.75
-    assert unchecked_s([unmoved(recorded), recorded]) == 0.0, "one clock has stamped them all"
+    assert timing_uncertainty_s([recorded]) == 0.0
+    assert timing_uncertainty_s([unmoved(recorded)]) == 0.75
+    assert timing_uncertainty_s([unmoved(recorded), recorded]) == 0.0, "one clock has stamped them all"
     for error_s, unsure_s in ((0.05, 0.0), (0.2, 0.392), (2.0, 0.75)):
-        monkeypatch.setattr(alignments, "_of_side", lambda *_, e=error_s: Alignment(0.0, e, 0.5))
-        assert unchecked_s([recorded]) == pytest.approx(unsure_s, abs=1e-3)
+        monkeypatch.setattr(alignments, "_of_side", lambda *_, e=error_s: LoadDelay(0.0, e, 0.5))
+        assert timing_uncertainty_s([recorded]) == pytest.approx(unsure_s, abs=1e-3)
 
 
 def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
@@ -140,11 +140,11 @@ def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
     garbled = replace(recorded, channels=np.where(np.arange(896) == 3, np.nan, recorded.channels))
     away = recorded.between(0, 12)
     for beside in (dead, garbled, away):
-        assert telling([recorded], [beside]) == [recorded]
+        assert timing_references([recorded], [beside]) == [recorded]
         assert fit("fused", [recorded], "beside it", timed_by=[beside]).torque.reader.widened == 1.0
         still = unmoved(recorded)
-        assert telling([still], [beside]) == [still], "it says nothing, and is not to be blamed"
-        assert telling([still], [beside, recorded]) == [recorded]
+        assert timing_references([still], [beside]) == [still], "it says nothing, and is not to be blamed"
+        assert timing_references([still], [beside, recorded]) == [recorded]
 
 
 def test_each_recording_is_looked_at_once(recorded, monkeypatch):
@@ -153,18 +153,18 @@ def test_each_recording_is_looked_at_once(recorded, monkeypatch):
     fit("regression", [recorded], "alone")
     assert len(looked) == len(set(looked)) == len(recorded.sides)
     looked.clear()
-    aligned = cache(alignment)
+    aligned = cache(find_load_delay)
     fit("regression", [recorded], "and asked again", aligned=aligned)
     still = unmoved(recorded)
-    assert telling([still], [recorded], aligned) == [recorded]
-    assert (doubt(still, aligned), doubt(recorded, aligned)) == ("", "")
-    assert unchecked_s([still, recorded], aligned) == 0.0
+    assert timing_references([still], [recorded], aligned) == [recorded]
+    assert (load_delay_warning(still, aligned), load_delay_warning(recorded, aligned)) == ("", "")
+    assert timing_uncertainty_s([still, recorded], aligned) == 0.0
     assert len(looked) == len(set(looked)) == 2 * len(recorded.sides)
 
 
 def test_a_torque_within_some_time_is_any_from_the_least_to_the_largest(recorded):
     rising = replace(recorded, torque_t_s=np.array([0.0, 100.0]), torque_nm=np.array([0.0, 1.0]))
-    least, largest = torque_within(rising, 0.5)
+    least, largest = torque_bounds(rising, 0.5)
     inner = (recorded.t_s > 1) & (recorded.t_s < 99)
     np.testing.assert_allclose(least[inner], recorded.t_s[inner] / 100 - 0.005, atol=1e-9)
     np.testing.assert_allclose(largest[inner], recorded.t_s[inner] / 100 + 0.005, atol=1e-9)
@@ -176,7 +176,9 @@ def test_intervals_hold_what_times_that_could_not_be_checked_do_to_the_torque(re
     unchecked = fit("fused", [recorded], "unchecked").torque.reader
     vouched = fit("fused", [recorded], "vouched for", trust_times=True).torque.reader
     assert checked.widened == vouched.widened == 1.0
-    assert unchecked.widened > 1.1 * for_few(5), "blocks of few loads tell little, and other times' loads are wider"
+    assert unchecked.widened > 1.1 * student_inflation(5), (
+        "blocks of few loads tell little, and other times' loads are wider"
+    )
     assert unchecked.intervals.half_widths[-1] == pytest.approx(unchecked.widened * checked.intervals.half_widths[-1])
     np.testing.assert_array_equal(vouched.intervals.half_widths, checked.intervals.half_widths)
     np.testing.assert_array_equal(unchecked.head.weights, checked.head.weights)

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from shearloop.bank.errors import BankError, CalibrationError
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame, fit
-from shearloop.bank.estimation.archive import write_archive
-from shearloop.bank.estimation.calibrated import OutputModel
-from shearloop.bank.estimation.cylinders import Gripped, fit_cylinders
+from shearloop.bank.estimation.calibration import OutputModel, write_archive
+from shearloop.bank.estimation.fitting_raw import CylinderGrip, fit_cylinders
 from shearloop.bank.estimation.regressors import Ridge
 
 
@@ -77,7 +76,7 @@ def test_diameters_that_were_calibrated_on_single_frames_are_refused(tmp_path, f
     """They loaded, and another grip of a tool of 10 mm was read as 21, and called certain."""
     weights = np.random.default_rng(0).normal(size=fused_calibration.scale.size)
     frames = weights + np.linspace(-1.0, 1.0, 30)[:, None] * weights
-    grips = [Gripped(mm, frames + mm * weights, frames + mm * weights) for mm in (10.0, 25.0, 40.0)]
+    grips = [CylinderGrip(mm, frames + mm * weights, frames + mm * weights) for mm in (10.0, 25.0, 40.0)]
     line, path = OutputModel(fit_cylinders(grips), None, np.zeros(0)), tmp_path / "several.cal"
     replace(fused_calibration, diameter=line).save(path)
     assert Calibration.load(path).diameter is not None

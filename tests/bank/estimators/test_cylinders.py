@@ -8,7 +8,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.estimation import EstimatorSession, TactileFrame, fit
-from shearloop.bank.estimation.cylinders import Gripped, fit_cylinders, fit_line
+from shearloop.bank.estimation.fitting_raw import CylinderGrip, fit_cylinders, fit_line
 from shearloop.bank.estimation.regressors import Ridge
 
 KNOWN_MM = (10.0, 25.0, 40.0)
@@ -25,7 +25,7 @@ def grip(diameter_mm, seed):
     twist = (rng.uniform(0.0, 1.0) + rng.uniform(0.0, 1.0, (N_FRAMES, 1))) * TWIST
     frames = diameter_mm * PER_MM + twist - idle + rng.normal(size=(N_FRAMES, 2 * N_CHANNELS))
     held = np.cumsum(frames, axis=0) / np.arange(1, N_FRAMES + 1)[:, None]
-    return Gripped(diameter_mm, frames, held)
+    return CylinderGrip(diameter_mm, frames, held)
 
 
 @pytest.fixture(scope="module")

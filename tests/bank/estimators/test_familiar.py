@@ -7,10 +7,8 @@ import pytest
 
 from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame
 from shearloop.bank.estimation.bank_match import BankMatch
-from shearloop.bank.estimation.fitting_regressor import fit_reader
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor
-from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.reciprocity import ReciprocityCheck
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, fit_interval_regressor
+from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
 from shearloop.bank.estimation.regressors import Ridge
 
 ALL = np.ones(896, dtype=np.bool_)
@@ -63,7 +61,9 @@ def saturating(value):
 
 
 def reader_of(features, values) -> IntervalRegressor:
-    return fit_reader(features, values, Ridge.fit, strengths=(1e-9,), difficulty=lambda _, later: np.ones(len(later)))
+    return fit_interval_regressor(
+        features, values, Ridge.fit, strengths=(1e-9,), difficulty=lambda _, later: np.ones(len(later))
+    )
 
 
 def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
@@ -93,7 +93,7 @@ def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_
     assert max(below, above) < 0.5
     value, _, above = reader.read(np.array([0.6]))
     assert value + above == pytest.approx(values.max() + 2 * np.ptp(values)), "as far beyond as is known to pass"
-    vouched = fit_reader(
+    vouched = fit_interval_regressor(
         features, values, Ridge.fit, strengths=(1e-9,), difficulty=lambda _, later: np.ones(len(later)), all_values=True
     )
     assert vouched.read(np.array([0.6]))[2] < 0.5
@@ -145,14 +145,14 @@ def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
     rng = np.random.default_rng(3)
     torque = np.where(np.arange(600) % 40 < 3, rng.uniform(0.02, 0.06, 600), 0.0)
     blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
-    reader = fit_reader(blind, torque, Ridge.fit)
+    reader = fit_interval_regressor(blind, torque, Ridge.fit)
     loaded = np.flatnonzero(torque > 0.01)
     read = np.array([reader.read(blind[i]) for i in loaded])
     assert (torque[loaded] - read[:, 0] <= read[:, 2]).mean() > 0.9
     assert reader.misses_loads
     # One that sees it pays nothing.
     seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
-    assert not fit_reader(seeing, torque, Ridge.fit).misses_loads
+    assert not fit_interval_regressor(seeing, torque, Ridge.fit).misses_loads
 
 
 def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
@@ -161,7 +161,7 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     torque = np.where(np.arange(600) % 40 < 5, rng.uniform(0.02, 0.06, 600), 0.0)
     blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
     beside = np.array([np.roll(torque, shift) for shift in range(-6, 7)])
-    reader = fit_reader(blind, torque, Ridge.fit, within=(beside.min(axis=0), beside.max(axis=0)))
+    reader = fit_interval_regressor(blind, torque, Ridge.fit, within=(beside.min(axis=0), beside.max(axis=0)))
     assert reader.widened > 1.2
     loaded = torque > 0.01
     read = np.array([reader.read(one) for one in blind[loaded]])
@@ -169,7 +169,7 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     assert (np.abs(torque[loaded] - read[:, 0]) <= half).mean() > 0.75, "as wide as that they would hold these loads"
     assert reader.misses_loads
     seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
-    sighted = fit_reader(seeing, torque, Ridge.fit, within=(beside.min(axis=0), beside.max(axis=0)))
+    sighted = fit_interval_regressor(seeing, torque, Ridge.fit, within=(beside.min(axis=0), beside.max(axis=0)))
     assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
 
 

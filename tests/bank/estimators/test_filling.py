@@ -9,7 +9,7 @@ import pytest
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, Physics, TactileFrame, fit
-from shearloop.bank.estimation.imputation import ChannelImputer
+from shearloop.bank.estimation.regressors import ChannelImputer
 from tests.bank.estimators import conftest
 
 # Some seconds into the first grip.

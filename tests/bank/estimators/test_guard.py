@@ -6,20 +6,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.fingertip_validator import LEAST_NOISE_V, FingertipValidator, Known, channel_noise
-from shearloop.bank.estimation.grip_segmentation import gripped_part
-from shearloop.bank.estimation.validity import JUMP_NOISES, JUMP_V, Guards
+from shearloop.bank.estimation.fingertip_validator import (
+    JUMP_NOISES,
+    JUMP_V,
+    LEAST_NOISE_V,
+    FingertipSet,
+    FingertipValidator,
+    ReferenceFrames,
+    channel_noise,
+)
+from shearloop.bank.estimation.grip_segmentation import segment_grip
 
 ALL = np.ones((1, 896), dtype=bool)
 
 
 def guard_of(series, layer=0):
-    idle, gripped, released = gripped_part(series)
+    idle, gripped, released = segment_grip(series)
     return FingertipValidator.fit("right", tuple(series.channels[part, layer] for part in (idle, gripped, released)))
 
 
 def test_grip_and_release_are_found_in_a_recording(recorded):
-    idle, gripped, released = gripped_part(recorded)
+    idle, gripped, released = segment_grip(recorded)
     t = recorded.t_s
     assert 15 < t[idle][-1] <= 20
     assert 20 <= t[gripped][0] < 24
@@ -38,7 +45,7 @@ def test_noise_is_what_is_fast(twisting):
 
 @pytest.mark.parametrize("gain", [0.85, 1.0, 1.2])
 def test_a_fingertip_is_known_under_any_gain(recorded, gain):
-    guards = Guards((guard_of(recorded),))
+    guards = FingertipSet((guard_of(recorded),))
     assert all(guards.seen(gain * frame[None], ALL)[0] == [""] for frame in recorded.channels[::20, 0])
     assert all(guards.seen(gain * frame[None], ALL)[0] != [""] for frame in recorded.channels[::20, 1])
 
@@ -57,7 +64,7 @@ def test_each_side_is_compared_with_its_own_fingertip_whatever_the_other_says(re
     """Side by side they are what each is by itself: why, which channels are lost, jumps and grips."""
     random = np.random.default_rng(3)
     sides = [guard_of(recorded, layer) for layer in (0, 1)]
-    both, alone = Guards(tuple(sides)), [Guards((side,)) for side in sides]
+    both, alone = FingertipSet(tuple(sides)), [FingertipSet((side,)) for side in sides]
     before, idle = recorded.channels[100], np.array([side.idle for side in sides])
     said = set()
     for number, frame in enumerate(recorded.channels[::10].copy()):
@@ -92,7 +99,7 @@ def test_grip_is_about_one_gripped_and_zero_idle(recorded):
 
 
 def test_a_release_is_known_by_its_step_where_none_was_calibrated(recorded):
-    idle, gripped, released = gripped_part(recorded)
+    idle, gripped, released = segment_grip(recorded)
     frames = recorded.channels[:, 0]
     guard = FingertipValidator.fit("right", (frames[idle], frames[gripped], frames[:0]))
     assert np.isfinite(guard.step_limit)
@@ -118,7 +125,7 @@ def test_too_little_is_said_to_be(recorded):
         ),
     ):
         with pytest.raises(CalibrationError, match=told):
-            gripped_part(replace(recorded, **changed))
+            segment_grip(replace(recorded, **changed))
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.4, 0.75, 0.76, 1.0]))
@@ -126,7 +133,7 @@ def test_gain_and_deviation_are_medians_of_the_channels_that_are_compared(seed: 
     random = np.random.default_rng(seed)
     known, usable = random.uniform(0.0, 0.3, (2, 896)), random.random(896) >= left_out
     frame = random.uniform(0.5, 2.0) * known[0] + random.normal(0, 0.02, 896)
-    compared = Known(known, usable)
+    compared = ReferenceFrames(known, usable)
     off_from_each, deviations = compared.compare(frame)
     gains = compared.gains(frame)[:, 0]
     for one, gain, deviation, channels in zip(known, gains, deviations, off_from_each, strict=True):

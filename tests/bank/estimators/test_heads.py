@@ -3,7 +3,7 @@ import pytest
 from scipy.stats import truncnorm
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.fitting_regressor import fit_reader
+from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.regressors import (
     InverseCalibration,
     Ridge,
@@ -170,7 +170,7 @@ def test_a_twist_the_other_way_than_the_lever_pushed_is_no_sure_zero(sign: float
     rng = np.random.default_rng(9)
     twist = np.sin(np.arange(400) / 9.0)
     frames = twist[:, None] * rng.normal(size=(1, 12)) + rng.normal(0.0, 0.05, (400, 12))
-    reader = fit_reader(frames, sign * np.maximum(twist, 0.0) * 0.1, TobitRidge.fit, strengths=(1e-5,))
+    reader = fit_interval_regressor(frames, sign * np.maximum(twist, 0.0) * 0.1, TobitRidge.fit, strengths=(1e-5,))
     other_way = np.flatnonzero(twist < -0.1)
     read = [reader.read(frames[i]) for i in other_way.tolist()]
     truth = (sign * 0.1 * twist[other_way]).tolist()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.intervals import Intervals, for_few
+from shearloop.bank.estimation.interval_regressor import Intervals, student_inflation
 
 
 def test_each_stratum_covers_its_own_future():
@@ -29,12 +29,12 @@ def test_strata_with_few_residuals_join():
 
 @pytest.mark.parametrize(("n", "students_t"), [(5, 2.776), (20, 2.093), (1001, 1.962)])
 def test_of_few_values_an_interval_is_as_wide_as_students(n, students_t):
-    assert for_few(n) == pytest.approx(students_t / 1.96, abs=3e-4)
+    assert student_inflation(n) == pytest.approx(students_t / 1.96, abs=3e-4)
 
 
 def test_an_interval_told_by_six_residuals_holds_what_it_promises():
     rng = np.random.default_rng(6)
-    held = {factor: [] for factor in (1.0, for_few(6))}
+    held = {factor: [] for factor in (1.0, student_inflation(6))}
     for _ in range(2000):
         residuals, future = rng.normal(size=6), rng.normal(size=20)
         for factor, inside in held.items():

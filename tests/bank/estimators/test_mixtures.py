@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, TactileFrame, fit
-from shearloop.bank.estimation.contamination import ContaminationTest, Passing
-from shearloop.bank.estimation.fitting_regressor import fit_reader
+from shearloop.bank.estimation.fitting_slices import ContaminationTest, Mixtures
+from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.bank.estimation.regressors import Ridge
 
@@ -117,10 +117,10 @@ def test_the_interval_reaches_to_the_side_on_which_the_truth_is_hidden(sign):
     values = rng.uniform(0.0, 1.0, 100)
     features = values[:, None] + rng.normal(0, 1e-3, (100, 1))
 
-    def moved(_, later) -> Passing:
-        return Passing(later, features[later] + sign * 0.3, np.full(len(later), 0.5))
+    def moved(_, later) -> Mixtures:
+        return Mixtures(later, features[later] + sign * 0.3, np.full(len(later), 0.5))
 
-    reader = fit_reader(features, values, Ridge.fit, strengths=(1e-9,), mixed=moved)
+    reader = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), mixed=moved)
     _, *plain = reader.read(np.array([0.5]))
     _, *at_limit = reader.read(np.array([0.5]), nearness=1.0)
     hidden, other = (0, 1) if sign > 0 else (1, 0)

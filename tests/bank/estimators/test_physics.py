@@ -9,11 +9,11 @@ from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import EstimatorSession, FrameSeries, Physics, TactileFrame, fit
 from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
-    NearestCell,
-    Registration,
+    ElectrodeNumbering,
+    RefinedMatcher,
+    find_numbering,
     image_matrix,
-    register,
-    settle_half_turn,
+    resolve_half_turn,
 )
 
 
@@ -22,13 +22,13 @@ from shearloop.bank.estimation.bank_match import (
 def test_the_numbering_of_the_electrodes_is_found(rotation, reflected):
     rng = np.random.default_rng(1)
     homogeneous = rng.normal(size=896)
-    turned = Registration(rotation, reflected, 0, 0).model_channels()
-    found = register(np.abs(homogeneous[turned]) + 0.2 * np.abs(rng.normal(size=896)), homogeneous)
+    turned = ElectrodeNumbering(rotation, reflected, 0, 0).model_channels()
+    found = find_numbering(np.abs(homogeneous[turned]) + 0.2 * np.abs(rng.normal(size=896)), homogeneous)
     assert (found.rotation, found.reflected) == (rotation, reflected)
     assert found.score > found.runner_up + 0.3
 
 
-@pytest.mark.parametrize("turned", [Registration(5, False, 0, 0), Registration(9, True, 0, 0)])
+@pytest.mark.parametrize("turned", [ElectrodeNumbering(5, False, 0, 0), ElectrodeNumbering(9, True, 0, 0)])
 def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
     electrode = (turned.rotation + (-1 if turned.reflected else 1) * CHANNELS) % 32
     model = CHANNELS[turned.model_channels()]
@@ -39,15 +39,15 @@ def test_a_turned_channel_measures_between_the_turned_electrodes(turned):
 
 @pytest.mark.parametrize("rotation", [5, 21])
 def test_a_touch_settles_the_half_turn(bank, rotation):
-    true = Registration(rotation, False, 0.9, 0.5)
+    true = ElectrodeNumbering(rotation, False, 0.9, 0.5)
     touch = np.abs(bank.signals[4, 7].astype(np.float64))[true.model_channels()]
-    for found in (true, Registration((rotation + 16) % 32, False, 0.9, 0.5)):
-        assert settle_half_turn(found, touch, bank).rotation == rotation
+    for found in (true, ElectrodeNumbering((rotation + 16) % 32, False, 0.9, 0.5)):
+        assert resolve_half_turn(found, touch, bank).rotation == rotation
 
 
 def test_a_place_between_cells_is_found_to_a_fraction_of_one(bank):
     channel = np.linspace(0, 4, 896)
-    locator = NearestCell(bank, NOT_TURNED)
+    locator = RefinedMatcher(bank, NOT_TURNED)
     for k, sigma in ((1.83, 1.04), (2.26, 0.77)):
         place = locator.locate(-2.5 * np.exp(-0.5 * ((channel - k) / (0.3 * sigma)) ** 2))
         assert place.k == pytest.approx(k, abs=0.02)
@@ -62,7 +62,7 @@ def test_two_places_that_fit_alike_are_ambiguous(bank):
     twice = type(bank)(
         bank.path, bank.definition, bank.identity, bank.homogeneous, bank.min_conductivity, bank.valid, signals, ""
     )
-    assert NearestCell(twice, NOT_TURNED).locate(signals[10, 8]).ambiguous
+    assert RefinedMatcher(twice, NOT_TURNED).locate(signals[10, 8]).ambiguous
 
 
 @pytest.mark.parametrize("name", ["paper", "bank"])

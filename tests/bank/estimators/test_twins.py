@@ -9,8 +9,7 @@ from scipy.stats import chi2
 
 from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame, fit
-from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.reciprocity import _FIRST, _SECOND, ReciprocityCheck
+from shearloop.bank.estimation.novelty import _FIRST, _SECOND, NoveltyDetector, ReciprocityCheck
 from tests.bank.conftest import small_fingertip
 
 ALL = np.ones(896, dtype=np.bool_)

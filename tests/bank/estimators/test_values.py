@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import FrameSeries, Measured, TactileFrame, fused
+from shearloop.bank.estimation import FrameSeries, Measured, TactileFrame, combine
 from shearloop.bank.estimation.values import distinct
 
 measurements = st.builds(Measured, st.floats(-1e3, 1e3, allow_nan=False), st.floats(1e-3, 1e3, allow_nan=False))
@@ -12,12 +12,12 @@ measurements = st.builds(Measured, st.floats(-1e3, 1e3, allow_nan=False), st.flo
 
 @given(st.lists(measurements, min_size=1, max_size=4))
 def test_fused_measurements_lie_between_and_cover_the_ones_that_contradict_each_other(several):
-    both = fused(*several, None)
+    both = combine(*several, None)
     assert both is not None
     low, high = min(m.value for m in several), max(m.value for m in several)
     assert low - 1e-6 <= both.value <= high + 1e-6
     assert both.half_width >= sum(m.half_width**-2 for m in several) ** -0.5 * (1 - 1e-12)
-    alike = fused(*(Measured(low, m.half_width) for m in several))
+    alike = combine(*(Measured(low, m.half_width) for m in several))
     assert alike is not None
     assert alike.half_width <= min(m.half_width for m in several) * (1 + 1e-12)
 
@@ -39,7 +39,7 @@ def test_a_gripper_tells_tools_apart_by_its_own_uncertainty():
 
 
 def test_two_that_contradict_each_other_are_not_a_sure_one_in_between():
-    both = fused(Measured(10.0, 1.0), Measured(40.0, 1.0))
+    both = combine(Measured(10.0, 1.0), Measured(40.0, 1.0))
     assert both is not None
     assert both.value == pytest.approx(25.0)
     # Both of them are within it, and it is not wider than they are apart.
@@ -50,15 +50,15 @@ def test_the_interval_of_fused_measurements_holds_the_truth_as_often_as_it_says(
     rng = np.random.default_rng(4)
     halves = np.array([1.0, 3.0])
     drawn = rng.normal(0.0, halves / 1.96, (4000, 2))
-    found = [fused(*(Measured(x, h) for x, h in zip(row, halves.tolist(), strict=True))) for row in drawn.tolist()]
+    found = [combine(*(Measured(x, h) for x, h in zip(row, halves.tolist(), strict=True))) for row in drawn.tolist()]
     assert 0.94 < np.mean([one is not None and abs(one.value) <= one.half_width for one in found]) < 0.99
 
 
 def test_nothing_measured_is_nothing():
-    assert fused(None, None) is None
-    assert fused(Measured(1.0, float("inf")), Measured(2.0, float("inf"))) is None, "each may be anything"
+    assert combine(None, None) is None
+    assert combine(Measured(1.0, float("inf")), Measured(2.0, float("inf"))) is None, "each may be anything"
     with pytest.raises(ValueError, match="no uncertainty"):
-        fused(Measured(1.0, 0.0), Measured(1.0, 1.0))
+        combine(Measured(1.0, 0.0), Measured(1.0, 1.0))
 
 
 def empty(n=3, **changed):

@@ -10,7 +10,7 @@ from scipy.stats import mannwhitneyu
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics
-from shearloop.bank.estimation.reciprocity import ReciprocityCheck
+from shearloop.bank.estimation.novelty import ReciprocityCheck
 from shearloop.daemon.analysis.charts.fault_sweeps import (
     FAULTS,
     FaultLevel,

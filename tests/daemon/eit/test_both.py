@@ -12,10 +12,8 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.both import BOTH, CombinedFingertipTask
-from shearloop.daemon.sensing.estimation import EstimatorTask
-from shearloop.daemon.sensing.estimator import Reading
-from shearloop.daemon.sensing.fingertip import FingertipTask
+from shearloop.daemon.sensing.estimators import COMBINED, Reading
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertipTask, EstimatorTask, FingertipTask
 from shearloop.drivers.eit_kit import EitKit, Frame
 
 PERIOD_S = 0.54
@@ -82,7 +80,7 @@ class Reader:
 
 
 def both_of(told: Told, reader: Reader) -> CombinedFingertipTask:
-    return CombinedFingertipTask(estimation(BOTH, told, reader), ("right", "left"), PERIOD_S)
+    return CombinedFingertipTask(estimation(COMBINED, told, reader), ("right", "left"), PERIOD_S)
 
 
 def estimation(name: str, told: Told, reader: Reader) -> EstimatorTask:
@@ -118,7 +116,11 @@ async def test_what_drives_the_loop_is_out_before_the_sides_own_estimate() -> No
     assert told.messages == [
         one
         for number in range(4)
-        for one in (("eit.estimate", BOTH, number), ("eit.estimate", "right", number), ("eit.frame", "right", number))
+        for one in (
+            ("eit.estimate", COMBINED, number),
+            ("eit.estimate", "right", number),
+            ("eit.frame", "right", number),
+        )
     ]
 
 
@@ -126,9 +128,9 @@ async def test_a_pair_that_takes_long_keeps_no_board_waiting_and_those_after_it_
     told, reader = Told(12), Reader(long=1)
     async with running(told, both_of(told, reader)), asyncio.timeout(20):
         await told.enough.wait()
-    assert [number for _, source, number in told.messages if source == BOTH] == [0, 1, 2, 3]
+    assert [number for _, source, number in told.messages if source == COMBINED] == [0, 1, 2, 3]
     assert reader.by_thread == [1]
-    assert told.messages.index(("eit.estimate", "right", 1)) < told.messages.index(("eit.estimate", BOTH, 1))
+    assert told.messages.index(("eit.estimate", "right", 1)) < told.messages.index(("eit.estimate", COMBINED, 1))
 
 
 async def test_what_the_estimator_of_both_dies_of_ends_its_own_task_and_not_the_one_that_reads_a_board() -> None:

@@ -8,8 +8,8 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.estimation import EstimatorTask
-from shearloop.daemon.sensing.estimator import Reading
+from shearloop.daemon.sensing.estimators import Reading
+from shearloop.daemon.sensing.fingertip_task import EstimatorTask
 from shearloop.drivers.eit_line import Frame
 from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
 

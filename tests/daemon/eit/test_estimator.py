@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.matching import Match, best_match
-from shearloop.daemon.sensing.estimator import Baseline, Estimator
+from shearloop.bank.estimation import Calibration
+from shearloop.daemon.sensing.estimators import Baseline, Estimator
 from shearloop.drivers.eit_kit import Frame
 
 K_GRID, SIGMA_GRID = np.linspace(3.0, 4.0, 11), np.linspace(1.0, 2.0, 11)

@@ -12,9 +12,8 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import FingertipConfig
 from shearloop.daemon.messaging.messages import Message
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.estimation import EstimatorTask
-from shearloop.daemon.sensing.estimator import Reading
-from shearloop.daemon.sensing.fingertip import FingertipTask
+from shearloop.daemon.sensing.estimators import Reading
+from shearloop.daemon.sensing.fingertip_task import EstimatorTask, FingertipTask
 from shearloop.drivers.eit_format import FRAME_PERIOD_S
 from shearloop.drivers.eit_kit import EitKit, Frame
 

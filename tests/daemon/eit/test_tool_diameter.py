@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 
 from shearloop.bank.eit.polynomial import Interval
 from shearloop.bank.estimation import Measured
-from shearloop.daemon.sensing.tool_diameter import STALE_AFTER_NS, FingertipDiameters, as_text, from_text
+from shearloop.daemon.sensing.tool_diameter import STALE_AFTER_NS, FingertipDiameters, tool_as_bytes, tool_from_bytes
 
 
 def test_fingertips_apart_are_weighed_and_both_together_hold_them_already() -> None:
@@ -43,10 +43,10 @@ POSITIVE = st.floats(0.0, allow_nan=False, allow_infinity=False)
 
 @given(st.integers(0), st.none() | st.builds(Measured, POSITIVE, POSITIVE))
 def test_a_tool_is_read_from_a_recording_as_it_was_written(frame: int, tool: Measured | None) -> None:
-    assert from_text(as_text(frame, tool)) == (frame, tool)
+    assert tool_from_bytes(tool_as_bytes(frame, tool)) == (frame, tool)
 
 
 @pytest.mark.parametrize("text", [b"", b"x", b"3 20", b"3 20 x", b"3 20 1 1"])
 def test_what_is_no_tool_is_none(text: bytes) -> None:
     with pytest.raises(ValueError):  # noqa: PT011 - the recording's reader says where
-        from_text(text)
+        tool_from_bytes(text)

@@ -13,8 +13,7 @@ from shearloop.daemon.cli.check import _torque
 from shearloop.daemon.config import CombinedConfig, FingertipConfig
 from shearloop.daemon.doctor.files import both_finding, calibration_finding
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.sensing.opening import open_both, open_estimator
-from shearloop.daemon.sensing.tracking import Scoring, TrackedEstimator
+from shearloop.daemon.sensing.estimators import LiveEstimator, Scoring, open_combined, open_estimator
 from shearloop.drivers.eit_kit import Frame
 from tests.bank.estimators.conftest import IDLE_S, PERIOD_S, series
 
@@ -50,7 +49,7 @@ def frame(
     )  # fmt: skip
 
 
-def followed(estimator: TrackedEstimator, played: FrameSeries, **flags: NDArray[np.bool_]) -> list[float | None]:
+def followed(estimator: LiveEstimator, played: FrameSeries, **flags: NDArray[np.bool_]) -> list[float | None]:
     """Return the torque of every pair, None where there is none."""
     found = []
     for number, pair in enumerate(played.channels):
@@ -62,7 +61,7 @@ def followed(estimator: TrackedEstimator, played: FrameSeries, **flags: NDArray[
 
 def test_both_fingertips_together_follow_another_session(calibration: Calibration) -> None:
     played = series(seed=3)
-    found = followed(TrackedEstimator(calibration, None, None, baseline_frames=10), played)
+    found = followed(LiveEstimator(calibration, None, None, baseline_frames=10), played)
     truth = played.torque_at_frames()
     errors = [value - true for value, true in zip(found, truth, strict=True) if value is not None]
     assert len(errors) > 0.6 * len(found)
@@ -72,7 +71,7 @@ def test_both_fingertips_together_follow_another_session(calibration: Calibratio
 
 def test_a_tare_takes_the_frames_that_follow_for_idle_ones(calibration: Calibration) -> None:
     played = series(seed=3)
-    estimator = TrackedEstimator(calibration, None, None, baseline_frames=5)
+    estimator = LiveEstimator(calibration, None, None, baseline_frames=5)
     estimator.tare()
     for number in range(5):
         assert not estimator.baseline_complete
@@ -85,19 +84,19 @@ def test_a_tare_takes_the_frames_that_follow_for_idle_ones(calibration: Calibrat
 def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_says_nothing(calibration: Calibration) -> None:
     played = series(seed=4)
     dead = np.random.default_rng(0).uniform(size=896) < 0.1
-    found = followed(TrackedEstimator(calibration, None, None, baseline_frames=10), played, dead=dead)
+    found = followed(LiveEstimator(calibration, None, None, baseline_frames=10), played, dead=dead)
     assert np.count_nonzero([value is not None for value in found]) > 0.6 * len(found)
     elsewhere = replace(played, channels=np.where(dead, 0.3, played.channels))
-    again = followed(TrackedEstimator(calibration, None, None, baseline_frames=10), elsewhere, dead=dead)
+    again = followed(LiveEstimator(calibration, None, None, baseline_frames=10), elsewhere, dead=dead)
     assert again == found, "whatever dead channels read"
-    estimator = TrackedEstimator(calibration, None, None, baseline_frames=10)
+    estimator = LiveEstimator(calibration, None, None, baseline_frames=10)
     pair = [frame(0, channels, repeated=True) for channels in played.channels[0]]
     assert estimator.update(*pair).why == ("the board sent the same frame again",)
 
 
 def test_a_bank_gives_k_sigma_and_heatmaps_beside(calibration: Calibration, tiny_bank: Path) -> None:
     bank = Bank.open(tiny_bank)
-    estimator = TrackedEstimator(
+    estimator = LiveEstimator(
         calibration, bank, Scoring(PrunedZeroLagMatcher.from_bank(bank), bank.model), baseline_frames=10
     )
     played = series(seed=3)
@@ -114,9 +113,7 @@ def test_a_bank_gives_k_sigma_and_heatmaps_beside(calibration: Calibration, tiny
 def test_readings_are_the_same_at_once_and_in_a_thread(calibration: Calibration, tiny_bank: Path) -> None:
     bank = Bank.open(tiny_bank)
     slow, quick = (
-        TrackedEstimator(
-            calibration, bank, Scoring(PrunedZeroLagMatcher.from_bank(bank), bank.model), baseline_frames=10
-        )
+        LiveEstimator(calibration, bank, Scoring(PrunedZeroLagMatcher.from_bank(bank), bank.model), baseline_frames=10)
         for _ in range(2)
     )
     left_undone = 0
@@ -133,7 +130,7 @@ def test_readings_are_the_same_at_once_and_in_a_thread(calibration: Calibration,
 
 @pytest.mark.parametrize(("name", "quick"), [("fused", True), ("reconstruction", False)])
 def test_only_what_takes_a_millisecond_is_not_left_to_a_thread(name, quick, calibration: Calibration) -> None:
-    estimator = TrackedEstimator(replace(calibration, estimator=name), None, None, baseline_frames=10)
+    estimator = LiveEstimator(replace(calibration, estimator=name), None, None, baseline_frames=10)
     found = estimator.quickly(*(frame(0, channels) for channels in series().channels[0]))
     assert (found is not None) == quick
 
@@ -144,8 +141,8 @@ def fingertip(**changes: object) -> FingertipConfig:
 
 def test_the_calibration_says_which_estimator_it_is(files: dict[str, Path]) -> None:
     opened = open_estimator(fingertip(calibration=files["right"]), "right")
-    assert isinstance(opened, TrackedEstimator)
-    both = open_both(CombinedConfig(calibration=files["both"]), {"right": fingertip(), "left": fingertip()})
+    assert isinstance(opened, LiveEstimator)
+    both = open_combined(CombinedConfig(calibration=files["both"]), {"right": fingertip(), "left": fingertip()})
     assert both.sides == ("right", "left")
     assert both.grids is None
 
@@ -160,7 +157,7 @@ def test_doctor_and_check_show_what_was_taken_on_somebodys_word(
     assert vouched.state == "good"
     assert vouched.found.endswith(", on somebody's word for when its loads were measured (--load-late)")
     assert "with torque, on somebody's word for" in _torque(
-        open_both(CombinedConfig(calibration=path), tips), calibrated=True
+        open_combined(CombinedConfig(calibration=path), tips), calibrated=True
     )
     for finding in (both_finding(CombinedConfig(calibration=files["both"]), tips), calibration_finding("right", alone)):
         assert finding.state == "good"
@@ -177,7 +174,7 @@ def test_doctor_and_check_show_what_was_taken_on_somebodys_word(
         (lambda _: open_estimator(fingertip(estimator="fused", calibration="no.cal"), "right"), "no.cal does not"),
         (lambda _: open_estimator(fingertip(estimator="fused", calibration=__file__), "right"), "is another kind;"),
         (lambda _: open_estimator(fingertip(), "right"), "needs its bank; add `bank:`"),
-        (lambda f: open_both(CombinedConfig(calibration=f["both"]), {"right": fingertip()}), "of both, and name"),
+        (lambda f: open_combined(CombinedConfig(calibration=f["both"]), {"right": fingertip()}), "of both, and name"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_a_sentence(

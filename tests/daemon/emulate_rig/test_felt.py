@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.estimation import Calibration
 from shearloop.drivers.hx711 import LoadCalibration
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import Estimate, FrameSeries, fit
-from shearloop.bank.estimation.alignment import Alignment
-from shearloop.daemon.analysis.evaluation import EstimateTrack, Reason, judge, reasons
+from shearloop.bank.estimation.load_delay import LoadDelay
+from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, figures_of, invalid_reasons
 from shearloop.daemon.cli import main
 from shearloop.daemon.cli.calibrated.recording import _of_times
 
@@ -119,10 +119,10 @@ def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alon
     nothing = np.full(8, np.nan)
     series = FrameSeries("raw", ("right",), np.arange(8.0), np.zeros((8, 1, 896)), nothing[:0], nothing[:0], nothing)
     track = EstimateTrack(series, tuple(Estimate(valid=False, why=(why,)) for why in said), np.zeros(8))
-    assert reasons([track]) == [
-        Reason(3, said[2], differ=True),
-        Reason(2, said[5], differ=True),
-        *(Reason(1, said[row], differ=False) for row in (0, 4, 7)),
+    assert invalid_reasons([track]) == [
+        InvalidReason(3, said[2], differ=True),
+        InvalidReason(2, said[5], differ=True),
+        *(InvalidReason(1, said[row], differ=False) for row in (0, 4, 7)),
     ]
 
 
@@ -130,8 +130,8 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
     calibration, slices = tmp_path / "a.cal", str(slices_folder / "torque_slices")
     assert main(["calibrate", slices, "--out", str(calibration)]) == 0
     told = [
-        Reason(12, "gripped too lately: 12 more frames are needed", differ=True),
-        Reason(1, "no grip", differ=False),
+        InvalidReason(12, "gripped too lately: 12 more frames are needed", differ=True),
+        InvalidReason(1, "no grip", differ=False),
     ]
     monkeypatch.setattr("shearloop.daemon.analysis.evaluation.reasons", lambda _: told)
     assert main(["evaluate", str(calibration), slices]) == 0
@@ -227,7 +227,7 @@ def test_figures_are_what_their_names_say():
     ] + [Estimate(False, ("no grip",))]
     t = np.arange(4.0)
     series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, truth, np.full(4, np.nan))
-    figures = judge([EstimateTrack(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
+    figures = figures_of([EstimateTrack(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
     error = np.array([0.02, 0.0, 0.07])
     assert figures["rmse_nm"] == pytest.approx(np.sqrt((error**2).mean()))
     assert figures["bias_nm"] == pytest.approx(error.mean())
@@ -251,11 +251,11 @@ def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
         EstimateTrack(told, (*torques, *refused), np.ones(4)),
         EstimateTrack(of_cylinders, tuple(cylinders), np.ones(4)),
     ]
-    figures = judge(tracks)
+    figures = figures_of(tracks)
     assert figures["coverage_95"] == 1.0
     assert figures["interval_nm"] == pytest.approx(0.04)
     assert figures["diameter_interval_mm"] == pytest.approx(11.5)
-    nothing = judge([EstimateTrack(replace(told, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))])
+    nothing = figures_of([EstimateTrack(replace(told, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))])
     assert nothing["interval_nm"] is nothing["diameter_interval_mm"] is None
 
 
@@ -263,7 +263,7 @@ def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
 def test_a_time_that_could_not_be_checked_is_told_as_probable(error_s, unsure):
     t = np.arange(4.0)
     series = FrameSeries("raw", ("right",), t, np.zeros((4, 1, 896)), t, np.zeros(4), np.full(4, np.nan))
-    found = Alignment(late_s=0.16, error_s=error_s, explained=0.5)
+    found = LoadDelay(late_s=0.16, error_s=error_s, explained=0.5)
     calibration = SimpleNamespace(torque=SimpleNamespace(reader=SimpleNamespace(widened=1.9)))
     told, (late, *sentences) = _of_times(calibration, [], [series], lambda _: found)
     assert late == f"The load is {'probably ' if unsure else ''}stamped 0.16 s after the frames move."

@@ -18,8 +18,7 @@ from shearloop.bank.eit.channels import channels_of_line, line_of_channels
 from shearloop.bank.estimation import FrameSeries, Measured, fit
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.sensing.both import LARGEST_BACKLOG, CombinedFingertipTask
-from shearloop.daemon.sensing.estimation import Taken
+from shearloop.daemon.sensing.fingertip_task import MAX_BACKLOG, CombinedFingertipTask, Taken
 from shearloop.drivers.eit_format import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import measured, replayed
@@ -84,7 +83,7 @@ async def test_pairs_follow_from_the_order_of_arrival_and_boards_wait_while_too_
         both.take("right", SimpleNamespace(t_mid_ns=number * 10**9))
         both.take("left", SimpleNamespace(t_mid_ns=number * 10**9 + 1))
         number += 1
-    assert both.facts()["backlog"] == LARGEST_BACKLOG
+    assert both.facts()["backlog"] == MAX_BACKLOG
     reading_on = asyncio.create_task(both.room())
     go_on.set()
     async with asyncio.timeout(DEADLINE_S):

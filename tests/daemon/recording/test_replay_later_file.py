@@ -13,7 +13,7 @@ from shearloop.bank.estimation import Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.recording.recorded_run import RecordedRun
-from shearloop.daemon.sensing.estimator import Estimator
+from shearloop.daemon.sensing.estimators import Estimator
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import replayed
 from tests.daemon.test_run import recording

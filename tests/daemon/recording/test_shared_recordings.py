@@ -17,12 +17,12 @@ import pytest
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, FrameSeries, Name, fit
-from shearloop.bank.estimation import alignment as alignments
-from shearloop.bank.estimation.alignment import alignment, doubt, is_filtered
-from shearloop.bank.estimation.bank_match import Registration
+from shearloop.bank.estimation import find_load_delay as alignments
+from shearloop.bank.estimation.bank_match import ElectrodeNumbering
+from shearloop.bank.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.daemon.analysis.charts.fault_sweeps import balanced
-from shearloop.daemon.analysis.evaluation import follow, judge
+from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli import main
 from shearloop.daemon.recording.importing import import_mat
@@ -83,7 +83,7 @@ def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders, of_one_cylinde
     for calibration in of_one_cylinder.values():
         for cylinder in cylinders.values():
             other = replace(cylinder, diameter_mm=np.full(len(cylinder.t_s), np.nan))
-            estimates = follow(calibration, other).estimates
+            estimates = estimate_series(calibration, other).estimates
             held = (other.t_s > held_s[0]) & (other.t_s < held_s[1])
             assert not any("no grip" in why for one in np.array(estimates)[held] for why in one.why)
             assert not any(one.valid for one in np.array(estimates)[(other.t_s < idle_s) | (other.t_s > 97.5)])
@@ -91,24 +91,24 @@ def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders, of_one_cylinde
 
 def test_the_torque_of_one_tool_is_not_read_as_that_of_another(cylinders, of_one_cylinder):
     calibration = of_one_cylinder[20]
-    estimates = follow(calibration, cylinders[10]).estimates
+    estimates = estimate_series(calibration, cylinders[10]).estimates
     assert not any(one.valid for one in estimates)
     assert "the tool is of 10 mm and the calibration of one of 20 mm" in estimates[80].why[0]
-    assert np.mean([one.valid for one in follow(calibration, cylinders[20]).estimates]) > 0.6
+    assert np.mean([one.valid for one in estimate_series(calibration, cylinders[20]).estimates]) > 0.6
 
 
 def test_cylinders_that_turn_differently_give_a_diameter_and_no_torque(cylinders):
     calibration = fit("fused", list(cylinders.values()), "all four")
     assert calibration.torque is None
     for mm, series in cylinders.items():
-        found = [one.diameter_mm for one in follow(calibration, series).estimates if one.valid]
+        found = [one.diameter_mm for one in estimate_series(calibration, series).estimates if one.valid]
         assert len(found) > 100
         assert abs(np.mean(found) - mm) < 2
     # Each was gripped once only: how far the diameter of a tool is off that was not among them is what it says.
     assert calibration.diameter is not None
     assert 8 < calibration.diameter.reader.intervals.half_widths[0] < 25
     # A session that begins gripped does not know where the gel stood before.
-    later = follow(calibration, part_of(cylinders[10], 0.5, 0.8)).estimates
+    later = estimate_series(calibration, part_of(cylinders[10], 0.5, 0.8)).estimates
     assert not any(one.valid for one in later)
     assert "its idle frame is not known" in later[-1].why[0]
 
@@ -120,7 +120,7 @@ def test_cylinders_that_turn_differently_give_a_diameter_and_no_torque(cylinders
 def test_later_twists(twists, sides, r, rmse_nm):
     series = twists.of_sides(sides)
     calibration = fit("fused", [part_of(series, 0, HALF)], "earlier", timed_by=[part_of(twists, 0, HALF)])
-    figures = judge([follow(calibration, part_of(series, HALF - 0.015, 1))])
+    figures = figures_of([estimate_series(calibration, part_of(series, HALF - 0.015, 1))])
     assert figures["r"] >= r
     assert figures["rmse_nm"] <= rmse_nm
     assert 0.90 <= figures["coverage_95"] <= 0.98
@@ -128,7 +128,7 @@ def test_later_twists(twists, sides, r, rmse_nm):
 
 
 def test_idle_disturbed_and_foreign_frames_are_never_valid(twists, of_all_twists):
-    whole = follow(of_all_twists, twists)
+    whole = estimate_series(of_all_twists, twists)
     idle = (twists.t_s < 22) | (twists.t_s > 380)
     assert not any(one.valid for one, free in zip(whole.estimates, idle, strict=True) if free)
     assert np.mean([one.valid for one in whole.estimates]) > 0.7
@@ -140,22 +140,22 @@ def test_idle_disturbed_and_foreign_frames_are_never_valid(twists, of_all_twists
             layer[rng.choice(896, 224, replace=False)] = np.abs(rng.normal(0, 0.05, 224))
     for channels in (noisy, some.channels[:, ::-1]):
         strange = FrameSeries("raw", some.sides, some.t_s, channels, some.torque_t_s, some.torque_nm, some.diameter_mm)
-        assert not any(one.valid for one in follow(of_all_twists, strange).estimates)
+        assert not any(one.valid for one in estimate_series(of_all_twists, strange).estimates)
 
 
 def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(of_all_twists, shared, tmp_path):
     imported = import_mat([shared / "recordings/streams/20241202_153632"], tmp_path / "other.mcap")
     assert "46 s in all" in imported.remarks[0]
     other = series_of(read_recording(tmp_path / "other.mcap"))
-    assert judge([follow(of_all_twists, other)])["valid_fraction"] == 0
+    assert figures_of([estimate_series(of_all_twists, other)])["valid_fraction"] == 0
 
 
 def test_later_torque_slices(slices, earlier):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
     errors, covered, widths_nm = [], [], []
     for n in (19, 24, 29, 34, 39, 44):
-        followed = follow(earlier("fused", n), slices.between(n, 49))
-        figures = judge([followed])
+        followed = estimate_series(earlier("fused", n), slices.between(n, 49))
+        figures = figures_of([followed])
         r, rmse_nm, coverage = LATER_SLICES.get(n, (0.96, 0.018, 0.0))
         assert figures["r"] >= r
         assert figures["rmse_nm"] <= rmse_nm
@@ -171,7 +171,7 @@ def test_later_torque_slices(slices, earlier):
     assert np.median(widths_nm) <= 0.12
     # Intervals of torques near the ends reach beyond them, unless somebody vouches for the range: 0.091 N·m after 29.
     vouched = fit("fused", [slices.between(0, 29)], "earlier", all_torques=True)
-    found = follow(vouched, slices.between(29, 49)).estimates
+    found = estimate_series(vouched, slices.between(29, 49)).estimates
     assert np.median([one.torque_high_nm - one.torque_low_nm for one in found]) <= 0.085
     without_ends = replace(earlier("fused", 29).torque.reader, low_end=-np.inf, high_end=np.inf)
     assert pickle.dumps(vouched.torque.reader) == pickle.dumps(without_ends), "nothing else is another"
@@ -185,13 +185,15 @@ def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_n
     """They are read within the range, and up to nine tenths of them false-valid; they lie up to 1.6 of it beyond."""
     inside = (low_nm <= slices.torque_nm) & (slices.torque_nm < high_nm)
     calibration = fit(name, [_some(slices, inside)], "a part of the torques")
-    figures = judge([follow(calibration, _some(slices, ~inside))])
+    figures = figures_of([estimate_series(calibration, _some(slices, ~inside))])
     assert figures["valid_fraction"] > 0.9, "or nothing would be tested"
     assert figures["coverage_95"] >= 0.9
     # As where somebody has vouched that no other will come, which changes nothing else (test_later_torque_slices).
     reader = replace(calibration.torque.reader, low_end=-np.inf, high_end=np.inf)
     vouched = replace(calibration, torque=replace(calibration.torque, reader=reader))
-    assert judge([follow(vouched, _some(slices, ~inside))])["coverage_95"] < 0.8, "or there was nothing to hold"
+    assert figures_of([estimate_series(vouched, _some(slices, ~inside))])["coverage_95"] < 0.8, (
+        "or there was nothing to hold"
+    )
 
 
 def _some(series: FrameSeries, chosen) -> FrameSeries:
@@ -207,12 +209,12 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
     calibration, later = earlier(name, 29), slices.between(29, 49)
     foreign = later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
     spoilt = replace(later, channels=0.9 * later.channels + 0.1 * foreign)
-    figures = judge([follow(calibration, spoilt)])
+    figures = figures_of([estimate_series(calibration, spoilt)])
     assert figures["valid_fraction"] == 1
     assert figures["coverage_95"] >= 0.95
     # It costs half as much again at most.
     width_nm, was_nm = (
-        np.median([one.torque_high_nm - one.torque_low_nm for one in follow(each, later).estimates])
+        np.median([one.torque_high_nm - one.torque_low_nm for one in estimate_series(each, later).estimates])
         for each in (calibration, _believing(calibration))
     )
     assert width_nm <= 1.5 * was_nm
@@ -221,11 +223,13 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
 def test_where_slices_tell_little_intervals_reach_to_what_may_be_hidden_in_them(slices, earlier):
     """Of ten slices after the narrowest calibration, with a tenth of the own ones mirrored, four were false-valid."""
     calibration, later = earlier("fused", 39), slices.between(39, 49)
-    mirrored = Registration(5, True, score=1.0, runner_up=0.0).model_channels()
+    mirrored = ElectrodeNumbering(5, True, score=1.0, runner_up=0.0).model_channels()
     foreign = later.channels.mean(axis=0)[:, mirrored]
     spoilt = replace(later, channels=0.9 * later.channels + 0.1 * foreign)
-    assert judge([follow(calibration, spoilt)])["coverage_95"] >= 0.9
-    assert judge([follow(_believing(calibration), spoilt)])["coverage_95"] <= 0.7, "or there was nothing to hold"
+    assert figures_of([estimate_series(calibration, spoilt)])["coverage_95"] >= 0.9
+    assert figures_of([estimate_series(_believing(calibration), spoilt)])["coverage_95"] <= 0.7, (
+        "or there was nothing to hold"
+    )
 
 
 def _believing(calibration: Calibration) -> Calibration:
@@ -243,7 +247,9 @@ def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_interval
         calibration, later = earlier(name, n), slices.between(n, 49)
         for diameter_mm in (10, 20, 30, 40):
             foreign = cylinders.channels[cylinders.diameter_mm == diameter_mm].mean(axis=0)
-            figures = judge([follow(calibration, replace(later, channels=0.8 * later.channels + 0.2 * foreign))])
+            figures = figures_of(
+                [estimate_series(calibration, replace(later, channels=0.8 * later.channels + 0.2 * foreign))]
+            )
             assert figures["valid_fraction"] == 1
             missed.append(1 - figures["coverage_95"])
     assert max(missed) <= 0.2, "else it breaks silently"
@@ -252,7 +258,9 @@ def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_interval
 
 def test_later_slices_of_the_cylinders(shared):
     (series,) = read_series(shared / "recordings/diameter_slices")
-    figures = judge([follow(fit("fused", [part_of(series, 0, 0.62)], "earlier"), part_of(series, 0.62, 1))])
+    figures = figures_of(
+        [estimate_series(fit("fused", [part_of(series, 0, 0.62)], "earlier"), part_of(series, 0.62, 1))]
+    )
     assert figures["diameter_rmse_mm"] <= 5
     assert figures["coverage_95"] >= 0.9
 
@@ -260,7 +268,7 @@ def test_later_slices_of_the_cylinders(shared):
 @pytest.mark.parametrize("stop", [0.5, 0.6, 1.0])
 def test_the_load_goes_with_the_frames_and_a_quarter_of_a_second_beside_is_refused(twists, stop):
     part = part_of(twists, 0, stop)
-    found = alignment(part)
+    found = find_load_delay(part)
     assert found is not None
     assert found.late_s == pytest.approx(0.26, abs=0.03)
     assert found.error_s < 0.08
@@ -291,7 +299,7 @@ def test_a_load_half_a_second_off_in_a_short_recording_lies_within_the_intervals
     future = part_of(twists.of_sides(sides), THIRD - 0.02, 1)
     calibration = fit("fused", [late], "shifted")
     assert calibration.torque.reader.widened > 1.1
-    estimates = follow(calibration, future).estimates
+    estimates = estimate_series(calibration, future).estimates
     truth_nm = balanced(future.torque_at_frames())
     missed = [
         one.valid and not one.torque_low_nm <= truth <= one.torque_high_nm
@@ -330,7 +338,7 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
 @pytest.mark.parametrize("name", ["20241202_153632", "glitch_20241202_173837"])
 def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(shared, tmp_path, name):
     import_mat([shared / "recordings/streams" / name], tmp_path / "other.mcap")
-    assert alignment(series_of(read_recording(tmp_path / "other.mcap"))) is None
+    assert find_load_delay(series_of(read_recording(tmp_path / "other.mcap"))) is None
 
 
 def test_a_load_that_seems_stamped_early_is_told_and_not_refused(shared, twists_file, tmp_path, capsys):
@@ -354,7 +362,7 @@ def test_no_good_recording_is_doubted(shared, twists_file, tmp_path):
     for n, sources in enumerate([[streams / "glitch_20241202_173837"], *cylinders]):
         paths.append(tmp_path / f"{n}.mcap")
         import_mat(sources, paths[-1])
-    assert [doubt(series_of(read_recording(path))) for path in paths] == [""] * 6
+    assert [load_delay_warning(series_of(read_recording(path))) for path in paths] == [""] * 6
 
 
 @pytest.mark.parametrize("n", [19, 24, 29, 34, 39, 44])

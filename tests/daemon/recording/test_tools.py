@@ -16,7 +16,7 @@ from shearloop.daemon.recording.identity import Identity, basic_identity, notes_
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.summary import summarise
-from shearloop.daemon.sensing.tool_diameter import as_text
+from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.drivers.raw_event import InputKind, RawEvent
 
 PERIOD_NS = 540_000_000
@@ -42,7 +42,9 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
         clock.t_ns += PERIOD_NS
         recorder.tap("right")(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
         if number in told:
-            recorder.tap("right")(RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, as_text(number, told[number])))
+            recorder.tap("right")(
+                RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool_as_bytes(number, told[number]))
+            )
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
         message = EitFrame(
             source="right",

@@ -7,7 +7,7 @@ import pytest
 from scipy.io import savemat
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.estimation import Calibration
 from shearloop.daemon.analysis.reproduce import banks
 from shearloop.daemon.analysis.reproduce.report import PAPER_MODEL_SCORES
 from shearloop.daemon.cli import main

@@ -198,7 +198,7 @@ class IntervalRegressor:
         return ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True)
 class PolynomialRegressor:
     """The paper's curve over the first feature, sigma or k in cm, with its prediction interval."""
 

@@ -194,7 +194,7 @@ class SessionState:
             self._disturbed = None
             self._skip()
             return self._refuse(channels, usable, *filter(None, reasons))
-        if disturbance := self._fingertips.disturbance(jumping_shares):
+        if jumping_shares and (disturbance := self._fingertips.disturbance(jumping_shares)):
             return self._bridge(channels, disturbance, usable)
         if self._before is None and not self._begun and not self._tare_frames:
             self._unknown = ~usable

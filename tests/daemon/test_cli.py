@@ -53,7 +53,7 @@ def test_a_calibration_of_diameters_alone_is_no_torque_to_drive_by(
     command: str, config: Write, tiny_bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
-    Calibration.fit(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
+    Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
     section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
     assert main(["check", str(config(fingertips=section))]) == 0
     assert "without torque: its calibration has diameters only" in capsys.readouterr().out
@@ -142,7 +142,7 @@ def test_a_calibration_of_another_bank_is_refused_by_name(
 
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)
-    Calibration.fit("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
+    Calibration.from_matches("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
     section = fingertip(bank=str(tiny_bank), calibration=str(foreign))
     said = mistake(capsys, "check", str(config(fingertips=section)))
     for part in (str(foreign), "made with the bank cdcdcd", "calibrate again"):

@@ -1,14 +1,10 @@
 """What is measured twice: half of the noise, drift in a few channels weighs little, a foreign frame is in all."""
 
-import zipfile
-
 import numpy as np
 import pytest
-import yaml
 from scipy.stats import chi2
 
 from shearloop.bank.eit.batch_forward import BatchForwardModel
-from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame, fit
 from shearloop.bank.estimation.novelty import _FIRST, _SECOND, NoveltyDetector, ReciprocityCheck
 from tests.bank.conftest import small_fingertip
 
@@ -34,10 +30,10 @@ def test_the_misfit_of_noise_is_that_of_noise() -> None:
     frames = slices(400, 2)
     twins = ReciprocityCheck.fit(frames[:200])
     expected = float(chi2.median(1)) * np.median(frames[:200].var(axis=0)) / 2 / np.median(twins.spread**2)
-    quiet = np.median([twins.misfit(one, ALL) for one in frames[200:]])
+    quiet = np.median([twins.residual(one, ALL) for one in frames[200:]])
     assert quiet == pytest.approx(expected * 1e-6 / np.median(frames[:200].var(axis=0)), rel=0.15)
     loud = slices(400, 2, noise=2e-3)[200:]
-    assert np.median([twins.misfit(one, ALL) for one in loud]) == pytest.approx(4 * quiet, rel=0.1)
+    assert np.median([twins.residual(one, ALL) for one in loud]) == pytest.approx(4 * quiet, rel=0.1)
 
 
 def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_not() -> None:
@@ -45,15 +41,15 @@ def test_drift_in_a_few_channels_is_familiar_and_a_share_of_a_foreign_frame_is_n
     guard, later = NoveltyDetector.fit(frames[:40]), frames[50]
     drifted = later + np.where(np.arange(896) % 28 < 2, 4e-3, 0.0)
     foreign = 0.85 * later + 0.15 * later[np.random.default_rng(4).permutation(896)]
-    assert guard.twins is not None
+    assert guard.reciprocity is not None
     by_mean, by_twins = (
         [one(frame, ALL) for frame in (drifted, foreign)]
-        for one in (lambda *a: guard.misfit(*a)[0], guard.twins.misfit)
+        for one in (lambda *a: guard.q_residual(*a)[0], guard.reciprocity.residual)
     )
     # The drift hides the foreign frame from the mean of the squares; the median tells them apart.
     assert by_twins[1] / by_twins[0] > 1.5 * by_mean[1] / by_mean[0]
-    assert by_twins[0] < guard.twins.largest_misfit < by_twins[1]
-    assert any("what opposite injections say twice" in why or "misfit" in why for why in guard.judge(foreign, ALL).why)
+    assert by_twins[0] < guard.reciprocity.largest_residual < by_twins[1]
+    assert any("opposite injections" in why or "Q residual" in why for why in guard.assess(foreign, ALL).reasons)
 
 
 def test_what_one_of_the_two_does_not_say_is_left_out() -> None:
@@ -62,23 +58,5 @@ def test_what_one_of_the_two_does_not_say_is_left_out() -> None:
     usable = ALL.copy()
     usable[_SECOND[:100]] = False
     wrong = np.where(usable, frames[45], 1e3)
-    assert twins.misfit(wrong, usable) == pytest.approx(twins.misfit(frames[45], usable), rel=1e-12)
-    assert twins.misfit(wrong, usable) < twins.largest_misfit < twins.misfit(wrong, ALL)
-
-
-def test_a_calibration_from_before_is_read_and_does_without(sliced, tmp_path) -> None:
-    path, old = tmp_path / "new.cal", tmp_path / "old.cal"
-    fit("fused", [sliced()], "x").save(path)
-    with zipfile.ZipFile(path) as new, zipfile.ZipFile(old, "w") as written:
-        header = yaml.safe_load(new.read("calibration.yaml"))
-        del header["content"]["torque"]["guard"]["twins"]
-        header["sha256"] = {name: one for name, one in header["sha256"].items() if "twins" not in name}
-        written.writestr("calibration.yaml", yaml.safe_dump(header))
-        for name in header["sha256"]:
-            written.writestr(name, new.read(name))
-    found = Calibration.load(old)
-    assert found.torque is not None
-    assert found.torque.guard is not None
-    assert found.torque.guard.twins is None
-    whole = sliced()
-    assert EstimatorSession(found).estimate(TactileFrame.of(0.0, whole.channels[3])).valid
+    assert twins.residual(wrong, usable) == pytest.approx(twins.residual(frames[45], usable), rel=1e-12)
+    assert twins.residual(wrong, usable) < twins.largest_residual < twins.residual(wrong, ALL)

@@ -57,7 +57,7 @@ def test_the_interval_of_fused_measurements_holds_the_truth_as_often_as_it_says(
 def test_nothing_measured_is_nothing():
     assert combine(None, None) is None
     assert combine(Measured(1.0, float("inf")), Measured(2.0, float("inf"))) is None, "each may be anything"
-    with pytest.raises(ValueError, match="no uncertainty"):
+    with pytest.raises(ValueError, match="without uncertainty"):
         combine(Measured(1.0, 0.0), Measured(1.0, 1.0))
 
 
@@ -87,8 +87,8 @@ def test_torque_at_frames_is_interpolated_and_never_extrapolated():
     ("changed", "message"),
     [
         ({"channels": np.zeros((3, 2, 896))}, "need channels of shape"),
-        ({"torque_nm": np.zeros(3)}, "do not go with"),
-        ({"t_s": np.array([0.0, 2.0, 1.0])}, "must not fall"),
+        ({"torque_nm": np.zeros(3)}, "do not match"),
+        ({"t_s": np.array([0.0, 2.0, 1.0])}, "must not decrease"),
     ],
 )
 def test_what_does_not_belong_together_is_refused(changed, message):
@@ -98,7 +98,7 @@ def test_what_does_not_belong_together_is_refused(changed, message):
 
 def test_a_missing_side_is_named():
     with pytest.raises(CalibrationError, match="not left"):
-        empty().of_sides(("left",))
+        empty().select_sides(("left",))
 
 
 def test_values_that_are_not_finite_are_not_usable():

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import find_load_delay as alignments
-from shearloop.bank.estimation import fit
+from shearloop.bank.estimation import fit, load_delay
 from shearloop.bank.estimation.grip_segmentation import segment_grip
 from shearloop.bank.estimation.interval_regressor import student_inflation
 from shearloop.bank.estimation.load_delay import (
@@ -28,7 +27,7 @@ from shearloop.bank.estimation.load_delay import (
 def test_lateness_is_measured_far_finer_than_a_frame(recorded, late_s):
     found = find_load_delay(replace(recorded, torque_t_s=recorded.torque_t_s + late_s))
     assert found is not None
-    assert found.late_s == pytest.approx(late_s, abs=0.03)
+    assert found.delay_s == pytest.approx(late_s, abs=0.03)
     assert 0 < found.error_s < 0.03
 
 
@@ -36,7 +35,7 @@ def test_lateness_is_measured_far_finer_than_a_frame(recorded, late_s):
 def test_torques_that_are_stamped_at_other_times_are_refused(recorded, late_s):
     late = replace(recorded, torque_t_s=recorded.torque_t_s + late_s)
     with pytest.raises(CalibrationError, match=f"s {'before' if late_s > 0 else 'after'} the load that moves"):
-        fit("fused", [late], "late")
+        fit("motion_regression", [late], "late")
 
 
 def test_torques_that_are_stamped_at_other_times_are_taken_where_somebody_vouches_for_them(recorded):
@@ -78,16 +77,16 @@ def test_what_is_late_depends_on_the_load_cell(recorded, taps, late_s, sound):
         torque_t_s=recorded.torque_t_s + late_s,
         torque_nm=recorded.torque_nm + noise(recorded.torque_nm, taps),
     )
-    with nullcontext() if sound else pytest.raises(CalibrationError, match="by itself"):
+    with nullcontext() if sound else pytest.raises(CalibrationError, match="own delay"):
         check_load_delay([late])
 
 
 def test_lateness_that_is_uncertain_is_not_refused(recorded, monkeypatch):
     late = replace(recorded, torque_t_s=recorded.torque_t_s + 0.4)
-    monkeypatch.setattr(alignments, "_of_side", lambda *_: LoadDelay(0.4, 0.1, 0.5))
+    monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_: LoadDelay(0.4, 0.1, 0.5))
     check_load_delay([late])
-    monkeypatch.setattr(alignments, "_of_side", lambda *_: LoadDelay(0.4, 0.02, 0.5))
-    with pytest.raises(CalibrationError, match=r"0\.40 ± 0\.02 s before the load .* --load-late 0\.32"):
+    monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_: LoadDelay(0.4, 0.02, 0.5))
+    with pytest.raises(CalibrationError, match=r"0\.40 ± 0\.02 s before the load .* --load-cell-delay-s 0\.32"):
         check_load_delay([late])
 
 
@@ -101,7 +100,7 @@ def test_a_knocked_frame_does_not_hide_the_rest(recorded):
     knocked[[90, 140]] *= 1.5
     found = find_load_delay(replace(recorded, channels=knocked))
     assert found is not None
-    assert abs(found.late_s) < 0.2
+    assert abs(found.delay_s) < 0.2
 
 
 def test_what_would_be_refused_is_doubted_and_so_is_a_clear_peak_of_few_frames(recorded, monkeypatch):
@@ -111,11 +110,11 @@ def test_what_would_be_refused_is_doubted_and_so_is_a_clear_peak_of_few_frames(r
     assert "s before the load that moves them is stamped" in load_delay_warning(late)
     assert "too few" not in load_delay_warning(late)
     gripped = len(recorded.t_s[segment_grip(recorded)[1]])
-    monkeypatch.setattr(alignments, "_SURE_FRAMES", gripped + 1)
+    monkeypatch.setattr(load_delay, "_SURE_FRAMES", gripped + 1)
     assert find_load_delay(late) is None
     check_load_delay([late])
     assert f"though {gripped} gripped frames are too few to be sure" in load_delay_warning(late)
-    monkeypatch.setattr(alignments, "_SUSPECT_EXPLAINED", 1.0)
+    monkeypatch.setattr(load_delay, "_WARN_EXPLAINED", 1.0)
     assert load_delay_warning(late) == "", "a peak that is less high may be chance"
 
 
@@ -130,7 +129,7 @@ def test_times_are_unchecked_where_no_recording_tells_or_only_roughly(recorded, 
     assert timing_uncertainty_s([unmoved(recorded)]) == 0.75
     assert timing_uncertainty_s([unmoved(recorded), recorded]) == 0.0, "one clock has stamped them all"
     for error_s, unsure_s in ((0.05, 0.0), (0.2, 0.392), (2.0, 0.75)):
-        monkeypatch.setattr(alignments, "_of_side", lambda *_, e=error_s: LoadDelay(0.0, e, 0.5))
+        monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_, e=error_s: LoadDelay(0.0, e, 0.5))
         assert timing_uncertainty_s([recorded]) == pytest.approx(unsure_s, abs=1e-3)
 
 
@@ -141,20 +140,22 @@ def test_a_board_beside_that_was_dead_garbled_or_away_spoils_no_times(recorded):
     away = recorded.between(0, 12)
     for beside in (dead, garbled, away):
         assert timing_references([recorded], [beside]) == [recorded]
-        assert fit("fused", [recorded], "beside it", timed_by=[beside]).torque.reader.widened == 1.0
+        assert (
+            fit("motion_regression", [recorded], "beside it", timed_by=[beside]).torque.regressor.timing_widening == 1.0
+        )
         still = unmoved(recorded)
         assert timing_references([still], [beside]) == [still], "it says nothing, and is not to be blamed"
         assert timing_references([still], [beside, recorded]) == [recorded]
 
 
 def test_each_recording_is_looked_at_once(recorded, monkeypatch):
-    looked, of_side = [], alignments._of_side
-    monkeypatch.setattr(alignments, "_of_side", lambda *a: (looked.append((a[0], a[2])), of_side(*a))[1])
+    looked, of_side = [], load_delay._delay_of_side
+    monkeypatch.setattr(load_delay, "_delay_of_side", lambda *a: (looked.append((a[0], a[2])), of_side(*a))[1])
     fit("regression", [recorded], "alone")
     assert len(looked) == len(set(looked)) == len(recorded.sides)
     looked.clear()
     aligned = cache(find_load_delay)
-    fit("regression", [recorded], "and asked again", aligned=aligned)
+    fit("regression", [recorded], "and asked again", find_delay=aligned)
     still = unmoved(recorded)
     assert timing_references([still], [recorded], aligned) == [recorded]
     assert (load_delay_warning(still, aligned), load_delay_warning(recorded, aligned)) == ("", "")
@@ -171,14 +172,16 @@ def test_a_torque_within_some_time_is_any_from_the_least_to_the_largest(recorded
 
 
 def test_intervals_hold_what_times_that_could_not_be_checked_do_to_the_torque(recorded, monkeypatch):
-    checked = fit("fused", [recorded], "checked").torque.reader
-    monkeypatch.setattr(alignments, "_of_side", lambda *_: None)
-    unchecked = fit("fused", [recorded], "unchecked").torque.reader
-    vouched = fit("fused", [recorded], "vouched for", trust_times=True).torque.reader
-    assert checked.widened == vouched.widened == 1.0
-    assert unchecked.widened > 1.1 * student_inflation(5), (
+    checked = fit("motion_regression", [recorded], "checked").torque.regressor
+    monkeypatch.setattr(load_delay, "_delay_of_side", lambda *_: None)
+    unchecked = fit("motion_regression", [recorded], "unchecked").torque.regressor
+    vouched = fit("motion_regression", [recorded], "vouched for", trust_times=True).torque.regressor
+    assert checked.timing_widening == vouched.timing_widening == 1.0
+    assert unchecked.timing_widening > 1.1 * student_inflation(5), (
         "blocks of few loads tell little, and other times' loads are wider"
     )
-    assert unchecked.intervals.half_widths[-1] == pytest.approx(unchecked.widened * checked.intervals.half_widths[-1])
+    assert unchecked.intervals.half_widths[-1] == pytest.approx(
+        unchecked.timing_widening * checked.intervals.half_widths[-1]
+    )
     np.testing.assert_array_equal(vouched.intervals.half_widths, checked.intervals.half_widths)
-    np.testing.assert_array_equal(unchecked.head.weights, checked.head.weights)
+    np.testing.assert_array_equal(unchecked.point.weights, checked.point.weights)

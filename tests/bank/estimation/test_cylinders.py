@@ -36,7 +36,7 @@ def known():
 def test_another_grip_is_read_without_a_pull_to_the_mean(known):
     """The noise of three idle frames parts three recordings as well as their tools do."""
     head = fit_line(known)
-    read = {mm: np.mean([head.predict(grip(mm, 100 + seed).held[-1:]) for seed in range(5)]) for mm in (12.0, 38.0)}
+    read = {mm: np.mean([head.predict(grip(mm, 100 + seed).means[-1:]) for seed in range(5)]) for mm in (12.0, 38.0)}
     slope = (read[38.0] - read[12.0]) / 26
     assert slope == pytest.approx(1.0, abs=0.1)
     frames, diameters = np.concatenate([one.frames for one in known]), np.repeat(KNOWN_MM, N_FRAMES)
@@ -50,7 +50,7 @@ def test_intervals_hold_cylinders_that_the_line_was_not_fitted_to():
     for number in range(4):
         reader = fit_cylinders([grip(mm, 10 * number + seed) for seed, mm in enumerate(KNOWN_MM)])
         for seed, mm in enumerate((12.0, 15.0, 20.0, 30.0, 35.0)):
-            value, below, above = reader.read(grip(mm, 200 + 10 * number + seed).held[-1])
+            value, below, above = reader.predict(grip(mm, 200 + 10 * number + seed).means[-1])
             inside.append(-below <= mm - value <= above)
     assert np.mean(inside) >= 0.85
 
@@ -61,17 +61,17 @@ def test_the_interval_tells_how_far_grips_differ_that_the_line_goes_through():
     placed = []
     for mm, place in zip((10.0, 20.0, 30.0, 40.0), 20 * places / np.linalg.norm(places[0]), strict=True):
         one = grip(mm, int(mm))
-        placed.append(replace(one, frames=one.frames + place, held=one.held + place))
+        placed.append(replace(one, frames=one.frames + place, means=one.means + place))
     # Another grip of the same cylinder vouches for no other.
     reader = fit_cylinders([*placed, *map(replace, placed)])
-    read = [reader.read(one.held[-1]) for one in placed]
+    read = [reader.predict(one.means[-1]) for one in placed]
     assert max(abs(one.diameter_mm - value) for one, (value, _, _) in zip(placed, read, strict=True)) < 2.0
     assert read[0][1] > 10.0
 
 
 def test_fingertips_that_see_no_diameter_say_so_by_their_interval(known):
-    blind = [replace(one, frames=one.frames - one.diameter_mm * PER_MM, held=one.held - 25 * PER_MM) for one in known]
-    value, below, above = fit_cylinders(blind).read(blind[0].held[-1])
+    blind = [replace(one, frames=one.frames - one.diameter_mm * PER_MM, means=one.means - 25 * PER_MM) for one in known]
+    value, below, above = fit_cylinders(blind).predict(blind[0].means[-1])
     assert 15.0 < min(below, above) < 150.0
     assert -50.0 < value < 100.0
 
@@ -86,7 +86,7 @@ def test_one_recording_under_three_diameters_reads_none_of_them_apart(known, fra
     """Nothing tells them apart but rounding, which was divided by."""
     one = replace(known[0], frames=known[0].frames[:frames])
     reader = fit_cylinders([replace(one, diameter_mm=mm) for mm in KNOWN_MM])
-    value, below, above = reader.read(one.held[-1])
+    value, below, above = reader.predict(one.means[-1])
     assert value == pytest.approx(25.0, abs=0.1)
     assert min(below, above) > 15.0
 
@@ -101,7 +101,7 @@ def test_a_diameter_is_of_this_grip_alone(twisting):
         channels = whole.channels + gripped[:, None, None] * (mm - 25) * 2e-4 * np.sin(np.arange(N_CHANNELS) / 9.0)
         return replace(whole, channels=channels, diameter_mm=np.full(len(whole.t_s), mm))
 
-    calibration = fit("fused", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "a played rig", trust_times=True)
+    calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", trust_times=True)
     tracker, read = EstimatorSession(calibration), []
     for number, mm in enumerate((12.0, 38.0)):
         for t_s, channels in zip(recorded.t_s, of(mm, 10 + number).channels, strict=True):
@@ -123,10 +123,10 @@ def test_the_first_frames_of_a_grip_have_the_interval_of_a_mean_of_few(twisting)
         channels = whole.channels + gripped[:, None, None] * (mm - 25) * 2e-5 * np.sin(np.arange(N_CHANNELS) / 9.0)
         return replace(whole, channels=channels, diameter_mm=np.full(len(whole.t_s), mm))
 
-    calibration = fit("fused", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "a played rig", trust_times=True)
+    calibration = fit("motion_regression", [of(mm, seed) for seed, mm in enumerate(KNOWN_MM)], "rig", trust_times=True)
     inside, widths = [], []
     for seed in range(20, 40):
-        tracker, known_half_mm = EstimatorSession(calibration), calibration.diameter.reader.intervals.half_widths[0]
+        tracker, known_half_mm = EstimatorSession(calibration), calibration.diameter.regressor.intervals.half_widths[0]
         frames = zip(recorded.t_s, of(15.0, seed).channels, strict=True)
         told = [tracker.estimate(TactileFrame.of(*one)) for one in frames]
         grip = [one for one in told if one.diameter_mm is not None]

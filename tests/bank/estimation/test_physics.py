@@ -49,7 +49,7 @@ def test_a_place_between_cells_is_found_to_a_fraction_of_one(bank):
     channel = np.linspace(0, 4, 896)
     locator = RefinedMatcher(bank, NOT_TURNED)
     for k, sigma in ((1.83, 1.04), (2.26, 0.77)):
-        place = locator.locate(-2.5 * np.exp(-0.5 * ((channel - k) / (0.3 * sigma)) ** 2))
+        place = locator.match(-2.5 * np.exp(-0.5 * ((channel - k) / (0.3 * sigma)) ** 2))
         assert place.k == pytest.approx(k, abs=0.02)
         assert place.sigma == pytest.approx(sigma, abs=0.02)
         assert place.log_amplitude == pytest.approx(np.log(2.5), abs=0.1)
@@ -62,7 +62,7 @@ def test_two_places_that_fit_alike_are_ambiguous(bank):
     twice = type(bank)(
         bank.path, bank.definition, bank.identity, bank.homogeneous, bank.min_conductivity, bank.valid, signals, ""
     )
-    assert RefinedMatcher(twice, NOT_TURNED).locate(signals[10, 8]).ambiguous
+    assert RefinedMatcher(twice, NOT_TURNED).match(signals[10, 8]).ambiguous
 
 
 @pytest.mark.parametrize("name", ["paper", "bank"])

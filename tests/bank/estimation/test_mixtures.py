@@ -1,6 +1,5 @@
 """What of something foreign a slice may hold unseen: intervals include it, and cost nothing where it is seen."""
 
-import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -65,20 +64,22 @@ def test_what_a_guard_cannot_see_lies_within_the_interval():
 
 def test_where_it_is_seen_intervals_are_as_wide_as_without(sliced, sliced_calibration):
     calibration = sliced_calibration
-    reader = calibration.torque.reader
-    without = replace(calibration, torque=replace(calibration.torque, reader=replace(reader, hidden_below=0.0)))
+    reader = calibration.torque.regressor
+    without = replace(
+        calibration, torque=replace(calibration.torque, regressor=replace(reader, contamination_below=0.0))
+    )
     later = sliced(seed=3)
     assert judged(calibration, mixed_with_a_foreign_frame(later, 0.2))[0] < 0.1
     assert judged(calibration, later)[2] < 1.15 * judged(without, later)[2]
 
 
-@pytest.mark.parametrize("name", ["fused", "regression"])
+@pytest.mark.parametrize("name", ["motion_regression", "regression"])
 def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced, sliced_calibration):
     """It only makes the own response smaller, which is what another torque does: no misfit tells of it."""
-    calibration = sliced_calibration if name == "fused" else fit(name, [sliced()], "all")
+    calibration = sliced_calibration if name == "motion_regression" else fit(name, [sliced()], "all")
     later = sliced(seed=3)
-    guard = calibration.torque.guard
-    blind = replace(calibration, torque=replace(calibration.torque, guard=replace(guard, largest_own=0.0)))
+    guard = calibration.torque.novelty
+    blind = replace(calibration, torque=replace(calibration.torque, novelty=replace(guard, typical_response=0.0)))
     foreign = 0.2 * later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
     spoilt = replace(later, channels=0.8 * later.channels + 0.2 * foreign)
     valid, false_valid, _ = judged(calibration, spoilt)
@@ -88,9 +89,9 @@ def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name
     assert judged(calibration, later)[2] < 1.2 * judged(blind, later)[2]
 
 
-def test_a_streams_intervals_know_nothing_of_mixtures(fused_calibration):
-    reader = fused_calibration.torque.reader
-    assert (reader.hidden_below, reader.hidden_above) == (0.0, 0.0)
+def test_a_streams_intervals_know_nothing_of_mixtures(motion_calibration):
+    reader = motion_calibration.torque.regressor
+    assert (reader.contamination_below, reader.contamination_above) == (0.0, 0.0)
 
 
 def test_mixtures_are_those_that_the_guard_of_the_earlier_slices_lets_pass():
@@ -99,14 +100,14 @@ def test_mixtures_are_those_that_the_guard_of_the_earlier_slices_lets_pass():
     guard = NoveltyDetector.fit(differences[past])
     usable = np.ones(896, dtype=bool)
     mixtures = ContaminationTest(differences, np.append)
-    passing = mixtures.passing(past, future)
+    passing = mixtures.accepted(past, future)
     assert 0 < len(passing.rows) < 20 * 15 * 3
-    for row, features, nearness in zip(passing.rows, passing.features, passing.nearness, strict=True):
+    for row, features, nearness in zip(passing.rows, passing.features, passing.limit_shares, strict=True):
         assert features[-1] == row
-        assert not guard.judge(features[:-1], usable).why
-        assert nearness == guard.judge(features[:-1], usable).nearness <= 1.0
+        assert not guard.assess(features[:-1], usable).reasons
+        assert nearness == guard.assess(features[:-1], usable).limit_share <= 1.0
     np.testing.assert_array_equal(
-        mixtures.difficulty(past, future), [guard.widening(one, usable) for one in differences[future]]
+        mixtures.growth(past, future), [guard.widening(one, usable) for one in differences[future]]
     )
 
 
@@ -120,34 +121,9 @@ def test_the_interval_reaches_to_the_side_on_which_the_truth_is_hidden(sign):
     def moved(_, later) -> Mixtures:
         return Mixtures(later, features[later] + sign * 0.3, np.full(len(later), 0.5))
 
-    reader = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), mixed=moved)
-    _, *plain = reader.read(np.array([0.5]))
-    _, *at_limit = reader.read(np.array([0.5]), nearness=1.0)
+    reader = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), mixtures=moved)
+    _, *plain = reader.predict(np.array([0.5]))
+    _, *at_limit = reader.predict(np.array([0.5]), limit_share=1.0)
     hidden, other = (0, 1) if sign > 0 else (1, 0)
     assert at_limit[hidden] == pytest.approx(0.6, abs=0.01)
     assert at_limit[other] == plain[other] < 0.01
-
-
-def test_a_calibration_from_before_is_read_as_it_was(sliced, sliced_calibration, tmp_path):
-    """Its file has no such numbers: intervals are as they were when it was made."""
-    calibration = sliced_calibration
-    old = replace(calibration, torque=replace(calibration.torque, reader=_without(calibration.torque.reader)))
-    old.save(tmp_path / "old.cal")
-    _remove_from_header(tmp_path / "old.cal", "hidden_below", "hidden_above", "lowest", "highest")
-    later = sliced(seed=3)
-    assert judged(Calibration.load(tmp_path / "old.cal"), later) == judged(old, later)
-
-
-def _without(reader):
-    return replace(reader, hidden_below=0.0, hidden_above=0.0, lowest=np.nan, highest=np.nan)
-
-
-def _remove_from_header(path, *names):
-    with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    lines = members["calibration.yaml"].decode().splitlines(keepends=True)
-    kept = [line for line in lines if not line.strip().startswith(names)]
-    assert len(kept) == len(lines) - len(names)
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, data in (members | {"calibration.yaml": "".join(kept).encode()}).items():
-            archive.writestr(name, data)

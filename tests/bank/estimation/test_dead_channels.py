@@ -6,7 +6,7 @@ import pytest
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, TactileFrame
 from shearloop.bank.estimation.session_state import SessionState
-from tests.bank.estimators.conftest import IDLE_S, PERIOD_S
+from tests.bank.estimation.conftest import IDLE_S, PERIOD_S
 
 GRIPPED = round(IDLE_S / PERIOD_S) + 2
 
@@ -39,11 +39,11 @@ def wrong_share(found: np.ndarray, series: FrameSeries) -> float:
 
 @pytest.mark.parametrize("kind", ["electrode", "a fifth", "lost"])
 def test_channels_that_the_session_began_without_say_nothing_when_they_come_back_in_the_grip(
-    fused_calibration, twisting, kind
+    motion_calibration, twisting, kind
 ) -> None:
     """Their idle voltages are not known: what is measured from made-up ones would be wrong, and pass for certain."""
     series, back = twisting(seed=3, cycles=2), GRIPPED + 30
-    trackers = [EstimatorSession(fused_calibration, period_s=PERIOD_S) for _ in range(2)]
+    trackers = [EstimatorSession(motion_calibration, period_s=PERIOD_S) for _ in range(2)]
     found, expected = (
         torques([tracker.estimate(frame) for frame in without(slice(0, end), kind, series)])
         for tracker, end in zip(trackers, (back, None), strict=True)
@@ -55,18 +55,18 @@ def test_channels_that_the_session_began_without_say_nothing_when_they_come_back
 @pytest.mark.parametrize("kind", ["electrode", "a fifth", "lost"])
 @pytest.mark.parametrize("with_motion", [True, False])
 def test_channels_that_come_back_while_idle_are_used_from_then_on(
-    fused_calibration, twisting, with_motion, kind
+    motion_calibration, twisting, with_motion, kind
 ) -> None:
-    calibration, series = fused_calibration, twisting(seed=3, cycles=2)
-    motion = calibration.motion if with_motion else None
-    memory = SessionState(calibration.guards, motion, period_s=PERIOD_S)
-    moments = [memory.see(frame) for frame in without(slice(0, 12), kind, series)]
-    whole = SessionState(calibration.guards, motion, period_s=PERIOD_S)
-    expected = [whole.see(frame) for frame in without(slice(0, 0), kind, series)]
-    gripped = [(one, other) for one, other in zip(moments, expected, strict=True) if not other.why]
+    calibration, series = motion_calibration, twisting(seed=3, cycles=2)
+    motion = calibration.temporal if with_motion else None
+    memory = SessionState(calibration.validators, motion, period_s=PERIOD_S)
+    moments = [memory.process(frame) for frame in without(slice(0, 12), kind, series)]
+    whole = SessionState(calibration.validators, motion, period_s=PERIOD_S)
+    expected = [whole.process(frame) for frame in without(slice(0, 0), kind, series)]
+    gripped = [(one, other) for one, other in zip(moments, expected, strict=True) if not other.reasons]
     assert len(gripped) > 60
     for one, other in gripped:
-        assert not one.why
+        assert not one.reasons
         assert one.usable.all()
         # Ten idle frames are averaged, and of fewer the mean is as much noisier.
         np.testing.assert_allclose(one.difference, other.difference, rtol=0, atol=0.003)

@@ -2,7 +2,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.bank.estimation.directions import coordinates
+from shearloop.bank.estimation.novelty import _coordinates as coordinates
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 4), st.floats(0, 0.6))

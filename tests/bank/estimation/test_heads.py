@@ -8,7 +8,7 @@ from shearloop.bank.estimation.regressors import (
     InverseCalibration,
     Ridge,
     TobitRidge,
-    _below_zero,
+    _moments_below_zero,
     best_strength,
     later_origins,
     later_splits,
@@ -56,8 +56,8 @@ def test_a_lever_may_be_pushed_either_way():
 
 
 @pytest.mark.parametrize(("mean", "sigma"), [(-0.5, 1.0), (0.0, 0.2), (0.7, 0.3), (3.0, 0.5)])
-def test_the_moments_of_a_gaussian_below_zero(mean, sigma):
-    found = _below_zero(np.array([mean]), sigma)
+def test_the_moments_of_a_gaussian_moments_below_zero(mean, sigma):
+    found = _moments_below_zero(np.array([mean]), sigma)
     expected = truncnorm.stats(-np.inf, -mean / sigma, loc=mean, scale=sigma, moments="mv")
     np.testing.assert_allclose(np.ravel(found), expected, rtol=1e-6)
 
@@ -172,13 +172,13 @@ def test_a_twist_the_other_way_than_the_lever_pushed_is_no_sure_zero(sign: float
     frames = twist[:, None] * rng.normal(size=(1, 12)) + rng.normal(0.0, 0.05, (400, 12))
     reader = fit_interval_regressor(frames, sign * np.maximum(twist, 0.0) * 0.1, TobitRidge.fit, strengths=(1e-5,))
     other_way = np.flatnonzero(twist < -0.1)
-    read = [reader.read(frames[i]) for i in other_way.tolist()]
+    read = [reader.predict(frames[i]) for i in other_way.tolist()]
     truth = (sign * 0.1 * twist[other_way]).tolist()
     inside = [value - below <= true <= value + above for (value, below, above), true in zip(read, truth, strict=True)]
     assert np.mean(inside) > 0.95
     for _, below, above in read:
         # Towards the side that the lever pushes to, it is as sure as it was.
         assert (above if sign > 0 else below) < 0.02
-    far, below, above = reader.read(frames[np.argmin(twist)])
+    far, below, above = reader.predict(frames[np.argmin(twist)])
     assert far == 0.0
     assert (below if sign > 0 else above) > 0.1

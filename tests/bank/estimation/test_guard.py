@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import (
-    JUMP_NOISES,
-    JUMP_V,
+    _JUMP_NOISES,
+    _JUMP_V,
     LEAST_NOISE_V,
     FingertipSet,
     FingertipValidator,
@@ -46,8 +46,8 @@ def test_noise_is_what_is_fast(twisting):
 @pytest.mark.parametrize("gain", [0.85, 1.0, 1.2])
 def test_a_fingertip_is_known_under_any_gain(recorded, gain):
     guards = FingertipSet((guard_of(recorded),))
-    assert all(guards.seen(gain * frame[None], ALL)[0] == [""] for frame in recorded.channels[::20, 0])
-    assert all(guards.seen(gain * frame[None], ALL)[0] != [""] for frame in recorded.channels[::20, 1])
+    assert all(guards.check(gain * frame[None], ALL)[0] == [""] for frame in recorded.channels[::20, 0])
+    assert all(guards.check(gain * frame[None], ALL)[0] != [""] for frame in recorded.channels[::20, 1])
 
 
 def lost_channels(side, frame, usable):
@@ -72,18 +72,18 @@ def test_each_side_is_compared_with_its_own_fingertip_whatever_the_other_says(re
         frame[0, 100:128] *= 0.1
         frame[1] = frame[1, ::-1] if number % 4 == 0 else frame[1]
         frame[:, :40] += 0.05 * random.random()
-        why, lost = both.seen(frame, usable)
-        jumps, grips = both.jumping_shares(frame, before, usable), both.grips(frame, idle)
+        why, lost = both.check(frame, usable)
+        jumps, grips = both.jumping_shares(frame, before, usable), both.grip_scores(frame, idle)
         for layer, (one, side) in enumerate(zip(alone, sides, strict=True)):
             own = slice(layer, layer + 1)
-            own_why, own_lost = one.seen(frame[own], usable[own])
+            own_why, own_lost = one.check(frame[own], usable[own])
             assert own_why == why[own]
             np.testing.assert_array_equal(own_lost, lost[own])
             np.testing.assert_array_equal(lost[layer], lost_channels(side, frame[layer], usable[layer]))
             assert one.jumping_shares(frame[own], before[own], usable[own]) == jumps[own]
-            assert side.grip(frame[layer], side.idle) == grips[layer]
+            assert side.grip_score(frame[layer], side.idle) == grips[layer]
             moved = np.abs(frame[layer] - before[layer])[usable[layer]]
-            limit = np.maximum(JUMP_NOISES * np.sqrt(2.0) * side.noise, JUMP_V)[usable[layer]]
+            limit = np.maximum(_JUMP_NOISES * np.sqrt(2.0) * side.noise, _JUMP_V)[usable[layer]]
             assert jumps[layer] == np.mean(moved > limit)
             said.add((layer, bool(why[layer]), bool(own_lost.any())))
         before = frame
@@ -92,7 +92,7 @@ def test_each_side_is_compared_with_its_own_fingertip_whatever_the_other_says(re
 
 def test_grip_is_about_one_gripped_and_zero_idle(recorded):
     guard = guard_of(recorded)
-    scores = np.array([guard.grip(frame, guard.idle) for frame in recorded.channels[:, 0]])
+    scores = np.array([guard.grip_score(frame, guard.idle) for frame in recorded.channels[:, 0]])
     gripped = (recorded.t_s > 24) & (recorded.t_s < 139)
     idle = (recorded.t_s < 19) | (recorded.t_s > 143)
     assert scores[gripped].min() > guard.grip_threshold > scores[idle].max()
@@ -113,15 +113,18 @@ def test_too_little_is_said_to_be(recorded):
     frames = recorded.channels[:, 0]
     with pytest.raises(CalibrationError, match="2 idle and 200 gripped frames are too few"):
         FingertipValidator.fit("right", (frames[:2], frames[50:250], frames[:0]))
-    with pytest.raises(CalibrationError, match="cannot be told from idle"):
+    with pytest.raises(CalibrationError, match="look like idle"):
         FingertipValidator.fit("right", (frames[:12], frames[6:34], frames[:0]))
     n = len(recorded.torque_nm)
     for changed, told in (
         ({"torque_nm": np.zeros(n)}, "is 0 at all of these frames; record twists"),
-        ({"torque_t_s": recorded.torque_t_s + 1e4}, "known at none of these frames; record the load cell beside them"),
+        (
+            {"torque_t_s": recorded.torque_t_s + 1e4},
+            "no torque is known for these frames",
+        ),
         (
             {"t_s": np.empty(0), "channels": recorded.channels[:0], "diameter_mm": np.empty(0)},
-            "holds no frames of right and left at one time; record some frames",
+            "holds no frames of right and left together; record some frames",
         ),
     ):
         with pytest.raises(CalibrationError, match=told):

@@ -19,13 +19,13 @@ COPIES: dict[str, Callable[[EstimatorSession], EstimatorSession]] = {
 
 
 @pytest.fixture(scope="module")
-def calibration_of(recorded, fused_calibration) -> Callable[[str, int], Calibration]:
+def calibration_of(recorded, motion_calibration) -> Callable[[str, int], Calibration]:
     """Return what gives the calibration of an estimator on so many fingertips of the shared recording."""
-    right = recorded.of_sides(("right",))
+    right = recorded.select_sides(("right",))
     found = {
-        ("fused", 2): fused_calibration,
-        ("fused", 1): fit("fused", [right], "the right one of a played rig"),
-        ("regression", 2): fit("regression", [recorded], "a played rig"),
+        ("motion_regression", 2): motion_calibration,
+        ("motion_regression", 1): fit("motion_regression", [right], "the right one of a played rig"),
+        ("regression", 2): fit("regression", [recorded], "rig"),
         ("regression", 1): fit("regression", [right], "the right one of a played rig"),
     }
     return lambda name, m: found[name, m]
@@ -66,18 +66,18 @@ FAULTS = st.lists(
 @pytest.mark.parametrize("how", COPIES)
 @settings(deadline=None, max_examples=12)
 @given(
-    st.sampled_from(["fused", "fused", "regression"]), st.integers(1, 2), FAULTS,
+    st.sampled_from(["motion_regression", "motion_regression", "regression"]), st.integers(1, 2), FAULTS,
     st.integers(0, 130), st.booleans(),
 )  # fmt: skip
 def test_a_copy_goes_on_with_the_same_estimates_to_the_bit(
     how, calibration_of, twisting, name, m, faults, at, tared
 ) -> None:
     calibration = calibration_of(name, m)
-    series = twisting(cycles=2, seed=9).of_sides(calibration.sides)
+    series = twisting(cycles=2, seed=9).select_sides(calibration.sides)
     tracker = EstimatorSession(calibration, period_s=0.54)
-    tracker.hold(Measured(20.0, 1.0))
+    tracker.set_tool(Measured(20.0, 1.0))
     if tared:
-        tracker.take_idle(6)
+        tracker.tare(6)
     frames = faulty(series, faults)
     for frame in frames[:at]:
         tracker.estimate(frame)

@@ -33,25 +33,25 @@ def without_electrodes(series: FrameSeries, electrodes: tuple[int, ...], start: 
 
 
 @pytest.mark.parametrize("electrodes", [(5,), (5, 19)])
-def test_electrodes_that_are_lost_without_a_word_are_done_without(fused_calibration, twisting, electrodes):
+def test_electrodes_that_are_lost_without_a_word_are_done_without(motion_calibration, twisting, electrodes):
     whole = twisting(seed=31)
     spoilt = without_electrodes(whole, electrodes, 90)
-    found = estimates(fused_calibration, spoilt)
-    before = estimates(fused_calibration, whole)
+    found = estimates(motion_calibration, spoilt)
+    before = estimates(motion_calibration, whole)
     assert sum(one.valid for one in found) > 0.9 * sum(one.valid for one in before)
     assert rms_error(found, spoilt) < 1.5 * rms_error(before, whole)
 
 
-def test_many_lost_electrodes_end_it(fused_calibration, twisting):
-    found = estimates(fused_calibration, without_electrodes(twisting(seed=32), (1, 4, 8, 12, 20, 25), 90))
+def test_many_lost_electrodes_end_it(motion_calibration, twisting):
+    found = estimates(motion_calibration, without_electrodes(twisting(seed=32), (1, 4, 8, 12, 20, 25), 90))
     assert not any(one.valid for one in found[90:])
 
 
-def test_channels_at_a_rail_are_found_and_done_without(fused_calibration, twisting):
+def test_channels_at_a_rail_are_found_and_done_without(motion_calibration, twisting):
     whole = twisting(seed=33)
     rail = np.quantile(whole.channels[5], 0.9)
     clipped = replace(whole, channels=np.minimum(whole.channels, rail))
-    found = estimates(fused_calibration, clipped)
+    found = estimates(motion_calibration, clipped)
     assert rms_error(found, clipped) < 0.02 * 0.06
     # One side is clipped, the other is not.
     frame, usable = np.array([clipped.channels[100, 0], whole.channels[100, 0]]), np.ones((2, 896), dtype=np.bool_)
@@ -80,7 +80,7 @@ def test_of_as_many_as_are_at_a_rail_one_less_is_chance():
 
 def test_a_drift_does_not_lead_a_regression_astray(twisting):
     past = twisting(seed=35)
-    calibration = fit("regression", [past], "a played rig")
+    calibration = fit("regression", [past], "rig")
     later = twisting(seed=36)
     moved = np.random.default_rng(0).normal(0.0, 0.05, 896) * later.channels[5]
     found = estimates(

@@ -30,10 +30,10 @@ def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced
     series = sliced()
     guard = NoveltyDetector.fit(series.channels[:, 0])
     near, far = (beyond(series, nm)[0] for nm in (0.01, 0.15))
-    assert guard.judge(near, ALL).why == ()
+    assert guard.assess(near, ALL).reasons == ()
     # Its misfit is as small as any: only how far it lies out tells of it.
-    assert guard.misfit(far, ALL)[0] < guard.largest_misfit
-    assert "standard deviations from those calibrated on" in guard.judge(far, ALL).why[0]
+    assert guard.q_residual(far, ALL)[0] < guard.largest_q
+    assert "standard deviations from the calibrated ones" in guard.assess(far, ALL).reasons[0]
 
 
 @pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
@@ -51,8 +51,8 @@ def test_channels_that_vary_much_do_not_drown_the_others():
     guard = NoveltyDetector.fit(frames)
     # Ten times its own spread on every quiet channel is nothing beside one spread of the loud ones, in volts.
     odd = frames[3] + np.where(np.arange(896) < 90, 0.0, 1e-3) * np.where(np.arange(896) % 2, 1, -1)
-    assert guard.judge(odd, ALL).why
-    assert not guard.judge(frames[3], ALL).why
+    assert guard.assess(odd, ALL).reasons
+    assert not guard.assess(frames[3], ALL).reasons
 
 
 def saturating(value):
@@ -62,7 +62,7 @@ def saturating(value):
 
 def reader_of(features, values) -> IntervalRegressor:
     return fit_interval_regressor(
-        features, values, Ridge.fit, strengths=(1e-9,), difficulty=lambda _, later: np.ones(len(later))
+        features, values, Ridge.fit, strengths=(1e-9,), growth=lambda _, later: np.ones(len(later))
     )
 
 
@@ -70,11 +70,11 @@ def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it(
     rng = np.random.default_rng(1)
     values = rng.uniform(0.0, 1.0, 200)
     reader = reader_of(saturating(values) + rng.normal(0, 1e-3, (200, 2)), values)
-    low_value, below, above = reader.read(saturating(np.array([-0.3]))[0])
+    low_value, below, above = reader.predict(saturating(np.array([-0.3]))[0])
     assert low_value == pytest.approx(0.15, abs=0.1)
     assert low_value - below < -0.3
     assert above < 0.3
-    _, below, above = reader.read(saturating(np.array([0.6]))[0])
+    _, below, above = reader.predict(saturating(np.array([0.6]))[0])
     assert max(below, above) < 0.3
 
 
@@ -89,15 +89,15 @@ def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_
     reader = reader_of(features, values)
     assert reader.low_end == values.min(), "below nothing is folded"
     assert reader.high_end == pytest.approx(0.5, abs=0.05)
-    _, below, above = reader.read(np.array([0.3]))
+    _, below, above = reader.predict(np.array([0.3]))
     assert max(below, above) < 0.5
-    value, _, above = reader.read(np.array([0.6]))
+    value, _, above = reader.predict(np.array([0.6]))
     assert value + above == pytest.approx(values.max() + 2 * np.ptp(values)), "as far beyond as is known to pass"
     vouched = fit_interval_regressor(
-        features, values, Ridge.fit, strengths=(1e-9,), difficulty=lambda _, later: np.ones(len(later)), all_values=True
+        features, values, Ridge.fit, strengths=(1e-9,), growth=lambda _, later: np.ones(len(later)), full_range=True
     )
-    assert vouched.read(np.array([0.6]))[2] < 0.5
-    assert vouched.read(np.array([0.6]))[0] == value
+    assert vouched.predict(np.array([0.6]))[2] < 0.5
+    assert vouched.predict(np.array([0.6]))[0] == value
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -105,7 +105,7 @@ def test_what_is_read_at_the_end_towards_zero_may_be_no_load_at_all(sign):
     rng = np.random.default_rng(1)
     values = rng.uniform(0.0, 1.0, 200)
     reader = reader_of(saturating(values) + rng.normal(0, 1e-3, (200, 2)), sign * (values + 3.0))
-    value, *reach = reader.read(saturating(np.array([-3.0]))[0])
+    value, *reach = reader.predict(saturating(np.array([-3.0]))[0])
     assert value - sign * reach[0 if sign > 0 else 1] == pytest.approx(0.0)
 
 
@@ -137,7 +137,7 @@ def test_where_values_beyond_are_read_as_such_intervals_reach_no_further_than_th
     values = rng.uniform(0.0, 1.0, 200)
     reader = reader_of(values[:, None] + rng.normal(0, 1e-3, (200, 1)), values)
     assert (reader.low_end, reader.high_end) == (values.min(), values.max())
-    assert reader.read(np.array([0.02]))[1] < 0.01
+    assert reader.predict(np.array([0.02]))[1] < 0.01
 
 
 def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
@@ -147,7 +147,7 @@ def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
     blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
     reader = fit_interval_regressor(blind, torque, Ridge.fit)
     loaded = np.flatnonzero(torque > 0.01)
-    read = np.array([reader.read(blind[i]) for i in loaded])
+    read = np.array([reader.predict(blind[i]) for i in loaded])
     assert (torque[loaded] - read[:, 0] <= read[:, 2]).mean() > 0.9
     assert reader.misses_loads
     # One that sees it pays nothing.
@@ -161,24 +161,24 @@ def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
     torque = np.where(np.arange(600) % 40 < 5, rng.uniform(0.02, 0.06, 600), 0.0)
     blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
     beside = np.array([np.roll(torque, shift) for shift in range(-6, 7)])
-    reader = fit_interval_regressor(blind, torque, Ridge.fit, within=(beside.min(axis=0), beside.max(axis=0)))
-    assert reader.widened > 1.2
+    reader = fit_interval_regressor(blind, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
+    assert reader.timing_widening > 1.2
     loaded = torque > 0.01
-    read = np.array([reader.read(one) for one in blind[loaded]])
+    read = np.array([reader.predict(one) for one in blind[loaded]])
     half = np.array([reader.intervals.half_width(one) for one in read[:, 0]])
     assert (np.abs(torque[loaded] - read[:, 0]) <= half).mean() > 0.75, "as wide as that they would hold these loads"
     assert reader.misses_loads
     seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
-    sighted = fit_interval_regressor(seeing, torque, Ridge.fit, within=(beside.min(axis=0), beside.max(axis=0)))
+    sighted = fit_interval_regressor(seeing, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
     assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
 
 
 def test_a_slice_is_measured_against_the_calibration_once(sliced, sliced_calibration, monkeypatch):
     """What lets it pass and its interval go by the same misfits: looked for twice they were a third of the time."""
     series, looked = sliced(), []
-    for kind in (NoveltyDetector, ReciprocityCheck):
-        found = kind.misfit
-        monkeypatch.setattr(kind, "misfit", lambda *args, found=found: (looked.append(type(args[0])), found(*args))[1])
+    for kind, name in ((NoveltyDetector, "q_residual"), (ReciprocityCheck, "residual")):
+        found = getattr(kind, name)
+        monkeypatch.setattr(kind, name, lambda *args, found=found: (looked.append(type(args[0])), found(*args))[1])
     assert all(one.valid for one in follow(sliced_calibration, series.channels[20:23]))
     assert looked == [NoveltyDetector, ReciprocityCheck] * 3
 
@@ -187,36 +187,40 @@ def test_a_judgement_holds_what_intervals_go_by(sliced):
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames[:30])
     for frame in frames[30:]:
-        judged = guard.judge(frame, ALL)
-        assert judged.why == ()
+        judged = guard.assess(frame, ALL)
+        assert judged.reasons == ()
         assert judged.widening == guard.widening(frame, ALL) >= 1.0
-        assert judged.nearness == guard.twins.misfit(frame, ALL) / guard.twins.largest_misfit <= 1.0
-    assert replace(guard, twins=None).judge(frames[35], ALL).nearness == 0.0, "a calibration from before there were any"
+        assert judged.limit_share == guard.reciprocity.residual(frame, ALL) / guard.reciprocity.largest_residual <= 1.0
 
 
 def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames)
-    own = guard.own_share(frames[35], ALL)
+    own = guard.response_share(frames[35], ALL)
     assert own == pytest.approx(1.0, abs=0.1)
-    assert guard.own_share(0.8 * frames[35], ALL) == pytest.approx(0.8 * own)
+    assert guard.response_share(0.8 * frames[35], ALL) == pytest.approx(0.8 * own)
     along = guard.spread * guard.directions[0] * np.sqrt(guard.variances[0])
-    assert guard.own_share(frames[35] + 2 * along, ALL) == pytest.approx(own), "so another torque moves it"
+    assert guard.response_share(frames[35] + 2 * along, ALL) == pytest.approx(own), "so another torque moves it"
     some = ALL & (np.arange(896) % 4 > 0)
-    assert guard.own_share(np.where(some, 0.8 * frames[35], 9.0), some) == pytest.approx(0.8 * own, abs=0.03)
+    assert guard.response_share(np.where(some, 0.8 * frames[35], 9.0), some) == pytest.approx(0.8 * own, abs=0.03)
 
 
 def test_a_judgement_says_how_much_of_the_own_response_may_be_missing(sliced):
     frames = sliced().channels[:, 0]
     guard = NoveltyDetector.fit(frames)
     less = 0.8 * frames[35]
-    assert guard.judge(less, ALL).missing == pytest.approx(1 - guard.own_share(less, ALL) / guard.largest_own)
-    assert guard.judge(less, ALL).missing > 0.15 > guard.judge(frames[35], ALL).missing
-    assert replace(guard, largest_own=1e-3).judge(frames[35], ALL).missing == 0.0, "more than ever is nothing missing"
-    assert replace(guard, largest_own=9.0).judge(frames[35], ALL).missing == 0.5, "no frame is made larger than twice"
-    assert replace(guard, largest_own=0.0).judge(less, ALL).missing == 0.0, "a calibration from before it was looked at"
+    assert guard.assess(less, ALL).missing_share == pytest.approx(
+        1 - guard.response_share(less, ALL) / guard.typical_response
+    )
+    assert guard.assess(less, ALL).missing_share > 0.15 > guard.assess(frames[35], ALL).missing_share
+    assert replace(guard, typical_response=1e-3).assess(frames[35], ALL).missing_share == 0.0, (
+        "more than ever is nothing missing"
+    )
+    assert replace(guard, typical_response=9.0).assess(frames[35], ALL).missing_share == 0.5, (
+        "no frame is made larger than twice"
+    )
     # But for one in twenty of those left out none is larger; so of good ones hardly any is.
-    assert np.mean([guard.own_share(one, ALL) <= guard.largest_own for one in frames]) >= 0.9
+    assert np.mean([guard.response_share(one, ALL) <= guard.typical_response for one in frames]) >= 0.9
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -225,17 +229,17 @@ def test_what_may_be_missing_widens_to_the_side_where_it_would_be_read(sign):
     values = rng.uniform(0.0, 1.0, 100)
     reader = reader_of(sign * values[:, None] + rng.normal(0, 1e-3, (100, 1)), values)
     features = np.array([sign * 0.5])
-    _, *plain = reader.read(features)
-    assert reader.read(features, whole=features)[1:] == pytest.approx(plain)
-    low, high = reader.read(features, whole=features - sign * 0.2)[1:]
+    _, *plain = reader.predict(features)
+    assert reader.predict(features, complete=features)[1:] == pytest.approx(plain)
+    low, high = reader.predict(features, complete=features - sign * 0.2)[1:]
     assert (low, high) == (pytest.approx(plain[0] + 0.2, abs=0.01), pytest.approx(plain[1]))
-    low, high = reader.read(features, whole=features + sign * 0.2)[1:]
+    low, high = reader.predict(features, complete=features + sign * 0.2)[1:]
     assert (low, high) == (pytest.approx(plain[0]), pytest.approx(plain[1] + 0.2, abs=0.01))
 
 
 def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced_calibration):
-    task = replace(sliced_calibration.torque, ks=np.array([3.12, 3.17]))
+    task = replace(sliced_calibration.torque, k_range=np.array([3.12, 3.17]))
     place = BankMatch(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
-    assert task.refuse_place(place) == ()
-    assert task.refuse_place(None) == ()
-    assert "another ridge" in task.refuse_place(replace(place, k=3.41))[0]
+    assert task.match_reasons(place) == ()
+    assert task.match_reasons(None) == ()
+    assert "another ridge" in task.match_reasons(replace(place, k=3.41))[0]

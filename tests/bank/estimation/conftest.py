@@ -101,15 +101,15 @@ def recorded() -> FrameSeries:
 
 
 @pytest.fixture(scope="session")
-def fused_calibration(recorded: FrameSeries) -> Calibration:
+def motion_calibration(recorded: FrameSeries) -> Calibration:
     """An estimator calibrated on the shared recording."""
-    return fit("fused", [recorded], "a played rig")
+    return fit("motion_regression", [recorded], "rig")
 
 
 @pytest.fixture(scope="session")
 def sliced_calibration() -> Calibration:
     """An estimator calibrated on fifty slices."""
-    return fit("fused", [slices()], "all")
+    return fit("motion_regression", [slices()], "all")
 
 
 @pytest.fixture(scope="session")

@@ -35,8 +35,8 @@ demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
 	$(BIN)/shearloop run $(DEMO) --show
 
 # Recordings of the emulated rig, and the calibrations of its fingertips that are made from them.
-run/rig.cal: run/demo.bank benchmarks/rig_twists.py | install
-	$(BIN)/python -m benchmarks.rig_twists --bank $< --out run
+run/rig.cal: run/demo.bank daemon/cli/demo_calibration.py | install
+	$(BIN)/python -m shearloop.daemon.cli.demo_calibration --bank $< --out run
 
 run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
 	mkdir -p run

@@ -4,7 +4,7 @@
 
 Each figure is measured on a daemon in its own process, through a pseudo-terminal and a subscriber's socket. Latency
 counts from before the last byte is written until the subscriber has the estimate. `--rig` is the folder of
-`benchmarks.rig_twists`, with the default estimator's recording and calibrations, and the emulated rig's bank.
+`shearloop.daemon.cli.demo_calibration`, with the default estimator's recording and calibrations, and the rig's bank.
 """
 
 import argparse
@@ -30,12 +30,11 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import line_of_channels
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.sensing.estimators import COMBINED
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.eit_line import TRANSFER_NS
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S, TRANSFER_NS
 
 MEASUREMENTS = ("commands", "latency", "flood", "rated", "twisting")
 REPEATS = 5
@@ -51,7 +50,7 @@ RIG_RECORDING, RIG_BANK, RIG_BOTH_CALIBRATION = "rig-25mm.mcap", "demo.bank", "r
 FIRST_FRAME, FIRST_VALID_FRAME = 12, 39
 TWISTS = {
     "name": "twists",
-    "drive": "load_cell",
+    "torque_source": "load_cell",
     "limits": {"torque_nm": 0.3, "angle_rad": 0.5},
     "steps": [
         {"do": "release", "timeout_s": 15},
@@ -245,7 +244,7 @@ def estimator_latency(rig: Path, sides: Sequence[str], n_frames: int, pause_s: f
                     "device": {"path": str(folder / side)},
                     "frame_period_s": pause_s,
                     "calibration": str((rig / f"rig-{side}.cal").resolve()),
-                    "estimator": "fused",
+                    "estimator": "motion_regression",
                 }
                 for side in sides
             }
@@ -280,7 +279,7 @@ def estimator_latency(rig: Path, sides: Sequence[str], n_frames: int, pause_s: f
                     else:
                         missed[source] += number >= FIRST_VALID_FRAME - FIRST_FRAME
     if not all(taken.values()):
-        raise RuntimeError("no estimate was valid: run benchmarks.rig_twists again")
+        raise RuntimeError("no estimate was valid: run shearloop.daemon.cli.demo_calibration again")
     return {source: {**_percentiles(found), "missed": missed[source]} for source, found in taken.items()}
 
 
@@ -385,10 +384,10 @@ def _listen(health: "zmq.Socket[bytes]", seconds: float) -> None:
 def _start(commands: str, experiment: Path) -> None:
     """Start an experiment, unlocking as the operator does."""
     until = time.monotonic() + SETTLING_S
-    while not (reply := request(commands, {"command": "start", "experiment": str(experiment)}, SETTLING_S))["ok"]:
+    while not (reply := send_command(commands, {"command": "start", "experiment": str(experiment)}, SETTLING_S))["ok"]:
         if time.monotonic() > until:
-            raise RuntimeError(reply["why"])
-        request(commands, {"command": "unlock"}, SETTLING_S)
+            raise RuntimeError(reply["reason"])
+        send_command(commands, {"command": "unlock"}, SETTLING_S)
 
 
 def command_s(*arguments: str, repeats: int = 1) -> float:

@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.rig_twists import calibrate, record
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
@@ -26,6 +25,7 @@ from shearloop.bank.estimation.interval_regressor import STRENGTHS
 from shearloop.bank.estimation.regressors import Ridge, best_strength, later_splits, ranked_channels
 from shearloop.daemon.analysis.evaluate import EstimateTrack, draw_tracks, estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
+from shearloop.daemon.cli.demo_calibration import calibrate, record
 from shearloop.daemon.recording.importing import import_mat
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.emulators.rig import SIDES

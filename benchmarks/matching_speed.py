@@ -24,11 +24,11 @@ from scipy.io import loadmat
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank
-from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES, channels_of_line
+from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.matching import Matcher, ReferenceMatcher, ZeroLagMatcher, best_match, unit_magnitudes
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import Conductivities
+from shearloop.bank.eit.models import ConductivityModel
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.daemon.analysis.charts.forward_methods import EIDORS_CELL_S, MODEL, pyeit_solver
 from shearloop.daemon.bank_config import load_geometry
@@ -56,16 +56,16 @@ def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], float]:
     The error is relative to the difference signal.
     """
     random = np.random.default_rng(0)
-    of = Conductivities(mesh)
+    of = ConductivityModel(mesh)
     settings: list[tuple[float, float]] = []
     while len(settings) < N_CELLS:
         k, sigma = random.uniform(0.01, 4.4, 2).tolist()
-        if of.of(MODEL, k, sigma).min() > 0:
+        if of.conductivity(MODEL, k, sigma).min() > 0:
             settings.append((k, sigma))
     model = BatchForwardModel(mesh)
 
     def batch(some: list[tuple[float, float]]) -> FloatArray:
-        return model.voltages(np.array([of.of(MODEL, *each) for each in some]))
+        return model.voltages(np.array([of.conductivity(MODEL, *each) for each in some]))
 
     def threaded() -> list[FloatArray]:
         with ThreadPoolExecutor(2) as pool:
@@ -73,17 +73,17 @@ def cell_methods(mesh: Mesh) -> tuple[dict[str, tuple[Run, int]], float]:
 
     one = settings[0]
     methods: dict[str, tuple[Run, int]] = {
-        "direct": (lambda: model.direct.voltages(of.of(MODEL, *one)), 1),
+        "direct": (lambda: model.direct.voltages(of.conductivity(MODEL, *one)), 1),
         "batch, one thread": (lambda: batch(settings), N_CELLS),
         "batch, two threads": (threaded, N_CELLS),
     }
     pyeit = pyeit_solver(mesh)
     if pyeit is not None:
-        methods["pyEIT"] = (lambda: pyeit(of.of(MODEL, *one)), 1)
+        methods["pyEIT"] = (lambda: pyeit(of.conductivity(MODEL, *one)), 1)
     homogeneous = model.direct.homogeneous()
     largest = 0.0
     for voltages, each in zip(batch(settings[:40]), settings, strict=False):
-        truth = model.direct.voltages(of.of(MODEL, *each))
+        truth = model.direct.voltages(of.conductivity(MODEL, *each))
         if (size := np.linalg.norm(truth - homogeneous)) >= MIN_SIGNAL_NORM:
             largest = max(largest, float(np.linalg.norm(voltages - truth) / size))
     return methods, largest

@@ -6,7 +6,7 @@ The real daemon in its own process and the real drivers, with the rig emulated o
 the middle of a slow twist. Measured is the time until `loop.state` reports the response, in periods of the failed
 sensor's or device's topic, and whether the next experiment completes once the fault is gone. Finally the daemon is
 killed with SIGKILL in the middle of a fast twist, and the emulated robot reports when it stood still. `--rig` is the
-folder of `benchmarks.rig_twists`, with demo.bank and rig-right.cal.
+folder of `shearloop.daemon.cli.demo_calibration`, with demo.bank and rig-right.cal.
 """
 
 import argparse
@@ -27,9 +27,8 @@ from typing import Any
 import yaml
 import zmq
 
-from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.client import send_command
+from shearloop.daemon.messaging.messages import TOPICS, decode
 
 DEADLINE_S = 90.0
 
@@ -94,13 +93,13 @@ class RunningRig:
             "publish": f"ipc://{self.folder}/publish",
             "commands": f"ipc://{self.folder}/commands",
             "fingertips": {
-                "right": {"device": {"path": "eit-right"}, "estimator": "fused", "calibration": calibration}
+                "right": {"device": {"path": "eit-right"}, "estimator": "motion_regression", "calibration": calibration}
             },
             "load_cell": {"device": {"path": "load-cell"}},
             "robot": "ur.yaml",
             "gripper": {"socket": {"host": args.host}},
             # Estimates that disagree are no fault here.
-            "loop": {"disagreement_nm": 1.0, "jump_nm": 1.0},
+            "loop": {"disagreement_nm": 1.0, "max_innovation_nm": 1.0},
         }
         path = self.folder / "config.yaml"
         path.write_text(yaml.safe_dump(content))
@@ -117,7 +116,7 @@ class RunningRig:
 
     def command(self, name: str, **arguments: Any) -> dict[str, Any]:
         """Send the daemon a command; return its reply."""
-        return request(f"ipc://{self.folder}/commands", {"command": name, **arguments}, DEADLINE_S)
+        return send_command(f"ipc://{self.folder}/commands", {"command": name, **arguments}, DEADLINE_S)
 
     def wait_for(self, topic: str, condition: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
         """Return the first new message of a topic that meets a condition."""
@@ -158,7 +157,7 @@ class RunningRig:
         end_s = time.monotonic() + DEADLINE_S
         while not (reply := self.command("start", experiment=str(path)))["ok"]:
             if time.monotonic() > end_s:
-                raise RuntimeError(reply["why"])
+                raise RuntimeError(reply["reason"])
             time.sleep(0.2)
             self.command("unlock")
 
@@ -179,8 +178,10 @@ def _process(*arguments: str, **options: Any) -> Iterator["subprocess.Popen[byte
 
 def _experiment(folder: Path, name: str, *steps: dict[str, Any]) -> Path:
     path = folder / f"{name}.yaml"
-    begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
-    content = {"name": name, "drive": "load_cell", "limits": {"torque_nm": 0.3}, "steps": [*begin, *steps]}
+    # The estimator needs seven seconds of the grip.
+    grip = [{"do": "grip", "width_mm": 5, "force_n": 60}, {"do": "wait", "wait_s": 8}]
+    begin = [{"do": "release"}, {"do": "tare"}, *grip]
+    content = {"name": name, "torque_source": "load_cell", "limits": {"torque_nm": 0.3}, "steps": [*begin, *steps]}
     path.write_text(yaml.safe_dump(content))
     return path
 
@@ -229,7 +230,7 @@ def measure_kill(rig: RunningRig) -> float:
     """Kill the daemon in the middle of a twist; return the seconds until the robot stood still."""
     fast = {"do": "twist", "angles_rad": [3.0], "speed_rad_per_s": 0.5, "hold_s": 1}
     path = rig.folder / "fast.yaml"
-    path.write_text(yaml.safe_dump({"name": "fast", "drive": "load_cell", "steps": [fast]}))
+    path.write_text(yaml.safe_dump({"name": "fast", "torque_source": "load_cell", "steps": [fast]}))
     rig.start(path)
     rig.wait_for("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.45)
     killed_ns = time.monotonic_ns()

@@ -30,7 +30,7 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
 from shearloop.daemon.control.controller import TwistController
 from shearloop.daemon.control.margins import LoopModel, gain_limit, pulse_response
 from shearloop.daemon.control.settings import ControllerSettings
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 COMMAND_S = 0.016
 ACTUATION_S = 0.02

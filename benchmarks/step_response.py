@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.rig_twists import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame
@@ -37,15 +36,15 @@ from shearloop.daemon.analysis.charts.simulated_loop import (
     settings_for,
     started_controller,
 )
-from shearloop.daemon.cli.emulated.frames import frame_maker
+from shearloop.daemon.cli.demo_calibration import ACTIVATE, GRIP, IDLE_S, SETTLE_S, calibrate, lines_of, record
 from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
 from shearloop.daemon.control.margins import margin_refusal
 from shearloop.daemon.control.settings import LoopConfig
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
+from shearloop.daemon.synthetic import frame_maker
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators.rig import SIDES, FrameOf
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
-from shearloop.drivers.emulators.scene import Scene
-from shearloop.drivers.emulators.twin import Joint, Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Joint, Scene, Twin, TwinSettings
 
 PlantOf = Callable[[SimulatedSensor, np.random.Generator], Plant]
 

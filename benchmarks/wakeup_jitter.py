@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from shearloop.daemon.service.realtime import NICENESS, lock_memory
+from shearloop.daemon.realtime import NICENESS, lock_memory
 
 PERIOD_S = 0.008
 WORK_S = 0.0005

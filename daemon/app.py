@@ -1,4 +1,4 @@
-"""The daemon: wires devices, estimators and sockets together and runs until it is told to stop."""
+"""The daemon: builds and connects devices, estimators, control loop and sockets, and runs their tasks."""
 
 import asyncio
 import contextlib
@@ -6,7 +6,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from types import FrameType, MappingProxyType
+from types import MappingProxyType
 from typing import Any
 
 import structlog
@@ -14,40 +14,38 @@ import zmq
 import zmq.asyncio
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
-from shearloop.daemon import sd_notify
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.commands import Commands, needed
+from shearloop.daemon.commands import Commands, required_rig
 from shearloop.daemon.config import DaemonConfig, FingertipConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.health import HealthReporter, TaskFacts
-from shearloop.daemon.links import log_link
-from shearloop.daemon.messaging.addresses import open_stop_address
+from shearloop.daemon.logs import log_link
+from shearloop.daemon.messaging.addresses import local_stop_address
 from shearloop.daemon.messaging.command_server import CommandServer
 from shearloop.daemon.messaging.keys import CurveAuthenticator, load_server_keys
 from shearloop.daemon.messaging.publisher import Listener, Publisher
-from shearloop.daemon.recording.identity import Attached, identity_of, notes_of
+from shearloop.daemon.recording.identity import AttachedFile, daemon_identity, experiment_notes
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.rig import Rig, make_load_cell
-from shearloop.daemon.rig_check import checked_experiment
+from shearloop.daemon.rig import Rig, check_experiment, make_load_cell
 from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator, torque_sources
 from shearloop.daemon.sensing.fingertip_task import CombinedFingertipTask, EstimatorTask, FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
-from shearloop.daemon.sensing.skin_setup import make_skin
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
+from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
+from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.eit_kit import EitKit
-from shearloop.drivers.raw_event import Tap, no_tap
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 
 
 class Daemon:
     """All parts of one running daemon."""
 
     def __init__(self, config: DaemonConfig, context: zmq.asyncio.Context) -> None:
-        """Open every file that the configuration names and bind the sockets; devices may come later."""
+        """Open every file of the configuration and bind the sockets; devices may connect later."""
         self._config = config
         self._clock = Clock()
         self.supervisor = Supervisor()
@@ -57,7 +55,7 @@ class Daemon:
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
         combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
         sources = torque_sources(config, estimators, combined)
-        checked_experiment(config, sources)
+        check_experiment(config, sources)
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
             self._gate: CurveAuthenticator | None = None
@@ -66,7 +64,7 @@ class Daemon:
                 opened.callback(self._gate.close)
             self.publisher = Publisher(context, config.publish, self._clock, keys)
             opened.callback(self.publisher.close)
-            self._recorder = _recorder(config, self.publisher, self._clock, self._busy, self._recording_failed)
+            self._recorder = _recorder(config, self.publisher, self._clock, self._busy, self._on_recording_error)
             if self._recorder is not None:
                 opened.callback(self._recorder.close)
             self._wire(estimators, combined, sources)
@@ -76,7 +74,7 @@ class Daemon:
             opened.callback(self._commands.close)
             self._open_stop: CommandServer | None = None
             if "commands" in config.network_addresses:
-                address = open_stop_address(config.commands)
+                address = local_stop_address(config.commands)
                 self._open_stop = CommandServer(context, address, commands.open_handlers())
                 opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
@@ -87,8 +85,9 @@ class Daemon:
         combined: LiveEstimator | None,
         sources: Mapping[str, TorqueSource],
     ) -> None:
-        """Make the task of every device and of every estimator; none is opened yet."""
+        """Create the tasks of devices and estimators; no device is opened yet."""
         config = self._config
+        diameters = FingertipDiameters(COMBINED)
         if config.robot is not None:
             self._rig = Rig(
                 config,
@@ -98,22 +97,22 @@ class Daemon:
                 self._tare_to_the_end,
                 self.supervisor.deaths,
                 self._tap,
+                diameters.latest,
             )
             if config.experiment is not None:
-                self._experiment = ConfiguredExperiment(config.experiment, self._begin, self._rig.loop.ended)
-        hear = self._rig.brain.on_torque if self._rig is not None else lambda _: None
+                self._experiment = ConfiguredExperiment(
+                    config.experiment, self.start_experiment, self._rig.runner.experiment_ended
+                )
+        on_torque = self._rig.control_loop.on_torque if self._rig is not None else lambda _: None
         self._load_cell = self._rig.load_cell if self._rig is not None else None
         if self._rig is None and config.load_cell is not None:
-            # Measured and recorded beside the fingertips, while something else twists.
+            # Measured and recorded while another machine twists.
             self._load_cell = make_load_cell(
-                config.load_cell, self.publisher, self._clock, hear, self._link_of(LOAD_CELL), self._tap(LOAD_CELL)
+                config.load_cell, self.publisher, self._clock, on_torque, self._on_link(LOAD_CELL), self._tap(LOAD_CELL)
             )
         self._skin: SkinTask | None = None
         if config.skin is not None:
-            self._skin = make_skin(config.skin, self.publisher, self._clock, hear, self._tap)
-        diameters = FingertipDiameters(COMBINED)
-        if self._rig is not None and self._rig.gripper is not None:
-            self._rig.gripper.fingertips_say = diameters.latest
+            self._skin = SkinTask(config.skin, self.publisher, self._clock, on_torque, self._tap)
 
         gripper = self._rig.gripper if self._rig is not None else None
 
@@ -124,7 +123,7 @@ class Daemon:
                 self.publisher,
                 self._clock,
                 period_s=period_s,
-                on_torque=hear,
+                on_torque=on_torque,
                 on_diameter=diameters.update,
                 held_tool=gripper.held_tool if gripper is not None else lambda _: None,
                 on_raw=self._tap(name),
@@ -136,7 +135,7 @@ class Daemon:
             self._combined = CombinedFingertipTask(estimator_task(COMBINED, combined, lambda: period_s), period_s)
 
         def fingertip(name: str, estimator: LiveEstimator) -> FingertipTask:
-            board = _board(config.fingertips[name], name, self._link_of(name), self._tap(name), self._combined)
+            board = _board(config.fingertips[name], name, self._on_link(name), self._tap(name), self._combined)
             return FingertipTask(
                 board,
                 estimator_task(name, estimator, lambda: board.period_s),
@@ -161,8 +160,8 @@ class Daemon:
             tares=tares,
             fingertips=self._fingertips,
             experiment=self._config.experiment,
-            begin=self._begin,
-            give_up_waiting=self._give_up_waiting,
+            start=self.start_experiment,
+            call_off_experiment=self._call_off_experiment,
             tasks=self.health.tasks,
             stop=self.stop,
         )
@@ -174,34 +173,34 @@ class Daemon:
         if self._combined is not None:
             health.add(COMBINED, self._combined.facts)
         if self._skin is not None:
-            health.add(SKIN, self._skin.facts)
-            health.add(SKIN_SOURCE, self._skin.source_facts)
+            health.add(SKIN, self._skin.diagnostics)
+            health.add(SKIN_SOURCE, self._skin.source_diagnostics)
         if self._load_cell is not None:
-            health.add(LOAD_CELL, self._load_cell.facts)
+            health.add(LOAD_CELL, self._load_cell.diagnostics)
         if self._rig is not None:
-            health.add("robot", self._rig.loop.facts)
+            health.add("robot", self._rig.runner.diagnostics)
             if self._rig.gripper is not None:
-                health.add("gripper", self._rig.gripper.facts)
+                health.add("gripper", self._rig.gripper.diagnostics)
         if self._recorder is not None:
-            health.add("recording", self._recorder.facts)
+            health.add("recording", self._recorder.diagnostics)
         health.add("commands", self._command_facts)
         return health
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
-        """Run until `stop` is called, then end every task and close the sockets; `on_ready` when all is made."""
+        """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
         try:
             await self._run_tasks(on_ready)
             if self._experiment is not None:
-                self._experiment.end()
+                self._experiment.close()
         finally:
             try:
                 if self._recorder is not None:
-                    # It may have to wait for the disk.
+                    # It may wait for the disk.
                     await asyncio.to_thread(self._recorder.close)
             finally:
-                # What the other parts left open, each though an earlier one could not be closed.
+                # Each part, even if another one fails to close.
                 self._close()
-                self._tell_of_recordings()
+                self._log_recordings()
         structlog.get_logger().info("stopped")
 
     async def _run_tasks(self, on_ready: Callable[[], None]) -> None:
@@ -209,14 +208,14 @@ class Daemon:
             running = [group.create_task(task, name=name) for name, task in self._tasks()]
             structlog.get_logger().info("running", fingertips=list(self._fingertips))
             on_ready()
-            sd_notify.notify("READY=1")
+            notify("READY=1")
             await self._stop.wait()
-            sd_notify.notify("STOPPING=1")
+            notify("STOPPING=1")
             if self._rig is not None:
-                self._rig.end()
+                self._rig.close()
                 if self._experiment is not None:
-                    await self._experiment.told()
-                await self._rig.loop.released()
+                    await self._experiment.wait_for_report()
+                await self._rig.runner.released()
             for task in running:
                 task.cancel()
 
@@ -226,15 +225,11 @@ class Daemon:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing was left undone: the experiment that ends the daemon is done, or there is none."""
+        """Whether the experiment that ends the daemon is done, or there is none."""
         return self._experiment is None or self._experiment.done or not self._config.stop_when_done
 
-    async def start_experiment(self, path: Path) -> str | None:
-        """Begin an experiment, or return why it cannot be begun; raises UserError for a file that is none."""
-        return await self._begin(path)
-
     async def stopped(self) -> None:
-        """Wait until somebody has asked for the end."""
+        """Wait for a call of `stop`."""
         await self._stop.wait()
 
     def _tasks(self) -> Iterator[tuple[str, Any]]:
@@ -269,38 +264,38 @@ class Daemon:
         await experiment.run()
         if self._config.stop_when_done:
             if experiment.left_to_operator:
-                await experiment.begun_and_ended()
+                await experiment.wait_for_end()
             self.stop()
 
-    async def _begin(self, path: Path) -> str | None:
-        """Begin the experiment in a file, recorded, or return why not; raises UserError for a file that is none."""
-        rig, recorder = needed(self._rig), self._recorder
-        attached = Attached.if_there(path) if recorder is not None else ()
-        why = await rig.start(path)
-        if why is None and self._experiment is not None:
-            self._experiment.has_begun(path)
-        if why is None and recorder is not None and rig.brain.experiment is not None:
-            file = rig.brain.experiment.file
-            recorder.experiment(file.name, attached, notes_of(file))
-        return why
+    async def start_experiment(self, path: Path) -> str | None:
+        """Start and record an experiment; return None, or why not. Raises UserError for an invalid file."""
+        rig, recorder = required_rig(self._rig), self._recorder
+        attached = AttachedFile.read(path) if recorder is not None else ()
+        reason = await rig.start(path)
+        if reason is None and self._experiment is not None:
+            self._experiment.on_begun(path)
+        if reason is None and recorder is not None and rig.control_loop.experiment is not None:
+            file = rig.control_loop.experiment.file
+            recorder.record_experiment(file.name, attached, experiment_notes(file))
+        return reason
 
-    def _give_up_waiting(self) -> Path | None:
-        """Begin the configured experiment no more, and return it; None where it was not waited for."""
-        return self._experiment.give_up() if self._experiment is not None else None
+    def _call_off_experiment(self) -> Path | None:
+        """Cancel the automatic start of the configured experiment; return it, or None if it was not awaited."""
+        return self._experiment.call_off() if self._experiment is not None else None
 
-    def _tap(self, source: str) -> Tap:
-        return no_tap if self._recorder is None else self._recorder.tap(source)
+    def _tap(self, source: str) -> OnRaw:
+        return ignore_raw if self._recorder is None else self._recorder.input_recorder(source)
 
     def _busy(self) -> bool:
         """Return whether an experiment is running."""
-        experiment = self._rig.brain.experiment if self._rig is not None else None
+        experiment = self._rig.control_loop.experiment if self._rig is not None else None
         return experiment is not None and experiment.running
 
-    def _recording_failed(self, why: str) -> None:
+    def _on_recording_error(self, error: str) -> None:
         if self._rig is not None:
-            self._rig.brain.inputs.recording_error = why
+            self._rig.control_loop.inputs.recording_error = error
 
-    def _tell_of_recordings(self) -> None:
+    def _log_recordings(self) -> None:
         if self._recorder is None:
             return
         for path in self._recorder.finished:
@@ -308,11 +303,11 @@ class Daemon:
         if self._recorder.failure:
             structlog.get_logger().error("the recording could not be finished", why=self._recorder.failure)
 
-    def _link_of(self, device: str) -> Callable[[LinkEvent], None]:
-        return self._rig.link_of(device) if self._rig is not None else partial(log_link, device)
+    def _on_link(self, device: str) -> Callable[[LinkEvent], None]:
+        return self._rig.on_link(device) if self._rig is not None else partial(log_link, device)
 
     def _command_facts(self) -> TaskFacts:
-        """Return what was refused, by kind: commands, and clients that had no right to connect."""
+        """Return the numbers of refused commands and clients, by kind."""
         refused = self._commands.refused.copy()
         for other in (self._gate, self._open_stop):
             if other is not None:
@@ -333,11 +328,11 @@ def _recorder(
     busy: Callable[[], bool],
     on_failure: Callable[[str], None],
 ) -> Recorder | None:
-    """Return what records all that is published, where that is configured; raises UserError where it cannot."""
+    """Return the recorder, if one is configured; raises UserError if it cannot write."""
     if config.recording is None:
         return None
-    recorder = Recorder(config.recording.folder, identity_of(config), clock, busy=busy, on_failure=on_failure)
-    publisher.listen(recorder.record)
+    recorder = Recorder(config.recording.folder, daemon_identity(config), clock, is_busy=busy, on_failure=on_failure)
+    publisher.add_listener(recorder.record_message)
     return recorder
 
 
@@ -345,7 +340,7 @@ def _board(
     config: FingertipConfig,
     name: str,
     on_event: Callable[[LinkEvent], None],
-    tap: Tap,
+    tap: OnRaw,
     combined: CombinedFingertipTask | None,
 ) -> EitKit:
     return EitKit(
@@ -354,13 +349,9 @@ def _board(
         zero_slots=ZERO_SLOTS,
         frame_period_s=config.frame_period_s,
         on_event=on_event,
-        tap=tap,
+        on_raw=tap,
         **({"on_frame": partial(combined.on_frame, name)} if combined is not None else {}),
     )
-
-
-def _told_already(_number: int, _frame: FrameType | None) -> None:
-    """Do nothing: the daemon has ended already."""
 
 
 async def run_daemon(
@@ -369,11 +360,11 @@ async def run_daemon(
     facts: Mapping[str, Callable[[], TaskFacts]] = MappingProxyType({}),
     on_ready: Callable[[], None] = lambda: None,
 ) -> bool:
-    """Run a daemon until SIGINT, SIGTERM, SIGHUP or the command `stop`; return whether nothing was left undone.
+    """Run a daemon until SIGINT, SIGTERM, SIGHUP or the command `stop`; return whether it ended as planned.
 
-    SIGTERM is how a service manager ends a service, SIGHUP tells that its terminal was closed: what they leave undone
-    was to be left. `listeners` hear every message; `facts` are what health tells of them, by name; `on_ready` is called
-    once all that lasts has been made. Afterwards SIGTERM and SIGHUP do nothing any more.
+    It ended as planned if its experiment is done, or by SIGTERM or SIGHUP. `listeners` receive every message; `facts`
+    are their parts of `health`, by name; `on_ready` is called once all tasks run. SIGTERM and SIGHUP are ignored
+    afterwards.
     """
     loop, terminated = asyncio.get_running_loop(), False
 
@@ -385,7 +376,7 @@ async def run_daemon(
     with zmq.asyncio.Context() as context:
         daemon = Daemon(config, context)
         for listener in listeners:
-            daemon.publisher.listen(listener)
+            daemon.publisher.add_listener(listener)
         for name, told in facts.items():
             daemon.health.add(name, told)
         ending = ending_signals()
@@ -397,6 +388,6 @@ async def run_daemon(
             for number in ending:
                 loop.remove_signal_handler(number)
                 if number != signal.SIGINT:
-                    # Said once more it would kill us, before emulators are ended and what is shown is written.
-                    signal.signal(number, _told_already)
+                    # A second one must not kill us before emulators have ended and the output is written.
+                    signal.signal(number, signal.SIG_IGN)
     return daemon.finished or terminated

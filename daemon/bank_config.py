@@ -1,4 +1,4 @@
-"""The configuration of banks and fingertips: what `config/banks/*.yaml` and `config/fingertips/*.yaml` may say."""
+"""The configuration of banks and fingertips: `config/banks/*.yaml` and `config/fingertips/*.yaml`."""
 
 from dataclasses import dataclass, fields
 from itertools import product
@@ -42,16 +42,16 @@ class GridConfig(ConfigModel):
 
 
 class MeshFileConfig(ConfigModel):
-    """A mesh to be read: an .npz or an EIDORS .mat file."""
+    """A mesh file: .npz or EIDORS .mat."""
 
     file: Path
 
 
 class OverConfig(ConfigModel):
-    """Further parameters: a bank for each of their values, and each combination of them.
+    """Further parameters: a bank for each combination of their values.
 
     amplitude, offset and tilt_deg vary the conductivity (1 + offset + amplitude · f along a turned axis); the others
-    take the place of the fingertip's.
+    replace the fingertip's.
     """
 
     amplitude: GridConfig | None = None
@@ -87,9 +87,9 @@ _VARIED = tuple(field.name for field in fields(Variation))
 
 
 class BankConfig(ConfigModel):
-    """What a bank is of. Paths are relative to the file that names them; mesh_size_cm overrides the fingertip's.
+    """A bank. Paths are relative to the file that names them; mesh_size_cm overrides the fingertip's.
 
-    With `over` it is a folder of banks.
+    With `over`, a folder of banks.
     """
 
     mesh: MeshFileConfig | None = None
@@ -122,7 +122,7 @@ class BankConfig(ConfigModel):
 
 
 class ElectrodeRunConfig(ConfigModel):
-    """Electrodes that follow each other on one side, by their centres along it."""
+    """Successive electrodes on one side, by their centres along it."""
 
     side: Side
     centres_cm: Annotated[list[Annotated[float, Field(ge=0, le=100)]], Field(min_length=1)]
@@ -152,8 +152,7 @@ class FingertipGeometryConfig(ConfigModel):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BankPlan:
-    """All that `shearloop.bank.eit.build.build_bank` needs to know: k_grid (K,) and sigma_grid (S,) in the model's
-    units."""
+    """The inputs of `build_bank`; k_grid (K,) and sigma_grid (S,) are in the model's units."""
 
     mesh: Mesh
     model: str
@@ -165,7 +164,7 @@ class BankPlan:
 def load_bank_plan(
     path: Path, *, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
 ) -> BankPlan:
-    """Read a bank's configuration and its mesh; what is given besides takes the place of what the file says.
+    """Read a bank's configuration and its mesh; the other arguments override the file.
 
     Raises UserError and GeometryError with the file and the key to mend, also for a configuration of several banks.
     """
@@ -178,9 +177,9 @@ def load_bank_plan(
 def load_bank_plans(
     path: Path, *, model: str | None = None, k: GridConfig | None = None, sigma: GridConfig | None = None
 ) -> dict[str, BankPlan]:
-    """Read a configuration as `load_bank_plan` does, and return the banks that it is `over` by their names.
+    """Read a configuration as `load_bank_plan` does, and return its banks by name.
 
-    A name tells the parameters, `amplitude=0.5,tilt_deg=2`; a configuration without `over` is one bank, without a name.
+    With `over`, a name lists the parameters, `amplitude=0.5,tilt_deg=2`; a single bank has an empty name.
     """
     config = load_yaml_model(path, BankConfig)
     model, k, sigma = model or config.model, k or config.k, sigma or config.sigma

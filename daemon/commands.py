@@ -1,4 +1,4 @@
-"""What the commands of the daemon do: a handler for each, which carries it out or refuses with a reason."""
+"""The daemon's commands: one handler each, which executes the command or refuses it with a reason."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Mapping
@@ -10,12 +10,12 @@ from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefus
 from shearloop.daemon.rig import Rig
 from shearloop.daemon.sensing.fingertip_task import FingertipTask
 
-# Until the reply to the `stop` that ends the daemon is out.
-FAREWELL_S = 0.05
+# The reply to the `stop` that ends the daemon is sent within this time.
+STOP_DELAY_S = 0.05
 
 
 class Commands:
-    """Carries out what operators and programs ask for over the command socket."""
+    """Executes the commands of the command socket."""
 
     def __init__(
         self,
@@ -24,22 +24,22 @@ class Commands:
         tares: Mapping[str, Callable[[], None]],
         fingertips: Mapping[str, FingertipTask],
         experiment: Path | None,
-        begin: Callable[[Path], Awaitable[str | None]],
-        give_up_waiting: Callable[[], Path | None],
+        start: Callable[[Path], Awaitable[str | None]],
+        call_off_experiment: Callable[[], Path | None],
         tasks: Callable[[], Any],
         stop: Callable[[], None],
     ) -> None:
-        """Take the rig, where there is one, and what takes the zero of each sensor.
+        """`tares` sets the zero of each sensor, `experiment` is the configured one, `tasks` returns their health.
 
-        `experiment` is the configured one; `begin` starts one or returns why not; `give_up_waiting` returns one that
-        was still to be started; `tasks` are what health knows of them; `stop` ends the daemon.
+        `start` starts an experiment or returns the reason of its refusal. `call_off_experiment` cancels an
+        experiment that waits to start and returns it. `stop` stops the daemon.
         """
         self._rig = rig
         self._tares = tares
         self._fingertips = fingertips
         self._experiment = experiment
-        self._begin = begin
-        self._give_up_waiting = give_up_waiting
+        self._start_experiment = start
+        self._call_off_experiment = call_off_experiment
         self._tasks = tasks
         self._stop_daemon = stop
 
@@ -57,45 +57,47 @@ class Commands:
         }
 
     def open_handlers(self) -> Mapping[str, Handler]:
-        """Return what everyone on the machine may do where commands need a key: look, and stop."""
+        """Return the handlers for users of this machine without a key: only `stop` and `status` work."""
 
         async def refuse(_request: Request) -> Reply:
-            raise CommandRefusedError("this needs a key: give --key and --server-key; without one there is only `stop`")
+            raise CommandRefusedError(
+                "this command needs a key: give --key and --server-key; without one only `stop` works"
+            )
 
         return {name: own if name in (STOP, STATUS) else refuse for name, own in self.handlers().items()}
 
     async def _start(self, request: Request) -> Reply:
         path = request.get("experiment") or self._experiment
         if not isinstance(path, str | Path):
-            raise CommandRefusedError("which experiment? Give its file, or name one in the configuration")
+            raise CommandRefusedError("no experiment is given: name its file, or one in the configuration")
         try:
-            why = await self._begin(Path(path))
+            reason = await self._start_experiment(Path(path))
         except UserError as error:
             raise CommandRefusedError(str(error)) from error
-        _refuse(why)
+        _refuse_if(reason)
         return {"experiment": str(path)}
 
     async def _pause(self, _request: Request) -> Reply:
-        _refuse(needed(self._rig).brain.pause())
+        _refuse_if(required_rig(self._rig).control_loop.pause())
         return {}
 
     async def _resume(self, _request: Request) -> Reply:
-        _refuse(needed(self._rig).brain.resume())
+        _refuse_if(required_rig(self._rig).control_loop.resume())
         return {}
 
     async def _unlock(self, _request: Request) -> Reply:
-        _refuse(await needed(self._rig).loop.unlock())
+        _refuse_if(await required_rig(self._rig).runner.unlock())
         return {}
 
     async def _tare(self, request: Request) -> Reply:
         source = request.get("source")
         if source is not None and not (isinstance(source, str) and source in self._tares):
             raise CommandRefusedError(f"there is no sensor {source!r} to tare; there are {', '.join(self._tares)}")
-        experiment = self._rig.brain.experiment if self._rig is not None else None
+        experiment = self._rig.control_loop.experiment if self._rig is not None else None
         if experiment is not None and experiment.running:
             raise CommandRefusedError(
-                f"the experiment {experiment.file.name!r} is running, and a new zero would change what its torques "
-                "are; stop it first, or give it a step `tare`"
+                f"the experiment {experiment.file.name!r} is running, and a new zero would change its "
+                "torques; stop it first, or give it a step `tare`"
             )
         tared = [source] if source is not None else list(self._tares)
         for name in tared:
@@ -103,10 +105,10 @@ class Commands:
         return {"tared": tared}
 
     async def _set(self, request: Request) -> Reply:
-        """Change what may be changed while it runs; nothing that moves anything is among it."""
+        """Change a setting of the running daemon; none of them moves the robot."""
         source, heatmap = request.get("source"), request.get("heatmap")
         if heatmap not in ("always", "on_request"):
-            raise CommandRefusedError("only `heatmap` can be set while it runs, to always or on_request")
+            raise CommandRefusedError("only `heatmap` can be set while the daemon runs, to always or on_request")
         if source is not None and not (isinstance(source, str) and source in self._fingertips):
             raise CommandRefusedError(f"there is no fingertip {source!r}; there are {', '.join(self._fingertips)}")
         names = [source] if source is not None else list(self._fingertips)
@@ -119,24 +121,24 @@ class Commands:
 
     async def _stop(self, request: Request) -> Reply:
         stopped = self._rig.stop() if self._rig is not None else ""
-        awaited = self._give_up_waiting()
+        waiting = self._call_off_experiment()
         if stopped:
             return {"stopped": stopped}
         if request.get("spare_daemon"):
-            # From a page that everyone may press stop on: it ends what moves or is about to, and nothing else.
-            return {"stopped": f"the start of {awaited.name}" if awaited is not None else ""}
-        # Nothing moves: the daemon itself is what stops, once the reply is out.
-        asyncio.get_running_loop().call_later(FAREWELL_S, self._stop_daemon)
+            # The live page's stop button stops motion, but not the daemon.
+            return {"stopped": f"the start of {waiting.name}" if waiting is not None else ""}
+        # Nothing moves, so the daemon itself stops after the reply.
+        asyncio.get_running_loop().call_later(STOP_DELAY_S, self._stop_daemon)
         return {}
 
 
-def needed(rig: Rig | None) -> Rig:
-    """Return the rig; CommandRefusedError where there is none."""
+def required_rig(rig: Rig | None) -> Rig:
+    """Return the rig; raises CommandRefusedError without a rig."""
     if rig is None:
         raise CommandRefusedError("the configuration has no robot; add `robot: ur.yaml` to it")
     return rig
 
 
-def _refuse(why: str | None) -> None:
-    if why:
-        raise CommandRefusedError(why)
+def _refuse_if(reason: str | None) -> None:
+    if reason:
+        raise CommandRefusedError(reason)

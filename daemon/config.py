@@ -1,9 +1,9 @@
-"""What a daemon is told in YAML. Units are in the keys; unknown keys are refused; nothing changes after loading."""
+"""The daemon's configuration. Units are in the keys; unknown keys are refused; loaded values do not change."""
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -13,13 +13,12 @@ from shearloop.daemon.messaging.addresses import (
     COMMAND_ADDRESS,
     LARGEST_PORT,
     PUBLISH_ADDRESS,
-    has_a_port,
-    open_to_the_network,
-    stays_on_this_machine,
+    has_valid_port,
+    is_local,
+    network_refusal,
 )
 
-# What else a daemon has a task of, publishes as, drives by or records under. A fingertip of such a name would be taken
-# for it: its torque for the load cell's that supervises it, its zero for the other's.
+# Names of other tasks, sources and recordings; a fingertip needs a different one.
 TAKEN_NAMES = frozenset(
     (
         *("load_cell", "wrench", "skin", "combined", "robot", "gripper", "loop", "experiment", "recording", "slices"),
@@ -30,8 +29,8 @@ TAKEN_NAMES = frozenset(
 
 def _known_transport(address: str) -> str:
     if not address.startswith(("ipc://", "tcp://")):
-        raise ValueError("must be ipc or a tcp address, for this machine alone a loopback one: tcp://127.0.0.1:7761")
-    if not has_a_port(address):
+        raise ValueError("must be ipc or a tcp address, for this machine only a loopback one: tcp://127.0.0.1:7761")
+    if not has_valid_port(address):
         raise ValueError(f"must end in a port, a whole number up to {LARGEST_PORT}, as in tcp://127.0.0.1:7761")
     return address
 
@@ -40,17 +39,17 @@ Address = Annotated[str, AfterValidator(_known_transport)]
 
 
 class CurveConfig(ConfigModel):
-    """Keys for the addresses that can be reached from the network; made by `shearloop keys`."""
+    """Keys for addresses that are open to the network; made by `shearloop keys`."""
 
     server_key: Path = Field(description="the daemon's own .key_secret; under systemd its credential of this name")
     clients: Path = Field(description="the allow-list: a folder with the .key of each client")
 
 
 class SerialDevice(ConfigModel):
-    """A board on a serial port, named by what does not change when cables are swapped."""
+    """A board on a serial port, identified by its serial number or by a path."""
 
     serial_number: str | None = Field(None, min_length=1, description="USB serial number, as the port's maker set it")
-    path: Path | None = Field(None, description="a port that is named by path, e.g. /dev/serial/by-id/…")
+    path: Path | None = Field(None, description="path of the port, such as /dev/serial/by-id/…")
 
     @model_validator(mode="after")
     def _one_name(self) -> "SerialDevice":
@@ -63,9 +62,9 @@ EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "motion
 
 
 class CreepConfig(ConfigModel):
-    """What a gel's torque loses under a held shear; see daemon/control/creep.py."""
+    """Loss of a gel's torque under a held shear; see daemon/control/creep.py."""
 
-    share: float = Field(ge=0, lt=1, description="of the torque, in the end")
+    share: float = Field(ge=0, lt=1, description="final loss, as a share of the torque")
     time_s: float = Field(gt=0, le=3600, description="time constant")
 
 
@@ -74,29 +73,29 @@ class FingertipConfig(ConfigModel):
 
     device: SerialDevice
     bank: Path | None = Field(
-        None, description="made by `shearloop bank build`; for k, sigma and heatmaps, and for the paper's estimator"
+        None, description="made by `shearloop bank build`; for k, sigma, heatmaps and the paper's estimator"
     )
     calibration: Path | None = Field(None, description="without one, k and sigma are published, but no torque")
-    estimator: EstimatorName | None = Field(None, description="default: the one that the calibration was made for")
+    estimator: EstimatorName | None = Field(None, description="default: the calibration's")
     matching: Literal["all_lags", "zero_lag"] = "all_lags"
     baseline_frames: int = Field(10, ge=2, le=1000, description="frames averaged into the homogeneous frame")
     average_frames: int = Field(1, ge=1, le=100, description="latest frames averaged before matching")
     creep: CreepConfig | None = Field(
-        None, description="of the gel, where the calibration gives its shear; the loop is driven by what is left"
+        None, description="of the gel, if the calibration gives its shear; subtracted from the loop's torque"
     )
-    # shearloop.drivers.eit_format.FRAME_PERIOD_S, which comes with NumPy: a configuration is read without.
+    # shearloop.drivers.eit_kit.FRAME_PERIOD_S, which comes with NumPy: a configuration is read without.
     frame_period_s: float = Field(0.5408, gt=0, le=60, description="the board's frame period before it is measured")
     heatmap: Literal["on_request", "always"] = Field(
-        "on_request", description="whether eit.heatmap is computed only while somebody subscribes to it"
+        "on_request", description="whether eit.heatmap is computed only for subscribers"
     )
 
 
 class CombinedConfig(ConfigModel):
-    """One estimate from several fingertips on one tool; they are named as the sides of the calibration."""
+    """One estimate from several fingertips on one tool; their names are the sides of the calibration."""
 
-    calibration: Path = Field(description="made by `shearloop calibrate` on recordings of all these sides")
-    estimator: EstimatorName | None = Field(None, description="default: the one that the calibration was made for")
-    creep: CreepConfig | None = Field(None, description="of the gels, as of a single fingertip")
+    calibration: Path = Field(description="made by `shearloop calibrate` from recordings of all these sides")
+    estimator: EstimatorName | None = Field(None, description="default: the calibration's")
+    creep: CreepConfig | None = Field(None, description="of the gels, as for a single fingertip")
 
 
 class LoadCellConfig(ConfigModel):
@@ -106,7 +105,7 @@ class LoadCellConfig(ConfigModel):
     calibration: Path | None = Field(
         None, description="made by `shearloop calibrate load`; without one the board's lines are torques in N·m"
     )
-    rate_hz: float = Field(10.9, gt=0, le=1000, description="how many lines a second the board sends")
+    rate_hz: float = Field(10.9, gt=0, le=1000, description="lines per second")
 
 
 class InstrumentSocket(ConfigModel):
@@ -117,7 +116,7 @@ class InstrumentSocket(ConfigModel):
 
 
 class SkinSourceConfig(ConfigModel):
-    """The Keithley 6430 that feeds the skin's gauges, by its RS-232 interface or a socket."""
+    """The Keithley 6430 that feeds the skin's gauges, on RS-232 or a socket."""
 
     socket: InstrumentSocket | None = None
     serial: SerialDevice | None = None
@@ -149,14 +148,14 @@ class ScannerConfig(ConfigModel):
 
 
 class AdcConfig(ConfigModel):
-    """A converter board that sends `v1,v2` in volts, a line a reading."""
+    """A converter board that sends lines `v1,v2` in volts."""
 
     device: SerialDevice
     full_scale_v: float = Field(0.512, gt=0, le=10)
 
 
 class SkinDaqConfig(ConfigModel):
-    """What reads the voltages of the skin's gauges, one of two."""
+    """The instrument that reads the gauges' voltages: a scanner or an ADC board."""
 
     scanner: ScannerConfig | None = None
     adc: AdcConfig | None = None
@@ -170,14 +169,14 @@ class SkinDaqConfig(ConfigModel):
 
 
 class SkinConfig(ConfigModel):
-    """The shear skin: its instruments, its calibration, and what it touches."""
+    """The shear skin: its instruments, its calibration and its contact."""
 
     source: SkinSourceConfig
     daq: SkinDaqConfig
     calibration: Path = Field(description="made by `shearloop skin calibrate`")
-    normal_n: float = Field(1.0, ge=0, le=100, description="normal force on the skin, by which friction goes")
+    normal_n: float = Field(1.0, ge=0, le=100, description="normal force on the skin, for its friction")
     tool_radius_mm: float | None = Field(
-        None, gt=0, le=200, description="from the axis of the wrist to the skin; makes a torque of the shear force"
+        None, gt=0, le=200, description="from the wrist's axis to the skin; converts shear force into torque"
     )
     zero_samples: int = Field(20, ge=10, le=1000, description="readings averaged into the zero")
     drift_per_hour: float = Field(2.9e-4, ge=0, le=1, description="95 % bound on the response's drift; the paper's")
@@ -191,12 +190,12 @@ class GripperSocket(ConfigModel):
 
 
 class GripperConfig(ConfigModel):
-    """The gripper, by one of its two ways in."""
+    """The gripper, on a socket or on Modbus."""
 
     socket: GripperSocket | None = None
     modbus: SerialDevice | None = None
     calibration: Path | None = Field(
-        None, description="made by `shearloop calibrate gripper`; else the maker's figures"
+        None, description="made by `shearloop calibrate gripper`; default: the maker's data"
     )
 
     @model_validator(mode="after")
@@ -207,26 +206,28 @@ class GripperConfig(ConfigModel):
 
 
 class RecordingConfig(ConfigModel):
-    """What is kept of every run: all messages and all raw inputs, a file for each experiment."""
+    """Recordings of all messages and raw inputs, one file per experiment."""
 
-    folder: Path = Field(description="made where it is not there; a rig with one fingertip writes some 50 MB an hour")
+    folder: Path = Field(description="created if missing; a rig with one fingertip writes some 50 MB an hour")
 
 
 class EventConfig(ConfigModel):
-    """What befalls an emulated device in the course of an experiment."""
+    """A command to an emulated device during an experiment."""
 
     step: int = Field(ge=1, description="number of the experiment's step, from 1")
-    held_for_s: float = Field(0.0, ge=0, description="after its torque or angle has been held for so long")
-    say: str = Field(min_length=1, pattern=r"^[^\n]*$", description="a command of the emulator, see its --help")
+    held_for_s: float = Field(0.0, ge=0, description="delay after the step begins to hold its torque or angle")
+    command: str = Field(
+        min_length=1, pattern=r"^[^\n]*$", description="one of the emulator's commands, see its --help"
+    )
 
 
 class EmulatorConfig(ConfigModel):
-    """A device that is played by a process of its own, for demonstrations."""
+    """A device that is emulated by its own process, for demonstrations."""
 
     device: str
     arguments: tuple[str, ...] = ()
-    synthetic: tuple[str, ...] = Field((), description="further arguments where no recording is played")
-    happenings: tuple[EventConfig, ...] = ()
+    synthetic: tuple[str, ...] = Field((), description="further arguments, unless a recording is played")
+    events: tuple[EventConfig, ...] = ()
 
 
 class DaemonConfig(ConfigModel):
@@ -234,23 +235,21 @@ class DaemonConfig(ConfigModel):
 
     publish: Address = PUBLISH_ADDRESS
     commands: Address = COMMAND_ADDRESS
-    curve: CurveConfig | None = Field(None, description="keys, for addresses that are not on this machine alone")
+    curve: CurveConfig | None = Field(None, description="keys for addresses that are open to the network")
     fingertips: dict[Annotated[str, Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")], FingertipConfig] = Field(
         default_factory=dict
     )
     combined: CombinedConfig | None = Field(
-        None, description="an estimate from both fingertips together, published as `combined`"
+        None, description="one estimate from both fingertips, published as `combined`"
     )
     skin: SkinConfig | None = None
     load_cell: LoadCellConfig | None = None
     robot: Path | None = Field(None, description="the robot's settings, a file such as config/ur.yaml")
     gripper: GripperConfig | None = None
     loop: LoopConfig = LoopConfig()
-    experiment: Path | None = Field(None, description="started as soon as all devices are there")
-    stop_when_done: bool = Field(
-        False, description="whether the daemon ends with that experiment: status 0 when done, else 3"
-    )
-    recording: RecordingConfig | None = Field(None, description="without one, nothing is recorded")
+    experiment: Path | None = Field(None, description="started once all devices are connected")
+    stop_when_done: bool = Field(False, description="the daemon ends with that experiment: status 0 if done, else 3")
+    recording: RecordingConfig | None = Field(None, description="default: no recording")
     lock_memory: bool = Field(False, description="keep all memory out of swap, see docs/service.md")
     emulators: tuple[EmulatorConfig, ...] = ()
 
@@ -266,12 +265,12 @@ class DaemonConfig(ConfigModel):
             raise ValueError("`combined` needs two `fingertips`, named as the sides of its calibration: right and left")
         for key, address in self.network_addresses.items():
             if self.curve is None:
-                raise ValueError(open_to_the_network(address, key))
+                raise ValueError(network_refusal(address, key))
         if self.publish == self.commands and not self.publish.endswith(":*"):
-            raise ValueError(f"`publish` and `commands` are both {self.publish}; give each an address of its own")
+            raise ValueError(f"`publish` and `commands` are both {self.publish}; give them different addresses")
         for port, keys in self._ports().items():
             if len(keys) > 1:
-                raise ValueError(f"`{keys[0]}` and `{keys[1]}` are both {port}; each device has its own")
+                raise ValueError(f"`{keys[0]}` and `{keys[1]}` are both {port}; each device needs its own")
         if self.experiment is not None and self.robot is None:
             raise ValueError("an experiment needs a robot: add `robot: ur.yaml`, or take `experiment` out")
         if self.gripper is not None and self.robot is None:
@@ -279,7 +278,7 @@ class DaemonConfig(ConfigModel):
         return self
 
     def _ports(self) -> dict[str, list[str]]:
-        """Return the keys that name each serial port and each socket."""
+        """Return the configuration keys of each serial port and socket."""
         found: dict[str, list[str]] = {}
         for key, section in _sections(self, ""):
             match section:
@@ -293,19 +292,14 @@ class DaemonConfig(ConfigModel):
 
     @property
     def network_addresses(self) -> dict[str, str]:
-        """The keys and addresses that can be reached from beyond this machine."""
+        """The configuration keys and addresses that are open to the network."""
         addresses = {"publish": self.publish, "commands": self.commands}
-        return {key: address for key, address in addresses.items() if not stays_on_this_machine(address)}
+        return {key: address for key, address in addresses.items() if not is_local(address)}
 
 
 def load_daemon_config(path: Path) -> DaemonConfig:
-    """Return the configuration in a YAML file, with the paths in it taken from the file's own folder.
-
-    Raises UserError naming every mistake at once.
-    """
-    config = load_yaml_model(path, DaemonConfig)
-    folder = path.resolve().parent
-    return _from_folder(config, folder)
+    """Return the configuration of a YAML file; raises UserError with every mistake."""
+    return load_yaml_model(path, DaemonConfig)
 
 
 def _sections(section: ConfigModel, key: str) -> Iterator[tuple[str, ConfigModel]]:
@@ -317,21 +311,3 @@ def _sections(section: ConfigModel, key: str) -> Iterator[tuple[str, ConfigModel
             if isinstance(item, ConfigModel):
                 yield path, item
                 yield from _sections(item, path)
-
-
-Model = TypeVar("Model", bound=ConfigModel)
-
-
-def _from_folder(section: Model, folder: Path) -> Model:
-    """Return the section with every relative path in it taken from a folder."""
-    changed: dict[str, object] = {}
-    for name in type(section).model_fields:
-        value = getattr(section, name)
-        if isinstance(value, Path):
-            # Normalised, not resolved: a port's link must be named, and not what it points to today.
-            changed[name] = Path(os.path.normpath(folder / value))
-        elif isinstance(value, ConfigModel):
-            changed[name] = _from_folder(value, folder)
-        elif isinstance(value, dict):
-            changed[name] = {key: _from_folder(item, folder) for key, item in value.items()}
-    return section.model_copy(update=changed)

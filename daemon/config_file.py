@@ -1,31 +1,38 @@
-"""Reading a YAML file into a pydantic model, with every mistake reported at once, by file, key and allowed range."""
+"""Loads a YAML file into a pydantic model and reports every mistake with its key and allowed range."""
 
+import os
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
 from pydantic_core import ErrorDetails
 
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.yaml_file import read_yaml
+from shearloop.drivers.yaml_files import read_yaml
 
 _LONGEST_VALUE = 60
 
 
 class ConfigModel(BaseModel):
-    """What all configuration models have in common: unknown keys are mistakes, and values do not change."""
+    """Base of the configuration models: unknown keys are mistakes, values do not change.
+
+    Relative paths are taken from the folder of the file.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @field_validator("*")
     @classmethod
-    def _paths_name_something(cls, value: object) -> object:
-        if isinstance(value, Path) and (value == Path() or "\0" in str(value)):
+    def _resolve_path(cls, value: object, info: ValidationInfo) -> object:
+        if not isinstance(value, Path):
+            return value
+        if value == Path() or "\0" in str(value):
             raise ValueError(f"must be the path of a file, not {str(value)!r}")
-        return value
+        # Normalised, not resolved: a port's link must stay a link.
+        return Path(os.path.normpath(info.context["folder"] / value)) if info.context else value
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -34,8 +41,8 @@ Model = TypeVar("Model", bound=BaseModel)
 def load_yaml_model(path: str | Path, model: type[Model]) -> Model:
     """Return a YAML file's content as a pydantic model.
 
-    Raises UserError for a file that is missing, empty, not YAML or not a map of keys, that has a key twice, or whose
-    values the model refuses; then the message names all of them.
+    Raises UserError for a file that is missing, no YAML map of keys, or has a key twice; and for invalid values, with
+    all of them.
     """
     path = Path(path)
     try:
@@ -45,13 +52,13 @@ def load_yaml_model(path: str | Path, model: type[Model]) -> Model:
     if not isinstance(content, dict):
         raise UserError(f"{path}: expected keys and values such as `{_example(model)}`, found {_shown(content)}")
     try:
-        return model.model_validate(content)
+        return model.model_validate(content, context={"folder": path.resolve().parent})
     except ValidationError as error:
         raise UserError(f"{path}: {mistakes(error, model)}") from error
 
 
 def mistakes(error: ValidationError, model: type[BaseModel]) -> str:
-    """Return all that a model found wrong, each with its key, what was found and the allowed range."""
+    """Return a sentence with every mistake: its key, the value and the allowed range."""
     schema = model.model_json_schema()
     return "; ".join(dict.fromkeys(_sentence(details, schema) for details in error.errors(include_url=False)))
 
@@ -59,7 +66,7 @@ def mistakes(error: ValidationError, model: type[BaseModel]) -> str:
 def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
     location = details["loc"]
     if details["type"] == "invalid_key":
-        return f"the key {_shown(details['input'])} is a number where a name is expected"
+        return f"the key {_shown(details['input'])} is a number; a name is expected"
     key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in location).lstrip(".")
     subject = f"`{key}` " if key else ""
     if details["type"] == "extra_forbidden":
@@ -77,15 +84,15 @@ def _sentence(details: ErrorDetails, schema: Mapping[str, Any]) -> str:
 
 
 def _tag(details: ErrorDetails) -> str:
-    """Return what is wrong with the key by which the kinds of a section are told apart."""
+    """Return the mistake in a key that selects the kind of a section."""
     context = details["ctx"]
     key = context["discriminator"].strip("'")
     if "tag" not in context:
-        return f"lacks `{key}`, which says what it is"
+        return f"lacks `{key}`, its kind"
     known = [tag.strip("'") for tag in context["expected_tags"].split(", ")]
     near = get_close_matches(context["tag"], known, 1)
     meant = f", did you mean {near[0]!r}?" if near else ""
-    return f"has the {key} {context['tag']!r}, which there is not{meant} (allowed: {', '.join(known)})"
+    return f"has the {key} {context['tag']!r}, which does not exist{meant} (allowed: {', '.join(known)})"
 
 
 def _known_keys(wrong: str, schema: Mapping[str, Any]) -> str:
@@ -97,7 +104,7 @@ def _known_keys(wrong: str, schema: Mapping[str, Any]) -> str:
 
 
 def _schema_at(schema: Mapping[str, Any], location: Sequence[int | str], root: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the part of a JSON schema that describes a place in the document, or nothing where that is not clear."""
+    """Return the JSON schema of a location in the document, or an empty one if it is ambiguous."""
     if "$ref" in schema:
         return _schema_at(root["$defs"][schema["$ref"].rsplit("/", 1)[-1]], location, root)
     if "anyOf" in schema:

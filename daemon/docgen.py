@@ -12,8 +12,7 @@ import numpy as np
 from shearloop.daemon.cli.command import COMMANDS
 from shearloop.daemon.control.safety import TABLE, Response
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS
-from shearloop.daemon.messaging.messages import Message
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, TOPICS
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, Message
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = Path("docs/examples")
@@ -54,9 +53,9 @@ def _introduction() -> str:
 Written by `make docs` from `daemon/messaging/messages.py`; change it there.
 
 The daemon publishes on a ZeroMQ PUB socket (`publish`, by default `{PUBLISH_ADDRESS}`). A message has two frames:
-the topic, and a [msgpack](https://msgpack.org) map with text keys. Numbers, booleans and texts are plain keys. A missing
-value is nil. An array is msgpack `bin`: little-endian float32 in C order, with its shape in `NAME_shape`. Plotting tools
-ignore both. `shearloop listen TOPIC --json` prints one message per line as JSON.
+the topic, and a [msgpack](https://msgpack.org) map with text keys. Numbers, booleans and texts are plain keys. A
+missing value is nil. An array is msgpack `bin`: little-endian float32 in C order, with its shape in `NAME_shape`.
+Plotting tools ignore both. `shearloop listen TOPIC --json` prints one message per line as JSON.
 
 PlotJuggler: see [live-view.md](live-view.md#plotjuggler).
 
@@ -107,7 +106,7 @@ def _commands() -> str:
 
 The daemon answers on a ZeroMQ ROUTER socket (`commands`, by default `{COMMAND_ADDRESS}`). Use a REQ or DEALER socket.
 A request is a msgpack map: `{{"command": NAME}}` and the command's arguments. Each gets one reply:
-`{{"ok": true, …}}` or `{{"ok": false, "why": REASON}}`. Limits are in [security.md](security.md).
+`{{"ok": true, …}}` or `{{"ok": false, "reason": REASON}}`. Limits are in [security.md](security.md).
 `shearloop command NAME --json` sends a command from a shell.
 
 {table(("command", "what it does"), rows)}

@@ -1,8 +1,4 @@
-"""When Python's garbage collector looks at what: never through all that a daemon keeps as long as it lives.
-
-Modules, banks and calibrations are some hundred thousand objects. To look through them, as the collector does now and
-then, takes 20 to 100 ms, in which no frame is read and the loop stands still.
-"""
+"""Keeps Python's garbage collector from stopping the control loop."""
 
 import gc
 from collections.abc import Callable, Iterator
@@ -10,21 +6,21 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def kept_from_lasting_objects() -> Iterator[Callable[[], None]]:
-    """Collect nothing until what is yielded is called, and from then on only among what is made after that.
+def without_long_collections() -> Iterator[Callable[[], None]]:
+    """Disable garbage collection until the yielded function is called; then exempt all objects made so far.
 
-    What is made before and becomes garbage in a cycle of references stays in memory until the block is left.
+    Modules, banks and calibrations are some 100 000 objects. A collection through them stops the loop for 20 to 100 ms.
     """
     was_enabled = gc.isenabled()
     gc.disable()
 
-    def collect_what_comes() -> None:
+    def on_ready() -> None:
         gc.freeze()
         if was_enabled:
             gc.enable()
 
     try:
-        yield collect_what_comes
+        yield on_ready
     finally:
         gc.unfreeze()
         if was_enabled:

@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from shearloop.daemon import sd_notify
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import Health, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import Supervisor
 
 HEALTH_PERIOD_S = 1.0
@@ -88,9 +88,9 @@ class HealthReporter:
         """Feed the service manager's watchdog, unless a task is dead: one that stays dead ends the service."""
         dead = self._supervisor.dead
         if dead:
-            sd_notify.notify(f"STATUS=dead, to be started again: {', '.join(dead)}")
+            notify(f"STATUS=dead, restarting: {', '.join(dead)}")
         else:
-            sd_notify.notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
+            notify("WATCHDOG=1", f"STATUS={len(self._supervisor.records)} tasks are alive")
 
 
 def resident_memory_mb() -> float:

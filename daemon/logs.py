@@ -1,23 +1,106 @@
-"""Structured logs: readable lines on a console, JSON where a service manager collects them."""
+"""Structured logs, and the writer that keeps the event loop from waiting for a terminal."""
 
+import contextlib
+import io
 import logging
 import os
+import queue
 import sys
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from typing import TextIO, cast
 
 import structlog
 
-from shearloop.daemon.nonblocking_writer import NonBlockingWriter
+from shearloop.daemon.messaging.messages import Scalar
+from shearloop.drivers.connection import LinkEvent
+
+# Texts beyond this number are dropped and counted.
+MOST_WAITING = 10_000
+# The end waits this long for the reader.
+CLOSE_S = 1.0
+
+
+class NonBlockingWriter:
+    """Writes text in a thread of its own, because a terminal stopped with Ctrl-S blocks its writers.
+
+    `lost` counts dropped texts; a line marks their place. After a broken pipe (`| head`) it stays silent.
+    """
+
+    def __init__(self, stream: TextIO, most_waiting: int = MOST_WAITING) -> None:
+        self.lost = 0
+        if isinstance(stream, io.TextIOWrapper):
+            # A terminal with another encoding may lack characters such as "…".
+            stream.reconfigure(errors="backslashreplace")
+        self._stream = stream
+        self._waiting: queue.Queue[str | None] = queue.Queue(most_waiting)
+        self._reported = 0
+        # Several threads log.
+        self._lock = threading.Lock()
+        # A daemon thread: a blocked write must not keep the process alive.
+        self._thread = threading.Thread(target=self._run, name="writer", daemon=True)
+        self._thread.start()
+
+    def write(self, text: str) -> int:
+        """Queue a text; return its length, as a stream does."""
+        with self._lock:
+            try:
+                self._report_lost()
+                self._waiting.put_nowait(text)
+            except queue.Full:
+                self.lost += 1
+        return len(text)
+
+    def flush(self) -> None:
+        """Do nothing; the thread flushes."""
+
+    def close(self, timeout_s: float = CLOSE_S) -> None:
+        """Write the rest, as far as the reader takes it in time."""
+        until_s = time.monotonic() + timeout_s
+        with contextlib.suppress(queue.Full):
+            with self._lock:
+                self._report_lost(timeout_s)
+            self._waiting.put(None, timeout=max(0.0, until_s - time.monotonic()))
+        self._thread.join(max(0.0, until_s - time.monotonic()))
+
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return the writer's part of `health`."""
+        if not self.lost:
+            return {"errors": {}, "error": ""}
+        error = f"{self.lost} texts were dropped without a reader; Ctrl-Q resumes a terminal stopped with Ctrl-S"
+        return {"errors": {"unread": self.lost}, "error": error}
+
+    def _report_lost(self, timeout_s: float = 0.0) -> None:
+        """Mark the place of dropped texts; raises queue.Full without room in time."""
+        missing = self.lost - self._reported
+        if missing:
+            note = f"… {missing} texts are missing here: the terminal did not read them\n"
+            self._waiting.put(note, block=timeout_s > 0, timeout=timeout_s)
+            self._reported = self.lost
+
+    def _run(self) -> None:
+        while (text := self._waiting.get()) is not None:
+            try:
+                self._stream.write(text)
+                if self._waiting.empty():
+                    self._stream.flush()
+            except OSError as error:
+                silence(self._stream)
+                structlog.get_logger().warning("the output has no reader any more", reason=error.strerror)
+
+
+def silence(stream: TextIO) -> None:
+    """Redirect a stream without a reader to the null device, so that its buffer does not fail again."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, stream.fileno())
+    os.close(null)
 
 
 @contextmanager
 def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.INFO) -> Iterator[NonBlockingWriter]:
-    """Configure structlog for as long as the context lasts; nobody who logs waits for whoever reads it.
-
-    JSON is chosen by itself when systemd has connected the log to its journal.
-    """
+    """Configure structlog for the context: readable lines at a console, JSON under systemd or with `json_lines`."""
     if json_lines is None:
         json_lines = "JOURNAL_STREAM" in os.environ
     renderer: structlog.typing.Processor = (
@@ -34,15 +117,25 @@ def logging_to_stderr(*, json_lines: bool | None = None, level: int = logging.IN
     ]
     if json_lines:
         processors.append(structlog.processors.format_exc_info)
-    with closing(NonBlockingWriter(sys.stderr)) as outlet:
+    with closing(NonBlockingWriter(sys.stderr)) as writer:
         structlog.configure(
             processors=[*processors, renderer],
             wrapper_class=structlog.make_filtering_bound_logger(level),
-            logger_factory=structlog.WriteLoggerFactory(cast(TextIO, outlet)),
+            logger_factory=structlog.WriteLoggerFactory(cast(TextIO, writer)),
             cache_logger_on_first_use=False,
         )
         try:
-            yield outlet
+            yield writer
         finally:
-            # What is logged later is written by whoever logs.
             structlog.configure(logger_factory=structlog.WriteLoggerFactory(sys.stderr))
+
+
+def log_link(device: str, event: LinkEvent) -> None:
+    """Log that a serial or network device came or went."""
+    log_event(device, event.up, event.sentence, repeated=event.repeated)
+
+
+def log_event(device: str, up: bool, sentence: str, *, repeated: bool) -> None:
+    """Log a change of a link: a return as info, a loss as warning, a repeated loss as debug."""
+    log = structlog.get_logger().bind(device=device)
+    (log.info if up else log.debug if repeated else log.warning)(sentence)

@@ -1,36 +1,47 @@
-"""Builds what acts: load cell, gripper, robot and the brain between them, from the configuration."""
+"""The rig: builds load cell, gripper, robot and control loop from the configuration, and checks its experiment."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from pathlib import Path
 
+from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig, GripperConfig, LoadCellConfig
+from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.control_loop import ControlLoop
 from shearloop.daemon.control.creep import Creep
+from shearloop.daemon.control.experiment_schema import (
+    ExperimentFile,
+    GripStep,
+    HoldTorqueStep,
+    IdentifyStep,
+    ReleaseStep,
+    TareStep,
+    check_limits,
+)
 from shearloop.daemon.control.gripper_task import GripperTask
 from shearloop.daemon.control.loop_inputs import GripperStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_source
-from shearloop.daemon.links import log_event, log_link
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.logs import log_event, log_link
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.rig_check import read_experiment
 from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
-from shearloop.drivers.calibration_file import load_calibration
-from shearloop.drivers.hx711 import LoadCalibration
-from shearloop.drivers.load_cell import LoadCell
-from shearloop.drivers.raw_event import Tap, no_tap
+from shearloop.daemon.sensing.skin_task import SKIN
+from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.serial_sensor import OnRaw, ignore_raw
 from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
 from shearloop.drivers.ur.settings import read_settings
+from shearloop.drivers.yaml_files import load_calibration
 
 
 def load_cell_calibration(config: LoadCellConfig) -> LoadCalibration:
-    """Return the load cell's calibration; raises DriverError when it cannot be used."""
+    """Return the load cell's calibration; raises DriverError if it cannot be used."""
     if config.calibration is None:
         return LoadCalibration.of_torque_lines()
     return load_calibration(config.calibration, LoadCalibration)
@@ -40,11 +51,11 @@ def make_load_cell(
     config: LoadCellConfig,
     publisher: Publisher,
     clock: Clock,
-    hear: Callable[[TorqueSample], None],
+    on_torque: Callable[[TorqueSample], None],
     on_event: Callable[[LinkEvent], None],
-    tap: Tap = no_tap,
+    tap: OnRaw = ignore_raw,
 ) -> LoadCellTask:
-    """Return the load cell's task; raises DriverError when its calibration cannot be used."""
+    """Return the load cell's task; raises DriverError if its calibration cannot be used."""
     calibration = load_cell_calibration(config)
     device = config.device
     board = LoadCell(
@@ -53,161 +64,222 @@ def make_load_cell(
         path=device.path,
         rate_hz=config.rate_hz,
         on_event=on_event,
-        tap=tap,
+        on_raw=tap,
     )
-    return LoadCellTask(board, publisher, clock, hear, config.rate_hz)
+    return LoadCellTask(board, publisher, clock, on_torque, config.rate_hz)
 
 
 def make_gripper_client(config: GripperConfig) -> GripperClient:
-    """Return the way to the gripper; nothing is opened yet."""
+    """Return the gripper's client, not connected yet."""
     if config.socket is not None:
         return SocketClient(config.socket.host, config.socket.port)
     if config.modbus is not None:
-        # Here, for pymodbus takes long to import, and most grippers are reached by their socket.
+        # Imported here: pymodbus is slow to import and rarely used.
         from shearloop.drivers.robotiq.modbus_client import ModbusClient
 
         path = str(config.modbus.path) if config.modbus.path is not None else None
         return ModbusClient(serial_number=config.modbus.serial_number, path=path)
-    raise ValueError("a gripper has a way in")
+    raise ValueError("a gripper needs a socket or modbus")
 
 
 def gripper_calibration(config: GripperConfig) -> WidthCalibration:
-    """Return the gripper's calibration, or the maker's figures; raises DriverError when it cannot be used."""
+    """Return the gripper's calibration, or the maker's data; raises DriverError if it cannot be used."""
     if config.calibration is None:
         return WidthCalibration.nominal()
     return load_calibration(config.calibration, WidthCalibration)
 
 
-def make_gripper(
-    config: GripperConfig,
-    publisher: Publisher,
-    feel: Callable[[GripperStatus], None],
-    on_event: Callable[[LinkEvent], None],
-) -> GripperTask:
-    """Return the gripper's task; raises DriverError when its calibration cannot be used."""
-    client = make_gripper_client(config)
-    gripper = RobotiqGripper(client, gripper_calibration(config), on_event=on_event)
-    return GripperTask(gripper, publisher, feel, measures_diameters=config.calibration is not None)
-
-
 class Rig:
-    """Everything that acts, and what belongs to it."""
+    """Robot, gripper, load cell and the control loop between them."""
 
     def __init__(
         self,
         config: DaemonConfig,
         publisher: Publisher,
         clock: Clock,
-        fingertips: Mapping[str, TorqueSource],
+        sources: Mapping[str, TorqueSource],
         tare_fingertips: Callable[[], Awaitable[str]],
-        died: Callable[[], Mapping[str, str]],
-        tap: Callable[[str], Tap] = lambda _: no_tap,
+        dead_tasks: Callable[[], Mapping[str, str]],
+        tap: Callable[[str], OnRaw] = lambda _: ignore_raw,
+        fingertip_diameter: Callable[[int], Measured | None] = lambda _: None,
     ) -> None:
         """Read the settings of every device; none is opened yet.
 
-        `died` names the daemon's dead tasks, and why; `tap` gives what hears of a source's raw inputs.
+        `sources` are fingertips and skin. `dead_tasks` returns the error of each dead task of the daemon, `tap` the
+        recorder's callback for a device's raw data.
         """
         if config.robot is None:
-            raise ValueError("a rig has a robot")
+            raise ValueError("a rig needs a robot")
         self._tare_fingertips = tare_fingertips
+        # Counts the operator's stops, also while an experiment starts.
         self._stops = 0
-        sources = dict(fingertips)
+        sources = dict(sources)
         self.load_cell: LoadCellTask | None = None
         if config.load_cell is not None:
             self.load_cell = make_load_cell(
-                config.load_cell, publisher, clock, self._hear, self.link_of(LOAD_CELL), tap(LOAD_CELL)
+                config.load_cell, publisher, clock, self._on_torque, self.on_link(LOAD_CELL), tap(LOAD_CELL)
             )
             sources[self.load_cell.source.name] = self.load_cell.source
         robot = read_settings(config.robot)
         sources[WRENCH] = wrench_source(robot.rate_hz)
         required = ("robot", "gripper") if config.gripper is not None else ("robot",)
-        creep = {
-            name: tip.creep
-            for name, tip in (*config.fingertips.items(), (COMBINED, config.combined))
-            if tip is not None
+        gels = {
+            name: Creep(fingertip.creep.share, fingertip.creep.time_s)
+            for name, fingertip in (*config.fingertips.items(), (COMBINED, config.combined))
+            if fingertip is not None and fingertip.creep is not None
         }
-        gels = {name: Creep(own.share, own.time_s) for name, own in creep.items() if own is not None}
-        self.brain = ControlLoop(config.loop, sources, required, gels)
-        self.gripper = None
+        self.control_loop = ControlLoop(config.loop, sources, required, gels)
+        self.gripper: GripperTask | None = None
         if config.gripper is not None:
-            self.gripper = make_gripper(config.gripper, publisher, self._feel, self.link_of("gripper"))
-        self.robot = UrRobot(robot, on_link=self._robot_link)
-        self.loop = ControlLoopRunner(
-            self.brain,
+            calibration = gripper_calibration(config.gripper)
+            self.gripper = GripperTask(
+                RobotiqGripper(make_gripper_client(config.gripper), calibration, on_event=self.on_link("gripper")),
+                publisher,
+                self._on_gripper_state,
+                fingertip_diameter=fingertip_diameter,
+                measures_diameters=config.gripper.calibration is not None,
+            )
+        self.robot = UrRobot(robot, on_link=self._on_robot_link)
+        self.runner = ControlLoopRunner(
+            self.control_loop,
             self.robot,
             self.gripper,
-            self.take_zero,
+            self.tare,
             publisher,
             clock,
-            died,
+            dead_tasks,
             config.loop.wrist_acceleration_rad_per_s2,
         )
 
-    def link_of(self, device: str) -> Callable[[LinkEvent], None]:
-        """Return what hears of a device that comes or goes: the log, and the loop, which stops at once."""
+    def on_link(self, device: str) -> Callable[[LinkEvent], None]:
+        """Return a callback for link events of a device: it logs them, and the control loop reacts at once."""
 
-        def heard(event: LinkEvent) -> None:
+        def on_event(event: LinkEvent) -> None:
             log_link(device, event)
-            self._come_or_gone(device, event.up, event.sentence)
+            self._set_link(device, event.up, event.sentence)
 
-        return heard
+        return on_event
 
     def tasks(self) -> Iterator[tuple[str, Callable[[], Awaitable[None]]]]:
-        """Yield the name and the coroutine of every task but the load cell's, which may run without a rig."""
+        """Yield name and coroutine function of every task except the load cell's, which may run without a rig."""
         if self.gripper is not None:
             yield "gripper", self.gripper.read
         yield "robot", self.robot.run
-        yield "loop", self.loop.drive
+        yield "loop", self.runner.run
 
-    async def take_zero(self) -> str:
-        """Take the zero of every torque sensor at once; return why one could not, or an empty text."""
-        zeros = [self._tare_fingertips()]
+    async def tare(self) -> str:
+        """Zero every torque sensor; return the errors, or an empty string."""
+        tares = [self._tare_fingertips()]
         if self.load_cell is not None:
-            zeros.append(self.load_cell.zero())
-        return " ".join(filter(None, await asyncio.gather(*zeros)))
+            tares.append(self.load_cell.zero())
+        return " ".join(filter(None, await asyncio.gather(*tares)))
 
     async def start(self, path: Path) -> str | None:
-        """Begin the experiment in a file, or return why not; raises UserError for a file that is none."""
-        before = self._stops
-        why = await self.loop.start(read_experiment(path))
-        if why is None and self._stops != before:
-            self.brain.stop("the operator said stop")
-            return "stop was said while it was being started"
-        return why
+        """Begin the experiment of a file; return None, or why not. Raises UserError for an invalid file."""
+        stops_before = self._stops
+        reason = await self.runner.start(read_experiment(path))
+        if reason is None and self._stops != stops_before:
+            self.control_loop.stop("the operator stopped it")
+            return "it was stopped during its start"
+        return reason
 
     def stop(self) -> str:
-        """End the experiment that runs, or is just being started, on the operator's word; return its name."""
+        """End the experiment on the operator's command, also during its start; return its name."""
         self._stops += 1
-        experiment = self.brain.experiment
+        experiment = self.control_loop.experiment
         if experiment is None or not experiment.running:
             return ""
-        self.brain.stop("the operator said stop")
+        self.control_loop.stop("the operator stopped it")
         return experiment.file.name
 
-    def end(self) -> None:
-        """Stop the experiment that runs, for the daemon ends, and tell of it as of every other end."""
-        experiment = self.brain.experiment
+    def close(self) -> None:
+        """Stop the running experiment at the daemon's end."""
+        experiment = self.control_loop.experiment
         if experiment is not None and experiment.running:
-            self.brain.stop("the daemon was told to end: the wrist is stopped, a tool that is gripped stays gripped")
-            # No other state of the robot may be decided upon before the loop is cancelled.
-            self.loop.decide_now()
+            self.control_loop.stop("the daemon ended: the wrist is stopped, a gripped tool stays gripped")
+            # The loop is cancelled before the next state.
+            self.runner.decide_now()
 
-    def _robot_link(self, event: UrLinkEvent) -> None:
+    def _on_robot_link(self, event: UrLinkEvent) -> None:
         up = event.status == "up"
         log_event("robot", up, event.sentence, repeated=event.losses > 1)
-        self._come_or_gone("robot", up, event.sentence)
+        self._set_link("robot", up, event.sentence)
 
-    def _come_or_gone(self, device: str, up: bool, sentence: str) -> None:
+    def _set_link(self, device: str, up: bool, sentence: str) -> None:
         if up:
-            self.brain.inputs.lost.pop(device, None)
+            self.control_loop.inputs.lost.pop(device, None)
         else:
-            self.brain.inputs.lost[device] = sentence
-            self.loop.decide_now()
+            self.control_loop.inputs.lost[device] = sentence
+            self.runner.decide_now()
 
-    def _hear(self, torque: TorqueSample) -> None:
-        self.brain.on_torque(torque)
+    def _on_torque(self, torque: TorqueSample) -> None:
+        self.control_loop.on_torque(torque)
 
-    def _feel(self, hand: GripperStatus) -> None:
-        known = self.brain.inputs.gripper
-        if known is None or hand.t_ns >= known.t_ns:
-            self.brain.inputs.gripper = hand
+    def _on_gripper_state(self, state: GripperStatus) -> None:
+        known = self.control_loop.inputs.gripper
+        if known is None or state.t_ns >= known.t_ns:
+            self.control_loop.inputs.gripper = state
+
+
+def read_experiment(path: Path) -> ExperimentFile:
+    """Return the experiment of a file; raises UserError for an invalid one, or one that exceeds its own limits."""
+    file = load_yaml_model(path, ExperimentFile)
+    if error := check_limits(file):
+        raise UserError(f"{path}: {error}")
+    return file
+
+
+def check_experiment(config: DaemonConfig, sources: Mapping[str, TorqueSource]) -> ExperimentFile | None:
+    """Return the configured experiment, if any; raises UserError if the configured devices cannot run it.
+
+    `sources` are fingertips and skin.
+    """
+    path = config.experiment
+    if path is None:
+        return None
+    file = read_experiment(path)
+    measured = [name for name, source in sources.items() if source.measures_torque]
+    driving = [*measured, *([LOAD_CELL] if config.load_cell is not None else []), WRENCH]
+    if file.torque_source not in driving:
+        reason = _why_not_driving(file.torque_source, config)
+        raise UserError(f"{path}: `torque_source: {file.torque_source}` {reason}; there are {', '.join(driving)}")
+    if config.gripper is None:
+        for number, step in enumerate(file.steps, 1):
+            if isinstance(step, GripStep | ReleaseStep):
+                raise UserError(
+                    f"{path}: step {number} is `{step.do}`, and no gripper is configured; "
+                    "add a `gripper` section to the configuration, or take the step out"
+                )
+    if (unidentified := _holds_unidentified(file)) is not None:
+        raise UserError(
+            f"{path}: step {unidentified} is `hold_torque`, and the tool is not identified then; put an `identify` "
+            "step before it, after the last `tare`, `grip` or `release`"
+        )
+    return file
+
+
+def _holds_unidentified(file: ExperimentFile) -> int | None:
+    """Return the number of the first step that closes the loop on an unidentified tool, or None.
+
+    A new grip or a new zero invalidates an identification.
+    """
+    identified = False
+    for number, step in enumerate(file.steps, 1):
+        match step:
+            case IdentifyStep():
+                identified = True
+            case TareStep() | GripStep() | ReleaseStep():
+                identified = False
+            case HoldTorqueStep() if not identified:
+                return number
+    return None
+
+
+def _why_not_driving(drive: str, config: DaemonConfig) -> str:
+    if drive in config.fingertips and config.fingertips[drive].calibration is None:
+        return "is a fingertip without a calibration, which has no torque: add `calibration`, or choose another"
+    if drive in config.fingertips or (drive == COMBINED and config.combined is not None):
+        return "has a calibration without torques: calibrate with the load cell and one tool, or choose another"
+    if drive == SKIN and config.skin is not None:
+        return "has no torque without a radius: add `skin.tool_radius_mm`, or choose another"
+    return "is not a measured torque: choose another, or configure its device"

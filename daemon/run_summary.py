@@ -95,7 +95,7 @@ class RunSummary:
         if phase == "idle" or (run is None and phase in _ENDS):
             return
         if run is None:
-            named = content["experiment"], content["driving"], content["steps"]
+            named = content["experiment"], content["torque_source"], content["steps"]
             run = self._run = _Run(*named, content["t_mono_ns"], content["tool_mm"])
         _note(run, content)
         if phase in _ENDS:
@@ -149,7 +149,7 @@ def _lines(run: _Run, phase: str, truth: Known | None, happened: Sequence[tuple[
     ended = "done" if phase == "done" else "STOPPED before its end"
     yield f"What happened: {run.name!r} was {ended}, after {(end_ns - run.from_ns) / 1e9:.0f} s."
     if run.last is not None and phase != "done":
-        yield f"  {run.last['doing']}"
+        yield f"  {run.last['activity']}"
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
         yield f"  step {step.number} of {run.steps_planned}  {step.name:<12} {took_s:6.1f} s{_beside(step, run)}"

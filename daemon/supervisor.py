@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import structlog
 
-from shearloop.drivers.cancelled import is_cancelled
+from shearloop.drivers.errors import is_cancelled
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0

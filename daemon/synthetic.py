@@ -1,68 +1,56 @@
-"""Frames as an EIT-kit on a twisted fingertip would send them, from a bank's signals and the measured noise. No I/O."""
+"""Synthetic frames of an EIT-kit on a twisted fingertip, from a bank's signals and the measured noise. No I/O."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.bank_file import BankDefinition
+from shearloop.bank.arrays import BoolArray, FloatArray
+from shearloop.bank.eit.bank_file import Bank, BankDefinition
 from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channels
 from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.estimation import Calibration
+from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
 from shearloop.daemon.errors import UserError
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 
-# Of the recorded frames: their mean, and the standard deviation of a channel from frame to frame.
+# Mean and frame-to-frame standard deviation of the recorded frames.
 MEAN_V = 0.13
 NOISE_V = 0.002
-# With this share of the modelled change of conductivity the difference frames have an RMS of 5 mV, as the 49 torque
-# slices have (Gaussian derivative, k = 3.25 cm, σ from 1.25 to 1.85 cm).
+# With this share of the modelled conductivity change, difference frames have an RMS of 5 mV, as the 49 torque peak
+# samples (Gaussian derivative, k = 3.25 cm, σ from 1.25 to 1.85 cm).
 AMPLITUDE = 0.17
-# Interpolated linearly, σ from 1.25 to 1.85 cm in so many values errs by less than a hundredth of the noise.
+# Linear interpolation between 13 values of σ from 1.25 to 1.85 cm errs by less than a hundredth of the noise.
 N_SIGMAS = 13
-# (896,) the injection, 0…31 in order of time, during which each channel is measured.
+# (896,) the injection, 0…31 in order of time, of each channel.
 INJECTIONS: NDArray[np.int64] = LINE_SLOTS // N_ELECTRODES
-
-
-class Signals(Protocol):
-    """What is needed of a bank: `shearloop.bank.eit.bank_file.Bank` has it."""
-
-    @property
-    def k_grid(self) -> NDArray[np.float64]:
-        """(K,) ascending."""
-
-    @property
-    def sigma_grid(self) -> NDArray[np.float64]:
-        """(S,) ascending."""
-
-    @property
-    def homogeneous(self) -> NDArray[np.float64]:
-        """(896,) voltages of the untouched fingertip."""
-
-    @property
-    def signals(self) -> NDArray[np.float32]:
-        """(K, S, 896) differences to them."""
-
-    @property
-    def valid(self) -> NDArray[np.bool_]:
-        """(K, S) cells that have a signal."""
+# σ at rest and at the largest torque of the peak samples, in N·m; k of the thinnest and thickest recorded cylinder.
+SIGMA_CM, LARGEST_TORQUE_NM = (1.85, 1.25), 0.14
+K_CM, DIAMETER_MM = (3.78, 3.47), (10.0, 40.0)
+MAX_WIDTH_MM = 140.0
+N_PLACES = 2000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolvedSignals:
-    """Signals of one k over some σ, in memory; the arrays are those of `Signals`."""
+    """Signals of one k over some σ, in memory: a bank's arrays without its file."""
 
-    k_grid: NDArray[np.float64]
-    sigma_grid: NDArray[np.float64]
-    homogeneous: NDArray[np.float64]
+    k_grid: FloatArray
+    sigma_grid: FloatArray
+    homogeneous: FloatArray
     signals: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    valid: BoolArray
 
 
-def solved_signals(mesh: Mesh, k: float, sigma_low: float, sigma_high: float) -> SolvedSignals:
-    """Solve the Gaussian derivative at one k and N_SIGMAS σ: what frames of a twist need where there is no bank.
+Signals: TypeAlias = Bank | SolvedSignals
+
+
+def solve_signals(mesh: Mesh, k: float, sigma_low: float, sigma_high: float) -> SolvedSignals:
+    """Return signals of the Gaussian derivative at one k and N_SIGMAS σ, for twists without a bank.
 
     Raises ModelError for a k or σ that the model does not have.
     """
@@ -74,7 +62,7 @@ def solved_signals(mesh: Mesh, k: float, sigma_low: float, sigma_high: float) ->
 
 @dataclass(frozen=True, slots=True)
 class TwistProgramme:
-    """What is done with a tool: nothing, grip it, twist and release it so many times, let go; then again.
+    """An endless programme: idle, grip, `cycles` twists, release.
 
     A cycle turns up to `torque_nm` in `turn_s`, holds for `hold_s`, turns back in `turn_s` and rests for `hold_s`.
     """
@@ -87,7 +75,7 @@ class TwistProgramme:
     cycles: int = 8
 
     def at(self, t_s: float) -> tuple[float, float]:
-        """Return how firmly the tool is gripped (0…1) and the torque in N·m at a time after the start."""
+        """Return the grip (0…1) and the torque in N·m at a time after the start."""
         cycle_s = 2 * (self.turn_s + self.hold_s)
         gripped_s = self.idle_s + self.grip_s
         released_s = gripped_s + self.cycles * cycle_s
@@ -102,9 +90,9 @@ class TwistProgramme:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SyntheticFrame:
-    """One line, (1024,) in volts, and the truth behind it at the middle of its acquisition."""
+    """One line, (1024,) in volts, and the true state in the middle of its acquisition."""
 
-    line: NDArray[np.float64]
+    line: FloatArray
     t_s: float
     torque_nm: float
     grip: float
@@ -113,7 +101,7 @@ class SyntheticFrame:
 
 
 class Synthesiser:
-    """Makes lines of RMS magnitudes, as the board's ADC would read them, for any cell of a bank and between cells."""
+    """Makes lines of RMS magnitudes, as the board's ADC reads them, at and between a bank's cells."""
 
     def __init__(self, bank: Signals, *, seed: int = 0, amplitude: float = AMPLITUDE, noise_v: float = NOISE_V) -> None:
         self._bank = bank
@@ -122,13 +110,10 @@ class Synthesiser:
         self._noise_v = noise_v
         self._random = np.random.default_rng(seed)
 
-    def line(
-        self, k: float, sigma: float | NDArray[np.float64], grip: float | NDArray[np.float64] = 1.0
-    ) -> NDArray[np.float64]:
+    def line(self, k: float, sigma: float | FloatArray, grip: float | FloatArray = 1.0) -> FloatArray:
         """Return the (1024,) values of one frame; `grip` from 0 (untouched) to 1 scales the change.
 
-        σ and grip may change while a frame is acquired: `[INJECTIONS]` makes (896,) values for the channels out of 32
-        for the injections. Raises UserError for a k or σ outside the bank's valid cells.
+        σ and grip may be (896,), with a value per channel. Raises UserError outside the bank's valid cells.
         """
         volts = self._bank.homogeneous + grip * self._amplitude * self.signal(k, sigma)
         volts = self._gain * np.abs(volts) + self._random.normal(0.0, self._noise_v, volts.shape)
@@ -136,8 +121,8 @@ class Synthesiser:
         steps = np.maximum(np.floor(np.abs(volts) / ADC_STEP_V), 1.0)
         return line_of_channels(steps * ADC_STEP_V)
 
-    def signal(self, k: float, sigma: float | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the (896,) difference signal, interpolated between the bank's cells; σ is one or (896,)."""
+    def signal(self, k: float, sigma: float | FloatArray) -> FloatArray:
+        """Return the (896,) difference signal, interpolated between the bank's cells; σ is a number or (896,)."""
         bank, mixed = self._bank, np.zeros(self._bank.homogeneous.shape)
         sigmas = np.broadcast_to(sigma, mixed.shape)
         channels = np.arange(mixed.size)
@@ -160,10 +145,9 @@ def twist_frames(
     sigma_of_torque: Callable[[float], float],
     period_s: float,
 ) -> Iterator[SyntheticFrame]:
-    """Yield the frames of a programme for ever, one every `period_s`.
+    """Yield the frames of a programme without end, one every `period_s`.
 
-    `sigma_of_torque` is the inverse of a calibration: the σ that a torque in N·m makes. Raises UserError as
-    Synthesiser.line does.
+    `sigma_of_torque` is the inverse of a calibration: the σ of a torque in N·m. Raises UserError as `Synthesiser.line`.
     """
     number = 0
     while True:
@@ -174,10 +158,8 @@ def twist_frames(
         number += 1
 
 
-def _neighbours(
-    grid: NDArray[np.float64], values: NDArray[np.float64], name: str
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Yield the indices of the grid values below and above `values`, with their shares, which may be nothing."""
+def _neighbours(grid: FloatArray, values: FloatArray, name: str) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:
+    """Yield the indices of the grid values below and above `values`, with their weights."""
     outside = values[~((values >= grid[0]) & (values <= grid[-1]))]
     if outside.size:
         raise UserError(f"the bank has {name} from {grid[0]:g} to {grid[-1]:g}, and not {outside[0]:g}; choose another")
@@ -185,3 +167,75 @@ def _neighbours(
     below = np.floor(places).astype(np.int64)
     yield below, 1.0 - (places - below)
     yield np.minimum(below + 1, len(grid) - 1), places - below
+
+
+def frame_maker(
+    bank_path: Path, seed: int, *, sigma: tuple[float, float] | None = None, calibration: Path | None = None
+) -> Callable[[FloatArray, FloatArray, float], FloatArray]:
+    """Return a function from each injection's grip and shear torque, (32,) each, and a diameter to a line (1024,).
+
+    σ falls linearly with the torque, from `sigma[0]` at none to `sigma[1]` at 0.14 N·m, and rises for negative
+    torques; or it follows a calibration. Beyond the bank σ and k stay at its edge. Raises UserError for a σ at rest
+    outside the bank, BankError for unreadable files.
+    """
+    bank = Bank.open(bank_path)
+    synthesiser = Synthesiser(bank, seed=seed)
+    torques_nm, sigmas = _linear(bank, *(sigma or SIGMA_CM)) if calibration is None else _inverse(bank, calibration)
+
+    def frame_of(grip: FloatArray, shear_torque_nm: FloatArray, diameter_mm: float) -> FloatArray:
+        sigma_cm = np.interp(shear_torque_nm, torques_nm, sigmas)
+        return synthesiser.line(_k_cm(bank, diameter_mm), sigma_cm[INJECTIONS], grip[INJECTIONS])
+
+    return frame_of
+
+
+def _k_cm(bank: Bank, diameter_mm: float) -> float:
+    slope = (K_CM[1] - K_CM[0]) / (DIAMETER_MM[1] - DIAMETER_MM[0])
+    k = K_CM[0] + slope * (diameter_mm - DIAMETER_MM[0])
+    return float(min(max(k, bank.k_grid[0]), bank.k_grid[-1]))
+
+
+def _linear(bank: Bank, rest: float, largest: float) -> tuple[FloatArray, FloatArray]:
+    """Return ascending torques and their σ: a line over the bank's σ."""
+    if largest >= rest:
+        raise UserError(f"--sigma {rest:g} {largest:g}: sigma falls as the torque rises; give the larger one first")
+    low, high = _sigma_range(bank, rest)
+    sigmas = np.array([high, low])
+    return (sigmas - rest) * LARGEST_TORQUE_NM / (largest - rest), sigmas
+
+
+def _inverse(bank: Bank, path: Path) -> tuple[FloatArray, FloatArray]:
+    """Return ascending torques and their σ: a calibration's curve, while it falls, over the bank's σ."""
+    calibration = Calibration.load(path)
+    calibration.check_bank(bank)
+    if calibration.torque is None or not isinstance(calibration.torque.regressor, PolynomialRegressor):
+        raise UserError(f"{path} has no curve of torque over sigma; give --sigma instead")
+    curve = calibration.torque.regressor.polynomial
+    low, high = _sigma_range(bank, (curve.x_low + curve.x_high) / 2)
+    sigmas = np.linspace(high, low, N_PLACES)
+    torques_nm = np.array([curve(sigma) for sigma in sigmas])
+    rising = np.diff(torques_nm) > 0
+    inside = np.flatnonzero((sigmas[1:] >= curve.x_low) & (sigmas[:-1] <= curve.x_high))
+    first, last = _run(rising, int(inside[0]))
+    if last < inside[-1]:
+        raise UserError(f"{path}: its torque does not fall with sigma everywhere; give --sigma instead")
+    kept = slice(first, last + 2)  # a step has two ends
+    return torques_nm[kept], sigmas[kept]
+
+
+def _sigma_range(bank: Bank, within: float) -> tuple[float, float]:
+    """Return the ends of the σ around `within` with a signal at every k of a tool."""
+    thick, thin = np.searchsorted(bank.k_grid, [_k_cm(bank, MAX_WIDTH_MM), _k_cm(bank, 0.0)])
+    valid = bank.valid[max(thick - 1, 0) : thin + 1].min(axis=0)
+    at = int(np.searchsorted(bank.sigma_grid, within))
+    if within < bank.sigma_grid[0] or at == len(valid) or not valid[at]:
+        raise UserError(f"the bank has no signal at sigma = {within:g}; give another --sigma or another bank")
+    first, last = _run(valid, at)
+    return float(bank.sigma_grid[first]), float(bank.sigma_grid[last])
+
+
+def _run(flags: BoolArray, at: int) -> tuple[int, int]:
+    """Return the first and last index of the true values around an index."""
+    missing = np.flatnonzero(~flags)
+    first = int(missing[missing < at].max(initial=-1)) + 1
+    return first, int(missing[missing > at].min(initial=len(flags))) - 1

@@ -1,7 +1,7 @@
-"""A shear skin that never was: the membrane of the paper on a finger, pushed or turned by a tool. No I/O, no clock.
+"""A synthetic shear skin: the paper's membrane on a finger, pushed or turned by a tool. No I/O, no clock.
 
-The tool touches the skin at `radius_mm` from the axis about which the wrist turns, through a contact that gives way.
-Wrist's angle → stretch of contact and membrane in series → shear force → strain of the gauges → resistances.
+The tool touches the skin at `radius_mm` from the wrist's axis, through an elastic contact.
+Wrist angle → stretch of contact and membrane in series → shear force → strain of the gauges → resistances.
 """
 
 import math
@@ -14,13 +14,13 @@ from shearloop.bank.skin.calibration import CalibrationTable
 from shearloop.bank.skin.membrane import PAPER_SECTION, UNSTRETCHED, Membrane, paper_membrane
 from shearloop.bank.skin.statistics import loop
 
-# Two gauges as they come off the wafer: never quite alike, which tells them apart.
+# Real gauges differ, so swapped ones can be recognised.
 REST_OHM = (24.6, 25.3)
 # A fingertip of elastomer under the tool's edge.
 CONTACT_N_PER_MM = 1.0
 RADIUS_MM = 15.0
 NORMAL_N = 1.0
-# The paper's std of the response over an hour; each gauge carries half of its variance. How fast is not told.
+# The paper's std of the response over an hour; each gauge has half of its variance. The time constant is assumed.
 DRIFT_STD, DRIFT_TIME_S = 1.48e-4, 600.0
 # The paper's response to 2 N of normal force alone.
 CROSSTALK_PER_N = 1.24e-4 / 2
@@ -28,7 +28,7 @@ CROSSTALK_PER_N = 1.24e-4 / 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SyntheticSkinSettings:
-    """How the skin is made and touched."""
+    """Properties of the skin and its contact."""
 
     rest_ohm: tuple[float, float] = REST_OHM
     contact_n_per_mm: float = CONTACT_N_PER_MM
@@ -37,12 +37,12 @@ class SyntheticSkinSettings:
 
 
 class SyntheticSkin:
-    """One skin and what touches it. Forces in N; positive shear stretches gauge 1."""
+    """One skin and the tool on it. Forces in N; positive shear stretches gauge 1."""
 
     def __init__(
         self, settings: SyntheticSkinSettings | None = None, membrane: Membrane | None = None, seed: int = 0
     ) -> None:
-        """Be unstretched, and touched with the normal force of the settings."""
+        """Start unstretched, with the normal force of the settings."""
         self.settings = settings or SyntheticSkinSettings()
         self.membrane = membrane or paper_membrane()
         self.normal_n = self.settings.normal_n
@@ -53,7 +53,7 @@ class SyntheticSkin:
 
     @property
     def stiffness_n_per_mm(self) -> float:
-        """Of the stretched side of the membrane: EA over the arc from the load to the bracket."""
+        """The stiffness of the membrane's stretched side: EA over the arc from the load to the bracket."""
         return self.membrane.axial_stiffness_n / (math.pi / 2 * PAPER_SECTION.mid_radius_mm)
 
     @property
@@ -62,15 +62,15 @@ class SyntheticSkin:
         return self.shear_n * self.settings.radius_mm * 1e-3
 
     def push(self, shear_n: float) -> None:
-        """Let the shear force go straight to a value."""
+        """Set the shear force."""
         self.shear_n = shear_n
         self._state = self.membrane.step(self._state, shear_n, self.normal_n)
 
     def turn(self, angle_rad: float) -> float:
-        """Let the tool turn to an angle, counted from where it touched the skin; return the shear force.
+        """Turn the tool to an angle, counted from its first contact; return the shear force.
 
-        Contact and membrane are stretched together by the way along the skin. While the skin sticks only the contact
-        gives way; once the force differs from the tension by μFₙ the skin slips along.
+        Contact and membrane stretch together. While the skin sticks only the contact yields; once force and tension
+        differ by μFₙ the skin slips.
         """
         way_mm = angle_rad * self.settings.radius_mm
         contact, membrane = self.settings.contact_n_per_mm, self.stiffness_n_per_mm
@@ -84,13 +84,13 @@ class SyntheticSkin:
         return shear_n
 
     def rest(self, seconds: float) -> None:
-        """Let time pass: the gauges wander by as much as the paper's do in an hour, and no further."""
+        """Advance the gauges' drift, which stays within the paper's range."""
         keep = math.exp(-seconds / DRIFT_TIME_S)
         std = DRIFT_STD / math.sqrt(2.0) * math.sqrt(1.0 - keep * keep)
         self._wander = [keep * wander + self._random.gauss(0.0, std) for wander in self._wander]
 
     def resistances_ohm(self) -> tuple[float, float]:
-        """Return R₁ and R₂ as they are now, without the noise of measuring them."""
+        """Return R₁ and R₂ now, without measurement noise."""
         factor = self.membrane.gauge_factor
         crosstalk = CROSSTALK_PER_N * self.normal_n
         changes = (factor * self._state.strain_1 + crosstalk, factor * self._state.strain_2)
@@ -104,7 +104,7 @@ class SyntheticSkin:
 def calibration_table(
     skin: SyntheticSkin, noise: float, normals_n: tuple[float, ...] = (0.5, 1.0, 2.0), up_to_n: float = 5.0
 ) -> CalibrationTable:
-    """Return what a bench would record with this skin: loops to 1.2 N and to `up_to_n`, each from two rows at rest.
+    """Return a bench's recording of this skin: loops to 1.2 N and to `up_to_n`, each after two rows at rest.
 
     `noise` is the standard deviation of one relative resistance.
     """

@@ -1,35 +1,296 @@
-"""The EIT-kit (a Teensy on USB): starts it, turns what it sends into frames, and awaits it when it goes away."""
+"""The EIT-kit, a Teensy on USB: checks its lines, turns them into frames, starts it and reconnects to it.
+
+The board sends a line per frame: 1024 values with four decimals, each followed by `, `, then a newline. It computes
+each value from 10-bit samples as floor(√(mean of (sample − 512)²)) × 2.2 V / 1024 (`read_signal` of the EIT-kit's
+open-source firmware), hence the steps of 2.2/1024 V. It writes 0 where the measuring pair touches a driven electrode.
+All values are below 10 V, so a valid line is 1024 cells of eight bytes.
+"""
 
 import os
+import re
 import time
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections import Counter
+from collections.abc import AsyncGenerator, Callable
+from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from shearloop.drivers.eit_line import NOMINAL_PERIOD_NS, Frame, FrameParser
+from shearloop.drivers.connection import Diagnostics, LinkEvent, Port, SerialLink
 from shearloop.drivers.errors import DeviceLostError
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
-from shearloop.drivers.serial_port import LinkEvent, Port, SerialLink
-from shearloop.drivers.serial_sensor import SerialSensor
+from shearloop.drivers.frame_clock import FrameClock
+from shearloop.drivers.serial_sensor import InputKind, LineSplitter, OnRaw, RawEvent, SerialSensor, ignore_raw
 
-__all__ = ["EitKit", "Frame"]
+N_VALUES = 1024
+CELL_BYTES = len(b"0.1234, ")
+LINE_BYTES = N_VALUES * CELL_BYTES
+# Twice a valid line: a line with a wrong count is shorter, a stream without newlines is longer.
+MAX_LINE_BYTES = 2 * LINE_BYTES
+EXCERPT_BYTES = 60
+
+# The mean over two recordings of 832 frames each.
+FRAME_PERIOD_S = 0.5408
+# The board's nominal period, 1.85 frames/s; the clock learns the real one.
+NOMINAL_PERIOD_NS = 541_000_000
+# A line of 8 kB over the high-speed USB of a Teensy 4.
+TRANSFER_NS = 1_000_000
+ADC_REFERENCE_V = 2.2
+ADC_STEP_V = ADC_REFERENCE_V / 1024
+# The RMS of the largest sine between the ADC's rails; larger readings are clipped.
+FULL_SCALE_SINE_RMS_V = ADC_REFERENCE_V / 2 / 2**0.5
+# The longest run of equal readings of a live channel in the recordings is 168 frames.
+DEAD_AFTER_FRAMES = 200
 
 START = b"y"
-# Silence of so many periods is more than a frame that was late, and the board is started again.
+# A silence of this many periods restarts the board.
 SILENT_PERIODS = 4
-# However fast the frames come: below this a busy machine may be what is silent.
-SHORTEST_SILENCE_S = 0.5
-# A board that was started again so often without a byte in return is opened anew.
+# At fast frame rates a shorter silence may come from a busy computer.
+MIN_SILENCE_S = 0.5
+# Unanswered starts before the port is reopened.
 STARTS_BEFORE_REOPENING = 5
+
+_SEPARATOR = b", "
+_DECIMAL = re.compile(rb"-?\d+\.\d{4}")
+_DIGITS_TO_0 = bytes.maketrans(b"0123456789", b"0" * 10)
+_ZERO_LINE = b"0.0000, " * N_VALUES
+# A cell's digits times these give its value in ten thousandths.
+_PLACES = np.array([10_000, 0, 1_000, 100, 10, 1, 0, 0], dtype=np.float64)
+
+
+class FrameErrorKind(Enum):
+    """Why a line is rejected; the value is the operator's sentence."""
+
+    TOO_LONG = f"a line of more than {MAX_LINE_BYTES} bytes: newlines are lost, or this is not an EIT-kit"
+    WRONG_COUNT = f"a line without {N_VALUES} values, each followed by a comma and a space: bytes were lost"
+    NOT_A_NUMBER = "a value that is not a decimal with four places: bytes were lost or changed"
+    NAN = "a value that is NaN: the board divided by zero, restart it so that it calibrates again"
+    NEGATIVE = "a negative value, impossible for an amplitude: bytes were changed"
+    OUT_OF_RANGE = f"a value above the ADC's {ADC_REFERENCE_V} V: bytes were changed"
+    ZERO_CHANNEL = "a channel that reads exactly 0: an electrode is shorted, or values are out of place"
+    NONZERO_SLOT = "a value where the pair touches a driven electrode and 0 belongs: a different injection pattern"
+
+
+@dataclass(frozen=True, slots=True)
+class FrameError:
+    """A rejected line: the reason, the first bad value (0…1023) if known, and its text."""
+
+    kind: FrameErrorKind
+    excerpt: bytes
+    position: int | None = None
+
+    def __str__(self) -> str:
+        """Return the sentence for health and log."""
+        where = "" if self.position is None else f" at value {self.position + 1}"
+        return f"rejected {self.kind.value} (read {self.excerpt.decode('ascii', 'backslashreplace')!r}{where})"
+
+
+# What remains of a line that was under way when the port was opened.
+_PARTIAL_ERRORS = (FrameErrorKind.WRONG_COUNT, FrameErrorKind.NOT_A_NUMBER)
+
+
+def read_line(line: bytes, zero_slots: NDArray[np.bool_]) -> NDArray[np.float64] | FrameError:
+    """Return the (1024,) values in volts of a line without its end, or the reason to reject it.
+
+    `zero_slots` (1024,) is true where the board writes 0. Values must have the board's own form, `d.dddd`.
+    """
+    if len(line) != LINE_BYTES or line.translate(_DIGITS_TO_0) != _ZERO_LINE:
+        return _find_error(line)
+    digits = np.frombuffer(line, np.uint8).reshape(N_VALUES, CELL_BYTES) - np.uint8(ord("0"))
+    # The quotient of whole numbers below 10⁵ is the same double that float() reads.
+    values = digits.astype(np.float64) @ _PLACES / 10_000.0
+    zeros = values == 0.0
+    for kind, bad in (
+        (FrameErrorKind.OUT_OF_RANGE, values > ADC_REFERENCE_V),
+        (FrameErrorKind.NONZERO_SLOT, ~zeros & zero_slots),
+        (FrameErrorKind.ZERO_CHANNEL, zeros & ~zero_slots),
+    ):
+        if bad.any():
+            position = int(bad.argmax())
+            return FrameError(kind, line.split(_SEPARATOR)[position], position)
+    return values
+
+
+def _find_error(line: bytes) -> FrameError:
+    *values, rest = line.split(_SEPARATOR)
+    if rest or len(values) != N_VALUES:
+        return FrameError(FrameErrorKind.WRONG_COUNT, line[:EXCERPT_BYTES])
+    for position, value in enumerate(values):
+        if value.lower().lstrip(b"-") == b"nan":
+            kind = FrameErrorKind.NAN
+        elif not _DECIMAL.fullmatch(value):
+            kind = FrameErrorKind.NOT_A_NUMBER
+        elif value.startswith(b"-"):
+            kind = FrameErrorKind.NEGATIVE
+        elif len(value) + len(_SEPARATOR) != CELL_BYTES:
+            kind = FrameErrorKind.OUT_OF_RANGE
+        else:
+            continue
+        return FrameError(kind, value[:EXCERPT_BYTES], position)
+    raise AssertionError("the line has no error")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One frame of the board; its arrays are read-only.
+
+    `channels` (896,) and `raw` (1024,) are in volts and line order; `line` is the received line without its end.
+    `t_mid_ns` is the middle of the acquisition, `t_arrival_ns` the arrival of the last byte (monotonic clock).
+    `seq` counts frames from 0 across reconnections. `saturated` (896,): the signal exceeds the ADC's range; `dead`
+    (896,): unchanged for DEAD_AFTER_FRAMES, so nothing is connected; `unusable` counts channels with either flag;
+    `repeated`: the same line as the frame before, so no new measurement.
+    """
+
+    channels: NDArray[np.float64]
+    raw: NDArray[np.float64]
+    line: bytes
+    t_mid_ns: int
+    t_arrival_ns: int
+    seq: int
+    saturated: NDArray[np.bool_]
+    dead: NDArray[np.bool_]
+    unusable: int
+    repeated: bool
+
+
+class FrameParser:
+    """Turns bytes, however they are sliced, into frames; counts rejected lines by kind. No I/O.
+
+    `zero_slots` (1024,) is true where the injection pattern makes the value 0. Two counters are not errors:
+    `partial_lines` were under way when the port was opened, `unfinished` were cut off by a reopening or restart.
+    """
+
+    def __init__(
+        self,
+        zero_slots: NDArray[np.bool_],
+        *,
+        nominal_period_ns: int = NOMINAL_PERIOD_NS,
+        dead_after: int = DEAD_AFTER_FRAMES,
+    ) -> None:
+        if zero_slots.shape != (N_VALUES,):
+            raise ValueError(f"the mask of zero slots has the shape {zero_slots.shape} instead of ({N_VALUES},)")
+        self.clock = FrameClock(nominal_period_ns)
+        self.frames = 0
+        self.errors: Counter[FrameErrorKind] = Counter()
+        self.last_error: FrameError | None = None
+        self.partial_lines = 0
+        self._zero_slots = zero_slots
+        self._slots = np.flatnonzero(~zero_slots)
+        self._dead_after = dead_after
+        self._lines = LineSplitter(MAX_LINE_BYTES)
+        self._first = True
+        self._rejected_since_frame = False
+        self._restarted_at = 0
+        self._restarted_lines = 0
+        self._last_mid_ns = -(2**63)
+        self._last_line = b""
+        self._last_channels = np.full(len(self._slots), np.nan)
+        self._equal_readings = np.zeros(len(self._slots), np.int64)
+
+    @property
+    def unfinished(self) -> int:
+        """Lines that were cut off."""
+        return self._lines.unfinished + self._restarted_lines
+
+    def handle(self, event: RawEvent) -> list[Frame]:
+        """Process a live or recorded event; return the frames that it completes."""
+        match event.kind:
+            case InputKind.OPENED:
+                self.port_opened()
+            case InputKind.STARTED:
+                self.board_started()
+            case InputKind.DATA:
+                return self.feed(event.data, event.t_ns)
+        return []
+
+    def port_opened(self) -> None:
+        """Drop a half-received line; the first line may lack its beginning."""
+        self._lines.restart()
+        self._first = True
+        self._rejected_since_frame = False
+        self._restarted_at = 0
+        self.clock.restart()
+
+    def board_started(self) -> None:
+        """Note a restart of a silent board: it continues its line or begins another."""
+        self._restarted_at = len(self._lines.partial)
+
+    def feed(self, data: bytes, t_arrival_ns: int) -> list[Frame]:
+        """Return the frames that `data` completes, in order; all of it had arrived at `t_arrival_ns`."""
+        complete = []
+        for line in self._lines.feed(data):
+            found = self._read(line)
+            self._first, self._restarted_at = False, 0
+            if found is not None:
+                complete.append((*found, self._rejected_since_frame))
+                self._rejected_since_frame = False
+        frames = []
+        for number, (line, values, missed) in enumerate(complete, 1):
+            # Frames that waited together were sent one period apart, the last one by now.
+            waited_ns = (len(complete) - number) * self.clock.period_ns if self.clock.learned else 0
+            sent_ns = self.clock.arrived(t_arrival_ns - waited_ns, missed)
+            frames.append(self._frame(line, values, sent_ns, t_arrival_ns))
+        return frames
+
+    def _read(self, line: bytes | None) -> tuple[bytes, NDArray[np.float64]] | None:
+        if line is None:
+            self._reject(FrameError(FrameErrorKind.TOO_LONG, self._lines.too_long_start))
+            return None
+        line = line.removesuffix(b"\r")
+        values = read_line(line, self._zero_slots)
+        if isinstance(values, FrameError) and self._restarted_at:
+            rest = line[self._restarted_at :]
+            rest_values = read_line(rest, self._zero_slots)
+            if not isinstance(rest_values, FrameError):
+                self._restarted_lines += 1
+                return rest, rest_values
+        if not isinstance(values, FrameError):
+            return line, values
+        if self._first and values.kind in _PARTIAL_ERRORS and len(line) < LINE_BYTES:
+            self.partial_lines += 1
+        else:
+            self._reject(values)
+        return None
+
+    def _reject(self, error: FrameError) -> None:
+        self.errors[error.kind] += 1
+        self.last_error = error
+        self._rejected_since_frame = True
+
+    def _frame(self, line: bytes, values: NDArray[np.float64], sent_ns: int, t_arrival_ns: int) -> Frame:
+        channels = values[self._slots]
+        repeated = line == self._last_line
+        if not repeated:
+            self._equal_readings = np.where(channels == self._last_channels, self._equal_readings + 1, 1)
+        self._last_line, self._last_channels = line, channels
+        saturated = channels > FULL_SCALE_SINE_RMS_V
+        dead = self._equal_readings >= self._dead_after
+        # Time stays in order when the clock learns a new period.
+        self._last_mid_ns = max(sent_ns - TRANSFER_NS - self.clock.period_ns // 2, self._last_mid_ns + 1)
+        for array in (channels, values, saturated, dead):
+            array.setflags(write=False)
+        frame = Frame(
+            channels=channels,
+            raw=values,
+            line=line,
+            t_mid_ns=self._last_mid_ns,
+            t_arrival_ns=t_arrival_ns,
+            seq=self.frames,
+            saturated=saturated,
+            dead=dead,
+            unusable=int(np.count_nonzero(saturated | dead)),
+            repeated=repeated,
+        )
+        self.frames += 1
+        return frame
 
 
 class EitKit(SerialSensor[Frame]):
     """One board, named by USB serial number or path.
 
-    `zero_slots` (1024,) is true where its injection pattern makes a value 0; `frame_period_s` serves until the period
-    is measured; `on_event` hears when the board comes and goes, `tap` of all that the parser is told, and `on_frame` at
-    once of every frame that comes of it, whenever `frames` is asked for the next.
+    `zero_slots` (1024,) is true where its injection pattern makes a value 0. `frame_period_s` is used until the period
+    is measured. `on_event` receives changes of the connection, `on_raw` every input of the parser, `on_frame` each
+    frame as soon as it is complete.
     """
 
     def __init__(
@@ -40,65 +301,63 @@ class EitKit(SerialSensor[Frame]):
         path: str | os.PathLike[str] | None = None,
         frame_period_s: float = NOMINAL_PERIOD_NS / 1e9,
         on_event: Callable[[LinkEvent], None] = lambda _: None,
-        tap: Tap = no_tap,
+        on_raw: OnRaw = ignore_raw,
         on_frame: Callable[[Frame], None] = lambda _: None,
     ) -> None:
-        path = None if path is None else os.fspath(path)
-        super().__init__(SerialLink(serial_number=serial_number, path=path, on_event=on_event), self._frames_of, tap)
-        self._on_frame = on_frame
+        super().__init__(SerialLink(serial_number=serial_number, path=path, on_event=on_event), on_raw)
         self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
+        self._on_frame = on_frame
         self._expected_hz = 1.0 / frame_period_s
-        self._unanswered = 0
+        self._starts = 0
         self._silences = 0
 
     def frames(self) -> AsyncGenerator[Frame]:
         """Yield every frame that arrives; see `values`."""
         return self.values()
 
-    async def _opened(self, port: Port) -> None:
-        self._unanswered = 0
-        await port.write(START)
+    @property
+    def period_s(self) -> float:
+        """The board's measured period, or the configured one until then."""
+        return self._parser.clock.period_ns / 1e9
 
-    def _patience_s(self) -> float:
-        return max(SILENT_PERIODS * self._parser.clock.period_ns / 1e9, SHORTEST_SILENCE_S)
+    def diagnostics(self) -> Diagnostics:
+        """Return the board's values for `health`; counts are since the process began."""
+        parser = self._parser
+        return {
+            **super().diagnostics(),
+            "frames": parser.frames,
+            "errors": {kind.name.lower(): count for kind, count in parser.errors.items()},
+            "last_frame_error": "" if parser.last_error is None else str(parser.last_error),
+            "partial_lines": parser.partial_lines,
+            "unfinished": parser.unfinished,
+            "silences": self._silences,
+            "expected_hz": self._expected_hz,
+            "measured_hz": 1.0 / self.period_s if parser.clock.learned else None,
+        }
 
-    def _heard(self) -> None:
-        self._unanswered = 0
-
-    async def _silent(self, port: Port, _waited_s: float) -> None:
-        """Start the board again, a few times; then it is lost."""
-        if self._unanswered == STARTS_BEFORE_REOPENING:
-            raise DeviceLostError(
-                f"{port.path} is open but silent, though the board was started {STARTS_BEFORE_REOPENING} times more; "
-                "see that it has power and that it is an EIT-kit."
-            )
-        self._unanswered += 1
-        self._silences += 1
-        self.tell(InputKind.STARTED, time.monotonic_ns())
-        await port.write(START)
-
-    def _frames_of(self, told: RawEvent) -> list[Frame]:
-        frames = self._parser.take(told)
+    def _parse(self, event: RawEvent) -> list[Frame]:
+        frames = self._parser.handle(event)
         for frame in frames:
             self._on_frame(frame)
         return frames
 
-    @property
-    def period_s(self) -> float:
-        """The board's period as it was measured, or as it was given until it is."""
-        return self._parser.clock.period_ns / 1e9
+    async def _on_open(self, port: Port) -> None:
+        self._starts = 0
+        await port.write(START)
 
-    def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
-        """Return what health tells of the board; counts are since the process began."""
-        parser, clock = self._parser, self._parser.clock
-        return {
-            **super().facts(),
-            "frames": parser.frames,
-            "errors": {kind.name.lower(): count for kind, count in parser.refused.items()},
-            "last_refusal": "" if parser.last_refusal is None else str(parser.last_refusal),
-            "first_partials": parser.first_partials,
-            "unfinished": parser.unfinished,
-            "silences": self._silences,
-            "expected_hz": self._expected_hz,
-            "measured_hz": 1e9 / clock.period_ns if clock.learned else None,
-        }
+    def _timeout_s(self) -> float:
+        return max(SILENT_PERIODS * self.period_s, MIN_SILENCE_S)
+
+    def _on_data(self) -> None:
+        self._starts = 0
+
+    async def _on_timeout(self, port: Port, _waited_s: float) -> None:
+        if self._starts == STARTS_BEFORE_REOPENING:
+            raise DeviceLostError(
+                f"{port.path} is open but silent, though the board was started {STARTS_BEFORE_REOPENING} times more; "
+                "see that it has power and that it is an EIT-kit."
+            )
+        self._starts += 1
+        self._silences += 1
+        self._dispatch(InputKind.STARTED, time.monotonic_ns())
+        await port.write(START)

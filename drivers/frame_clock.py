@@ -1,10 +1,9 @@
-"""When a frame was measured, from when it was read.
+"""The board's clock: when a frame was measured, from when it was read.
 
-A board with a steady period sends each frame as soon as it is complete, but the reader sees it later whenever the
-reader (or the bus) was busy: delays are never negative. The straight line that runs below all (frame number, arrival)
-points and as close to them as it can is therefore the board's own clock (Moon, Skelly and Towsley 1999, "Estimation
-and removal of clock skew from network delay measurements": the line is the edge of the lower convex hull that
-spans the middle of the points). Its slope is the period; its height, over the last few frames, is the phase.
+A board with a steady period sends each frame as soon as it is complete. A busy reader or bus sees it later, never
+earlier. The board's clock is therefore the line closest below all (frame number, arrival) points. That line is the edge
+of their lower convex hull that spans the middle (Moon, Skelly and Towsley 1999, "Estimation and removal of clock skew
+from network delay measurements"). Its slope is the period; its height over the last few frames is the phase.
 """
 
 from collections import deque
@@ -12,37 +11,35 @@ from collections.abc import Iterable
 from itertools import islice, pairwise
 from statistics import median
 
-# Frames from which the period is learned: at 0.54 s the last 35 s, in which a crystal drifts by microseconds.
+# Frames behind the period: 35 s at 0.54 s, while a crystal drifts by microseconds.
 PERIOD_WINDOW = 64
-# The period is learned anew at every so many frames only: that is most of the cost, and it hardly moves.
+# Frames between updates of the period, which hardly moves.
 LEARN_EVERY = 4
-# Frames whose earliest fixes the phase: short, so that a board that paused for a moment is followed within 6 s.
+# Frames behind the phase: a board that paused is followed within 6 s.
 PHASE_WINDOW = 12
-# Fewer spacings than this say nothing about the period that the nominal one does not say better. Each is taken over
-# so many frames that a burst of late ones within it does no harm.
+# Spacings needed to learn a period. Each spans several frames, so that a burst of late ones does no harm.
 LEARN_FROM = 16
 SPACING_FRAMES = 4
-# A longer pause than this, in periods, is a board that stopped; its new phase has nothing to do with the old one.
+# A longer pause, in periods, means that the board stopped and has a new phase.
 LONGEST_GAP = 2.5
-# A period further than this from the usual spacing of frames is a burst of late frames, not a clock.
+# A period further from the usual spacing is a burst of late frames.
 PLAUSIBLE = 0.05
 
 
 class FrameClock:
-    """Straightens the arrival stamps of frames, causally, and learns the board's period.
+    """Straightens the arrival times of frames, causally, and learns the board's period.
 
-    All times are integer nanoseconds of one monotonic clock. A straightened stamp is never later than the arrival.
-    The nominal period serves until enough frames have come to learn the real one.
+    All times are integer nanoseconds of one monotonic clock. A straightened time is never later than the arrival. The
+    nominal period applies until the real one is learned.
     """
 
     def __init__(self, nominal_period_ns: int) -> None:
         self._period_ns = float(nominal_period_ns)
         self._learned = False
-        # (frames counted, arrival) of the last frames, restarts included, and the last spacings, each over some of
-        # them: their usual one is the period, roughly.
+        # (frame number, arrival) of the last frames across restarts, and the last spacings.
         self._latest: deque[tuple[int, int]] = deque(maxlen=SPACING_FRAMES + 1)
         self._spacings: deque[float] = deque(maxlen=LEARN_FROM)
-        # (frame number, arrival), one run of the board without a gap.
+        # (frame number, arrival) since the last restart.
         self._seen: deque[tuple[int, int]] = deque(maxlen=PERIOD_WINDOW)
         self._straight_ns = 0
 
@@ -53,18 +50,18 @@ class FrameClock:
 
     @property
     def learned(self) -> bool:
-        """Whether the period comes from frames rather than from the nominal value."""
+        """Whether the period is learned."""
         return self._learned
 
     def restart(self) -> None:
-        """Forget the phase (the board was started anew); the period is kept."""
+        """Forget the phase and keep the period: the board was restarted."""
         self._seen.clear()
 
     def arrived(self, arrival_ns: int, missed: bool = False) -> int:
-        """Take the next frame's arrival and return when it would have arrived at a reader that is never late.
+        """Return when the next frame would have arrived at a reader that is never late.
 
-        `missed` says that something came since the last frame which was no frame (a refused line): the number of
-        periods is then read from the time. Without it a late frame counts as the next one.
+        After a rejected line (`missed`) the number of periods follows from the time; otherwise a late frame is the
+        next one.
         """
         number, steps = 0, 1
         if self._seen:
@@ -74,8 +71,8 @@ class FrameClock:
             number += steps
             late = elapsed - steps
             late_before = (last_ns - self._straight_ns) / self._period_ns
-            # Frames that waited for the reader come in a burst, each less late than the one before. Frames that stay
-            # as late come from a board that paused. Half a period early: the one before was counted as two.
+            # Waiting frames come in a burst, each less late than the one before; a constant delay means a pause of the
+            # board. Half a period early means that the last one was counted as two.
             paused = min(late, late_before) > 0.5 and late > late_before - 0.5
             if elapsed > LONGEST_GAP or late < -0.5 or paused:
                 self.restart()
@@ -105,11 +102,11 @@ class FrameClock:
 
 
 def slope_below(points: Iterable[tuple[int, int]]) -> float:
-    """Return the slope of the line below all points, in order of their abscissa, that is closest to them in total."""
+    """Return the slope of the line closest below all points, which are in order of their abscissa."""
     points = list(points)
     hull: list[tuple[int, int]] = []
     for n, t in points:
-        # The last corner leaves the lower hull when it lies on or above the chord past it.
+        # Drop a corner on or above the chord past it.
         while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (n - hull[-2][0]) >= (t - hull[-2][1]) * (
             hull[-1][0] - hull[-2][0]
         ):

@@ -1,18 +1,246 @@
-"""The load cell as a device: kept connected, and lost when it falls silent."""
+"""The load cell of the torque rig: an HX711 on an Arduino Uno, one decimal per line, 115200 baud, 10.9 Hz.
+
+A lever arm on the tool's shaft presses on the cell; force times lever arm is the torque (Trehan et al. 2025, section
+2). Our sketch (`firmware/hx711_torque`) sends raw counts, the paper's sent N·m. One linear calibration covers both.
+With its RATE pin high an HX711 converts eight times as often; the configuration gives the rate.
+"""
 
 import os
+import re
 import time
-from collections.abc import AsyncGenerator, Callable, Mapping
+from collections import Counter
+from collections.abc import AsyncGenerator, Callable
 from contextlib import aclosing
+from dataclasses import dataclass
+from typing import Literal, Self
 
-from shearloop.drivers.hx711 import BAUD_RATE, RATE_HZ, LoadCalibration, LoadParser, LoadSample, refusals
-from shearloop.drivers.raw_event import InputKind, Tap, no_tap
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
-from shearloop.drivers.streaming_sensor import StreamingSensor
+from shearloop.drivers.connection import Diagnostics, LinkEvent, ReconnectPolicy, SerialLink
+from shearloop.drivers.serial_sensor import (
+    InputKind,
+    LineSplitter,
+    OnRaw,
+    RawEvent,
+    StreamingSensor,
+    ignore_raw,
+    transfer_ns,
+)
+from shearloop.drivers.yaml_files import CalibrationModel, Finite, Positive
+
+BAUD_RATE = 115200
+# Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second.
+RATE_HZ = 10.9
+PERIOD_NS = round(1e9 / RATE_HZ)
+# The ends of the converter's range (HX711 data sheet, "Output data": 24 bits, two's complement).
+COUNTS_MAX, COUNTS_MIN = 8388607, -8388608
+# "-8388608" has 8 characters, a float printed by an Uno at most 15.
+MAX_LINE_BYTES = 32
+# No value stood more than three times in a row in 10 274 real ones.
+STUCK_AFTER = 20
+# A 5 kg cell at 35 mm; larger values are corrupted.
+CAPACITY_NM = 1.75
+# More than twice the fastest change in the paper's recordings (0.76 N·m/s, a 10 mm cylinder slipping free).
+SLEW_NM_PER_S = 2.0
+# Values in a row that agree with each other and become the new level.
+SETTLE_SAMPLES = 3
+
+_DECIMAL = re.compile(rb"[+-]?[0-9]{1,15}(\.[0-9]{1,15})?")
+
+LINE_ERRORS = {
+    "not_decimal": "The load cell's board sent a line that is not a decimal; check the baud rate and the sketch.",
+    "too_long": f"The load cell's board sent more than {MAX_LINE_BYTES} bytes without a line end; check the baud rate.",
+    "empty": "The load cell's board sent an empty line; bytes were lost, check the cable.",
+    "unfinished": "The load cell's board broke off in the middle of a line; check its plug and its power.",
+}
 
 
-class LoadCell:
-    """One board, by USB serial number or path. It only ever sends; there is nothing to command."""
+class LoadCalibration(CalibrationModel):
+    """Converts a line's decimal to a torque: sign × lever_arm_m × scale_n_per_count × (raw − tare_counts).
+
+    With our sketch a count is a converter count. With a board that sends N·m, `of_torque_lines` gives the scale
+    (1 / lever arm) that keeps its values; the tare is then in N·m.
+    """
+
+    tare_counts: Finite
+    # The sign of the wiring, measured with a mass. `sign` chooses the positive direction.
+    scale_n_per_count: Finite
+    lever_arm_m: Positive = 0.035
+    sign: Literal[-1, 1] = 1
+
+    @classmethod
+    def of_torque_lines(cls) -> Self:
+        """Return the calibration of a board that sends N·m, as in the paper's recordings."""
+        return cls(tare_counts=0.0, scale_n_per_count=1 / 0.035, lever_arm_m=0.035)
+
+    @property
+    def nm_per_count(self) -> float:
+        """The torque of one count, N·m."""
+        return self.sign * self.lever_arm_m * self.scale_n_per_count
+
+    def torque_nm(self, raw: float) -> float:
+        """Return the torque of a line's decimal, N·m."""
+        return (raw - self.tare_counts) * self.nm_per_count
+
+    def raw(self, torque_nm: float) -> float:
+        """Return the decimal of a torque: the inverse of `torque_nm`."""
+        return torque_nm / self.nm_per_count + self.tare_counts
+
+    def tared(self, raw_at_rest: float) -> Self:
+        """Return this calibration with its zero at the given raw value."""
+        return self.model_copy(update={"tare_counts": raw_at_rest})
+
+
+@dataclass(frozen=True, slots=True)
+class LoadSample:
+    """One line of the board; flags mark values that are not to be trusted.
+
+    raw: the decimal as sent; torque_nm: calibrated; t_mid_ns: the middle of the conversion, t_arrival_ns: the line's
+    arrival (both monotonic); seq: counts samples. `saturated`: at an end of the converter's range. `spike`: beyond
+    the cell's capacity, or further from the last good value than the rig can move. `stuck`: the same value for two
+    seconds. `partial`: the first line after opening, which may lack its beginning.
+    """
+
+    raw: float
+    torque_nm: float
+    t_mid_ns: int
+    t_arrival_ns: int
+    seq: int
+    saturated: bool = False
+    spike: bool = False
+    stuck: bool = False
+    partial: bool = False
+
+    @property
+    def trusted(self) -> bool:
+        """Whether no flag is set."""
+        return not (self.saturated or self.spike or self.stuck or self.partial)
+
+
+class SpikeFilter:
+    """Separates corrupted values from loads, causally.
+
+    A spike lies beyond the cell's capacity, or further from the last good value than the rig can move in between. A
+    real step looks alike, so SETTLE_SAMPLES values in a row that agree with each other become the new level.
+    """
+
+    def __init__(self, period_ns: int = PERIOD_NS) -> None:
+        """Trust the first value within the capacity; the board sends one every `period_ns`."""
+        self._period_ns = period_ns
+        self._good: tuple[float, int] | None = None
+        self._candidates: list[tuple[float, int]] = []
+
+    def is_spike(self, torque_nm: float, t_ns: int) -> bool:
+        """Judge the next value; calls are in order of time."""
+        if abs(torque_nm) > CAPACITY_NM:
+            self._candidates.clear()
+            return True
+        value = (torque_nm, t_ns)
+        if self._good is not None and not self._reachable(self._good, value):
+            if self._candidates and not self._reachable(self._candidates[-1], value):
+                self._candidates.clear()
+            self._candidates.append(value)
+            if len(self._candidates) < SETTLE_SAMPLES:
+                return True
+        self._good = value
+        self._candidates.clear()
+        return False
+
+    def _reachable(self, before: tuple[float, int], after: tuple[float, int]) -> bool:
+        # Arrival stamps bunch on a busy host: no interval counts as shorter than a period.
+        elapsed_s = max(after[1] - before[1], self._period_ns) * 1e-9
+        return abs(after[0] - before[0]) <= SLEW_NM_PER_S * elapsed_s
+
+
+class LoadParser:
+    """Turns the board's bytes, however they are sliced, into samples; counts rejected lines by kind. No I/O."""
+
+    def __init__(self, calibration: LoadCalibration, rate_hz: float = RATE_HZ) -> None:
+        """Start before the first byte of a board that sends `rate_hz` lines a second."""
+        self._period_ns = round(1e9 / rate_hz)
+        self._stuck_after = max(STUCK_AFTER, round(STUCK_AFTER * rate_hz / RATE_HZ))
+        self._lines = LineSplitter(MAX_LINE_BYTES)
+        self._errors: Counter[str] = Counter()
+        self._seq = 0
+        self._last_mid_ns: int | None = None
+        self.calibration = calibration
+        self.restart()
+
+    def handle(self, event: RawEvent) -> list[LoadSample]:
+        """Process a live or recorded event; return the samples that it completes."""
+        match event.kind:
+            case InputKind.OPENED:
+                self.restart()
+            case InputKind.TARE:
+                self.calibration = self.calibration.tared(float(event.data))
+                self._spikes = SpikeFilter(self._period_ns)
+            case InputKind.DATA:
+                return self.feed(event.data, event.t_ns)
+        return []
+
+    def restart(self) -> None:
+        """Forget everything but counters and calibration: the port was (re)opened."""
+        self._lines.restart()
+        self._first_line = True
+        self._last_raw: float | None = None
+        self._repeats = 0
+        self._spikes = SpikeFilter(self._period_ns)
+
+    @property
+    def errors(self) -> Counter[str]:
+        """The number of rejected lines, by kind."""
+        return self._errors + Counter(too_long=self._lines.too_long, unfinished=self._lines.unfinished)
+
+    def feed(self, data: bytes, t_arrival_ns: int) -> list[LoadSample]:
+        """Return the samples that `data` completes; of several lines each is a period older than the next."""
+        lines = self._lines.feed(data)
+        samples = []
+        for age, line in zip(range(len(lines) - 1, -1, -1), lines, strict=True):
+            value = None if line is None else self._value(line)
+            partial, self._first_line = self._first_line, False
+            if line is not None and value is not None:
+                t_ns = t_arrival_ns - age * self._period_ns
+                samples.append(self._sample(value, len(line) + 1, t_ns, partial=partial))
+        return samples
+
+    def _value(self, line: bytes) -> float | None:
+        text = line.strip(b"\r")
+        if not _DECIMAL.fullmatch(text):
+            self._errors["not_decimal" if text else "empty"] += 1
+            return None
+        return float(text)
+
+    def _sample(self, raw: float, n_bytes: int, t_arrival_ns: int, *, partial: bool) -> LoadSample:
+        torque_nm = self.calibration.torque_nm(raw)
+        t_mid_ns = t_arrival_ns - transfer_ns(n_bytes, BAUD_RATE) - self._period_ns // 2
+        if self._last_mid_ns is not None:
+            t_mid_ns = max(t_mid_ns, self._last_mid_ns + 1)
+        self._last_mid_ns = t_mid_ns
+        self._repeats = self._repeats + 1 if raw == self._last_raw else 1
+        self._last_raw = raw
+        saturated = raw in (COUNTS_MAX, COUNTS_MIN)
+        # An unreliable value is not a level to judge the next one by.
+        unreliable = saturated or partial
+        sample = LoadSample(
+            raw=raw,
+            torque_nm=torque_nm,
+            t_mid_ns=t_mid_ns,
+            t_arrival_ns=t_arrival_ns,
+            seq=self._seq,
+            saturated=saturated,
+            spike=abs(torque_nm) > CAPACITY_NM if unreliable else self._spikes.is_spike(torque_nm, t_mid_ns),
+            stuck=self._repeats >= self._stuck_after,
+            partial=partial,
+        )
+        self._seq += 1
+        return sample
+
+
+def describe_errors(errors: Counter[str], sentences: dict[str, str] = LINE_ERRORS) -> str:
+    """Return one sentence, with its count, for every kind of rejected line."""
+    return " ".join(f"{sentences[kind]} ({count} times)" for kind, count in sorted(errors.items()))
+
+
+class LoadCell(StreamingSensor[LoadSample]):
+    """One board, by USB serial number or path; it only sends."""
 
     def __init__(
         self,
@@ -23,64 +251,49 @@ class LoadCell:
         rate_hz: float = RATE_HZ,
         policy: ReconnectPolicy | None = None,
         on_event: Callable[[LinkEvent], None] = lambda _: None,
-        tap: Tap = no_tap,
+        on_raw: OnRaw = ignore_raw,
     ) -> None:
-        """Name the board and how many lines a second it sends; nothing is opened yet.
-
-        `tap` hears of all that the parser is told.
-        """
-        link = SerialLink(
-            serial_number=serial_number,
-            path=None if path is None else os.fspath(path),
-            baud=BAUD_RATE,
-            policy=policy,
-            on_event=on_event,
+        """Name the board and its lines per second; nothing is opened yet."""
+        super().__init__(
+            SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, policy=policy, on_event=on_event),
+            # A fast board may seem silent to a busy computer; reopening would reset it.
+            period_s=1.0 / min(rate_hz, RATE_HZ),
+            silence_hint=(
+                "check that it is the load cell's board and that the HX711 has power and its DT and SCK wires."
+            ),
+            on_raw=on_raw,
         )
         self._parser = LoadParser(calibration, rate_hz)
-        self._board = StreamingSensor(
-            link,
-            self._parser.take,
-            # One that is quicker is not silent yet where this computer was late; opening it anew would reset it.
-            period_s=1.0 / min(rate_hz, RATE_HZ),
-            silent=_silent,
-            tap=tap,
-        )
         self._samples = 0
         self._flagged = 0
 
     @property
     def calibration(self) -> LoadCalibration:
-        """The calibration of the samples to come; a tare makes a new one."""
+        """The calibration of the samples to come; a tare replaces it."""
         return self._parser.calibration
 
     def tare(self, raw_at_rest: float) -> None:
-        """Take a raw value for the zero of the samples to come."""
-        self._board.tell(InputKind.TARE, time.monotonic_ns(), repr(raw_at_rest).encode())
+        """Make a raw value the zero of the samples to come."""
+        self._dispatch(InputKind.TARE, time.monotonic_ns(), repr(raw_at_rest).encode())
 
     async def samples(self) -> AsyncGenerator[LoadSample]:
-        """Yield every sample that arrives, in order and for ever, whatever becomes of the board meanwhile.
-
-        Iterate within `contextlib.aclosing`, so that the port is closed when the iteration is left.
-        """
-        async with aclosing(self._board.values()) as samples:
+        """Yield every sample that arrives; see `values`."""
+        async with aclosing(self.values()) as samples:
             async for sample in samples:
                 self._samples += 1
                 self._flagged += not sample.trusted
                 yield sample
 
-    def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
-        """Return what health tells of the board; counts are since the process began."""
+    def diagnostics(self) -> Diagnostics:
+        """Return the board's values for `health`; counts are since the process began."""
+        errors = self._parser.errors
         return {
-            **self._board.facts(),
+            **super().diagnostics(),
             "samples": self._samples,
             "flagged": self._flagged,
-            "errors": dict(self._parser.refused),
-            "refusals": " ".join(refusals(self._parser)),
+            "errors": dict(errors),
+            "error_details": describe_errors(errors),
         }
 
-
-def _silent(path: str, waited_s: float) -> str:
-    return (
-        f"{path} is open but has sent nothing for {waited_s:.1f} s; "
-        "check that it is the load cell's board and that the HX711 has power and its DT and SCK wires."
-    )
+    def _parse(self, event: RawEvent) -> list[LoadSample]:
+        return self._parser.handle(event)

@@ -1,31 +1,119 @@
-"""A board on a serial port and the parser of what it says: kept connected, whatever becomes of the board."""
+"""Sensors on serial lines: raw events, lines, and the loop that reads a board and reconnects to it."""
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
-from typing import Generic, TypeVar
+from collections.abc import AsyncGenerator, Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, TypeAlias, TypeVar
 
-from shearloop.drivers.errors import DriverError
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap
-from shearloop.drivers.serial_port import Link, Port, Received
+from shearloop.drivers.connection import Diagnostics, Link, Port, Received
+from shearloop.drivers.errors import DeviceLostError, DriverError
+
+# Opening the port resets an Uno; its boot loader waits before it starts the sketch.
+BOOT_S = 4.0
+SILENT_PERIODS = 8
 
 ValueT = TypeVar("ValueT")
 
 
-class SerialSensor(ABC, Generic[ValueT]):
-    """One board behind a link, and the parser that is told all that happens to it."""
+class InputKind(Enum):
+    """What a parser is given; the value is the name in recordings."""
 
-    def __init__(self, link: Link, take: Callable[[RawEvent], Sequence[ValueT]], tap: Tap) -> None:
-        """Take the link and the parser; nothing is opened yet. `tap` hears of all that the parser is told."""
+    OPENED = "opened"  # the port was opened, a half-received line is void
+    STARTED = "started"  # a silent board was started again
+    ASKED = "asked"  # an instrument was sent the query in `data`; its reply follows
+    DATA = "data"  # bytes arrived
+    TARE = "tare"  # a new zero was asked for, or found
+    TOOL = "tool"  # the gripped tool changed
+
+
+@dataclass(frozen=True, slots=True)
+class RawEvent:
+    """One input of a parser at `t_ns` (monotonic), as it is recorded and replayed; `data` depends on the kind."""
+
+    kind: InputKind
+    t_ns: int
+    data: bytes = b""
+
+
+OnRaw: TypeAlias = Callable[[RawEvent], None]
+
+
+def ignore_raw(_event: RawEvent) -> None:
+    """Drop a raw event."""
+
+
+def transfer_ns(n_bytes: int, baud: int) -> int:
+    """Return the time of `n_bytes` on a serial line: ten bits each, with start and stop."""
+    return n_bytes * (10 * 10**9 // baud)
+
+
+class LineSplitter:
+    """Splits a byte stream into lines, however it is sliced. A line that is too long is counted once and dropped whole.
+
+    `too_long` and `unfinished` count since the beginning: lines beyond `max_bytes`, and lines cut off by a reopening.
+    `too_long_start` is the beginning of the last line that was too long.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        """Wait for the first line; `max_bytes` excludes the newline."""
+        self._max_bytes = max_bytes
+        self._dropping = False
+        self.partial = b""
+        self.too_long = 0
+        self.too_long_start = b""
+        self.unfinished = 0
+
+    @property
+    def in_line(self) -> bool:
+        """Whether a line has begun and not ended."""
+        return self._dropping or bool(self.partial.strip())
+
+    def restart(self) -> None:
+        """Drop a half-received line: the port was reopened."""
+        self.unfinished += self.in_line and not self._dropping
+        self.partial = b""
+        self._dropping = False
+
+    def feed(self, data: bytes) -> list[bytes | None]:
+        """Return the lines that `data` completes, without newlines; None for each line found to be too long."""
+        *ends, rest = (self.partial + data).split(b"\n")
+        lines: list[bytes | None] = []
+        for end in ends:
+            if not self._dropping:
+                lines.append(self._checked(end))
+            self._dropping = False
+        self.partial = b""
+        if not self._dropping:
+            if len(rest) > self._max_bytes:
+                lines.append(self._checked(rest))
+                self._dropping = True
+            else:
+                self.partial = rest
+        return lines
+
+    def _checked(self, line: bytes) -> bytes | None:
+        if len(line) <= self._max_bytes:
+            return line
+        self.too_long += 1
+        self.too_long_start = line[:60]
+        return None
+
+
+class SerialSensor(ABC, Generic[ValueT]):
+    """One board behind a link, kept connected, with a parser for its bytes."""
+
+    def __init__(self, link: Link, on_raw: OnRaw = ignore_raw) -> None:
+        """Use the link, not yet open; `on_raw` receives every input of the parser."""
         self._link = link
-        self._take = take
-        self._tap = tap
+        self._on_raw = on_raw
 
     async def values(self) -> AsyncGenerator[ValueT]:
-        """Yield what the parser makes of every line, in order and for ever, whatever becomes of the board meanwhile.
+        """Yield the values of every line, in order and without end; reconnects when the board disappears.
 
-        While the receiver is busy nothing is read and nothing is lost: the bytes wait in the kernel, then on the board.
-        Iterate within `contextlib.aclosing`, so that the port is closed when the iteration is left.
+        Nothing is lost while the receiver is busy: the bytes wait in the kernel, then on the board. Iterate within
+        `contextlib.aclosing`, which closes the port at the end.
         """
         with self._link:
             while True:
@@ -35,50 +123,76 @@ class SerialSensor(ABC, Generic[ValueT]):
                     await self._link.lost(error)
                     continue
                 if received is not None:
-                    for value in self.tell(InputKind.DATA, received.t_arrival_ns, received.data):
+                    for value in self._dispatch(InputKind.DATA, received.t_arrival_ns, received.data):
                         yield value
 
-    def tell(self, kind: InputKind, t_ns: int, data: bytes = b"") -> Sequence[ValueT]:
-        """Tell the parser, and whoever listens, what has happened."""
-        told = RawEvent(kind, t_ns, data)
-        self._tap(told)
-        return self._take(told)
+    def diagnostics(self) -> Diagnostics:
+        """Return the board's values for `health`; counts are since the process began."""
+        return self._link.diagnostics()
+
+    def _dispatch(self, kind: InputKind, t_ns: int, data: bytes = b"") -> Sequence[ValueT]:
+        event = RawEvent(kind, t_ns, data)
+        self._on_raw(event)
+        return self._parse(event)
 
     async def _receive(self) -> Received | None:
-        """Return what arrives next, or None after a silence that the board may get over."""
+        """Return the next bytes, or None after a timeout that the board may recover from."""
         port = self._link.port
         if port is None:
             port = await self._link.open()
-            self.tell(InputKind.OPENED, time.monotonic_ns())
-            await self._opened(port)
-        patience_s = self._patience_s()
-        received = await port.read(patience_s)
+            self._dispatch(InputKind.OPENED, time.monotonic_ns())
+            await self._on_open(port)
+        timeout_s = self._timeout_s()
+        received = await port.read(timeout_s)
         if received is None:
-            await self._silent(port, patience_s)
+            await self._on_timeout(port, timeout_s)
         else:
-            self._heard()
+            self._on_data()
         return received
 
     @abstractmethod
-    async def _opened(self, port: Port) -> None:
-        """Do what a board needs whose port was opened just now."""
+    def _parse(self, event: RawEvent) -> Sequence[ValueT]:
+        """Return the values that an event completes."""
 
     @abstractmethod
-    def _patience_s(self) -> float:
-        """Return how long it may say nothing."""
+    async def _on_open(self, port: Port) -> None:
+        """Set up a board after its port was opened."""
 
     @abstractmethod
-    def _heard(self) -> None:
-        """Take note that it has said something."""
+    def _timeout_s(self) -> float:
+        """Return how long the board may be silent."""
 
     @abstractmethod
-    async def _silent(self, port: Port, waited_s: float) -> None:
-        """Do what helps a board that has said nothing for so long; DeviceLostError where nothing does."""
+    def _on_data(self) -> None:
+        """Note that bytes arrived."""
 
-    def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
-        """Return what health tells of the connection."""
-        return {
-            "connected": self._link.port is not None,
-            "openings": self._link.openings,
-            "last_loss": self._link.last_error,
-        }
+    @abstractmethod
+    async def _on_timeout(self, port: Port, waited_s: float) -> None:
+        """Wake a silent board; DeviceLostError if that is impossible."""
+
+
+class StreamingSensor(SerialSensor[ValueT]):
+    """A board that only sends: lost when it falls silent."""
+
+    def __init__(self, link: Link, *, period_s: float, silence_hint: str, on_raw: OnRaw = ignore_raw) -> None:
+        """Use the link, not yet open, of a board with a line every `period_s`.
+
+        `silence_hint` is the operator's checklist when nothing comes.
+        """
+        super().__init__(link, on_raw)
+        self._silence_s = SILENT_PERIODS * period_s
+        self._silence_hint = silence_hint
+        self._has_sent = False
+
+    async def _on_open(self, _port: Port) -> None:
+        self._has_sent = False
+
+    def _timeout_s(self) -> float:
+        return self._silence_s if self._has_sent else BOOT_S
+
+    def _on_data(self) -> None:
+        self._has_sent = True
+
+    async def _on_timeout(self, port: Port, waited_s: float) -> None:
+        hint = self._silence_hint
+        raise DeviceLostError(f"{port.path} is open but has sent nothing for {waited_s:.1f} s; {hint}")

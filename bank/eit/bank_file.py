@@ -10,7 +10,7 @@ Layout, all numbers little-endian:
     4096  arrays    the small ones at multiples of 64, and last the signals at a multiple of the page size:
                     float32 (k × σ × 896), C order
 
-The header and the small arrays are checked each time a bank is opened, the signals when asked for.
+Opening a bank checks the header and the small arrays; the signals are checked on request.
 """
 
 import errno
@@ -26,14 +26,14 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS, STIMULATION_CURRENT
 from shearloop.bank.eit.models import MODELS, PLAIN, Variation, model_named
 from shearloop.bank.errors import BankFileError, ModelError
 from shearloop.files import replace_file
 
 FORMAT_VERSION = 1
-# A signal with a smaller norm than this (in the units of the homogeneous voltages, whose norm is about 20) has no
-# shape to compare with: its normalised correlation is 0/0.
+# A signal with a smaller norm (the homogeneous voltages have about 20) has no shape: its correlation is 0/0.
 MIN_SIGNAL_NORM = 1e-3
 
 BANK_MAGIC = b"\x8eSHLBANK"
@@ -52,16 +52,16 @@ _TYPES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BankDefinition:
-    """What a bank is of: the geometry's digest, the basis model, and the grids of k (K,) and σ (S,) in its units.
+    """The definition of a bank: the geometry's digest, the basis model, the grids of k (K,) and σ (S,) in its units.
 
-    `variation` is what all of its cells have in common beside k and σ; without one it has no part in the identity.
-    Raises ModelError for an unknown model, and for a grid that is empty, does not ascend or holds a σ ≤ 0.
+    All cells share `variation`; a plain one is not part of the identity. Raises ModelError for an unknown model, and
+    for a grid that is empty, does not ascend or holds a σ ≤ 0.
     """
 
     geometry_hash: str
     model: str
-    k_grid: NDArray[np.float64]
-    sigma_grid: NDArray[np.float64]
+    k_grid: FloatArray
+    sigma_grid: FloatArray
     variation: Variation = PLAIN
 
     def __post_init__(self) -> None:
@@ -88,7 +88,7 @@ class BankDefinition:
             # Twelve digits: the last of a grid's sixteen may differ between machines.
             "k": [f"{k:.11e}" for k in self.k_grid.tolist()],
             "sigma": [f"{sigma:.11e}" for sigma in self.sigma_grid.tolist()],
-        } | _told(self.variation)
+        } | _variation_entry(self.variation)
         return hashlib.sha256(json.dumps(defining, sort_keys=True).encode()).hexdigest()
 
 
@@ -104,10 +104,10 @@ class Bank:
     path: Path
     definition: BankDefinition
     identity: str
-    homogeneous: NDArray[np.float64]
-    min_conductivity: NDArray[np.float64]
-    valid: NDArray[np.bool_]
-    signals: NDArray[np.float32]
+    homogeneous: FloatArray
+    min_conductivity: FloatArray
+    valid: BoolArray
+    signals: Float32Array
     signals_sha256: str
 
     @property
@@ -121,12 +121,12 @@ class Bank:
         return self.definition.geometry_hash
 
     @property
-    def k_grid(self) -> NDArray[np.float64]:
+    def k_grid(self) -> FloatArray:
         """The (K,) values of k, ascending."""
         return self.definition.k_grid
 
     @property
-    def sigma_grid(self) -> NDArray[np.float64]:
+    def sigma_grid(self) -> FloatArray:
         """The (S,) values of σ, ascending."""
         return self.definition.sigma_grid
 
@@ -142,13 +142,13 @@ class Bank:
 
     @classmethod
     def open(cls, path: str | Path, verify: bool = False) -> "Bank":
-        """Map a bank file read-only; `verify` also reads all signals and compares their checksum.
+        """Map a bank file read-only; `verify` also compares the checksum of all signals.
 
         Raises BankFileError for a file that is missing, not a bank, truncated, damaged, or made under another format
         or channel table.
         """
         path = Path(path)
-        # One descriptor for all of it: a bank that is renamed over this one meanwhile does not mix with it.
+        # One descriptor: a bank that replaces this one meanwhile does not mix with it.
         try:
             with path.open("rb") as file:
                 header = _read_header(path, file)
@@ -188,15 +188,12 @@ class Bank:
 def write_bank(
     path: Path,
     definition: BankDefinition,
-    homogeneous: NDArray[np.float64],
-    min_conductivity: NDArray[np.float64],
-    valid: NDArray[np.bool_],
-    signals: NDArray[np.float32],
+    homogeneous: FloatArray,
+    min_conductivity: FloatArray,
+    valid: BoolArray,
+    signals: Float32Array,
 ) -> None:
-    """Write a bank file over what was there.
-
-    Raises BankFileError where it cannot be written; a file that was there before is then untouched.
-    """
+    """Write a bank file, replacing an earlier one at once. Raises BankFileError where it cannot be written."""
     arrays: dict[str, NDArray[Any]] = {
         "k_grid": definition.k_grid,
         "sigma_grid": definition.sigma_grid,
@@ -219,7 +216,7 @@ def write_bank(
 
 
 def unwritable(path: Path, error: OSError) -> BankFileError:
-    """Return what to say of a bank, or its journal, that the disk refuses: where it is full, the solved rows stay."""
+    """Return the error for a bank, or its journal, that the disk refuses; on a full disk the solved rows stay."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return BankFileError(
             f"{path}: the bank cannot be written: {error.strerror}, and the rows solved so far are kept; make room and "
@@ -228,14 +225,15 @@ def unwritable(path: Path, error: OSError) -> BankFileError:
     return BankFileError(f"{path}: the bank cannot be written: {error.strerror}; choose another --out")
 
 
-def _told(variation: Variation) -> dict[str, Any]:
+def _variation_entry(variation: Variation) -> dict[str, Any]:
     return {} if variation == PLAIN else {"variation": asdict(variation)}
 
 
 def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tuple[bytes, dict[str, int]]:
     offsets, end = {}, _PAGE
     for name, array in stored.items():
-        offsets[name] = _up(end, _PAGE if name == "signals" else _ALIGNMENT)
+        alignment = _PAGE if name == "signals" else _ALIGNMENT
+        offsets[name] = -(-end // alignment) * alignment
         end = offsets[name] + array.nbytes
     header = {
         "identity": definition.identity,
@@ -248,15 +246,15 @@ def _layout(definition: BankDefinition, stored: dict[str, NDArray[Any]]) -> tupl
             name: {"type": _TYPES[name], "shape": array.shape, "offset": offsets[name], "sha256": _sha256(array)}
             for name, array in stored.items()
         },
-    } | _told(definition.variation)
-    # About 1.4 kB whatever the bank: the grids are arrays, and nothing in it is of the user's length.
+    } | _variation_entry(definition.variation)
+    # About 1.4 kB for every bank: nothing in it has a length that the user chooses.
     return json.dumps(header).encode().ljust(_PAGE - _PREAMBLE.size), offsets
 
 
 def _read_header(path: Path, file: BinaryIO) -> dict[str, Any]:
     page = file.read(_PAGE)
     if not page.startswith(BANK_MAGIC):
-        # Whatever it is, it is not to be written over.
+        # The cure must not overwrite a foreign file.
         raise BankFileError(
             f"{path}: this is not a bank: expected a file that starts with shearloop's mark of one; name a bank, or "
             "make one with `shearloop bank build --config FILE --out NAME.bank`"
@@ -268,7 +266,7 @@ def _read_header(path: Path, file: BinaryIO) -> dict[str, Any]:
         raise _unusable(path, f"the bank has format version {version}, expected {FORMAT_VERSION}")
     text = page[_PREAMBLE.size :]
     if hashlib.sha256(text).digest() != checksum:
-        raise _unusable(path, "the file is damaged: its header does not have the checksum expected")
+        raise _unusable(path, "the file is damaged: its header does not have the expected checksum")
     header = json.loads(text)
     if not isinstance(header, dict):
         raise _unusable(path, "its header does not describe a bank")
@@ -311,12 +309,8 @@ def _sha256(array: NDArray[Any]) -> str:
     return hashlib.sha256(array.data).hexdigest()
 
 
-def _up(position: int, multiple: int) -> int:
-    return -(-position // multiple) * multiple
-
-
 def _cure(path: Path) -> str:
-    return f"make it anew with `shearloop bank build --config FILE --out {path}`"
+    return f"build it with `shearloop bank build --config FILE --out {path}`"
 
 
 def _unusable(path: Path, why: str) -> BankFileError:

@@ -1,31 +1,48 @@
-"""Building a bank: row by row (a row is one k), in threads, and going on where an interrupted build stopped.
+"""Building a bank: row by row (a row is one k), in threads, resuming an interrupted build.
 
-The finished bank has the same bytes however often the build was interrupted and however many threads took part.
+The finished bank has the same bytes however often the build was interrupted and with any number of threads.
 """
 
+import fcntl
+import hashlib
+import os
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, BankDefinition, write_bank
-from shearloop.bank.eit.batch_forward import BatchForwardModel
+from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray
+from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, BankDefinition, unwritable, write_bank
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.journal import BankRow, RowJournal
+from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import PLAIN, Conductivities, Variation
+from shearloop.bank.eit.models import PLAIN, ConductivityModel, Variation
 from shearloop.bank.errors import BankFileError, EmptyBankError
 
-Progress = Callable[[int, int], None]
-Notice = Callable[[str], None]
+_JOURNAL_MAGIC = b"\x8eSHLPART"
+_RECORD = struct.Struct("<Q32s")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BankRow:
+    """The cells of one k: min_conductivity (S,), valid (S,), and signals (S, 896), zeros where not valid."""
+
+    min_conductivity: FloatArray
+    valid: BoolArray
+    signals: Float32Array
+
+
 # Yields (row, its cells) for the rows of a bank on a mesh, in any order.
 RowsSolver = Callable[[Mesh, BankDefinition, Sequence[int]], Iterator[tuple[int, BankRow]]]
 
 
 class RowSolver:
-    """Solves a bank's rows on its mesh, in several threads if need be.
+    """Solves a bank's rows on its mesh; safe to use from several threads.
 
     `homogeneous` are the (896,) voltages that signals are differences from.
     """
@@ -33,7 +50,7 @@ class RowSolver:
     def __init__(self, mesh: Mesh, definition: BankDefinition) -> None:
         """Prepare the forward model and solve it for the homogeneous voltages."""
         self._forward = BatchForwardModel(mesh)
-        self._conductivities = Conductivities(mesh, definition.variation)
+        self._conductivities = ConductivityModel(mesh, definition.variation)
         self._definition = definition
         self._n_triangles = len(mesh.triangles)
         (self.homogeneous,) = self._forward.voltages(np.ones((1, len(mesh.triangles))))
@@ -43,8 +60,8 @@ class RowSolver:
         k, sigmas = float(self._definition.k_grid[row]), self._definition.sigma_grid
         cells, smallest, n_solved = np.empty((len(sigmas), self._n_triangles)), np.empty(len(sigmas)), 0
         for cell, sigma in enumerate(sigmas.tolist()):
-            # What is not positive is written over by the next one.
-            cells[n_solved] = self._conductivities.of(self._definition.model, k, sigma)
+            # The next cell overwrites one that is not positive.
+            cells[n_solved] = self._conductivities.conductivity(self._definition.model, k, sigma)
             smallest[cell] = cells[n_solved].min()
             n_solved += smallest[cell] > 0
         valid = smallest > 0
@@ -59,40 +76,37 @@ class RowSolver:
 def build_bank(
     mesh: Mesh,
     model: str,
-    k_grid: NDArray[np.float64],
-    sigma_grid: NDArray[np.float64],
+    k_grid: FloatArray,
+    sigma_grid: FloatArray,
     path: Path,
     *,
     variation: Variation = PLAIN,
     jobs: int = 1,
     elsewhere: RowsSolver | None = None,
-    on_row: Progress | None = None,
-    on_notice: Notice | None = None,
+    on_row: Callable[[int, int], None] = lambda *_: None,
+    on_notice: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Build a bank file of (K,) k and (S,) σ, taking over the finished rows of an interrupted build of the same bank.
+    """Build a bank file of (K,) k and (S,) σ, resuming an interrupted build of the same bank.
 
     `on_row(done, total)` is called once at the start and after each row that is safely on the disk; `on_notice` gets
-    a sentence when there is something to say. Rows are solved by `elsewhere` where that is given, else in `jobs`
-    threads: with the same bytes. Raises ModelError, GeometryError, EmptyBankError where no cell is valid, and
-    BankFileError where the bank cannot be written or another build is at work on it. A bank that was there before is
-    replaced only by a finished one.
+    sentences for the user. Rows are solved in `jobs` threads, or by `elsewhere`, with the same bytes. An existing bank
+    is replaced only by a finished one. Raises ModelError, GeometryError, EmptyBankError where no cell is valid, and
+    BankFileError where the bank cannot be written or another build works on it.
     """
     definition = BankDefinition(mesh.digest, model, k_grid, sigma_grid, variation)
     if path.is_dir():
         raise BankFileError(f"{path} is a directory; give the name of a file in it to --out")
-    # A device or a pipe cannot be opened as a bank once all is solved.
     if path.exists() and not path.is_file():
         raise BankFileError(f"{path} is no file, and cannot hold a bank; give the name of a file to --out")
     solver = RowSolver(mesh, definition)
-    with RowJournal(path, definition, on_notice or _ignore) as journal:
+    with RowJournal(path, definition, on_notice) as journal:
         total = len(definition.k_grid)
         missing = [row for row in range(total) if row not in journal.rows]
-        tell = on_row or _ignore
-        tell(total - len(missing), total)
+        on_row(total - len(missing), total)
         solved = _solve(solver, missing, jobs) if elsewhere is None else elsewhere(mesh, definition, missing)
         for row, cells in solved:
             journal.append(row, cells)
-            tell(len(journal.rows), total)
+            on_row(len(journal.rows), total)
         rows = [journal.rows[row] for row in range(total)]
         if not any(cells.valid.any() for cells in rows):
             journal.remove()
@@ -113,7 +127,7 @@ def build_bank(
 
 
 def solve_row(task: tuple[Mesh, BankDefinition], row: int) -> BankRow:
-    """Return the cells of a row, wherever this runs; the solver is kept for the next row of the same bank."""
+    """Return the cells of a row, in any process; the solver is kept for the next row of the same bank."""
     definition = task[1]
     if definition.identity not in _solvers:
         _solvers.clear()
@@ -125,7 +139,7 @@ _solvers: dict[str, RowSolver] = {}
 
 
 def _solve(solver: RowSolver, rows: Sequence[int], jobs: int) -> Iterator[tuple[int, BankRow]]:
-    """Yield rows as they are finished. What takes long in them leaves the interpreter to the other threads."""
+    """Yield rows as they are finished; the solver releases the interpreter's lock."""
     with ThreadPoolExecutor(max(1, min(jobs, len(rows)))) as pool:
         try:
             tasks = {pool.submit(solver.solve, row): row for row in rows}
@@ -142,5 +156,110 @@ def _why_empty(highest: float) -> str:
     return f"the conductivity of each falls to {highest:.3g} or below, and must be above 0"
 
 
-def _ignore(*_: object) -> None:
-    """Tell nobody."""
+class RowJournal:
+    """The finished rows of an unfinished bank, in a file `TARGET.part`; a context manager that holds the file's lock.
+
+    The file begins with a mark and the bank's identity; then one record with a checksum for each row, all of one size.
+    A truncated record is dropped and its row solved again. `rows` are those of earlier builds of the same bank, and
+    those appended since.
+    """
+
+    def __init__(self, target: Path, definition: BankDefinition, on_notice: Callable[[str], None]) -> None:
+        """Take the bank that the journal belongs to; nothing is opened yet."""
+        self.path = target.with_name(f"{target.name}.part")
+        self.rows: dict[int, BankRow] = {}
+        self._target = target
+        self._on_notice = on_notice
+        self._mark = _JOURNAL_MAGIC + bytes.fromhex(definition.identity)
+        self._n_rows = len(definition.k_grid)
+        self._n_cells = len(definition.sigma_grid)
+        self._file: BinaryIO | None = None
+
+    def __enter__(self) -> Self:
+        """Open the journal and read its rows; raises BankFileError where that is not possible."""
+        try:
+            # Neither truncated nor created exclusively: the content is judged under the lock.
+            handle = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
+        except OSError as error:
+            raise unwritable(self.path, error) from error
+        file = os.fdopen(handle, "r+b")
+        with ExitStack() as on_error:
+            on_error.callback(file.close)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self._resume(file)
+            except BlockingIOError as error:
+                raise BankFileError(
+                    f"{self._target}: another build is at work on this bank; wait for it or choose another --out"
+                ) from error
+            except OSError as error:
+                raise unwritable(self.path, error) from error
+            on_error.pop_all()
+        self._file = file
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the file; it stays for the next build unless it was removed."""
+        if self._file is not None:
+            # `append` has already reported what could not be flushed.
+            with suppress(OSError):
+                self._file.close()
+
+    def append(self, row: int, cells: BankRow) -> None:
+        """Write a finished row to the disk. Raises BankFileError when the disk refuses it."""
+        if self._file is None:
+            raise BankFileError(f"{self.path}: the journal is not open")
+        body = cells.min_conductivity.astype("<f8").tobytes() + cells.valid.astype("|b1").tobytes()
+        body += cells.signals.astype("<f4").tobytes()
+        try:
+            self._file.write(_RECORD.pack(row, _checksum(row, body)) + body)
+            self._file.flush()
+            os.fsync(self._file.fileno())
+        except OSError as error:
+            raise unwritable(self.path, error) from error
+        self.rows[row] = cells
+
+    def remove(self) -> None:
+        """Delete the journal of a finished bank."""
+        self.path.unlink(missing_ok=True)
+
+    def _resume(self, file: BinaryIO) -> None:
+        mark, end = file.read(len(self._mark)), 0
+        if mark == self._mark:
+            end = self._read_rows(file)
+            if self.rows:
+                self._on_notice(f"{self.path}: resuming, {len(self.rows)} of {self._n_rows} rows are already solved")
+        elif mark:
+            if not mark.startswith(_JOURNAL_MAGIC):
+                raise BankFileError(
+                    f"{self.path} is in the way: it is not the journal of an unfinished bank; move it or choose "
+                    "another --out"
+                )
+            self._on_notice(f"{self.path}: its rows belong to another bank and are discarded")
+        file.seek(end)
+        file.truncate(end)
+        if end == 0:
+            file.write(self._mark)
+            file.flush()
+
+    def _read_rows(self, file: BinaryIO) -> int:
+        """Read the rows up to the first damaged record, and return where that begins."""
+        size = self._n_cells * (8 + 1 + 4 * N_CHANNELS)
+        while True:
+            start = file.tell()
+            head, body = file.read(_RECORD.size), file.read(size)
+            if len(head) < _RECORD.size or len(body) < size:
+                return start
+            row, checksum = _RECORD.unpack(head)
+            if checksum != _checksum(row, body) or row >= self._n_rows:
+                return start
+            n = self._n_cells
+            self.rows[row] = BankRow(
+                np.frombuffer(body, "<f8", n),
+                np.frombuffer(body, "|b1", n, offset=8 * n),
+                np.frombuffer(body, "<f4", n * N_CHANNELS, offset=9 * n).reshape(n, N_CHANNELS),
+            )
+
+
+def _checksum(row: int, body: bytes) -> bytes:
+    return hashlib.sha256(row.to_bytes(8, "little") + body).digest()

@@ -1,4 +1,4 @@
-"""A bank compressed to a few numbers per cell, with bounds on what is left out.
+"""A bank compressed to a few numbers per cell, with bounds on the remainder.
 
 Every unit signal b of the bank is split as b = Φ c + d, with Φ (896 × r) an orthonormal basis fitted to the bank, d
 orthogonal to it and ‖d‖ = ρ. For a frame y with g = Φᵀ y and t = ‖y − Φ g‖, Cauchy and Schwarz give
@@ -49,7 +49,7 @@ SQUARE_ROUNDING = 4e-6
 _SQUARE_ROUNDING_64 = 1e-12
 
 
-class Level(NamedTuple):
+class GroupLevel(NamedTuple):
     """Groups of cells: their rows (m, r + 2), and (m,) the group of the previous level that contains each."""
 
     rows: Float32Array
@@ -69,7 +69,7 @@ class CompressedBank:
     basis: Float32Array
     fine: Float32Array
     coarse: Float32Array
-    levels: tuple[Level, ...]
+    levels: tuple[GroupLevel, ...]
     overlaps: FloatArray
     group_of: IntArray
     members: tuple[IntArray, ...]
@@ -108,7 +108,7 @@ def compress(unit_signals: Callable[[IntArray], FloatArray], cells: IntArray) ->
     partitions = _partitions(coarse, [min(size, len(cells) // _MIN_GROUP_CELLS) for size in _N_GROUPS])
     for groups in partitions:
         part_of = np.array([group_of[chosen[0]] for chosen, _ in groups])
-        levels.append(Level(np.array([row for _, row in groups]), part_of))
+        levels.append(GroupLevel(np.array([row for _, row in groups]), part_of))
         for group, (chosen, _) in enumerate(groups):
             group_of[chosen] = group
     members = tuple(chosen for chosen, _ in partitions[SEED_LEVEL])

@@ -1,9 +1,8 @@
-"""How much model a scene needs: the coarsest of everything whose added error stays below a third of the noise.
+"""The smallest bank that a recording asks for: each choice is the coarsest that adds less than a third of the noise.
 
-All errors are relative L2 errors of a difference frame, in units of the measured noise of one frame: a step adds
-little while it is below a third, since errors add as squares (√(1 + 1/9) = 1.05). Torque is read from how frames change
-with it, so for channels and injections it is the torque's standard deviation by generalised least squares that may
-grow by that much.
+Errors are relative L2 errors of a difference frame, in units of the measured noise of one frame. They add as squares,
+so a third adds little: √(1 + 1/9) = 1.05. Torque is read from the frames' change with it, so channels and injections
+are judged by the torque's standard deviation by generalised least squares.
 """
 
 import itertools
@@ -13,10 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray, IntArray
-from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.model_scores import Setting, searched_settings
 from shearloop.bank.eit.models import MODELS, conductivity
 from shearloop.bank.errors import CalibrationError
@@ -24,47 +22,46 @@ from shearloop.bank.errors import CalibrationError
 # The share of the noise that each choice may add.
 ALLOWED = 1.0 / 3.0
 CHANNEL_S = 0.6e-3
-# Above 0.5 cm the electrodes decide: nothing becomes coarser.
+# Above 0.5 cm the electrodes determine the mesh.
 MESH_SIZES_CM = (0.5, 0.4, 0.3, 0.2, 0.14, 0.1, 0.07, 0.05)
 COUNTS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 100, 150)
 RANKS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 CHANNEL_COUNTS = (8, 16, 32, 64, 112, 168, 224, 280, 336, 392, 448, 504, 560, 616, 672, 728, 784, 840, 896)
 _WITHOUT_SIGMA = tuple(name for name, model in MODELS.items() if model.sigma_unit == "not used")
-# Parameters of each model beside the amplitude: the step has no width.
+# Parameters of each model, without the amplitude.
 PARAMETERS = {name: 1 if name in _WITHOUT_SIGMA else 2 for name in MODELS}
 _FOLDS = 8
-# Linear elements: errors fall in proportion to the mesh size, and two fine meshes tell where they go.
+# Errors of linear elements are proportional to the mesh size: two fine meshes extrapolate to the limit.
 _FINE_CM = (0.05, 0.035)
-# Places along k and along sigma that a rank is judged by: from fewer of them, few directions seem to carry all (of nine
-# a rank whose error is a third of the noise on other places seemed to add a tenth).
+# Places along k and along sigma that judge a rank. Nine are too few: they underestimate the error threefold.
 _RANKED = 17
 _N_DRIFT = 2
-_LEAST_FRAMES = 8
-# What is less than this share of a frame is rounding: a board's converter alone makes thousands of times as much.
-_LEAST_NOISE = 1e-6
+_MIN_FRAMES = 8
+# A smaller share of a frame is rounding: the board's converter alone makes thousands of times as much noise.
+_MIN_NOISE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
-    """What was measured: (n, 896) differences in volts, the noise of one frame in volts, torque (n,) or None."""
+class MeasuredFrames:
+    """(n, 896) measured differences in volts, the noise of one frame in volts, torque (n,) or None."""
 
     differences: FloatArray
     noise_v: float
     torque_nm: FloatArray | None
 
     def __post_init__(self) -> None:
-        """Refuse too little, and what no board makes."""
-        if len(self.differences) < _LEAST_FRAMES:
+        """Refuse too few frames, and frames that no board sends."""
+        if len(self.differences) < _MIN_FRAMES:
             raise CalibrationError(
-                f"{len(self.differences)} gripped frames are too few to judge a model by; record {_LEAST_FRAMES}"
+                f"{len(self.differences)} gripped frames are too few to judge a model by; record {_MIN_FRAMES}"
             )
-        # Sizes that overflow as a square, or vanish, are no number here.
+        # Sizes that overflow as a square, or vanish, give no number.
         with np.errstate(all="ignore"):
             noise = self.noise_v / np.sqrt((self.differences**2).mean())
-        if not _LEAST_NOISE <= noise < np.inf:
+        if not _MIN_NOISE <= noise < np.inf:
             raise CalibrationError(
-                "the gripped frames have no noise to design for: they are all alike, multiples of a few, or none a "
-                "board sends; record frames as they come"
+                "the gripped frames have no noise to design for: they are all alike, multiples of a few, or not from a "
+                "board; record frames as they come"
             )
 
     @property
@@ -74,8 +71,8 @@ class Scene:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """One setting: the error it adds in units of the noise, and what it costs, in words."""
+class DesignStep:
+    """One setting: the error it adds in units of the noise, and its cost in words."""
 
     setting: float
     added: float
@@ -83,21 +80,21 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
-    """Settings from coarse to fine, and the coarsest that is good enough; the finest where none is."""
+class DesignChoice:
+    """Settings from coarse to fine."""
 
     name: str
     unit: str
-    steps: tuple[Step, ...]
+    steps: tuple[DesignStep, ...]
 
     @property
-    def chosen(self) -> Step:
-        """The coarsest step that adds at most a third of the noise, as all finer ones do: none by luck alone."""
+    def chosen(self) -> DesignStep:
+        """The coarsest step that, like all finer ones, adds at most a third of the noise; else the finest."""
         good = itertools.takewhile(lambda step: step.added <= ALLOWED, reversed(self.steps))
         return min(good, key=self.steps.index, default=self.steps[-1])
 
     @property
-    def next_step(self) -> Step | None:
+    def next_step(self) -> DesignStep | None:
         """The step after the chosen one, None where that is the finest."""
         after = self.steps.index(self.chosen) + 1
         return self.steps[after] if after < len(self.steps) else None
@@ -108,15 +105,15 @@ class Choice:
         return self.chosen.added <= ALLOWED
 
 
-_ONE_SIGMA = Choice("cells along sigma", "cells", (Step(1, 0.0, "the model does not depend on sigma"),))
+_ONE_SIGMA = DesignChoice("cells along sigma", "cells", (DesignStep(1, 0.0, "the model does not depend on sigma"),))
 
 
 @dataclass(frozen=True, slots=True)
-class Supported:
+class ModelFit:
     """A model against the data: error of held-out channels relative to the frame, its standard error, BIC per frame.
 
-    The error is that of predictions for injections that k, σ and amplitude were not fitted to; `penalised` adds to it
-    what its parameters would explain of pure noise.
+    Held out are injections that k, σ and amplitude were not fitted to. `penalised` adds to the error the share of pure
+    noise that the model's parameters would explain.
     """
 
     model: str
@@ -129,38 +126,37 @@ class Supported:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """The choices for a scene; k and sigma (low, high), in the model's units, are where the frames lie, with a margin.
+    """The choices for a recording; k and sigma (low, high), in the model's units, contain the frames with a margin.
 
     A model that does not depend on sigma has a range of one value, and one cell along it.
     """
 
     relative_noise: float
-    models: tuple[Supported, ...]
+    models: tuple[ModelFit, ...]
     model: str
     k_range: tuple[float, float]
     sigma_range: tuple[float, float]
-    mesh: Choice
-    k_count: Choice
-    sigma_count: Choice
-    rank: Choice
-    channels: Choice
-    injections: Choice
+    mesh: DesignChoice
+    k_count: DesignChoice
+    sigma_count: DesignChoice
+    rank: DesignChoice
+    channels: DesignChoice
+    injections: DesignChoice
 
 
-def designed(scene: Scene, fingertip: Fingertip) -> Design:
-    """Return the choices for a scene on this fingertip. Raises BankError for a geometry that cannot be solved on."""
+def design_bank(measured: MeasuredFrames, fingertip: Fingertip) -> Design:
+    """Return the choices for frames of this fingertip. Raises BankError for a geometry that cannot be solved on."""
     forward = BatchForwardModel(replace(fingertip, mesh_size_cm=0.2).mesh())
-    height_cm = forward.mesh.height_cm
-    signals = {name: _signals(forward, name, searched_settings(name, height_cm)) for name in MODELS}
-    models = tuple(_supported(scene, name, signals[name][1]) for name in MODELS)
+    signals = {name: _signals(forward, name, searched_settings(name, forward.mesh.height_cm)) for name in MODELS}
+    models = tuple(_model_fit(measured, name, signals[name][1]) for name in MODELS)
     model = min(models, key=lambda one: one.penalised).model
     settings, own = signals[model]
-    k_range, sigma_range = _ranges(scene, settings, own)
-    # Of the searched settings, which are positive everywhere, the nearest to the middle of the ranges.
+    k_range, sigma_range = _ranges(measured, settings, own)
+    # The searched settings are positive everywhere; take the nearest to the middle of the ranges.
     middle = min(settings, key=lambda one: abs(one.k - sum(k_range) / 2) + abs(one.sigma - sum(sigma_range) / 2))
     if one_sigma := model in _WITHOUT_SIGMA:
         sigma_range = (middle.sigma, middle.sigma)
-    noise = scene.relative_noise
+    noise = measured.relative_noise
     return Design(
         noise, models, model, k_range, sigma_range,
         _mesh_choice(fingertip, model, middle, noise),
@@ -169,12 +165,12 @@ def designed(scene: Scene, fingertip: Fingertip) -> Design:
             forward, model, sigma_range, lambda s: Setting(middle.k, s), noise, "sigma"
         ),
         _rank_choice(forward, model, k_range, sigma_range, noise),
-        *_board_choices(scene),
+        *_board_choices(measured),
     )  # fmt: skip
 
 
 def _signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]) -> tuple[list[Setting], FloatArray]:
-    """Return those settings that are positive everywhere, and their (m, 896) magnitudes."""
+    """Return the settings with a positive conductivity, and their (m, 896) magnitudes."""
     cells = [conductivity(forward.mesh, model, *setting) for setting in settings]
     kept = [i for i, cell in enumerate(cells) if cell.min() > 0]
     voltages = forward.voltages(np.array([np.ones(len(forward.mesh.triangles)), *(cells[i] for i in kept)]))
@@ -182,15 +178,14 @@ def _signals(forward: BatchForwardModel, model: str, settings: Sequence[Setting]
 
 
 def _fit(frames: FloatArray, signals: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return (n, m) amplitudes of the best multiples of (m, d) signals for (n, d) frames, and the squares left."""
+    """Return (n, m) amplitudes of the best multiples of (m, d) signals for (n, d) frames, and the squared residuals."""
     energy = (signals**2).sum(axis=1)
     amplitude = frames @ signals.T / energy
     return amplitude, (frames**2).sum(axis=1)[:, None] - amplitude**2 * energy
 
 
-def _supported(scene: Scene, model: str, signals: FloatArray) -> Supported:
-    """Judge a model on injections that its parameters were not fitted to."""
-    frames, injection = np.abs(scene.differences), CHANNELS[:, 0]
+def _model_fit(measured: MeasuredFrames, model: str, signals: FloatArray) -> ModelFit:
+    frames, injection = np.abs(measured.differences), CHANNELS[:, 0]
     left = np.zeros(len(frames))
     for fold in range(_FOLDS):
         out = injection % _FOLDS == fold
@@ -203,34 +198,33 @@ def _supported(scene: Scene, model: str, signals: FloatArray) -> Supported:
     p = PARAMETERS[model] + 1
     bic = N_CHANNELS * np.log(whole / N_CHANNELS) + p * np.log(N_CHANNELS)
     error = float(np.sqrt(share.mean()))
-    return Supported(
+    return ModelFit(
         model, p, error, float(share.std() / np.sqrt(len(share)) / (2 * error)),
         float(np.sqrt(share.mean() * (1 + p * np.log(N_CHANNELS) / N_CHANNELS))), float(bic.mean()),
     )  # fmt: skip
 
 
 def _ranges(
-    scene: Scene, settings: Sequence[Setting], signals: FloatArray
+    measured: MeasuredFrames, settings: Sequence[Setting], signals: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return where the frames lie, with the distance to the next searched setting as margin."""
-    best = _fit(np.abs(scene.differences), signals)[1].argmin(axis=1)
+    """Return the ranges of the frames' k and σ, with the distance to the next searched setting as margin."""
+    best = _fit(np.abs(measured.differences), signals)[1].argmin(axis=1)
     found = []
-    for values, every in (
-        (np.array([settings[i][axis] for i in best]), np.unique([s[axis] for s in settings])) for axis in (0, 1)
-    ):
-        low, high = np.quantile(values, [0.02, 0.98])
+    for axis in (0, 1):
+        every = np.unique([setting[axis] for setting in settings])
+        low, high = np.quantile([settings[i][axis] for i in best], [0.02, 0.98])
         below, above = every[every < low], every[every > high]
         found.append((float(below[-1] if len(below) else 0.8 * low), float(above[0] if len(above) else 1.2 * high)))
     return found[0], found[1]
 
 
-def _off(one: FloatArray, other: FloatArray) -> float:
-    """Return how far two magnitudes are apart in shape, relative L2: the amplitude is free."""
+def _shape_error(one: FloatArray, other: FloatArray) -> float:
+    """Return the relative L2 distance of two magnitudes in shape: the amplitude is free."""
     amplitude = float(one @ other / (other @ other))
     return float(np.linalg.norm(one - amplitude * other) / np.linalg.norm(one))
 
 
-def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float) -> Choice:
+def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float) -> DesignChoice:
     def solved(size: float) -> tuple[FloatArray, int]:
         forward = ForwardModel(mesh := replace(fingertip, mesh_size_cm=size).mesh())
         signal = forward.voltages(conductivity(mesh, model, *place)) - forward.homogeneous()
@@ -241,8 +235,8 @@ def _mesh_choice(fingertip: Fingertip, model: str, place: Setting, noise: float)
     steps = []
     for size in MESH_SIZES_CM:
         signal, triangles = solved(size)
-        steps.append(Step(size, _off(truth, signal) / noise, f"{triangles} triangles"))
-    return Choice("mesh size", "cm", tuple(steps))
+        steps.append(DesignStep(size, _shape_error(truth, signal) / noise, f"{triangles} triangles"))
+    return DesignChoice("mesh size", "cm", tuple(steps))
 
 
 def _count_choice(
@@ -252,51 +246,51 @@ def _count_choice(
     at: Callable[[float], Setting],
     noise: float,
     name: str,
-) -> Choice:
-    """Choose how many cells lie between the ends: the error is that of a frame half-way between two cells."""
+) -> DesignChoice:
+    """Choose the number of cells between the ends: the error is that of a frame half-way between two cells."""
     steps, unit = [], MODELS[model].k_unit if name == "k" else MODELS[model].sigma_unit
     for count in COUNTS:
         spacing = (ends[1] - ends[0]) / (count - 1)
-        # Half a cell to either side of places all over the range; the worst of them counts.
+        # Half a cell away from places all over the range; the worst counts.
         places = np.linspace(ends[0] + spacing, ends[1] - spacing, 4)
         pairs = (_signals(forward, model, [at(v), at(v + spacing / 2)])[1] for v in places.tolist())
-        # Where a conductivity would not be positive there is no cell.
-        found = [_off(*pair) for pair in pairs if len(pair) == 2]
+        # A cell whose conductivity would not be positive does not exist.
+        found = [_shape_error(*pair) for pair in pairs if len(pair) == 2]
         if not found:
             raise CalibrationError(
                 f"the {model} model is positive nowhere along {name} from {ends[0]:.3g} to {ends[1]:.3g}: these frames "
                 "lie at the rim of what it can describe; record a grip that is less strong"
             )
-        added = max(found)
-        steps.append(Step(count, added / noise, f"{spacing:.3g} {unit} apart"))
-    return Choice(f"cells along {name}", "cells", tuple(steps))
+        steps.append(DesignStep(count, max(found) / noise, f"{spacing:.3g} {unit} apart"))
+    return DesignChoice(f"cells along {name}", "cells", tuple(steps))
 
 
 def _rank_choice(
     forward: BatchForwardModel, model: str, k: tuple[float, float], sigma: tuple[float, float], noise: float
-) -> Choice:
+) -> DesignChoice:
     ks, sigmas = (np.unique(np.linspace(*ends, _RANKED)).tolist() for ends in (k, sigma))
-    grid = [Setting(a, b) for a in ks for b in sigmas]
-    signals = _signals(forward, model, grid)[1]
+    signals = _signals(forward, model, [Setting(a, b) for a in ks for b in sigmas])[1]
     signals /= np.linalg.norm(signals, axis=1, keepdims=True)
     squares = np.linalg.svd(signals, compute_uv=False) ** 2
     steps = [
-        Step(rank, float(np.sqrt(squares[rank:].sum() / squares.sum())) / noise, f"{4 * rank} bytes a cell, of 3584")
+        DesignStep(
+            rank, float(np.sqrt(squares[rank:].sum() / squares.sum())) / noise, f"{4 * rank} bytes a cell, of 3584"
+        )
         for rank in RANKS
     ]
-    return Choice("rank of the bank", "numbers a cell", tuple(steps))
+    return DesignChoice("rank of the bank", "numbers a cell", tuple(steps))
 
 
-def _board_choices(scene: Scene) -> tuple[Choice, Choice]:
-    """Choose channels and injections by the torque's standard deviation, from the frames' own change with torque.
+def _board_choices(measured: MeasuredFrames) -> tuple[DesignChoice, DesignChoice]:
+    """Choose channels and injections by the torque's standard deviation.
 
-    The frames' slope over torque, their drift about it and their noise are those of the recording; without a known
-    torque the main direction in which the frames vary stands for it.
+    The recording gives the frames' slope over torque, their drift about it and their noise. Without a known torque the
+    main direction of the frames' variation replaces the slope.
     """
-    frames = np.abs(scene.differences)
+    frames = np.abs(measured.differences)
     centred = frames - frames.mean(axis=0)
-    if scene.torque_nm is not None and np.ptp(scene.torque_nm) > 0:
-        torque = scene.torque_nm - scene.torque_nm.mean()
+    if measured.torque_nm is not None and np.ptp(measured.torque_nm) > 0:
+        torque = measured.torque_nm - measured.torque_nm.mean()
         slope = centred.T @ torque / float(torque @ torque)
         residual = centred - np.outer(torque, slope)
     else:
@@ -307,21 +301,20 @@ def _board_choices(scene: Scene) -> tuple[Choice, Choice]:
 
     def spread(channels: IntArray) -> float:
         """Return the standard deviation of a torque read from these channels."""
-        b, v = slope[channels] / scene.noise_v, drift[channels] / scene.noise_v
+        b, v = slope[channels] / measured.noise_v, drift[channels] / measured.noise_v
         inner = np.linalg.inv(np.eye(_N_DRIFT) + v.T @ v)
         information = float(b @ b - (b @ v) @ inner @ (v.T @ b))
         return float(1.0 / np.sqrt(max(information, 1e-300)))
 
-    everything = np.arange(N_CHANNELS)
-    least = spread(everything)
+    least = spread(np.arange(N_CHANNELS))
 
     def added(channels: IntArray) -> float:
         return float(np.sqrt(max((spread(channels) / least) ** 2 - 1.0, 0.0)))
 
-    # By how much each counts in that reading, where drift is taken out: not by how far the torque moves it alone.
-    inner = np.linalg.inv(np.eye(_N_DRIFT) * scene.noise_v**2 + drift.T @ drift)
+    # Channels are ordered by their weight in that reading, which takes the drift out.
+    inner = np.linalg.inv(np.eye(_N_DRIFT) * measured.noise_v**2 + drift.T @ drift)
     order = np.argsort(-np.abs(slope - drift @ (inner @ (drift.T @ slope))), kind="stable")
-    channels = [Step(n, added(order[:n]), _rate(n)) for n in CHANNEL_COUNTS]
+    channels = [DesignStep(n, added(order[:n]), _rate(n)) for n in CHANNEL_COUNTS]
     injection = CHANNELS[:, 0]
     taken: list[int] = []
     steps = []
@@ -329,10 +322,9 @@ def _board_choices(scene: Scene) -> tuple[Choice, Choice]:
         rest = [one for one in range(N_ELECTRODES) if one not in taken]
         taken.append(min(rest, key=lambda one: spread(np.flatnonzero(np.isin(injection, [*taken, one])))))
         chosen = np.flatnonzero(np.isin(injection, taken))
-        steps.append(
-            Step(len(taken), added(chosen), f"{_rate(len(chosen))}; injections {', '.join(map(str, sorted(taken)))}")
-        )
-    return Choice("channels", "of 896", tuple(channels)), Choice("injections", "of 32", tuple(steps))
+        cost = f"{_rate(len(chosen))}; injections {', '.join(map(str, sorted(taken)))}"
+        steps.append(DesignStep(len(taken), added(chosen), cost))
+    return DesignChoice("channels", "of 896", tuple(channels)), DesignChoice("injections", "of 32", tuple(steps))
 
 
 def _rate(channels: int) -> str:

@@ -1,9 +1,8 @@
-"""A fingertip described by its measures, and a mesh made for it.
+"""A fingertip described by its measures, and its mesh.
 
 The mesh is a grid of lines parallel to the sides, each cell cut into two triangles. Lines run through both ends of
-every electrode, so electrodes have exactly their width; between them the spacing is `mesh_size_cm` at most, and towards
-the boundary, where the current is crowded, the outermost rows are halved twice. The diagonals alternate like the fields
-of a chessboard, so that no direction is preferred.
+every electrode, with a spacing of at most `mesh_size_cm` between them. The current is crowded at the boundary, so the
+outermost rows are halved twice. The diagonals alternate like a chessboard, so that no direction is preferred.
 """
 
 from collections.abc import Sequence
@@ -23,9 +22,9 @@ SIDES: tuple[Side, ...] = ("left", "top", "right", "bottom")
 
 # The outermost rows and columns are 1/2, 1/4, 1/4 of the spacing.
 _BOUNDARY_HALVINGS = 2
-# Two lines nearer than this are one: below any measure that a maker could mean.
+# Two lines nearer than this are one.
 _SAME_CM = 1e-6
-# 10 µm: no electrode is made as narrow, and a line at each end of it is still a line of its own.
+# 10 µm: narrower than any electrode, wider than two lines that are one.
 _LEAST_ELECTRODE_CM = 1e-3
 
 

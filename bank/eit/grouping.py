@@ -1,4 +1,4 @@
-"""Groups of measurements that belong to one level: by their place in repeated series, or by k-means."""
+"""Groups of measurements of one torque level: by their place in repeated series, or by k-means."""
 
 from dataclasses import dataclass
 
@@ -10,30 +10,29 @@ from shearloop.bank.errors import CalibrationError
 
 # A fall by more than this share of the whole range begins a new series.
 _RESTART_SHARE = 0.5
-# A series rises; so many of its steps must, for noise may make neighbouring levels change places.
+# This share of a series' steps must rise: noise may swap neighbouring levels.
 _RISING_SHARE = 0.8
-# k-means is begun anew from so many starts, and the tightest groups are kept.
+# k-means runs from this many starts, and the tightest groups are kept.
 _STARTS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Series:
-    """Repeats of one rising series: for each of n measurements, which repeat it is of and which level of it.
+class RepeatedSeries:
+    """Repeats of one rising series: the repeat and the level (n,) of each measurement, from 0.
 
-    repeat and level are (n,), from 0; a repeat may lack levels.
+    A repeat may lack levels.
     """
 
     repeat: IntArray
     level: IntArray
 
 
-def place_in_series(values: FloatArray) -> Series | None:
-    """Return the places of (n,) values, in the order of time, that run through one rising series again and again.
+def place_in_series(values: FloatArray) -> RepeatedSeries | None:
+    """Return the places of (n,) values, in order of time, that repeat one rising series; None where they do not.
 
-    A series begins anew where the value falls by more than half of the whole range. The longest series have all
-    levels; the values of a shorter one are given, in their order, to the levels whose means, over the longest, they are
-    nearest to in the sum of squares. A value of a shorter series that is nearer to a level which that lacks than to its
-    own goes there: nothing tells the two apart. None where there are no two such series of three levels or more.
+    A series restarts where the value falls by more than half of the whole range. The longest series have all levels.
+    The values of a shorter one go, in their order, to the levels with the nearest means over the longest, in the sum of
+    squares. There must be two series, of three levels or more.
     """
     falls = np.diff(values) < -_RESTART_SHARE * np.ptp(values)
     repeat = np.concatenate([[0], np.cumsum(falls)]).astype(np.int64)
@@ -47,13 +46,13 @@ def place_in_series(values: FloatArray) -> Series | None:
     for each in range(len(length)):
         members = np.flatnonzero(repeat == each)
         level[members] = _rising_levels((values[members, None] - means) ** 2)
-    return Series(repeat, level)
+    return RepeatedSeries(repeat, level)
 
 
 def _rising_levels(cost: FloatArray) -> IntArray:
-    """Return the rising levels (n,) of n values that cost least in all, (n, m) being what each level costs each."""
+    """Return the rising levels (n,) of n values with the least total of an (n, m) cost."""
     n, m = cost.shape
-    # The least cost of the first i values on the first j levels: the last level is the last value's, or nobody's.
+    # least[i, j] is the least cost of the first i values on the first j levels.
     least = np.full((n + 1, m + 1), np.inf)
     least[0] = 0.0
     for i in range(1, n + 1):

@@ -15,9 +15,9 @@ from scipy.sparse.csgraph import connected_components
 from shearloop.bank.eit.channels import N_ELECTRODES
 from shearloop.bank.errors import GeometryError
 
-# A triangle thinner than this (its area over its longest edge squared) is an error of the mesh, not a shape.
+# A triangle with a smaller area over its longest edge squared is an error of the mesh.
 _THINNEST = 1e-8
-# Coordinates enter the digest in this unit: far below any mesh size, far above the rounding of any machine.
+# The unit of coordinates in the digest: far below any mesh size, far above rounding.
 _DIGEST_UNIT_CM = 1e-9
 
 
@@ -27,7 +27,7 @@ class Mesh:
 
     nodes (N, 2) in cm; triangles (T, 3) node numbers, in either orientation; electrode_edges (E, 2) node numbers of
     boundary edges; electrode_of_edge (E,) electrode number of each; contact_impedance (L,) of each electrode, in cm
-    over the unit of conductivity. Raises GeometryError for anything that the equations cannot be solved on.
+    over the unit of conductivity. Raises GeometryError for a mesh that the equations cannot be solved on.
     """
 
     nodes: NDArray[np.float64]
@@ -137,7 +137,7 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def require_fingertip(mesh: Mesh) -> None:
-    """Raise GeometryError unless the mesh has the 32 electrodes that the channel table speaks of."""
+    """Raise GeometryError unless the mesh has the channel table's 32 electrodes."""
     if mesh.n_electrodes != N_ELECTRODES:
         raise GeometryError(f"the mesh has {mesh.n_electrodes} electrodes, but the channel table needs {N_ELECTRODES}")
 
@@ -147,13 +147,13 @@ _FIELDS = tuple(Mesh.__dataclass_fields__)
 
 def _npz_fields(path: Path) -> dict[str, Any]:
     try:
-        # Opened here: numpy leaves a file open that turns out not to be an archive.
+        # Opened here: numpy leaves a file open that is no archive.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             missing = [name for name in _FIELDS if name not in archive.files]
             if missing:
                 raise GeometryError(f"{path}: the mesh lacks {', '.join(missing)}; it has {', '.join(archive.files)}")
             return {name: archive[name] for name in _FIELDS}
-    # What numpy raises for files that are cut off or damaged, as far as they have been seen.
+    # The errors that numpy raises for truncated or damaged files.
     except (zipfile.BadZipFile, OSError, ValueError, EOFError, KeyError, pickle.UnpicklingError) as error:
         raise GeometryError(f"{path}: the file is truncated or damaged ({error}); fetch or save it again") from error
 
@@ -164,7 +164,7 @@ def _eidors_fields(path: Path) -> dict[str, Any]:
 
     try:
         model: Any = loadmat(path, squeeze_me=True, struct_as_record=False, variable_names=["mdl"]).get("mdl")
-    # scipy's reader has no error of its own for a file that ends early: these are what its parts raise.
+    # The errors that scipy's reader raises for a file that ends early.
     except (MatReadError, OSError, ValueError, TypeError, IndexError, EOFError, NotImplementedError) as error:
         raise GeometryError(
             f"{path}: the EIDORS model is truncated, damaged or not of a MATLAB version before 7.3 ({error}); "
@@ -196,7 +196,7 @@ def _eidors_fields(path: Path) -> dict[str, Any]:
 def _edges_of_electrodes(
     boundary: NDArray[np.int64], members: list[NDArray[np.int64]]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Turn each electrode's list of nodes into the boundary edges between them, as EIDORS reads it."""
+    """Return the boundary edges between each electrode's nodes, as EIDORS reads them."""
     edges = [boundary[np.isin(boundary, nodes).all(axis=1)] for nodes in members]
     return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
 

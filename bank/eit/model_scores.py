@@ -1,9 +1,8 @@
-"""How well each basis model resembles measured differences: the ranking of Trehan et al. 2025, figure 5.
+"""Scores of the basis models on measured differences: the ranking of Trehan et al. 2025, figure 5.
 
-Two measures. `envelope_score` is the paper's: the rank correlation of the envelopes of one raw difference and the
-simulated signal, at the best circular shift. It is taken for models that are centred on the fingertip, and averaged
-over a few settings, since it jumps from one setting to the next. `matching_scores` is what the matching itself sees:
-the largest normalised cross-correlation, at the best of many settings, averaged over many differences.
+`envelope_score` is the paper's: the rank correlation of the envelopes of a raw difference and a simulated signal, at
+the best circular shift. It is averaged over a few settings of models centred on the fingertip, because it jumps between
+settings. `matching_scores` is the matcher's own: the largest normalised cross-correlation at the best of many settings.
 """
 
 from collections.abc import Sequence
@@ -21,8 +20,7 @@ from shearloop.bank.eit.matching import ReferenceMatcher
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import MatchingError
 
-# Peaks that carry an envelope are at least this many channels apart, and both it and the difference are smoothed by a
-# moving average: as in the paper's analysis.
+# As in the paper: peaks of an envelope are this many channels apart, and a moving average smooths it.
 _PEAK_DISTANCE = 50
 _AVERAGED = 5
 
@@ -48,7 +46,7 @@ def centred_settings(model: str, centre: float) -> list[Setting]:
 
 
 def searched_settings(model: str, height: float) -> list[Setting]:
-    """Return settings all over a fingertip of this height, in cm, among which the best may be sought."""
+    """Return settings all over a fingertip of this height, in cm, to search for the best one."""
     up = (height * np.linspace(0.1, 0.9, 9)).tolist()
     places, widths = {
         "step": (up, [1.0]),

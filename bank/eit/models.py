@@ -1,6 +1,6 @@
 """The five basis models of a sheared fingertip: conductivity 1 + f(y; k, σ), y along the fingertip's height.
 
-Trehan et al. 2025, equations (1) to (5). A `Variation` beside k and σ scales f, adds to it, or turns the axis.
+Trehan et al. 2025, equations (1) to (5). A `Variation` scales f, adds to it, or turns the axis.
 """
 
 from collections.abc import Callable
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 _SUBDIVISIONS = 5
-# Triangles whose points are computed in one go.
+# Triangles computed at a time: small enough for the processor's caches.
 _AT_ONCE = 1300
-# An axis turned as far as this lies across: no height is along it.
+# An axis turned this far lies across the fingertip.
 QUARTER_DEG = 90.0
 
 
@@ -36,10 +36,10 @@ class BasisModel:
 
 @dataclass(frozen=True, slots=True)
 class Variation:
-    """What else a conductivity may depend on: 1 + offset + amplitude · f(y′; k, σ).
+    """Further parameters of a conductivity: 1 + offset + amplitude · f(y′; k, σ).
 
-    y′ is the height along an axis that is turned by tilt_deg about the fingertip's centre, towards x. Raises ModelError
-    for what is not finite, and for a tilt of a quarter turn or more.
+    y′ is the height along an axis turned by tilt_deg about the fingertip's centre, towards x. Raises ModelError for
+    values that are not finite, and for a tilt of a quarter turn or more.
     """
 
     amplitude: float = 1.0
@@ -47,7 +47,7 @@ class Variation:
     tilt_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what describes no conductivity."""
+        """Check the values."""
         if not np.isfinite([self.amplitude, self.offset, self.tilt_deg]).all() or abs(self.tilt_deg) >= QUARTER_DEG:
             raise ModelError(
                 f"amplitude, offset and tilt must be finite, and the tilt less than ±{QUARTER_DEG:g}°, not "
@@ -71,7 +71,7 @@ def _cut_linear(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:
 
 
 def _gaussian_derivative(y: FloatArray, k: float, sigma: float, c: float) -> FloatArray:  # noqa: ARG001 - as above
-    # In place: memory that is new at each step takes longer than the arithmetic.
+    # In place: allocating memory takes longer than the arithmetic.
     d = y - k
     f = d * d
     f *= -0.5 / np.square(sigma)
@@ -98,7 +98,7 @@ MODELS = {
 
 
 def model_named(name: str) -> BasisModel:
-    """Return a basis model; raises ModelError, with the names that exist, for one that does not."""
+    """Return a basis model; raises ModelError with the known names for an unknown one."""
     try:
         return MODELS[name]
     except KeyError:
@@ -106,11 +106,10 @@ def model_named(name: str) -> BasisModel:
 
 
 def averaging_points() -> FloatArray:
-    """Return the (15, 3) barycentric coordinates that f is averaged over in a triangle.
+    """Return the (15, 3) barycentric coordinates of the points over which f is averaged in a triangle.
 
-    Each edge is cut into five and lines parallel to the edges are drawn through the cuts: 25 equal triangles. The
-    points are the centroids of the 15 that stand as the whole one does: ((3i + 1)/15, (3j + 1)/15, (3l + 1)/15) with
-    i + j + l = 4.
+    Lines parallel to the edges, through five equal parts of each, cut the triangle into 25. The points are the
+    centroids of the 15 upright ones: ((3i + 1)/15, (3j + 1)/15, (3l + 1)/15) with i + j + l = 4.
     """
     n = _SUBDIVISIONS
     steps = [(i, j, n - 1 - i - j) for i in range(n) for j in range(n - i)]
@@ -127,8 +126,8 @@ def conductivity(mesh: "Mesh", model: str, k: float, sigma: float, variation: Va
     return values
 
 
-class Conductivities:
-    """What `conductivity` returns, to the bit, for many parameters on one mesh: triangles alike are averaged once."""
+class ConductivityModel:
+    """The conductivity for many parameters on one mesh: bit-identical to `conductivity`, alike triangles only once."""
 
     def __init__(self, mesh: "Mesh", variation: Variation = PLAIN) -> None:
         """Find the triangles whose corners have the same heights."""
@@ -139,8 +138,8 @@ class Conductivities:
         self._centre = _centre(mesh)
         self._variation = variation
 
-    def of(self, model: str, k: float, sigma: float) -> FloatArray:
-        """Return the (T,) conductivity; errors as of `conductivity`."""
+    def conductivity(self, model: str, k: float, sigma: float) -> FloatArray:
+        """Return the (T,) conductivity; errors as `conductivity`."""
         values: FloatArray = _mean(self._heights, self._centre, model, k, sigma, self._variation)[self._alike]
         return values
 
@@ -160,7 +159,7 @@ def _centre(mesh: "Mesh") -> float:
 
 
 def _pieces(heights: FloatArray) -> list[FloatArray]:
-    """Cut (T, 15) heights into (15, ≤ _AT_ONCE) of some triangles each: small enough for the processor's caches."""
+    """Cut (T, 15) heights into pieces (15, ≤ _AT_ONCE)."""
     return [np.ascontiguousarray(piece.T) for piece in np.array_split(heights, -(-len(heights) // _AT_ONCE))]
 
 

@@ -1,4 +1,4 @@
-"""A polynomial through measurements, with the interval in which the next measurement is to be expected."""
+"""A polynomial through measurements with its prediction interval, and the constants of 95 % intervals."""
 
 from dataclasses import dataclass
 from typing import NamedTuple, Self
@@ -10,6 +10,8 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.errors import CalibrationError
 
 CONFIDENCE = 0.95
+# Standard deviations to either side of a Gaussian's mean that hold 95 %.
+TWO_SIDED_95 = 1.96
 
 
 class Interval(NamedTuple):
@@ -24,8 +26,8 @@ class Interval(NamedTuple):
 class Polynomial:
     """y = Σ coefficients[i] (x − centre)^i, fitted by least squares to n points between x_low and x_high.
 
-    residual_std is that of the points about the curve, with n − len(coefficients) degrees of freedom; spread is the
-    inverse of the normal matrix, row by row, from which the curve's own uncertainty follows.
+    residual_std has n − len(coefficients) degrees of freedom. spread is the inverse of the normal matrix, by rows: the
+    curve's own uncertainty.
     """
 
     coefficients: tuple[float, ...]
@@ -37,7 +39,7 @@ class Polynomial:
     spread: tuple[tuple[float, ...], ...]
 
     def __post_init__(self) -> None:
-        """Refuse what no fit can have made."""
+        """Refuse numbers that no fit gives."""
         size = len(self.coefficients)
         numbers = [*self.coefficients, self.centre, self.residual_std, self.x_low, self.x_high, *sum(self.spread, ())]
         if not np.isfinite(numbers).all():
@@ -84,9 +86,9 @@ class Polynomial:
     def interval(self, x: float) -> Interval:
         """Return y at x with the 95 % prediction interval of a single new measurement.
 
-        y ± t s √(1 + pᵀ S p), where p are the powers of x − centre, S is spread, s is residual_std and t is Student's
-        quantile at 97.5 % with n − len(coefficients) degrees of freedom. It takes the residuals to be independent,
-        Gaussian, and of the same size everywhere.
+        y ± t s √(1 + pᵀ S p), with p the powers of x − centre, S the spread, s the residual_std, and t Student's
+        quantile at 97.5 % with n − len(coefficients) degrees of freedom. Assumes
+        independent Gaussian residuals of one size.
         """
         powers = (x - self.centre) ** np.arange(len(self.coefficients))
         t = float(stdtrit(self.n - len(powers), (1 + CONFIDENCE) / 2))

@@ -1,7 +1,7 @@
 """The same match as from the whole heatmap, from a few of its cells: cells that cannot be the maximum are not scored.
 
-A compressed bank (`compression`) bounds the scores of groups of cells, then of cells. What is bounded below a score
-that some cell reaches is dropped; the rest is scored in float64. The compression decides the time, never the result.
+A compressed bank (`compression`) bounds the scores of groups of cells, then of cells. Cells bounded below a score that
+another cell reaches are dropped; the rest is scored in float64. The compression decides the time, never the result.
 """
 
 from abc import abstractmethod
@@ -196,7 +196,7 @@ class AllLagsBounds:
         return int(cells[np.argmax(self._bank.coarse.take(cells, axis=0)[:, :-2] @ parts)])
 
     def _bound_groups(self, score: float) -> None:
-        """Bound the first level's groups at all lags at which any cell may reach the score."""
+        """Bound the first level's groups at all lags that let any cell reach the score."""
         self._bounded_down_to = score
         overlap = self._bank.overlaps * np.sqrt(self._energies) >= score - ROUNDING
         first, end = int(overlap.argmax()), 2 * N_CHANNELS - int(overlap[::-1].argmax())

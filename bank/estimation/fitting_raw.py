@@ -10,7 +10,7 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS, smoothed_along_channels
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatcher, find_numbering, resolve_half_turn
 from shearloop.bank.estimation.calibration import NEEDS_BANK, Calibration, Name, OutputModel

@@ -15,8 +15,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
-from shearloop.bank.eit.polynomial import Polynomial
+from shearloop.bank.eit.polynomial import TWO_SIDED_95, Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.regressors import (
     InverseCalibration,

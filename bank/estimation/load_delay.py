@@ -15,7 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.bank.estimation.grip_segmentation import segment_grip

@@ -9,7 +9,7 @@ import numpy as np
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import BankMatch, BankMatcher
 from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE, Calibration, OutputModel, Quantity

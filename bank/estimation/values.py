@@ -9,7 +9,7 @@ import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.errors import CalibrationError
 
 # "raw": volts as the board sends them. "difference": |frame − homogeneous frame|, smoothed over time.

@@ -3,7 +3,8 @@
 The curve is a straight line through the origin up to 1.2 N. Beyond, to 5 N and more, it has as many straight pieces as
 the recorded data support. Rising straight pieces invert without iteration. The fit reads a table of recorded
 resistances and forces: the membrane's two plays turn the forces into the tension at the gauges, friction included, and
-leave the coefficient of friction and the curve to be fitted.
+leave the coefficient of friction and the curve to be fitted. The daemon loads calibrations, so scipy.optimize is
+imported only to fit.
 """
 
 import csv
@@ -14,8 +15,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from scipy.optimize import minimize_scalar, nnls
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
@@ -317,6 +317,8 @@ class _CurveFit:
 
     def squares(self, friction: float) -> float:
         """Return the sum of squared residuals with the best curve for this friction."""
+        from scipy.optimize import nnls
+
         return float(nnls(self._design(self._tensions(friction)), self._response)[1] ** 2)
 
     def rises(self, friction: float) -> bool:
@@ -325,6 +327,8 @@ class _CurveFit:
 
     def calibration(self, friction: float, rows_beyond: int, rest_ohm: tuple[float, float]) -> SkinCalibration:
         """Return the calibration with the best curve for this friction."""
+        from scipy.optimize import nnls
+
         tension = self._tensions(friction)
         design = self._design(tension)
         slopes, distance = nnls(design, self._response)
@@ -341,7 +345,7 @@ class _CurveFit:
             linear_to_n=self._linear_to_n,
             tension_n=tuple(knots.tolist()),
             response=tuple((self._design(knots) @ slopes).tolist()),
-            response_half_width=float(student.ppf(0.975, freedom)) * scatter * math.sqrt(1 + leverage),
+            response_half_width=float(stdtrit(freedom, 0.975)) * scatter * math.sqrt(1 + leverage),
             rows=self.rows,
             rows_beyond=rows_beyond,
             rest_ohm=rest_ohm,
@@ -373,6 +377,10 @@ def _knots(tension: FloatArray, linear_to_n: float) -> FloatArray:
 
 
 def _fit_friction(curve: _CurveFit) -> float:
+    from scipy.optimize import minimize_scalar
+
+    # Imported here: the daemon loads calibrations and does not fit them.
+
     coarse = np.linspace(0.0, MAX_FRICTION, 26)
     best = coarse[int(np.argmin([curve.squares(mu) for mu in coarse]))]
     bounds = max(best - coarse[1], 0.0), min(best + coarse[1], MAX_FRICTION)

@@ -1,4 +1,4 @@
-"""The paper's figures of merit next to those of the models and estimators: one table and three figures' curves.
+"""The paper's figures of merit next to the models' and estimators': one table and three figures' curves.
 
 Noise, drift and temperature are properties of a made skin. For those the table shows estimates from synthetic
 recordings with the paper's figure as the true one.
@@ -30,7 +30,7 @@ PAPER_MEASURED_SENSITIVITY = {0.5: "0.078", 1.0: "0.076", 1.5: "0.080", 2.0: "0.
 
 @dataclass(frozen=True, slots=True)
 class FigureOfMerit:
-    """One quantity: the paper's computed and measured values, as printed, and that of each model or estimator."""
+    """One quantity: the paper's computed and measured values, as printed, and each model's or estimator's."""
 
     quantity: str
     unit: str

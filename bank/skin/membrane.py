@@ -30,7 +30,7 @@ class Section:
 
     The paper's load coordinates, (0, −6.35) on the outer surface and (0, −6) on the mid-line, give the radii. They
     contradict its fabrication text (mid-line at 6.3 mm, 0.6 mm thick), but its computed results belong to them. The
-    width is that of the sheet, 20 mm, loaded evenly. The gauge strips are 3 mm long, 28.65° on the mid-line. The paper
+    width is the sheet's, 20 mm, loaded evenly. The gauge strips are 3 mm long, 28.65° on the mid-line. The paper
     places them "adjacent to the nail bed"; here they begin at 15°, two thicknesses clear of the bracket.
     """
 
@@ -125,12 +125,6 @@ def gauge_factor(poisson_ratio: float = 0.5) -> float:
     return 1 + 2 * poisson_ratio
 
 
-def resistance_change(strain: FloatArray, poisson_ratio: float = 0.5) -> FloatArray:
-    """Return ΔR/R₀ of a channel stretched along itself, (1+ε)/(1−νε)² − 1; gauge_factor · ε to first order."""
-    change: FloatArray = (1 + strain) / (1 - poisson_ratio * strain) ** 2 - 1
-    return change
-
-
 def measured_response(
     r1_ohm: FloatArray, r2_ohm: FloatArray, r1_unloaded_ohm: float, r2_unloaded_ohm: float
 ) -> FloatArray:
@@ -161,7 +155,7 @@ def response_of_strains(strain_1: FloatArray, strain_2: FloatArray, factor: floa
 def sensitivity_per_n(section: Section, factor: float | None = None) -> float:
     """Return S = F (1−ν²)/(E w t) · (1 + ν/(1−ν) · t/2R) · (R_out/R) · e^(−μφ), beyond the deadband, in 1/N.
 
-    F is that of an incompressible elastomer, 2, unless given.
+    F is 2, as of an incompressible elastomer, unless given.
     """
     nu, radius, thickness = section.poisson_ratio, section.mid_radius_mm, section.thickness_mm
     flat = (1 - nu**2) / (section.young_mpa * section.width_mm * thickness)

@@ -243,7 +243,6 @@ class ContactState:
     shear_n: float
     contact_force_n: FloatArray
     along_mm: FloatArray
-    newton_steps: int = 0
 
     @property
     def touching(self) -> BoolArray:
@@ -275,9 +274,9 @@ def apply_load(
     friction = skin.section.friction if friction is None else friction
     start = before.contact_force_n if start_force_n is None else start_force_n
     free = skin.load_displacement @ (normal_n, shear_n)
-    force, steps = solve_contact(skin.compliance, free, before.along_mm, friction, start)
+    force = solve_contact(skin.compliance, free, before.along_mm, friction, start)
     n = len(before.along_mm)
-    return ContactState(normal_n, shear_n, force, skin.compliance[n:] @ force + free[n:], steps)
+    return ContactState(normal_n, shear_n, force, skin.compliance[n:] @ force + free[n:])
 
 
 def states_along(
@@ -309,8 +308,8 @@ def gauge_strains(skin: CondensedSkin, states: Iterable[ContactState]) -> FloatA
 
 def solve_contact(
     compliance: FloatArray, displacement: FloatArray, along_before: FloatArray, friction: float, start: FloatArray
-) -> tuple[FloatArray, int]:
-    """Return the contact forces (2n,) in N of one increment, and the number of Newton steps.
+) -> FloatArray:
+    """Return the contact forces (2n,) in N of one increment.
 
     `compliance` (2n, 2n) mm/N, `displacement` (2n,) mm without contact, `along_before` (n,) mm at the previous
     increment, `start` (2n,) N. Raises ContactError where no solution is found.
@@ -332,7 +331,7 @@ def solve_contact(
             f"The contact of the skin did not converge in {steps} steps at a friction of {friction}; "
             "apply the load in smaller steps."
         )
-    return force, steps
+    return force
 
 
 def _newton(problem: "_Problem", force: FloatArray) -> tuple[FloatArray, int, bool]:

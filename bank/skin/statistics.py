@@ -1,7 +1,7 @@
 """A skin's figures of merit by the paper's definitions, and synthetic recordings to test their estimators.
 
 Noise, dynamic range, precision, drift, crosstalk and temperature: each function takes recorded arrays and returns
-numbers. Responses are those of equation (1), forces are in N.
+numbers. Responses follow equation (1), forces are in N.
 """
 
 import math
@@ -81,38 +81,11 @@ def fit_line(shear_n: FloatArray, response: FloatArray) -> LineFit:
     return LineFit(slope, offset, scatter, n, float(shear_n.mean()), spread)
 
 
-@dataclass(frozen=True, slots=True)
-class Drift:
-    """How a response wanders at constant load: its standard deviation, in N too, and its trend in N per hour."""
-
-    std: float
-    std_n: float
-    trend_n_per_h: float
-
-
-def drift(time_s: FloatArray, response: FloatArray, sensitivity_per_n: float) -> Drift:
-    """Return the drift over a recording at constant load; the paper's is one hour at 0.01 Hz, reported as std."""
-    if len(time_s) < 3:
+def drift_std(response: FloatArray) -> float:
+    """Return the standard deviation of the responses at constant load; the paper records one hour at 0.01 Hz."""
+    if len(response) < 3:
         raise CalibrationError("Drift needs at least three responses at constant load; the paper's hour has 36.")
-    std = float(np.std(response, ddof=1))
-    trend = float(np.polyfit(time_s / 3600, response, 1)[0])
-    return Drift(std, std / sensitivity_per_n, trend / sensitivity_per_n)
-
-
-@dataclass(frozen=True, slots=True)
-class Crosstalk:
-    """The largest response to normal force alone, the same in N of shear, and N of shear per N of normal force."""
-
-    largest: float
-    largest_n: float
-    slope_n_per_n: float
-
-
-def crosstalk(normal_n: FloatArray, response: FloatArray, sensitivity_per_n: float) -> Crosstalk:
-    """Return the crosstalk from responses to normal forces without shear."""
-    largest = float(abs(response).max())
-    slope = origin_slope(normal_n, response)
-    return Crosstalk(largest, largest / sensitivity_per_n, slope / sensitivity_per_n)
+    return float(np.std(response, ddof=1))
 
 
 def temperature_sensitivity_per_k(
@@ -177,8 +150,7 @@ def estimated_figures(membrane: Membrane, true: SkinFigures, rng: np.random.Gene
     scatter = true.prediction_half_width_n / norm.ppf(0.975) * sensitivity
     line = fit_line(shear_n, shear_n * sensitivity + rng.normal(0, scatter, len(shear_n)))
 
-    hour_s = np.arange(0, 3600, 100.0)
-    wandering = 0.15 * sensitivity + rng.normal(0, true.drift_std, len(hour_s))
+    wandering = 0.15 * sensitivity + rng.normal(0, true.drift_std, 36)
 
     normal_n = np.array([0.5, 1.0, 1.5, 2.0])
     pressed = true.crosstalk * normal_n / 2 + rng.normal(0, noise / np.sqrt(600), len(normal_n))
@@ -190,7 +162,7 @@ def estimated_figures(membrane: Membrane, true: SkinFigures, rng: np.random.Gene
     return SkinFigures(
         noise_floor_n=noise_floor_n(time_s, still, sensitivity),
         prediction_half_width_n=line.prediction_half_width_n(0.0),
-        drift_std=drift(hour_s, wandering, sensitivity).std,
-        crosstalk=crosstalk(normal_n, pressed, sensitivity).largest,
+        drift_std=drift_std(wandering),
+        crosstalk=float(abs(pressed).max()),
         sensitivity_per_k=temperature_sensitivity_per_k(at_temperature(25.0), at_temperature(40.0), 25.0, 40.0),
     )

@@ -16,7 +16,7 @@ from shearloop.bank.skin.membrane import Direction, ShearInterval, direction_of
 STANDARD_DEVIATIONS = 5.0
 # Responses averaged before they are compared.
 AVERAGED = 3
-# A slip tells the direction for this long. A longer time misses a hand that turns back, a shorter one forgets a slow
+# A slip proves the direction for this long. A longer time misses a hand that turns back, a shorter one forgets a slow
 # loading between two responses.
 MEMORY_S = 0.2
 # While the skin sticks, the reference response is averaged over about this many: noise chose the first one.
@@ -24,7 +24,7 @@ SETTLES_OVER = 20.0
 
 
 class DirectionFinder:
-    """Tells from successive responses whether the magnitude of the force rises, falls, or may do either."""
+    """Finds from successive responses whether the magnitude of the force rises, falls, or may do either."""
 
     def __init__(self, noise: float) -> None:
         """Take the standard deviation of one response."""

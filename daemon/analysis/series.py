@@ -11,7 +11,7 @@ from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import FrameSeries, Measured
 from shearloop.bank.estimation.calibration import LARGEST_TOOL_SHARE
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab_streams import read_diameter_slices, read_torque_slices
+from shearloop.daemon.recording.matlab import read_diameter_slices, read_torque_slices
 from shearloop.daemon.recording.reader import Recording, read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE, LARGEST_DIAMETER_MM, SIDES
 

@@ -22,7 +22,7 @@ def run(args: argparse.Namespace) -> int:
 
     from shearloop.daemon.cli.run import check_emulators
     from shearloop.daemon.config import load_daemon_config
-    from shearloop.daemon.rig_check import checked_experiment
+    from shearloop.daemon.rig import check_experiment
     from shearloop.daemon.sensing.estimators import open_combined, open_estimator, torque_sources
 
     config = load_daemon_config(args.config)
@@ -42,9 +42,11 @@ def run(args: argparse.Namespace) -> int:
     if config.skin is not None:
         parts["skin"] = _skin(config.skin)
     parts |= _rig(config)
-    experiment = checked_experiment(config, torque_sources(config, estimators, combined))
+    experiment = check_experiment(config, torque_sources(config, estimators, combined))
     if experiment is not None:
-        parts["experiment"] = f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.drive}"
+        parts["experiment"] = (
+            f"{experiment.name!r}, {len(experiment.steps)} steps, driven by {experiment.torque_source}"
+        )
     if args.json:
         print(json.dumps({"config": str(args.config), "parts": parts}, ensure_ascii=False))
         return 0
@@ -80,18 +82,18 @@ def _rig(config: "DaemonConfig") -> dict[str, str]:
 
 
 def _clients(curve: "CurveConfig") -> str:
-    from shearloop.daemon.messaging.keys import admitted_clients, load_server_keys
+    from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys
 
     load_server_keys(curve.server_key)
-    return ", ".join(sorted(admitted_clients(curve.clients).values()))
+    return ", ".join(sorted(check_allowed_clients(curve.clients).values()))
 
 
 def _skin(config: "SkinConfig") -> str:
     import math
 
     from shearloop.bank.skin.calibration import load_calibration
-    from shearloop.daemon.sensing.skin_setup import check_circuit
-    from shearloop.daemon.sensing.skin_zero import MOST_CHANGE
+    from shearloop.daemon.sensing.skin_estimator import MAX_CHANGE
+    from shearloop.daemon.sensing.skin_task import check_circuit
 
     calibration = load_calibration(config.calibration)
     check_circuit(config, calibration)
@@ -100,6 +102,6 @@ def _skin(config: "SkinConfig") -> str:
         f"calibration {config.calibration} to {calibration.tension_n[0]:+.1f} … {calibration.tension_n[-1]:+.1f} N, "
         f"± {calibration.prediction_half_width_n:.3f} N, {radius}"
     )
-    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MOST_CHANGE:
+    if abs(math.log(calibration.rest_ohm[0] / calibration.rest_ohm[1])) < MAX_CHANGE:
         text += "; its gauges are too similar at rest to detect swapped wires: check the sign of a push"
     return text

@@ -1,21 +1,26 @@
-"""`shearloop command`: ask a running daemon to do something."""
+"""`shearloop command`: send a command to a running daemon."""
 
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.connection import add_connection, client_keys
-from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, needs_keys, stop_address
-from shearloop.daemon.messaging.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
+from shearloop.daemon.cli.options import add_connection, client_keys
+from shearloop.daemon.messaging.addresses import (
+    COMMAND_ADDRESS,
+    COMMAND_TIMEOUT_S,
+    UNLOCK_TIMEOUT_S,
+    needs_keys,
+    stop_address,
+)
 
 COMMANDS = {
-    "tare": "take the zero of the torque sensors anew: nothing gripped, no experiment running",
-    "status": "how each task is",
-    "start": "begin an experiment",
-    "pause": "the arm stands still until `resume`; fingers that move go on to their end",
-    "resume": "go on",
-    "stop": "end the experiment and stand still; where none is running, end the daemon",
-    "unlock": "let robot and gripper move again after a stop, once nobody is in reach of them",
-    "set": "change what may change while it runs: --heatmap",
+    "tare": "set the zero of the torque sensors, with nothing gripped and no experiment running",
+    "status": "show the state of each task",
+    "start": "start an experiment",
+    "pause": "hold the arm until `resume`; moving fingers finish their move",
+    "resume": "continue after `pause`",
+    "stop": "stop the experiment and the arm; without an experiment, stop the daemon",
+    "unlock": "allow motion again after a stop, when no person is within reach",
+    "set": "change a setting of the running daemon: --heatmap",
 }
 
 
@@ -25,48 +30,43 @@ examples:
   shearloop command start --experiment config/experiments/loosen.yaml
   shearloop command stop
 
-Exit status: 0 done, 1 refused (and why), 2 nobody answered. On the daemon's own
-machine `stop` and `status` need no key. `shearloop listen` prints what it publishes.
+Exit status: 0 done, 1 refused, 2 no answer. On the daemon's own machine `stop` and
+`status` need no key. `shearloop listen` prints the daemon's messages.
 """
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `command`."""
-    parser.description = "Ask a running daemon to do something, and print what it answers."
+    parser.description = "Send a command to a running daemon and print the reply."
     width = max(map(len, COMMANDS))
-    parser.epilog = (
-        "what it can be asked:\n" + "".join(f"  {name:<{width}}  {what}\n" for name, what in COMMANDS.items()) + EPILOG
-    )
+    parser.epilog = "commands:\n" + "".join(f"  {name:<{width}}  {what}\n" for name, what in COMMANDS.items()) + EPILOG
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("name", choices=COMMANDS, metavar="WHAT", help="one of those below")
-    parser.add_argument(
-        "--source", metavar="NAME", help="for tare and set: which sensor, as the configuration names it (default: all)"
-    )
+    parser.add_argument("name", choices=COMMANDS, metavar="COMMAND", help="one of the commands below")
+    parser.add_argument("--source", metavar="NAME", help="for tare and set: name of the sensor (default: all)")
     parser.add_argument(
         "--heatmap",
         choices=("always", "on_request"),
-        help="for set: whether heatmaps are computed always, or while somebody subscribes to them",
+        help="for set: compute heatmaps always, or only for subscribers",
     )
     parser.add_argument(
-        "--experiment", type=Path, metavar="FILE", help="for start (default: the one that the configuration names)"
+        "--experiment", type=Path, metavar="FILE", help="for start (default: that of the configuration)"
     )
-    add_connection(parser, COMMAND_ADDRESS, "where the daemon takes commands")
+    add_connection(parser, COMMAND_ADDRESS, "the daemon's command address")
     parser.add_argument(
         "--timeout",
         type=float,
         metavar="S",
-        help=f"how long to wait for the answer (default: {COMMAND_TIMEOUT_S:g} s, for unlock {UNLOCK_TIMEOUT_S:g} s)",
+        help=f"time to wait for the reply (default: {COMMAND_TIMEOUT_S:g} s, for unlock {UNLOCK_TIMEOUT_S:g} s)",
     )
     parser.add_argument("--json", action="store_true", help="print the reply as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Send one command and print its reply; status 1 when the daemon refused it."""
+    """Send one command and print its reply; status 1 if the daemon refused it."""
     import json
     import sys
 
-    from shearloop.daemon.messaging.request import request
-    from shearloop.daemon.messaging.subscriber import checked_timeout_s
+    from shearloop.daemon.messaging.client import check_timeout_s, send_command
 
     arguments = {} if args.source is None else {"source": args.source}
     if args.heatmap is not None:
@@ -76,21 +76,21 @@ def run(args: argparse.Namespace) -> int:
         arguments["experiment"] = str(args.experiment.resolve())
     address, keys = args.connect, None
     if args.name in ("stop", "status") and args.key is None and not needs_keys(address):
-        # Where the daemon's commands need keys, these two do not.
+        # These two need no key on the daemon's own machine.
         address = stop_address(address)
     else:
         keys = client_keys(args)
-    timeout_s = COMMAND_TIMEOUT_S if args.timeout is None else checked_timeout_s(args.timeout)
+    timeout_s = COMMAND_TIMEOUT_S if args.timeout is None else check_timeout_s(args.timeout)
     if args.name == "unlock" and args.timeout is None:
-        # That nobody is there is said at once all the same.
-        request(address, {"command": "status"}, COMMAND_TIMEOUT_S, keys)
+        # A missing daemon is reported without the long timeout.
+        send_command(address, {"command": "status"}, COMMAND_TIMEOUT_S, keys)
         timeout_s = UNLOCK_TIMEOUT_S
-    reply = request(address, {"command": args.name, **arguments}, timeout_s, keys)
+    reply = send_command(address, {"command": args.name, **arguments}, timeout_s, keys)
     accepted = bool(reply.pop("ok", False))
     if args.json:
         print(json.dumps({"ok": accepted, **reply}, ensure_ascii=False))
     elif accepted:
         print(f"{args.name}: done" if not reply else f"{args.name}: {json.dumps(reply, ensure_ascii=False, indent=2)}")
     else:
-        print(f"shearloop command: {args.name} was refused: {reply.get('why')}", file=sys.stderr)
+        print(f"shearloop command: {args.name} was refused: {reply.get('reason')}", file=sys.stderr)
     return 0 if accepted else 1

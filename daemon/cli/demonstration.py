@@ -1,4 +1,4 @@
-"""What a demonstration adds to a run: what befalls the emulated rig, the truth about it, and the summary's end."""
+"""Support for demonstrations with emulated devices: events of an experiment, the true torque, and lost emulators."""
 
 import contextlib
 import json
@@ -16,32 +16,30 @@ if TYPE_CHECKING:
     from shearloop.daemon.config import EmulatorConfig
     from shearloop.daemon.run_summary import Known
 
-RIG = "rig"
 
-
-class Truth:
-    """The file in which an emulated rig writes what is really so; removed with `close`."""
+class TruthFile:
+    """A temporary file for the true state of an emulated rig; `close` removes it."""
 
     def __init__(self, emulators: "tuple[EmulatorConfig, ...]") -> None:
-        """Make room for it where a rig is emulated that does not write one anyway."""
+        """Make the file's folder, unless no rig is emulated or it has a file already."""
         self._folder: tempfile.TemporaryDirectory[str] | None = None
         self.path: Path | None = None
-        if any(emulator.device == RIG and "--truth" not in emulator.arguments for emulator in emulators):
+        if any(emulator.device == "rig" and "--truth" not in emulator.arguments for emulator in emulators):
             self._folder = tempfile.TemporaryDirectory(prefix="shearloop-")
             self.path = Path(self._folder.name) / "truth.jsonl"
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """What the emulator is told."""
+        """The emulator's arguments for the file."""
         return () if self.path is None else ("--truth", str(self.path))
 
     def torques(self) -> "Known | None":
-        """Return the true torque so far; None where nobody knows it."""
+        """Return the true torque so far; None if it is unknown."""
         from shearloop.daemon.run_summary import Known
 
         if self.path is None or not self.path.exists():
             return None
-        # The last line may be half written.
+        # The last line may be incomplete.
         lines = self.path.read_text(encoding="utf-8").rpartition("\n")[0].splitlines()
         rows = [(row["t_mono_ns"], row["torque_nm"]) for row in map(json.loads, lines)]
         table = np.array(rows, dtype=float).reshape(-1, 2)
@@ -53,55 +51,51 @@ class Truth:
             self._folder.cleanup()
 
 
-class Happenings:
-    """Says to the emulators what the configuration wants to befall them, at a step of the experiment."""
+class EventInjector:
+    """A listener that sends the configured events to the emulators, each at its step of the experiment."""
 
     def __init__(self, emulators: "tuple[EmulatorConfig, ...]", processes: Sequence["Popen[bytes]"]) -> None:
-        """Take the emulators and their processes, in the same order."""
-        self._left = [
-            (happening, process)
+        """Use the emulators and their processes, in the same order."""
+        self._waiting = [
+            (event, process)
             for emulator, process in zip(emulators, processes, strict=True)
-            for happening in emulator.happenings
+            for event in emulator.events
         ]
         self._since_ns: dict[int, int] = {}
-        self.happened: list[tuple[int, str]] = []
+        self.sent: list[tuple[int, str]] = []
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Look at `loop.state`, which comes once a second, whether it is time."""
+        """Send the events that are due, at each `loop.state`."""
         if topic != "loop.state" or content["phase"] != "running" or not content["hold"]:
             return
-        now_ns = content["t_mono_ns"]
-        since_ns = self._since_ns.setdefault(content["step"], now_ns)
-        due = [
-            entry
-            for entry in self._left
-            if entry[0].step == content["step"] and now_ns - since_ns >= entry[0].held_for_s * 1e9
-        ]
-        for happening, process in due:
-            self._left.remove((happening, process))
-            # One that ends just now is told of as dead; here it must not take along whose message this is.
+        now_ns, step = content["t_mono_ns"], content["step"]
+        held_s = (now_ns - self._since_ns.setdefault(step, now_ns)) / 1e9
+        for entry in [entry for entry in self._waiting if entry[0].step == step and held_s >= entry[0].held_for_s]:
+            self._waiting.remove(entry)
+            event, process = entry
+            # EmulatorMonitor reports a dead process.
             with contextlib.suppress(BrokenPipeError):
                 if process.stdin is not None and process.poll() is None:
-                    process.stdin.write(f"{happening.say}\n".encode())
+                    process.stdin.write(f"{event.command}\n".encode())
                     process.stdin.flush()
-                    self.happened.append((time.monotonic_ns(), happening.say))
+                    self.sent.append((time.monotonic_ns(), event.command))
 
 
-class Deaths:
-    """Says once, for each emulated device, that its process has ended while the daemon runs."""
+class EmulatorMonitor:
+    """A listener that reports once when an emulator's process has ended."""
 
     def __init__(self, emulators: "tuple[EmulatorConfig, ...]", processes: Sequence["Popen[bytes]"]) -> None:
-        """Take the emulators and their processes, in the same order."""
+        """Use the emulators and their processes, in the same order."""
         self._alive = [(emulator.device, process) for emulator, process in zip(emulators, processes, strict=True)]
 
     def __call__(self, topic: str, _: Mapping[str, Any]) -> None:
-        """Look at each message of `health`, which comes once a second, whether all of them live."""
+        """Check the processes at each `health`."""
         if topic != "health":
             return
         for entry in [entry for entry in self._alive if entry[1].poll() is not None]:
             self._alive.remove(entry)
             structlog.get_logger().error(
-                "an emulated device has ended: what it played is gone until the daemon is started again",
+                "an emulated device has ended: restart the daemon to emulate it again",
                 device=entry[0],
                 status=entry[1].returncode,
             )

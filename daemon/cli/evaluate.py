@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation.load_delay import load_delay_warning
     from shearloop.daemon.analysis.evaluate import draw_tracks, estimate_in_worker, figures_of, invalid_reasons
     from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series
-    from shearloop.daemon.cli.recorded import check_kind, parsed_time_range
+    from shearloop.daemon.cli.options import check_kind, parse_time_range
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.workers import in_order, open_executor
 
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
-    start, stop = parsed_time_range(args.time_range)
+    start, stop = parse_time_range(args.time_range)
     named = [(path, one) for path in args.recordings for one in read_series(path)]
     check_kind(args.calibration, calibration, [one for _, one in named])
     parts = [part_of(one, start, stop) for _, one in named]

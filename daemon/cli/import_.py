@@ -1,20 +1,20 @@
-"""`shearloop import mat SRC… --out REC`: bring recordings made elsewhere into the project's format."""
+"""`shearloop import mat SRC… --out REC`: import recordings of other programs."""
 
 import argparse
 from pathlib import Path
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add a sub-parser per foreign format."""
+    """Add a sub-parser per format."""
     formats = parser.add_subparsers(dest="format", metavar="FORMAT", required=True)
     mat = formats.add_parser("mat", help="the paper's MATLAB streams", description="Import the paper's streams.")
     mat.add_argument("sources", nargs="+", type=Path, metavar="SRC", help=".mat files of one recording, or its folder")
     mat.add_argument("--out", type=Path, required=True, metavar="REC", help="recording to write, e.g. twist.mcap")
-    mat.add_argument("--json", action="store_true", help="print what came in as JSON")
+    mat.add_argument("--json", action="store_true", help="print the result as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Import and say what came in."""
+    """Import and print the counts."""
     import json
 
     from mcap.writer import MCAP0_MAGIC

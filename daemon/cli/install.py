@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from shearloop.daemon.service.installation import Step
+    from shearloop.daemon.service import Step
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +33,7 @@ def add_common_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Install the service and print each step."""
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.service.installation import find_program, install_steps
+    from shearloop.daemon.service import find_program, install_steps
 
     program = find_program() if args.program is None else args.program.absolute()
     if not program.is_file():

@@ -1,17 +1,16 @@
-"""`shearloop keys`: the keys of daemon and clients, for addresses that can be reached from the network."""
+"""`shearloop keys`: make and manage the CURVE keys of daemon and clients for network addresses."""
 
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.connection import own_key_folder
-from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.options import add_json, user_key_folder
 from shearloop.daemon.cli.output import print_result
 
 SERVER_FOLDER = Path("/etc/shearloop/keys")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add the five actions and their arguments."""
+    """Add the five actions."""
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
 
     def action(name: str, summary: str, folder: Path) -> argparse.ArgumentParser:
@@ -22,24 +21,24 @@ def configure(parser: argparse.ArgumentParser) -> None:
         add_json(added)
         return added
 
-    action("server", "make the daemon's keys, and the folder of allowed clients", SERVER_FOLDER)
-    action("client", "make your own keys, on the machine that you connect from", own_key_folder())
-    allow = action("allow", "let a client in", SERVER_FOLDER)
-    allow.add_argument("key", type=Path, metavar="FILE", help="the client's .key, which is no secret")
-    allow.add_argument("--name", help="what the client is called in the daemon's log (default: the file's name)")
-    revoke = action("revoke", "let a client in no more", SERVER_FOLDER)
-    revoke.add_argument("name", metavar="NAME", help="as `shearloop keys list` shows it")
+    action("server", "make the daemon's keys and the folder of allowed clients", SERVER_FOLDER)
+    action("client", "make your own keys, on the client's machine", user_key_folder())
+    allow = action("allow", "allow a client", SERVER_FOLDER)
+    allow.add_argument("key", type=Path, metavar="FILE", help="the client's .key, which is public")
+    allow.add_argument("--name", help="the client's name in the daemon's log (default: the file's name)")
+    revoke = action("revoke", "remove a client", SERVER_FOLDER)
+    revoke.add_argument("name", metavar="NAME", help="a name from `shearloop keys list`")
     action("list", "show the daemon's public key and the allowed clients", SERVER_FOLDER)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out one action and return the exit status."""
+    """Run one action and return the exit status."""
     {"server": _server, "client": _client, "allow": _allow, "revoke": _revoke, "list": _list}[args.action](args)
     return 0
 
 
 def _server(args: argparse.Namespace) -> None:
-    from shearloop.daemon.messaging.keys import cannot_write, make_key_pair
+    from shearloop.daemon.messaging.keys import make_key_pair, write_error
 
     public, secret = make_key_pair(args.dir, "server")
     clients = args.dir / "clients"
@@ -47,15 +46,15 @@ def _server(args: argparse.Namespace) -> None:
         clients.mkdir(exist_ok=True)
         clients.chmod(0o755)
     except OSError as error:
-        raise cannot_write(error) from error
+        raise write_error(error) from error
     sentences = [
-        f"{secret}: the daemon's secret key, for its eyes alone",
+        f"{secret}: the daemon's secret key; only the daemon may read it",
         f"{public}: give this file to every client, as ~/.config/shearloop/server.key",
         "next: `shearloop keys allow CLIENT.key` for each client, then add to the configuration:",
         f"curve: {{server_key: {secret}, clients: {clients}}}",
     ]
-    told = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
-    print_result(told, sentences, as_json=args.json)
+    content = {"secret_file": str(secret), "public_file": str(public), "clients": str(clients)}
+    print_result(content, sentences, as_json=args.json)
 
 
 def _client(args: argparse.Namespace) -> None:
@@ -63,16 +62,16 @@ def _client(args: argparse.Namespace) -> None:
 
     public, secret = make_key_pair(args.dir, "client")
     sentences = [
-        f"{secret}: your secret key, which never leaves this machine",
-        f"{public}: bring this file to the daemon's machine, and there `sudo shearloop keys allow FILE --name YOU`",
-        f"bring the daemon's server.key back, as {args.dir / 'server.key'}",
+        f"{secret}: your secret key; it never leaves this machine",
+        f"{public}: copy this file to the daemon's machine and run `sudo shearloop keys allow FILE --name YOU` there",
+        f"copy the daemon's server.key back to {args.dir / 'server.key'}",
     ]
     print_result({"secret_file": str(secret), "public_file": str(public)}, sentences, as_json=args.json)
 
 
 def _allow(args: argparse.Namespace) -> None:
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.messaging.keys import allowed_clients, cannot_write, load_public_key, write_public_key
+    from shearloop.daemon.messaging.keys import allowed_clients, load_public_key, write_error, write_public_key
 
     public = load_public_key(args.key)
     name, clients = args.name or args.key.stem, args.dir / "clients"
@@ -87,24 +86,24 @@ def _allow(args: argparse.Namespace) -> None:
             f"there is a client {name!r} already; choose another with --name, or revoke it first"
         ) from error
     except OSError as error:
-        raise cannot_write(error) from error
-    print_result({"allowed": name}, [f"{name} may connect from now on"], as_json=args.json)
+        raise write_error(error) from error
+    print_result({"allowed": name}, [f"{name} may connect now"], as_json=args.json)
 
 
 def _revoke(args: argparse.Namespace) -> None:
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.messaging.keys import allowed_clients, cannot_write
+    from shearloop.daemon.messaging.keys import allowed_clients, write_error
 
     clients = args.dir / "clients"
     _check_name(args.name)
     try:
         (clients / f"{args.name}.key").unlink()
     except FileNotFoundError as error:
-        known = ", ".join(sorted(allowed_clients(clients).values())) or "nobody"
-        raise UserError(f"there is no client {args.name!r}; allowed is {known}") from error
+        known = ", ".join(sorted(allowed_clients(clients).values())) or "none"
+        raise UserError(f"there is no client {args.name!r}; the allowed clients are {known}") from error
     except OSError as error:
-        raise cannot_write(error) from error
-    sentence = f"{args.name} may connect no more; restart the daemon to end a connection that is open"
+        raise write_error(error) from error
+    sentence = f"{args.name} may not connect any more; restart the daemon to end an open connection"
     print_result({"revoked": args.name}, [sentence], as_json=args.json)
 
 
@@ -115,7 +114,7 @@ def _list(args: argparse.Namespace) -> None:
     clients = {name: key.decode() for key, name in allowed_clients(args.dir / "clients").items()}
     sentences = [f"{server}  the daemon", *(f"{key}  {name}" for name, key in clients.items())]
     if not clients:
-        sentences.append("nobody may connect yet; see `shearloop keys allow`")
+        sentences.append("no client may connect yet; see `shearloop keys allow`")
     print_result({"server": server, "clients": clients}, sentences, as_json=args.json)
 
 

@@ -1,9 +1,8 @@
-"""What the operator types, one line at a time, while the event loop goes on; a pipe or a file answers as well."""
+"""Lines that the operator types while the event loop runs; a pipe or a file works too."""
 
 import asyncio
 import os
 import sys
-from types import TracebackType
 from typing import Self
 
 STDIN = 0
@@ -14,31 +13,29 @@ class Operator:
     """The person at the terminal, as an asynchronous context."""
 
     def __init__(self, *, stdout_is_for_json: bool = False) -> None:
-        """Nothing has been typed yet; what is said goes to stderr where stdout is for a result alone."""
+        """Print to stdout, or to stderr if stdout is for a result in JSON."""
         self._out = sys.stderr if stdout_is_for_json else sys.stdout
-        self._begun = b""
+        self._partial = b""
         self._lines: asyncio.Queue[str | None] = asyncio.Queue()
         self._watching = False
 
     async def __aenter__(self) -> Self:
-        """Begin to listen."""
+        """Start reading."""
         try:
             asyncio.get_running_loop().add_reader(STDIN, self._read)
             self._watching = True
         except PermissionError:
-            # A file cannot be waited for, and need not be: it never blocks.
+            # epoll refuses a file; reading a file never blocks.
             while self._read():
                 pass
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Listen no more."""
+    async def __aexit__(self, *_: object) -> None:
+        """Stop reading."""
         self._stop()
 
     async def ask(self, prompt: str) -> str:
-        """Return the line that is typed after the prompt; UserError when the input has ended."""
+        """Print the prompt and return the next line; raise UserError at the end of the input."""
         from shearloop.daemon.errors import UserError
 
         self.say(prompt)
@@ -49,14 +46,14 @@ class Operator:
         return line
 
     def say(self, sentence: str) -> None:
-        """Print a sentence that asks for nothing."""
+        """Print a sentence."""
         print(sentence, file=self._out, flush=True)
 
     def _read(self) -> bool:
         data = os.read(STDIN, READ_BYTES)
-        *lines, self._begun = (self._begun + data).split(b"\n")
-        # No answer is as long as this.
-        self._begun = self._begun[-READ_BYTES:]
+        *lines, self._partial = (self._partial + data).split(b"\n")
+        # An unfinished line must not grow without limit.
+        self._partial = self._partial[-READ_BYTES:]
         for line in lines:
             self._lines.put_nowait(line.decode(errors="replace").strip())
         if not data:

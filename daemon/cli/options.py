@@ -1,10 +1,18 @@
-"""Options that several commands share, and the check of `--out`."""
+"""Options that several commands share, and their checks."""
 
 import argparse
 import codecs
+import os
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.addresses import needs_keys
+
+if TYPE_CHECKING:
+    from shearloop.bank.estimation import Calibration, FrameSeries
+    from shearloop.daemon.messaging.keys import ClientKeys
 
 # Longer than the 124 characters of text at the start of a MATLAB file.
 _HEAD_BYTES = 512
@@ -25,6 +33,75 @@ def add_cluster(parser: argparse.ArgumentParser) -> None:
         help="run on the Dask scheduler at this address, such as tcp://host:8786; without an address: on processes of "
         "this computer",
     )
+
+
+def add_connection(parser: argparse.ArgumentParser, default: str, purpose: str) -> None:
+    """Add `--connect`, `--key` and `--server-key`; `purpose` describes the address."""
+    parser.add_argument("--connect", default=default, metavar="ADDRESS", help=f"{purpose} (default: %(default)s)")
+    parser.add_argument(
+        "--key", type=Path, metavar="FILE", help="your .key_secret, for a daemon on the network (default: in ~/.config)"
+    )
+    parser.add_argument("--server-key", type=Path, metavar="FILE", help="that daemon's .key (default: in ~/.config)")
+
+
+def user_key_folder() -> Path:
+    """Return the folder of the user's keys."""
+    home = os.environ.get("XDG_CONFIG_HOME")
+    return (Path(home) if home else Path.home() / ".config") / "shearloop"
+
+
+def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
+    """Return the keys for the address, None for an address on this machine; raises UserError for missing keys."""
+    if args.key is None and args.server_key is None and not needs_keys(args.connect):
+        return None
+    from shearloop.daemon.messaging.keys import ClientKeys, load_key_pair, load_public_key
+
+    folder = user_key_folder()
+    key = args.key or folder / "client.key_secret"
+    server_key = args.server_key or folder / "server.key"
+    for path, option, cure in (
+        (key, "--key", "make one with `shearloop keys client`"),
+        (server_key, "--server-key", "copy the daemon's server.key there"),
+    ):
+        if not path.exists():
+            raise UserError(
+                f"{args.connect} is not on this machine, and there is no key {path}: {cure}, or give {option}"
+            )
+    return ClientKeys(load_key_pair(key), load_public_key(server_key))
+
+
+def parse_time_range(text: str) -> tuple[float, float]:
+    """Return the shares of FROM:TO; raises UserError unless 0 ≤ FROM < TO ≤ 1."""
+    try:
+        start, stop = (float(share) for share in text.split(":"))
+    except ValueError as error:
+        raise UserError(f"--time-range must be two shares such as 0.5:1, not {text!r}") from error
+    if not 0 <= start < stop <= 1:
+        raise UserError(f"--time-range must rise from 0 or more to 1 or less, not {text!r}")
+    return start, stop
+
+
+def parse_sides(text: str | None) -> tuple[str, ...] | None:
+    """Return the sides of SIDE[,SIDE], None for no option; raises UserError for an unknown side."""
+    from shearloop.daemon.recording.schema import SIDES
+
+    if text is None:
+        return None
+    sides = tuple(text.split(","))
+    if not set(sides) <= set(SIDES) or len(set(sides)) < len(sides):
+        raise UserError(f"--sides must be {' or '.join(SIDES)}, or both with a comma between, not {text!r}")
+    return sides
+
+
+def check_kind(path: Path, calibration: "Calibration", series: "Sequence[FrameSeries]") -> None:
+    """Raise UserError for a calibration of slices with raw frames, and for the reverse."""
+    kinds = {"raw": "raw frames", "difference": "slices"}
+    other = next((one.kind for one in series if one.kind != calibration.kind), None)
+    if other is not None:
+        raise UserError(
+            f"{path} was made from {kinds[calibration.kind]}, and cannot judge {kinds[other]}; "
+            "calibrate on recordings of the same kind"
+        )
 
 
 def check_overwrite(out: Path, kind: str, begins: bytes | None = None) -> None:

@@ -14,9 +14,9 @@ def run(args: argparse.Namespace) -> int:
     import json
     from dataclasses import asdict
 
-    from shearloop.daemon.ports import ports_there
+    from shearloop.daemon.serial_ports import list_serial_ports
 
-    ports = ports_there()
+    ports = list_serial_ports()
     if args.json:
         print(json.dumps([{**asdict(port), "named_by": port.named_by} for port in ports], ensure_ascii=False))
         return 0
@@ -27,6 +27,6 @@ def run(args: argparse.Namespace) -> int:
         print(f"    device: {port.named_by}")
         if not port.serial_number:
             print("    it has no serial number: leave it in the same socket")
-        if port.trouble:
-            print(f"    {port.trouble}")
+        if port.error:
+            print(f"    {port.error}")
     return 0

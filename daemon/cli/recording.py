@@ -1,4 +1,4 @@
-"""`shearloop recording info|repair|export`: look into recordings, save what was not closed, make tables of them."""
+"""`shearloop recording info|repair|export`: show the content of recordings, repair them, export tables."""
 
 import argparse
 import json
@@ -9,23 +9,25 @@ from shearloop.daemon.cli.options import add_json
 from shearloop.daemon.cli.output import print_result, progress_bar
 
 if TYPE_CHECKING:
-    from shearloop.daemon.recording.summary import Summary
+    from shearloop.daemon.recording.repair import RecordingSummary
 
 FORMS = ("csv", "parquet", "mat")
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
-    """Add a sub-parser for each of the three."""
+    """Add a sub-parser for each action."""
     parts = parser.add_subparsers(dest="part", metavar="WHAT", required=True)
-    info = parts.add_parser("info", help="what is in it", description="Say what is in recordings, closed or not.")
+    info = parts.add_parser(
+        "info", help="show its content", description="Show the content of recordings, closed or not."
+    )
     info.add_argument("recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap or .mcap.partial)")
-    info.add_argument("--json", action="store_true", help="one JSON object a recording")
+    info.add_argument("--json", action="store_true", help="one JSON object per recording")
     repair = parts.add_parser(
         "repair",
-        help="save what is sound of one that was not closed",
-        description="Copy what is sound of a recording that was not closed, or is damaged, into one with an index.",
+        help="save the intact part of one that was not closed",
+        description="Copy the intact part of a recording that was not closed, or is damaged, into a new one.",
     )
-    repair.add_argument("recording", type=Path, metavar="REC", help="e.g. NAME.mcap.partial; it stays as it is")
+    repair.add_argument("recording", type=Path, metavar="REC", help="e.g. NAME.mcap.partial; it is not changed")
     repair.add_argument(
         "--out", type=Path, metavar="FILE", help="recording to write (default: NAME.mcap, or NAME.repaired.mcap)"
     )
@@ -34,30 +36,30 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "export", help="as CSV, Parquet or for MATLAB", description="Write a recording's topics as tables."
     )
     export.add_argument("recording", type=Path, metavar="REC", help="a recording (.mcap or .mcap.partial)")
-    export.add_argument("--format", choices=FORMS, default="csv", help="of the tables (default: %(default)s)")
+    export.add_argument("--format", choices=FORMS, default="csv", help="format of the tables (default: %(default)s)")
     export.add_argument(
-        "--out", type=Path, metavar="PATH", help="a folder for a file per topic; for mat a file (default: beside REC)"
+        "--out", type=Path, metavar="PATH", help="folder of one file per topic; for mat a file (default: next to REC)"
     )
-    export.add_argument("--topic", action="append", metavar="TOPIC", help="only this topic; may be given several times")
+    export.add_argument("--topic", action="append", metavar="TOPIC", help="export only this topic; repeatable")
     add_json(export)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do one of the three."""
+    """Run one action."""
     return {"info": _info, "repair": _repair, "export": _export}[args.part](args)
 
 
 def _info(args: argparse.Namespace) -> int:
-    from shearloop.daemon.recording.summary import summarise
+    from shearloop.daemon.recording.repair import summarise
 
     for path in args.recordings:
         with progress_bar(path.name, path.stat().st_size if path.is_file() else 0, "B") as progress:
             found = summarise(path, progress)
-        print(json.dumps(found.as_map(), ensure_ascii=False) if args.json else _told(found))
+        print(json.dumps(found.as_map(), ensure_ascii=False) if args.json else _summary_text(found))
     return 0
 
 
-def _told(found: "Summary") -> str:
+def _summary_text(found: "RecordingSummary") -> str:
     from datetime import datetime
 
     from shearloop.daemon.recording.identity import software_version
@@ -65,65 +67,65 @@ def _told(found: "Summary") -> str:
     lines = [str(found.path)]
     if found.first_ns is not None:
         began = datetime.fromtimestamp(found.first_ns / 1e9).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
-        lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.size / 1e6:.2f} MB")
-    lines.append(f"  source   {found.metadata.get('source', 'unknown: it is no recording of shearloop')}")
+        lines.append(f"  from     {began}, {found.duration_s:.1f} s, {found.condition.size / 1e6:.2f} MB")
+    lines.append(f"  source   {found.metadata.get('source', 'unknown: not a recording of shearloop')}")
     lines += [f"  ran      {name}" for name in found.experiments]
-    lines += [f"  tool     of {found.tool_mm} mm"] if found.tool_mm is not None else []
+    lines += [f"  tool     {found.tool_mm} mm"] if found.tool_mm is not None else []
     if software := found.metadata.get("software"):
-        here = "the same code as here" if found.same_code else f"other code than here ({software_version()})"
+        here = "the same code as here" if found.same_code else f"different code from here ({software_version()})"
         lines.append(f"  made by  shearloop {software}, {here}")
     for name, topic in sorted(found.topics.items()):
         rate = "" if topic.rate_hz is None else f"{topic.rate_hz:8.2f} Hz"
         lines.append(f"  {name:<20} {topic.messages:>8} messages {rate}")
     lines += [f"  attached {name}" for name in found.attachments]
-    if not found.closed:
+    if not found.condition.closed:
         lines.append(
-            f"  It was not closed, or is still being written; {found.torn_bytes} bytes at its end are torn. "
+            f"  It was not closed, or is still being written; {found.condition.torn_bytes} bytes are incomplete. "
             f"`shearloop recording repair {found.path}` makes an indexed copy."
         )
-    if found.damaged_chunks:
-        lines.append(f"  {found.damaged_chunks} chunks are damaged and were left out.")
+    if found.condition.damaged_chunks:
+        lines.append(f"  {found.condition.damaged_chunks} chunks are damaged and left out.")
     if found.dropped:
-        lines.append(f"  {found.dropped} messages were dropped, because the disk did not take them in time.")
+        lines.append(f"  {found.dropped} messages were dropped because the disk was too slow.")
     return "\n".join(lines)
 
 
 def _repair(args: argparse.Namespace) -> int:
-    from shearloop.daemon.recording.repair import condition_of, repair
+    from shearloop.daemon.recording.repair import FileCondition, repair
 
-    size = condition_of(args.recording).size
+    size = FileCondition.of_file(args.recording).size
     with progress_bar(args.recording.name, size, "B") as progress:
-        repaired = repair(args.recording, args.out, progress)
-    condition = repaired.condition
-    lost = [f"{condition.torn_bytes} torn bytes at the end"] if condition.torn_bytes else []
+        result = repair(args.recording, args.out, progress)
+    condition = result.condition
+    lost = [f"{condition.torn_bytes} incomplete bytes at the end"] if condition.torn_bytes else []
     if condition.damaged_chunks:
         lost.append(f"{condition.damaged_chunks} damaged chunks")
-    told = {
-        "path": str(repaired.path),
-        "messages": repaired.messages,
+    content = {
+        "path": str(result.path),
+        "messages": result.messages,
         "torn_bytes": condition.torn_bytes,
         "damaged_chunks": condition.damaged_chunks,
     }
-    sentence = f"{repaired.path}: {repaired.messages} messages are safe; left out: {' and '.join(lost) or 'nothing'}."
-    print_result(told, [sentence], as_json=args.json)
+    sentence = f"{result.path}: {result.messages} messages are saved; left out: {' and '.join(lost) or 'nothing'}."
+    print_result(content, [sentence], as_json=args.json)
     return 0
 
 
 def _export(args: argparse.Namespace) -> int:
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
-    from shearloop.daemon.recording.export import export, topics_of
+    from shearloop.daemon.recording.export import count_messages, export
 
     stem = args.recording.name.partition(".mcap")[0]
     out = args.out or args.recording.with_name(f"{stem}.mat" if args.format == "mat" else f"{stem}_{args.format}")
     if args.format == "mat":
         check_overwrite(out, "a MATLAB file", b"MATLAB")
-    there = topics_of(args.recording)
-    unknown = [topic for topic in args.topic or () if topic not in there]
+    counts = count_messages(args.recording)
+    unknown = [topic for topic in args.topic or () if topic not in counts]
     if unknown:
-        raise UserError(f"{args.recording} has no topic {unknown[0]!r}; it has {', '.join(sorted(there))}")
-    topics = args.topic or sorted(topic for topic, count in there.items() if count)
-    with progress_bar(args.format, sum(there[topic] for topic in topics), "message") as progress:
+        raise UserError(f"{args.recording} has no topic {unknown[0]!r}; it has {', '.join(sorted(counts))}")
+    topics = args.topic or sorted(topic for topic, count in counts.items() if count)
+    with progress_bar(args.format, sum(counts[topic] for topic in topics), "message") as progress:
         done = 0
 
         def count(step: int) -> None:

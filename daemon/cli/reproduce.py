@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     if jobs < 1:
         raise UserError(f"--jobs must be 1 or more, not {jobs}")
     try:
-        from shearloop.daemon.analysis.reproduce.figures import draw_all
+        from shearloop.daemon.analysis.reproduce.report import draw_all
     except ModuleNotFoundError as error:
         raise UserError(f"the figures need {error.name}; install it with `pip install 'shearloop[plot]'`") from error
     from shearloop.daemon.analysis.reproduce.report import json_text, save_calibrations, table, write_json
@@ -68,10 +68,10 @@ def _reproduce(args: argparse.Namespace, jobs: int) -> "tuple[Reproduction, dict
         analyse_diameter,
         analyse_torque,
         match_slices,
+        read_inputs,
         score_models,
     )
     from shearloop.daemon.analysis.reproduce.banks import GRIDS, cached_bank, choose_mesh, focused_grid
-    from shearloop.daemon.analysis.reproduce.inputs import read_inputs
     from shearloop.daemon.analysis.reproduce.report import Reproduction, moved_focus
 
     inputs = read_inputs(args.recordings)

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from shearloop.daemon.cli.demonstration import Truth
+    from shearloop.daemon.cli.demonstration import TruthFile
     from shearloop.daemon.config import EmulatorConfig
+    from shearloop.daemon.logs import NonBlockingWriter
     from shearloop.daemon.messaging.publisher import Listener
-    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
 
 # An emulator needs some of it to remove its port's link; a clean stop takes less than a second in all.
 EMULATOR_STOP_S = 0.5
@@ -46,9 +46,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run until a signal, `shearloop command stop`, or the end of the experiment (`stop_when_done`)."""
-    from shearloop.daemon.gc_control import kept_from_lasting_objects
-    from shearloop.daemon.logs import logging_to_stderr
-    from shearloop.daemon.nonblocking_writer import NonBlockingWriter
+    from shearloop.daemon.gc_control import without_long_collections
+    from shearloop.daemon.logs import NonBlockingWriter, logging_to_stderr
     from shearloop.daemon.signals import ending_signals
 
     # Until the event loop handles the signals: stopping a service that is still starting is no failure.
@@ -56,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         if number != signal.SIGINT:
             signal.signal(number, lambda *_: sys.exit(0))
     with (
-        kept_from_lasting_objects() as on_ready,
+        without_long_collections() as on_ready,
         logging_to_stderr(json_lines=args.json_log) as log,
         closing(NonBlockingWriter(sys.stdout)) as out,
     ):
@@ -70,12 +69,12 @@ def _run(
 
     from shearloop.daemon.app import run_daemon
     from shearloop.daemon.cli import EXIT_OK, EXIT_UNFINISHED
-    from shearloop.daemon.cli.demonstration import Deaths, Happenings, Truth
-    from shearloop.daemon.cli.message_lines import EstimatePrinter
+    from shearloop.daemon.cli.demonstration import EmulatorMonitor, EventInjector, TruthFile
+    from shearloop.daemon.cli.output import EstimatePrinter
     from shearloop.daemon.config import RecordingConfig, load_daemon_config
     from shearloop.daemon.errors import UserError
+    from shearloop.daemon.realtime import high_priority, lock_memory
     from shearloop.daemon.run_summary import RunSummary
-    from shearloop.daemon.service.realtime import high_priority, lock_memory
 
     config = load_daemon_config(args.config)
     emulators = config.emulators
@@ -87,14 +86,14 @@ def _run(
         lock_memory()
     options = check_emulators(emulators, args.config)
     if args.recording is not None:
-        from shearloop.daemon.recording.matlab_streams import read_stream
+        from shearloop.daemon.recording.matlab import read_stream
 
         for emulator, given in zip(emulators, options, strict=True):
             if emulator.device == "eit-kit":
                 # Without its frames the daemon would wait forever.
                 read_stream(args.recording, given.side)
     listeners: list[Listener] = []
-    diagnostics = {"log": log.facts, "shown": out.facts}
+    diagnostics = {"log": log.diagnostics, "shown": out.diagnostics}
     with ExitStack() as stack:
         slices = None
         if args.slices is not None:
@@ -104,13 +103,13 @@ def _run(
             slices = SliceRecorder(args.slices)
             stack.callback(slices.close)
             listeners.append(slices)
-            diagnostics["slices"] = slices.facts
-        truth = stack.enter_context(closing(Truth(emulators)))
+            diagnostics["slices"] = slices.diagnostics
+        truth = stack.enter_context(closing(TruthFile(emulators)))
         # Without permission the loop still detects late commands and holds the wrist.
         stack.enter_context(high_priority() if config.robot is not None else nullcontext())
         processes = stack.enter_context(_run_emulators(emulators, args.config.parent, args.recording, truth))
-        happenings = Happenings(emulators, processes)
-        listeners += [Deaths(emulators, processes), happenings]
+        events = EventInjector(emulators, processes)
+        listeners += [EmulatorMonitor(emulators, processes), events]
         if processes:
             # The daemon does not know about emulation and will report missing devices.
             structlog.get_logger().info(
@@ -119,7 +118,7 @@ def _run(
             )
         if args.show:
             summary = RunSummary(
-                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: happenings.happened
+                lambda lines: out.write("\n".join(("", *lines, "", ""))), truth.torques, lambda: events.sent
             )
             listeners += [EstimatePrinter(out), summary]
         finished = asyncio.run(run_daemon(config, tuple(listeners), diagnostics, on_ready))
@@ -150,7 +149,7 @@ def check_emulators(emulators: "tuple[EmulatorConfig, ...]", config: Path) -> li
 
 @contextmanager
 def _run_emulators(
-    emulators: "tuple[EmulatorConfig, ...]", folder: Path, recording: Path | None, truth: "Truth"
+    emulators: "tuple[EmulatorConfig, ...]", folder: Path, recording: Path | None, truth: "TruthFile"
 ) -> Iterator[list["subprocess.Popen[bytes]"]]:
     """Run the configuration's emulated devices, each in a process."""
     processes: list[subprocess.Popen[bytes]] = []

@@ -1,4 +1,4 @@
-"""`shearloop skin`: hold the shear skin's models against its paper, and calibrate a skin from a recorded table."""
+"""`shearloop skin`: compare the shear skin's models with its paper, and calibrate a skin from a recorded table."""
 
 import argparse
 import json
@@ -18,7 +18,7 @@ COLUMNS = ("quantity", "unit", "paper: computed", "measured", "closed form", "1-
 EXPLANATION = """\
 Sensitivity: least squares through the origin over one loading in 0.1 N steps, from the first step up to Fn.
 1-D: membrane with the paper's own F/(EA). 2-D: plane strain, 112 elements, nothing tuned; w = 20 mm is assumed.
-Synthetic: the paper's measured figure was put into a synthetic recording; this is what the estimator found in it."""
+Synthetic: the estimator's result on a synthetic recording with the paper's measured value."""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -26,8 +26,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     characterise = actions.add_parser(
         "characterise",
-        help="print the paper's table beside the models'",
-        description="Print the paper's table beside the models'.",
+        help="compare the paper's table with the models'",
+        description="Compare the paper's table with the models'.",
     )
     characterise.add_argument("--out", type=Path, metavar="DIR", help="draw figures 5, 6 and 7 here, PNG and SVG")
     add_json(characterise)
@@ -35,15 +35,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "calibrate", help="fit a calibration to a recorded table", description="Fit a calibration to a recorded table."
     )
     calibrate.add_argument("table", type=Path, metavar="TABLE", help="CSV with r1_ohm, r2_ohm, shear_n, normal_n")
-    calibrate.add_argument("--out", type=Path, required=True, metavar="YAML", help="where the calibration goes")
+    calibrate.add_argument("--out", type=Path, required=True, metavar="YAML", help="the calibration file to write")
     calibrate.add_argument(
-        "--friction", type=float, metavar="MU", help="coefficient of friction, where the table cannot tell it"
+        "--friction", type=float, metavar="MU", help="coefficient of friction, if the table does not determine it"
     )
     add_json(calibrate)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Carry out the action asked for."""
+    """Run the action."""
     return _characterise(args.out, args.json) if args.action == "characterise" else _calibrate(args)
 
 
@@ -53,8 +53,8 @@ def _characterise(out: Path | None, as_json: bool) -> int:
     from shearloop.bank.skin.characterisation import characterise
 
     if out is not None:
-        # Before the work: a missing library is then told at once.
-        from shearloop.daemon.cli.skin_figures import draw
+        # First, to report a missing library at once.
+        from shearloop.daemon.analysis.charts.skin_figures import draw
     found = characterise(np.random.default_rng(SEED))
     if as_json:
         print(json.dumps([asdict(row) for row in found.rows], indent=1, ensure_ascii=False))
@@ -99,8 +99,8 @@ def _calibrate(args: argparse.Namespace) -> int:
     except CalibrationError as error:
         raise UserError(f"{args.table}: {error}") from error
     save_calibration(calibration, args.out)
-    whence = "fitted" if args.friction is None else "given"
-    told = {
+    source = "fitted" if args.friction is None else "given"
+    result = {
         "path": str(args.out),
         "friction": calibration.friction,
         "friction_given": args.friction is not None,
@@ -112,7 +112,7 @@ def _calibrate(args: argparse.Namespace) -> int:
         "rows_beyond": calibration.rows_beyond,
     }
     sentences = [
-        f"friction coefficient ({whence})        {calibration.friction:.4f}",
+        f"friction coefficient ({source})        {calibration.friction:.4f}",
         f"response per N of gauge tension      {calibration.slope_per_n:.4f} 1/N",
         f"95 % prediction interval             ± {calibration.prediction_half_width_n:.4f} N",
         f"straight to {calibration.linear_to_n} N; tension calibrated  "
@@ -121,5 +121,5 @@ def _calibrate(args: argparse.Namespace) -> int:
         f"rows left out beyond the curve       {calibration.rows_beyond}",
         f"written: {args.out}",
     ]
-    print_result(told, sentences, as_json=args.json)
+    print_result(result, sentences, as_json=args.json)
     return 0

@@ -10,7 +10,7 @@ __all__ = ["configure", "run"]
 
 def run(args: argparse.Namespace) -> int:
     """Remove everything that `install` added and print each step; your own files stay."""
-    from shearloop.daemon.service.installation import uninstall_steps
+    from shearloop.daemon.service import uninstall_steps
 
     root = args.root.absolute()
     return run_steps(uninstall_steps(root, running=systemd_runs(root)), root, args)

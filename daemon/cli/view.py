@@ -3,7 +3,7 @@
 import argparse
 from pathlib import Path
 
-from shearloop.daemon.cli.connection import add_connection, client_keys
+from shearloop.daemon.cli.options import add_connection, client_keys
 from shearloop.daemon.messaging.addresses import COMMAND_ADDRESS, PUBLISH_ADDRESS, needs_keys, stop_address
 
 PORT = 7760

@@ -1,70 +1,70 @@
-"""The experiment that a configuration names: begun once, as soon as it can be, unless somebody calls it off."""
+"""Starts the configured experiment as soon as it can begin, unless the operator starts or stops one first."""
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable
+import os
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 
 import structlog
 
 from shearloop.daemon.control.step_runner import Experiment, ExperimentPhase
-from shearloop.daemon.crash_marker import CrashMarker
 
-# How often a start that was refused is tried again.
+# Interval between attempts to start.
 START_RETRY_S = 0.5
-# A daemon that ends waits no longer than this to be told of the experiment's end; where the loop is dead it is not.
-TOLD_WITHIN_S = 0.2
+# The daemon's end waits this long for the experiment's end; a dead loop does not report it.
+ENDED_WITHIN_S = 0.2
 
 
 class ConfiguredExperiment:
-    """Begins the experiment by itself, and sees it to its end."""
+    """Starts one experiment automatically and waits for its end."""
 
     def __init__(
-        self, path: Path, begin: Callable[[Path], Awaitable[str | None]], ended: Callable[[], Awaitable[Experiment]]
+        self, path: Path, start: Callable[[Path], Awaitable[str | None]], ended: Callable[[], Awaitable[Experiment]]
     ) -> None:
-        """Take what begins an experiment or returns why not, and what returns the one that runs once it has ended."""
+        """`start` begins an experiment or returns why not; `ended` returns the next experiment that has ended."""
         self.path = path
         self.done = False
-        self._begin = begin
-        self._ended = ended
         self.begun = False
-        # Whether it is the operator's to begin it, if anybody's.
+        # Only the operator may start it.
         self.left_to_operator = False
+        self._start = start
+        self._ended = ended
         self._awaited = self._called_off = False
-        self._begun_now = asyncio.Event()
-        # Set unless an experiment is seen to its end, of which it has not been told yet.
-        self._told = asyncio.Event()
-        self._told.set()
-        self._mark = CrashMarker()
+        self._has_begun = asyncio.Event()
+        # Cleared while a running experiment has not reported its end.
+        self._end_reported = asyncio.Event()
+        self._end_reported.set()
+        self._crash_marker = CrashMarker()
 
     async def run(self) -> None:
-        """Begin it as soon as it can be begun, and return when it has ended or does not begin by itself."""
-        log, told = structlog.get_logger().bind(experiment=str(self.path)), ""
-        if self._mark.left_behind and not self._called_off:
+        """Start the experiment once, and return at its end, or if only the operator may start it."""
+        log, logged = structlog.get_logger().bind(experiment=str(self.path)), ""
+        if self._crash_marker.left_behind and not self._called_off:
             log.warning(
-                "the daemon before this one died after it had begun an experiment: this one waits for "
+                "the previous daemon crashed after it had started an experiment: this one waits for "
                 "`shearloop command start`"
             )
             self._called_off = True
-        # Begun once: by us or by hand, and whatever becomes of this task. What was called off stays so.
+        # After a crash of this task, an experiment that has begun or was called off is not started again.
         self._awaited = not (self.begun or self._called_off)
         while self._awaited:
-            why = await self._begin(self.path)
-            if why is not None:
-                if why != told:
-                    log.info("waiting to start", why=why)
-                    told = why
+            reason = await self._start(self.path)
+            if reason is not None:
+                if reason != logged:
+                    log.info("waiting to start", reason=reason)
+                    logged = reason
                 await asyncio.sleep(START_RETRY_S)
         self.left_to_operator = not self.begun
         if self.left_to_operator:
-            log.info("it begins by `shearloop command start` alone")
+            log.info("it starts by `shearloop command start` only")
             return
-        await self.begun_and_ended()
+        await self.wait_for_end()
 
-    async def begun_and_ended(self) -> None:
-        """Wait until it is begun, by hand where it does not begin by itself, and return when it has ended."""
-        await self._begun_now.wait()
-        self._told.clear()
+    async def wait_for_end(self) -> None:
+        """Wait until it has begun, automatically or by hand, and has ended."""
+        await self._has_begun.wait()
+        self._end_reported.clear()
         try:
             experiment = await self._ended()
             self.done = experiment.phase is ExperimentPhase.DONE
@@ -72,31 +72,63 @@ class ConfiguredExperiment:
                 "the experiment has ended",
                 experiment=str(self.path),
                 phase=experiment.phase.value,
-                why=experiment.stop_reason,
+                reason=experiment.stop_reason,
             )
         finally:
-            self._told.set()
+            self._end_reported.set()
 
-    async def told(self) -> None:
-        """Wait until the end of the experiment is told, where it has begun and has ended just now."""
+    async def wait_for_report(self) -> None:
+        """Wait briefly for the report of an experiment that has just ended."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(TOLD_WITHIN_S):
-                await self._told.wait()
+            async with asyncio.timeout(ENDED_WITHIN_S):
+                await self._end_reported.wait()
 
-    def has_begun(self, path: Path) -> None:
-        """Take note that an experiment has begun: this one does no more by itself, whichever it was."""
-        self._mark.set()
+    def on_begun(self, path: Path) -> None:
+        """Note that an experiment has begun; no other starts automatically afterwards."""
+        self._crash_marker.set()
         self._awaited, self._called_off = False, True
         if path.resolve() == self.path.resolve():
             self.begun = True
-            self._begun_now.set()
+            self._has_begun.set()
 
-    def give_up(self) -> Path | None:
-        """Begin it no more, and return it; None where it was not waited for."""
+    def call_off(self) -> Path | None:
+        """Cancel the automatic start; return the experiment, or None if it was not awaited."""
         awaited, self._awaited = self._awaited, False
         self._called_off |= awaited
         return self.path if awaited else None
 
-    def end(self) -> None:
-        """Take note that the daemon ends in good order."""
-        self._mark.clear()
+    def close(self) -> None:
+        """Note the daemon's normal end."""
+        self._crash_marker.clear()
+
+
+class CrashMarker:
+    """A file in systemd's runtime folder that exists while an experiment may have moved something.
+
+    systemd restarts a crashed daemon, and the operator's last command is lost with the crash: the marker keeps the new
+    daemon from starting its experiment. Without a runtime folder, as at a terminal, there is no marker.
+    """
+
+    def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
+        # systemd separates several folders with colons; ours is one.
+        folder = environment.get("RUNTIME_DIRECTORY", "").partition(":")[0]
+        self._path = Path(folder) / "begun" if folder else None
+        self.left_behind = self._path is not None and self._path.exists()
+
+    def set(self) -> None:
+        """Note that an experiment has begun."""
+        if self._path is None:
+            return
+        try:
+            self._path.touch()
+        except OSError as error:
+            structlog.get_logger().warning(
+                "cannot write the crash marker: a daemon restarted after a crash would start its experiment again",
+                path=str(self._path),
+                reason=error.strerror,
+            )
+
+    def clear(self) -> None:
+        """Note the daemon's normal end."""
+        if self._path is not None:
+            self._path.unlink(missing_ok=True)

@@ -110,13 +110,14 @@ class ControlLoop:
         """Begin an experiment; return None, or why it cannot begin."""
         if self.experiment is not None and self.experiment.running:
             return f"the experiment {self.experiment.file.name!r} is still running; stop it first"
-        if file.drive not in self._wrists:
-            return f"`drive: {file.drive}` is not a measured torque; choose one of {', '.join(self._wrists)}"
+        if file.torque_source not in self._wrists:
+            known = ", ".join(self._wrists)
+            return f"`torque_source: {file.torque_source}` is not a measured torque; choose one of {known}"
         if self.safety.stopped:
             return f"a stop has not been acknowledged: {' '.join(self.status.decision.reasons)}"
         refusals = [
             fault.sentence
-            for fault in self._faults(file.limits, file.drive, t_ns)
+            for fault in self._faults(file.limits, file.torque_source, t_ns)
             if fault.rule.response >= Response.REFUSE_START
         ]
         if refusals:
@@ -195,7 +196,7 @@ class ControlLoop:
         """Return the commands for now."""
         experiment, arm = self.experiment, self.inputs.arm
         limits = experiment.limits if experiment is not None else NO_LIMITS
-        drive = experiment.file.drive if experiment is not None else next(iter(self._wrists))
+        drive = experiment.file.torque_source if experiment is not None else next(iter(self._wrists))
         found = [*self._faults(limits, drive, t_ns), *self._refusals]
         self._refusals.clear()
         if self._release_error:
@@ -225,7 +226,7 @@ class ControlLoop:
     def _driving_wrist(self) -> WristController:
         if self.experiment is None:
             return next(iter(self._wrists.values()))
-        return self._wrists[self.experiment.file.drive]
+        return self._wrists[self.experiment.file.torque_source]
 
     def _uncertain_gripper(self) -> GripperStatus | None:
         """Return the gripper's state if it cannot say whether it holds a tool, else None."""
@@ -237,7 +238,7 @@ class ControlLoop:
         held = decision.response is Response.HOLD
         if self._origin_rad is None:
             self._origin_rad = wrist_rad
-        latest = self.inputs.torques.get(experiment.file.drive)
+        latest = self.inputs.torques.get(experiment.file.torque_source)
         context = StepContext(
             wrist_rad - self._origin_rad,
             latest.torque_nm if latest is not None and not held else None,

@@ -171,7 +171,7 @@ class ExperimentFile(_Section):
     """One experiment: its torque source, its limits and its steps in order."""
 
     name: Annotated[str, Field(min_length=1, max_length=80)]
-    drive: Annotated[str, Field(min_length=1)] = Field(
+    torque_source: Annotated[str, Field(min_length=1)] = Field(
         "right", description="torque that drives the loop: a fingertip's name, `skin`, `load_cell` or `wrench`"
     )
     limits: ExperimentLimits = ExperimentLimits()

@@ -7,7 +7,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentLimits
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopInputs, TorqueSource
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.settings import LoopConfig
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, stale_after_s
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, stale_after_s
 
 # 2.5 periods of their topics.
 ARM_STALE_S = stale_after_s("robot.state")
@@ -77,7 +77,7 @@ def _torque_faults(inputs: LoopInputs, watched: MonitorInputs, config: LoopConfi
     latest = inputs.torques.get(source.name)
     if driving or latest is None or latest.torque_nm is None:
         return found
-    if watched.expected_nm is not None and abs(latest.torque_nm - watched.expected_nm) > config.jump_nm:
+    if watched.expected_nm is not None and abs(latest.torque_nm - watched.expected_nm) > config.max_innovation_nm:
         jumped = f"{source.name} measured {latest.torque_nm:+.3f} N·m where {watched.expected_nm:+.3f} N·m was expected"
         found.append(Fault(FaultCode.ESTIMATE_JUMPED, jumped))
     for other in watched.supervising:
@@ -120,7 +120,7 @@ def _stale(inputs: LoopInputs, source: TorqueSource, config: LoopConfig, t_ns: i
 
 def _fresh_for_s(source: TorqueSource, config: LoopConfig) -> float:
     """Return how long after its arrival a torque is fresh."""
-    return max(STALE_AFTER_PERIODS * source.period_s, config.freshness_s)
+    return max(STALE_AFTER_PERIODS * source.period_s, config.stale_after_s)
 
 
 def _disagreement(

@@ -16,10 +16,12 @@ class LoopConfig(ConfigModel):
     kp: float | None = Field(default=None, gt=0, le=1, description="fixes the gain, which else follows from the noise")
     deadband_nm: float = Field(default=0.001, ge=0, le=1, description="error below which the wrist rests")
     disagreement_nm: float = Field(default=0.05, gt=0, le=5)
-    jump_nm: float = Field(default=0.08, gt=0, le=5)
-    slip_nm: float = Field(default=0.06, gt=0, le=5, description="drift of the torque at a fixed angle: slip")
+    max_innovation_nm: float = Field(default=0.08, gt=0, le=5)
+    max_offset_drift_nm: float = Field(
+        default=0.06, gt=0, le=5, description="drift of the torque at a fixed angle: slip"
+    )
     wrist_speed_rad_per_s: float = Field(default=0.5, gt=0, le=3.14)
-    freshness_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
+    stale_after_s: float = Field(default=0.1, ge=0, le=10, description="no torque that is younger counts as stale")
     wrist_acceleration_rad_per_s2: float = Field(default=4.0, gt=0, le=1000, description="given to the robot")
     angle_bandwidth_per_s: float = Field(default=5.0, gt=0, le=80, description="how fast the wrist approaches an angle")
     torque_bandwidth_per_s: float = Field(default=4.0, gt=0, le=30, description="how fast it approaches a torque")

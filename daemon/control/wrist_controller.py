@@ -209,7 +209,7 @@ def controller_settings(
         deadband_nm=config.deadband_nm,
         innovation_limit_nm=max(3.0 * found.noise_nm, LEAST_INNOVATION_LIMIT_NM),
         creep_limit_nm_per_s=CREEP_LIMIT_NM_PER_S,
-        offset_limit_nm=config.slip_nm,
+        offset_limit_nm=config.max_offset_drift_nm,
         torque_limit_nm=torque_limit_nm,
         speed_limit_rad_per_s=config.wrist_speed_rad_per_s,
         acceleration_limit_rad_per_s2=config.planned_acceleration_rad_per_s2,

@@ -1,4 +1,4 @@
-"""`shearloop doctor`: checks the computer, files and devices, and says what is wrong and what to do."""
+"""`shearloop doctor`: checks the computer, files and devices, and names the next step for each fault."""
 
 import asyncio
 from collections.abc import Iterator

@@ -18,8 +18,8 @@ from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, F
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.ports import ports_there
 from shearloop.daemon.sensing.estimators import open_combined, open_estimator
+from shearloop.daemon.serial_ports import list_serial_ports
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.settings import read_settings
 
@@ -140,7 +140,7 @@ def check_disk(folder: Path) -> Finding:
 
 def check_ports() -> Finding:
     """List the USB serial ports with their serial numbers."""
-    ports = ports_there()
+    ports = list_serial_ports()
     if not ports:
         return note(
             "USB serial ports",
@@ -149,7 +149,7 @@ def check_ports() -> Finding:
             "plug the boards in; look at `sudo dmesg | tail`",
         )
     shown = ", ".join(f"{port.path} ({port.serial_number or 'without a serial number'})" for port in ports)
-    denied = "; ".join(f"{port.path}: {port.trouble}" for port in ports if port.trouble)
+    denied = "; ".join(f"{port.path}: {port.error}" for port in ports if port.error)
     if denied:
         return note("USB serial ports", shown, denied, "see `shearloop ports`")
     return good("USB serial ports", shown)
@@ -253,18 +253,20 @@ def _check_experiment(path: Path) -> Finding:
         experiment = load_yaml_model(path, ExperimentFile)
     except UserError as error:
         return from_file("experiment", str(error), "it cannot start")
-    return good("experiment", f"{path}: {experiment.name}, {len(experiment.steps)} steps, driven by {experiment.drive}")
+    return good(
+        "experiment", f"{path}: {experiment.name}, {len(experiment.steps)} steps, driven by {experiment.torque_source}"
+    )
 
 
 def check_keys(curve: CurveConfig | None, network: dict[str, str]) -> Finding:
     """Say who may connect from the network, and check that the secret key is secret."""
-    from shearloop.daemon.messaging.keys import admitted_clients, load_server_keys, server_key_file
+    from shearloop.daemon.messaging.keys import check_allowed_clients, load_server_keys, server_key_file
 
     if curve is None:
         return good("keys", "not needed: every address is on this computer")
     try:
         load_server_keys(curve.server_key)
-        clients = admitted_clients(curve.clients)
+        clients = check_allowed_clients(curve.clients)
     except UserError as error:
         return from_error("keys", error, "the daemon does not start")
     path = server_key_file(curve.server_key)

@@ -4,8 +4,8 @@ import asyncio
 import contextlib
 import os
 import time
+from collections import defaultdict
 from collections.abc import AsyncIterator, Awaitable, Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,17 +16,16 @@ from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.config import DaemonConfig, FingertipConfig, GripperConfig, LoadCellConfig, SerialDevice
 from shearloop.daemon.doctor.checks import Finding, from_error, good, note, trouble
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
-from shearloop.daemon.ports import access_trouble
 from shearloop.daemon.rig import make_gripper_client
+from shearloop.daemon.serial_ports import access_error
+from shearloop.drivers.connection import find_port
 from shearloop.drivers.eit_kit import EitKit
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.hx711 import LoadCalibration
-from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.messages import ActivationStatus
-from shearloop.drivers.serial_port import find_port
-from shearloop.drivers.ur.controller_query import look
+from shearloop.drivers.ur.controller import query_controller
 from shearloop.drivers.ur.settings import read_settings
 
 # A larger relative difference between measured and configured rate is reported.
@@ -62,7 +61,7 @@ def check_port(name: str, device: SerialDevice) -> Finding:
         path = find_port(serial_number=device.serial_number, path=str(device.path) if device.path else None)
     except DriverError as error:
         return from_error(subject, error, "the board is not plugged in, or has another serial number")
-    denied = access_trouble(path)
+    denied = access_error(path)
     if denied:
         what, _, cure = denied.partition("; ")
         return trouble(subject, f"{path} exists, but {what}", "the daemon cannot read the board", cure)
@@ -131,7 +130,7 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
         frame_period_s=config.frame_period_s,
     )
     frames = await _received(board.frames(), seconds)
-    facts = board.facts()
+    facts = board.diagnostics()
     if not frames and facts["last_loss"]:
         return [port, from_error(f"rate of {name}", str(facts["last_loss"]), "no frame came")]
     measured_hz = _rate_hz([frame.t_arrival_ns for frame in frames])
@@ -141,7 +140,7 @@ async def _check_fingertip(name: str, config: FingertipConfig, seconds: float) -
         findings.append(
             note(
                 f"lines of {name}",
-                f"{sum(refused.values())} refused; {facts['last_refusal']}",
+                f"{sum(refused.values())} refused; {facts['last_frame_error']}",
                 "a bad cable, or another program on the same board",
                 "replace the USB cable",
             )
@@ -203,7 +202,7 @@ async def _check_gripper(config: GripperConfig) -> list[Finding]:
 def _check_robot(settings: Path) -> list[Finding]:
     try:
         host = read_settings(settings).host
-        seen = look(host, ROBOT_TIMEOUT_S)
+        seen = query_controller(host, ROBOT_TIMEOUT_S)
     except DriverError as error:
         return [from_error("robot", error, "the robot cannot be driven")]
     findings = [good("robot", f"{host} answers, PolyScope {seen.version}")]
@@ -244,71 +243,59 @@ def _rate_hz(times_ns: list[int]) -> float | None:
     return (len(times_ns) - 1) * 1e9 / (times_ns[-1] - times_ns[0])
 
 
-@dataclass(slots=True)
-class TopicLog:
-    """What was received of one topic and source."""
-
-    times_ns: list[int] = field(default_factory=list)
-    latest: Mapping[str, Any] = field(default_factory=dict)
-    saturated: int = 0
-    dead: int = 0
-
-
 def daemon_tasks(address: str) -> Mapping[str, Mapping[str, Any]] | None:
     """Return the status of a running daemon's tasks; None when no daemon answers."""
     try:
-        tasks = request(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
+        tasks = send_command(address, {"command": "status"}, DAEMON_TIMEOUT_S).get("tasks")
     except UserError:
         return None
     return tasks if isinstance(tasks, dict) else {}
 
 
-def listen(address: str, seconds: float) -> dict[tuple[str, str], TopicLog]:
+def listen(address: str, seconds: float) -> dict[tuple[str, str], list[Mapping[str, Any]]]:
     """Collect the messages of a local daemon for `seconds`, by topic and source."""
-    received: dict[tuple[str, str], TopicLog] = {}
+    received: dict[tuple[str, str], list[Mapping[str, Any]]] = defaultdict(list)
     with zmq.Context() as context, context.socket(zmq.SUB) as socket:
         socket.setsockopt(zmq.LINGER, 0)
         socket.setsockopt(zmq.SUBSCRIBE, b"")
         socket.connect(address)
         end_s = time.monotonic() + seconds
         while (left_s := end_s - time.monotonic()) > 0:
-            if not socket.poll(int(left_s * 1000) + 1):
-                continue
-            topic, payload = socket.recv_multipart()[:2]
-            content = decode(payload)
-            log = received.setdefault((topic.decode(), str(content.get("source"))), TopicLog())
-            log.times_ns.append(int(content["t_mono_ns"]))
-            log.latest = content
-            log.saturated = max(log.saturated, int(content.get("saturated") or 0))
-            log.dead = max(log.dead, int(content.get("dead") or 0))
+            if socket.poll(int(left_s * 1000) + 1):
+                topic, payload = socket.recv_multipart()[:2]
+                content = decode(payload)
+                received[topic.decode(), str(content.get("source"))].append(content)
     return received
 
 
 def check_daemon(
-    config: DaemonConfig, tasks: Mapping[str, Mapping[str, Any]], received: Mapping[tuple[str, str], TopicLog]
+    config: DaemonConfig,
+    tasks: Mapping[str, Mapping[str, Any]],
+    received: Mapping[tuple[str, str], list[Mapping[str, Any]]],
 ) -> Iterator[Finding]:
     """Judge a running daemon by its tasks and its messages."""
     for name, status in tasks.items():
         yield check_task(name, status)
     for (topic, source), rate_hz in _expected_rates(config).items():
-        times_ns = received.get((topic, source), TopicLog()).times_ns
+        times_ns = [int(message["t_mono_ns"]) for message in received.get((topic, source), ())]
         yield check_rate(f"rate of {topic} {source}", _rate_hz(times_ns), rate_hz)
     for name in config.fingertips:
         if frames := received.get(("eit.frame", name)):
-            yield check_channels(name, frames.saturated, frames.dead, len(frames.times_ns))
+            saturated, dead = (max(int(frame.get(key) or 0) for frame in frames) for key in ("saturated", "dead"))
+            yield check_channels(name, saturated, dead, len(frames))
         estimates = received.get(("eit.estimate", name))
-        if estimates and (reason := estimates.latest.get("why")):
+        if estimates and (reason := estimates[-1].get("reason")):
             yield note(f"estimate of {name}", "not valid", str(reason), "see docs/troubleshooting.md")
-    loop = received.get(("loop.state", "loop"))
-    if loop and (reasons := loop.latest.get("reasons")):
-        yield note("loop", str(loop.latest.get("phase")), str(reasons), "see docs/safety.md")
+    states = received.get(("loop.state", "loop"))
+    if states and (reasons := states[-1].get("reasons")):
+        yield note("loop", str(states[-1].get("phase")), str(reasons), "see docs/safety.md")
 
 
 def check_task(name: str, status: Mapping[str, Any]) -> Finding:
     """Judge one task by the counters that it reports."""
     subject = f"task {name}"
     counted = ", ".join(f"{count} × {kind}" for kind, count in (status.get("errors") or {}).items() if count)
-    reason = str(status.get("trouble") or status.get("last_loss") or "")
+    reason = str(status.get("error") or status.get("last_loss") or "")
     restarts, last_error = status.get("restarts", 0), str(status.get("last_error", ""))
     read_log = "read the daemon's log; report it if it comes back"
     if status.get("alive") is False:

@@ -1,1 +1,1 @@
-"""Messages and how they travel: topics, publisher, subscriber, command server, keys."""
+"""ZeroMQ messages and commands: the table of topics, publisher, client, command server, addresses and keys."""

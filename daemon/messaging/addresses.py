@@ -1,4 +1,4 @@
-"""Where the daemon is found when nothing else is said, and which addresses are safe without keys."""
+"""Default ZeroMQ addresses and timeouts, and which addresses need CURVE keys."""
 
 import ipaddress
 import socket
@@ -7,14 +7,18 @@ from urllib.parse import urlsplit
 PUBLISH_ADDRESS = "tcp://127.0.0.1:7761"
 COMMAND_ADDRESS = "tcp://127.0.0.1:7762"
 LARGEST_PORT = 65535
+# A running daemon answers within milliseconds.
+COMMAND_TIMEOUT_S = 2.0
+# The robot may have to power up, release its brakes and start its program, and the gripper to activate.
+UNLOCK_TIMEOUT_S = 60.0
 
 
-def stays_on_this_machine(address: str) -> bool:
-    """Return whether a ZeroMQ address is ipc or a loopback IP: reachable from this machine alone."""
+def is_local(address: str) -> bool:
+    """Return whether only this machine can reach an address: ipc, or tcp on a loopback IP."""
     parts = urlsplit(address)
     if parts.scheme == "ipc":
         return bool(address.removeprefix("ipc://"))
-    # After a semicolon libzmq takes another address.
+    # libzmq accepts a second address after a semicolon.
     if parts.scheme != "tcp" or parts.hostname is None or ";" in address:
         return False
     try:
@@ -23,10 +27,10 @@ def stays_on_this_machine(address: str) -> bool:
         return False
 
 
-def has_a_port(address: str) -> bool:
-    """Return whether a tcp address ends in a port, or in `*` for one that is free; every other address needs none.
+def has_valid_port(address: str) -> bool:
+    """Return whether a tcp address ends in a port, or in `*` for any free port; other addresses need no port.
 
-    libzmq reads a port up to what is no digit, and takes 65536 off what is too large: 70000 would be 4464.
+    libzmq ignores trailing characters and wraps large numbers: it would take 70000 for 4464.
     """
     port = address.rpartition(":")[2]
     if not address.startswith("tcp://") or port == "*":
@@ -35,42 +39,38 @@ def has_a_port(address: str) -> bool:
 
 
 def needs_keys(address: str) -> bool:
-    """Return whether a client needs keys to speak to an address: it lies beyond this machine.
+    """Return whether a client needs keys for an address, because it is on another machine.
 
-    The name `localhost` is as good as a loopback IP for one who connects; nobody binds to it.
+    A client may use the name `localhost`. A server may not bind to it.
     """
-    return (
-        address.startswith("tcp://")
-        and urlsplit(address).hostname != "localhost"
-        and not stays_on_this_machine(address)
-    )
+    return address.startswith("tcp://") and urlsplit(address).hostname != "localhost" and not is_local(address)
 
 
-def open_stop_address(address: str) -> str:
-    """Return where everyone on the machine can say `stop` to a daemon whose commands are on the network.
+def local_stop_address(address: str) -> str:
+    """Return the socket that accepts `stop` without a key, for a daemon that takes its commands over the network.
 
-    An abstract socket, which has no permissions and leaves no file behind; named by the port of `commands`.
+    It is an abstract Unix socket, open to all users of this machine, named after the port of `commands`.
     """
     return f"ipc://@shearloop-stop-{address.rpartition(':')[2]}"
 
 
-def open_to_the_network(address: str, key: str) -> str:
-    """Return the sentence for an address that is not to be bound in the clear."""
-    return (
-        f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
-        "tcp://127.0.0.1:7761, or add `curve` with keys made by `shearloop keys`"
-    )
-
-
 def stop_address(address: str) -> str:
-    """Return where `stop` is heard without a key: the address itself, or the open socket of a daemon on the network."""
-    open_address = open_stop_address(address)
+    """Return where to send `stop` without a key: the local stop socket if it exists, else the address itself."""
+    local = local_stop_address(address)
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
-            probe.connect("\0" + open_address.removeprefix("ipc://@"))
+            probe.connect("\0" + local.removeprefix("ipc://@"))
         except BlockingIOError:
-            return open_address
+            return local
         except OSError:
             return address
-    return open_address
+    return local
+
+
+def network_refusal(address: str, key: str) -> str:
+    """Return the error for a network address without keys; `key` is its key in the configuration."""
+    return (
+        f"`{key}: {address}` would open the robot to the network: use ipc or a loopback address such as "
+        "tcp://127.0.0.1:7761, or add `curve` with keys from `shearloop keys`"
+    )

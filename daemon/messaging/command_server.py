@@ -1,12 +1,12 @@
-"""Answers commands: a ROUTER socket, msgpack maps in and out, every request answered exactly once.
+"""The command server: a ROUTER socket that answers every request exactly once.
 
-A request is `{"command": NAME, …}`; the reply is `{"ok": true, …}` or `{"ok": false, "why": SENTENCE}`. Both REQ and
-DEALER clients are understood. Requests are limited in number, `stop` excepted: it is carried out whatever else comes.
+Requests and replies are msgpack maps. A request is `{"command": NAME, …}`, a reply `{"ok": true, …}` or
+`{"ok": false, "reason": SENTENCE}`. REQ and DEALER clients both work. The request rate is limited, except for `stop`.
 """
 
 import asyncio
 import time
-from collections import Counter
+from collections import Counter, OrderedDict
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeAlias
 
@@ -17,12 +17,17 @@ import zmq.asyncio
 from shearloop.daemon.messaging.keys import KeyPair
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import bind
-from shearloop.daemon.messaging.rate_limit import PER_CLIENT_PER_S, RateLimit
 
 LARGEST_REQUEST_BYTES = 64 * 1024
-MOST_AT_ONCE = 16
+MAX_CONCURRENT = 16
 STOP, STATUS = "stop", "status"
 _LONGEST_NAME = 40
+
+# A person, a script and a polling page stay far below these limits. A client in an endless loop does not.
+CLIENT_BURST, CLIENT_PER_S = 20.0, 10.0
+TOTAL_BURST, TOTAL_PER_S = 100.0, 50.0
+# A client that reconnects to reset its own limit still meets the total limit.
+MAX_CLIENTS = 256
 
 Request: TypeAlias = Mapping[str, Any]
 Reply: TypeAlias = dict[str, Any]
@@ -30,11 +35,52 @@ Handler: TypeAlias = Callable[[Request], Awaitable[Reply]]
 
 
 class CommandRefusedError(Exception):
-    """A command that will not be carried out; the message is the reason that the operator reads."""
+    """A command is refused; the message is the reason that the operator reads."""
+
+
+class TokenBucket:
+    """Allows `burst` requests at once and `per_s` requests per second on average."""
+
+    def __init__(self, burst: float, per_s: float) -> None:
+        self._burst = burst
+        self._per_s = per_s
+        self._tokens = burst
+        self._updated_ns: int | None = None
+
+    def allow(self, t_ns: int) -> bool:
+        """Use one token at monotonic time t_ns; return False if no token is left."""
+        if self._updated_ns is not None:
+            self._tokens = min(self._burst, self._tokens + self._per_s * max(0, t_ns - self._updated_ns) / 1e9)
+        self._updated_ns = t_ns
+        if self._tokens < 1.0:
+            return False
+        self._tokens -= 1.0
+        return True
+
+
+class RateLimit:
+    """Limits the requests of each client and of all clients together."""
+
+    def __init__(self) -> None:
+        self._total = TokenBucket(TOTAL_BURST, TOTAL_PER_S)
+        self._clients: OrderedDict[bytes, TokenBucket] = OrderedDict()
+
+    def allow(self, client: bytes, t_ns: int) -> bool:
+        """Return whether a client may send one more request at monotonic time t_ns.
+
+        Requests above a client's own limit do not count against the total.
+        """
+        bucket = self._clients.get(client)
+        if bucket is None:
+            bucket = self._clients[client] = TokenBucket(CLIENT_BURST, CLIENT_PER_S)
+            if len(self._clients) > MAX_CLIENTS:
+                self._clients.popitem(last=False)
+        self._clients.move_to_end(client)
+        return bucket.allow(t_ns) and self._total.allow(t_ns)
 
 
 class CommandServer:
-    """Receives requests, lets handlers decide, and sends each reply back to whom it belongs."""
+    """Receives requests, passes them to handlers and sends the replies."""
 
     def __init__(
         self,
@@ -43,97 +89,94 @@ class CommandServer:
         handlers: Mapping[str, Handler],
         keys: KeyPair | None = None,
     ) -> None:
-        """Bind the socket; raises UserError when the address is taken, malformed, or needs keys and has none."""
+        """Bind the socket; raises UserError if the address is in use, malformed, or needs keys."""
         self._handlers = handlers
         self._limit = RateLimit()
         self.refused: Counter[str] = Counter()
-        self._serving: set[asyncio.Task[None]] = set()
+        self._running: set[asyncio.Task[None]] = set()
         self._socket = context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 100)
         self._socket.setsockopt(zmq.MAXMSGSIZE, LARGEST_REQUEST_BYTES)
         bind(self._socket, address, "commands", keys)
 
     async def run(self) -> None:
-        """Serve requests until cancelled; a slow one, such as `unlock`, does not keep a `stop` waiting."""
+        """Serve requests until cancelled; a slow command such as `unlock` does not delay a `stop`."""
         async with asyncio.TaskGroup() as group:
             while True:
                 parts = await self._socket.recv_multipart()
-                # A message that is there already is received without a turn of the loop.
+                # Receiving a message that has already arrived does not yield to other tasks.
                 await asyncio.sleep(0)
-                # Two frames from a DEALER, three from a REQ; whoever sends more is answered as a DEALER.
+                # A DEALER sends two frames, a REQ three. Other counts are answered like a DEALER's.
                 route = parts[:2] if len(parts) == 3 and not parts[1] else parts[:1]
-                ready = self.accept(parts[0], parts[len(route) :], time.monotonic_ns())
-                if isinstance(ready, dict):
-                    await self._reply(route, ready)
+                checked = self.check(parts[0], parts[len(route) :], time.monotonic_ns())
+                if isinstance(checked, dict):
+                    await self._reply(route, checked)
                 else:
-                    task = group.create_task(self._serve(route, *ready))
-                    self._serving.add(task)
-                    task.add_done_callback(self._serving.discard)
+                    task = group.create_task(self._serve(route, *checked))
+                    self._running.add(task)
+                    task.add_done_callback(self._running.discard)
 
-    def accept(self, client: bytes, frames: list[bytes], t_ns: int) -> tuple[str, Request] | Reply:
-        """Return the name and the content of a request that is to be carried out, or the refusal of one that is not.
-
-        Raises nothing for what a client may send. `t_ns` is the moment on the monotonic clock.
-        """
-        request, why = _read(frames)
+    def check(self, client: bytes, frames: list[bytes], t_ns: int) -> tuple[str, Request] | Reply:
+        """Return the name and content of a valid request, or the refusal; t_ns is the monotonic time."""
+        request, problem = _decoded(frames)
         name = request.get("command")
         if name == STOP and STOP in self._handlers:
             return STOP, request
-        if not self._limit.allows(client, t_ns):
+        if not self._limit.allow(client, t_ns):
             return self._refuse(
-                "too many requests", f"too many requests; send at most {PER_CLIENT_PER_S:g} a second", often=True
+                "too many requests", f"too many requests; send at most {CLIENT_PER_S:g} a second", frequent=True
             )
-        if why:
-            return self._refuse("malformed request", f"the request is {why}")
+        if problem:
+            return self._refuse("malformed request", f"the request is {problem}")
         if not isinstance(name, str) or name not in self._handlers:
             known, shown = ", ".join(sorted(self._handlers)), repr(name)[:_LONGEST_NAME]
             return self._refuse("unknown command", f"there is no command {shown}; the commands are {known}")
-        if len(self._serving) >= MOST_AT_ONCE:
+        if len(self._running) >= MAX_CONCURRENT:
             return self._refuse("too many at once", "too many commands at once; wait")
         return name, request
 
-    async def answer(self, name: str, request: Request) -> Reply:
-        """Carry a request out and return the reply; never raises for what a client may send."""
+    async def execute(self, name: str, request: Request) -> Reply:
+        """Call the handler and return the reply; a handler's exception becomes a refusal."""
         try:
             reply = await self._handlers[name](request)
-        except CommandRefusedError as reason:
-            return self._refuse(f"{name} refused", str(reason), often=name == STOP)
-        except Exception as error:  # noqa: BLE001 - one request that a handler cannot bear must not leave the others unanswered
+        except CommandRefusedError as error:
+            return self._refuse(f"{name} refused", str(error), frequent=name == STOP)
+        except Exception as error:  # noqa: BLE001 - a bug in one handler must not stop the server
             structlog.get_logger().exception("command failed", command=name)
             return self._refuse(
                 f"{name} failed", f"{name} failed ({type(error).__name__}: {error}); see the daemon's log"
             )
         log = structlog.get_logger()
-        # What only asks, as pages and scripts do every second, is no news.
-        (log.debug if name == STATUS else log.info)("command carried out", command=name)
+        # Pages and scripts ask for the status every second.
+        (log.debug if name == STATUS else log.info)("command executed", command=name)
         return {"ok": True, **reply}
 
     async def _serve(self, route: list[bytes], name: str, request: Request) -> None:
-        await self._reply(route, await self.answer(name, request))
+        await self._reply(route, await self.execute(name, request))
 
     async def _reply(self, route: list[bytes], reply: Reply) -> None:
         try:
             await self._socket.send_multipart([*route, encode(reply)], zmq.NOBLOCK)
         except zmq.Again:
-            self.refused["a client that does not read its replies"] += 1
+            self.refused["client does not read its replies"] += 1
 
-    def _refuse(self, kind: str, why: str, *, often: bool = False) -> Reply:
-        """Count and tell a refusal; one that may come by the thousand is told at 1, 10, 100 … of its kind."""
+    def _refuse(self, kind: str, reason: str, *, frequent: bool = False) -> Reply:
+        """Count and log a refusal; a frequent kind is logged at counts 1, 10, 100 and so on."""
         self.refused[kind] += 1
         count = self.refused[kind]
-        if not often or str(count).strip("0") == "1":
-            structlog.get_logger().warning("command refused", why=why, count=count)
-        return {"ok": False, "why": why}
+        if not frequent or str(count).strip("0") == "1":
+            structlog.get_logger().warning("command refused", reason=reason, count=count)
+        return {"ok": False, "reason": reason}
 
     def close(self) -> None:
-        """Close the socket after the last replies are out."""
+        """Close the socket after the last replies are sent."""
         self._socket.close()
 
 
-def _read(frames: list[bytes]) -> tuple[Request, str]:
-    """Return the content of a request, or nothing and what is wrong with it."""
+def _decoded(frames: list[bytes]) -> tuple[Request, str]:
+    """Return the content of a request, or an empty one and the problem."""
     if len(frames) != 1:
-        return {}, f"{len(frames)} frames where one is expected"
+        return {}, f"{len(frames)} frames, expected one"
     try:
         return decode(frames[0]), ""
     except ValueError as error:

@@ -1,1 +1,1 @@
-"""The project's recordings: MCAP files of JSON messages, written live or brought in from elsewhere."""
+"""Recordings: write, import, read, replay, repair and export MCAP files of JSON messages."""

@@ -1,8 +1,8 @@
-"""A recording's topics as tables: CSV and Parquet, a file for each topic, or one MATLAB file with a struct for each."""
+"""Exports topics of a recording as tables: CSV or Parquet, one file per topic, or one MATLAB file."""
 
 import csv
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,35 +10,35 @@ import numpy as np
 from scipy.io import savemat
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.opened import opened
-from shearloop.daemon.recording.schema import completed, schema_of
+from shearloop.daemon.recording.reader import open_recording
+from shearloop.daemon.recording.schema import schema_name, with_missing_keys
 
-# A MATLAB name is at most 63 characters long; ours are far shorter.
 _LOG_TIME = "log_time_ns"
 Rows = list[dict[str, Any]]
 Progress = Callable[[int], None]
 
 
-def topics_of(path: Path) -> dict[str, int]:
-    """Return the topics of a recording with their numbers of messages; raises UserError for one not to be read."""
-    with opened(path) as recording:
+def count_messages(path: Path) -> dict[str, int]:
+    """Return the number of messages of each topic; raises UserError for an unreadable recording."""
+    with open_recording(path) as recording:
         return recording.counts
 
 
 def export(path: Path, form: str, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:
-    """Write topics of a recording as `form` (csv, parquet or mat) and return the files written.
+    """Write topics as `form` (csv, parquet or mat) and return the files.
 
-    For csv and parquet `out` is a folder, for mat a file. One topic at a time is in memory. `progress` hears of each
-    message. Raises UserError for a recording that cannot be read, and where nothing can be written.
+    For csv and parquet `out` is a folder, for mat a file. `progress` is called for each message. Raises UserError for
+    a recording that cannot be read and for files that cannot be written.
     """
     try:
         if form == "mat":
-            structs = {}
-            for topic in topics:
-                structs[topic.replace(".", "_").replace("-", "_")] = _matlab(rows_of(path, topic, progress))
-            # Opened here: the library has a sentence of its own for what it cannot open, and another name.
+            structs = {
+                topic.replace(".", "_").replace("-", "_"): _matlab_struct(read_rows(path, topic, progress))
+                for topic in topics
+            }
+            # savemat changes names and hides the reason if it opens the file itself.
             with out.open("wb") as file:
-                # Its stubs know of names alone.
+                # The stubs allow only names.
                 savemat(file, structs, long_field_names=True, oned_as="column", do_compression=True)  # type: ignore[arg-type]
             return [out]
         out.mkdir(parents=True, exist_ok=True)
@@ -46,58 +46,45 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
         written = []
         for topic in topics:
             written.append(out / f"{topic}.{form}")
-            write(written[-1], rows_of(path, topic, progress))
+            write(written[-1], read_rows(path, topic, progress))
     except OSError as error:
         raise UserError(f"{out}: the export cannot be written: {error.strerror or error}") from error
     return written
 
 
-def rows_of(path: Path, topic: str, progress: Progress = lambda _: None) -> Rows:
-    """Return a topic's messages in order of time, log_time_ns first, nested maps as JSON text, None for no value."""
+def read_rows(path: Path, topic: str, progress: Progress = lambda _: None) -> Rows:
+    """Return a topic's messages by time: log_time_ns first, maps as JSON text, None for a missing value."""
     rows = []
-    with opened(path) as recording:
-        wire = schema_of(topic)
+    with open_recording(path) as recording:
+        live = schema_name(topic)
         for _, message in recording.messages([topic]):
-            content = completed(wire, json.loads(message.data))
+            content = with_missing_keys(live, json.loads(message.data))
             row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
             rows.append({_LOG_TIME: message.log_time, **row})
             progress(1)
     return rows
 
 
-def columns_of(rows: Rows) -> dict[str, list[Any]]:
-    """Return the rows' keys, in the order in which they appear, each with a value per row, None where there is none."""
+def _columns(rows: Rows) -> dict[str, list[Any]]:
+    """Return the values of each key, None where a row lacks it."""
     keys = dict.fromkeys(key for row in rows for key in row)
     return {key: [row.get(key) for row in rows] for key in keys}
 
 
 def _write_csv(path: Path, rows: Rows) -> None:
-    """Write a table whose arrays have a column for each element: channels_0, channels_1, …"""
-    widths: dict[str, int] = {}
-    for row in rows:
-        for key, value in row.items():
-            widths[key] = max(widths.get(key, 0), len(value) if isinstance(value, list) else 0)
-    arrays = {key for row in rows for key, value in row.items() if isinstance(value, list)}
-    with path.open("w", newline="", encoding="utf-8") as file:
-        write = csv.writer(file)
-        header = []
-        for key, width in widths.items():
-            header += [f"{key}_{i}" for i in range(width)] if key in arrays else [key]
-        write.writerow(header)
-        for row in rows:
-            write.writerow(_cells(row, widths, arrays))
-
-
-def _cells(row: Mapping[str, Any], widths: Mapping[str, int], arrays: set[str]) -> list[Any]:
-    cells: list[Any] = []
-    for key, width in widths.items():
-        value = row.get(key)
-        if key in arrays:
-            values = list(value or [])
-            cells += values + [None] * (width - len(values))
+    """Write a table with one column per array element: channels_0, channels_1, …"""
+    columns: dict[str, list[Any]] = {}
+    for key, values in _columns(rows).items():
+        if any(isinstance(value, list) for value in values):
+            width = max(len(value or []) for value in values)
+            for i in range(width):
+                columns[f"{key}_{i}"] = [value[i] if value and i < len(value) else None for value in values]
         else:
-            cells.append(value)
-    return cells
+            columns[key] = values
+    with path.open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file)
+        table.writerow(columns)
+        table.writerows(zip(*columns.values(), strict=True))
 
 
 def _write_parquet(path: Path, rows: Rows) -> None:
@@ -106,25 +93,25 @@ def _write_parquet(path: Path, rows: Rows) -> None:
         import pyarrow.parquet
     except ModuleNotFoundError as error:
         raise UserError("Parquet needs pyarrow: `pip install 'shearloop[export]'`") from error
-    pyarrow.parquet.write_table(pyarrow.table(columns_of(rows)), path)
+    pyarrow.parquet.write_table(pyarrow.table(_columns(rows)), path)
 
 
-def _matlab(rows: Rows) -> dict[str, Any]:
-    """Return a struct: numbers as (n, 1), arrays as (n, m) with NaN for what is missing, texts as a cell array."""
+def _matlab_struct(rows: Rows) -> dict[str, Any]:
+    """Return numbers as (n, 1), arrays as (n, m) with NaN for missing elements, texts as a cell array."""
     struct: dict[str, Any] = {}
-    for key, values in columns_of(rows).items():
+    for key, values in _columns(rows).items():
         present = [value for value in values if value is not None]
+        complete = bool(present) and len(present) == len(values)
         if any(isinstance(value, list) for value in present):
-            width = max(len(value) for value in present)
-            matrix = np.full((len(values), width), np.nan)
+            matrix = np.full((len(values), max(map(len, present))), np.nan)
             for row, value in zip(matrix, values, strict=True):
                 row[: len(value or [])] = np.array(value or [], dtype=np.float64)
             struct[key] = matrix
         elif any(isinstance(value, str) for value in present):
             struct[key] = np.array([value or "" for value in values], dtype=object)[:, None]
-        elif present and len(present) == len(values) and all(type(value) is int for value in present):
+        elif complete and all(type(value) is int for value in present):
             struct[key] = np.array(values, dtype=np.int64)
-        elif present and len(present) == len(values) and all(type(value) is bool for value in present):
+        elif complete and all(type(value) is bool for value in present):
             struct[key] = np.array(values, dtype=bool)
         else:
             struct[key] = np.array([np.nan if value is None else value for value in values], dtype=np.float64)

@@ -1,21 +1,26 @@
-"""Reads a recording back, and refuses by name what is truncated, foreign, damaged or of another channel table."""
+"""Reads recordings that were closed; refuses foreign, damaged and outdated files with one sentence."""
 
 import json
-from collections.abc import Mapping
+import mmap
+import struct
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Channel, Message
+from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC
+from numpy.typing import NDArray
 
-from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_LINE_VALUES
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.content import as_json, input_of
-from shearloop.daemon.recording.opened import opened
 from shearloop.daemon.recording.schema import (
     DIAMETER_NOTE,
     EXPERIMENT_METADATA,
@@ -23,135 +28,200 @@ from shearloop.daemon.recording.schema import (
     FRAME_TOPIC,
     LOAD_TOPIC,
     METADATA,
+    input_event,
     input_topic,
 )
 from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
-from shearloop.drivers.raw_event import InputKind
+from shearloop.drivers.serial_sensor import InputKind
 
-# What every recording says of itself, beside the notes of this one.
-_IDENTITIES = ("format_version", "channel_table_hash", "software", "code_sha256")
-# How a raw input of this kind is written; see `input_json`.
-_TELLS_OF_A_TOOL = as_json({"kind": InputKind.TOOL.value})[1:-1]
+# Metadata of every recording; the other keys are notes of this one.
+_IDENTITY_KEYS = ("format_version", "channel_table_hash", "software", "code_sha256")
+# The end of an MCAP file (https://mcap.dev/spec): the footer's opcode and length, the offsets of summary and summary
+# offsets, the summary's checksum, and the magic bytes. Before the summary: the opcode, length and checksum of DataEnd.
+_END = struct.Struct("<BQQQI8s")
+_DATA_END = struct.Struct("<BQI")
+_FOOTER_OPCODE, _FOOTER_BYTES, _DATA_END_OPCODE = 0x02, 20, 0x0F
+# The summary's checksum covers the footer up to the checksum itself.
+_AFTER_CHECKSUM = 4 + len(MCAP0_MAGIC)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SideFrames:
     """One side's frames by rising time: t_mid_ns and arrival_ns (n,) in Unix nanoseconds, lines (n, 1024) in volts."""
 
-    t_mid_ns: IntArray
-    arrival_ns: IntArray
-    lines: FloatArray
+    t_mid_ns: NDArray[np.int64]
+    arrival_ns: NDArray[np.int64]
+    lines: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recording:
-    """All of a recording: frames by side, and the torque in N·m at t_ns (p,), Unix nanoseconds, both maybe empty."""
+    """Frames by side, and torque_nm (p,) in N·m at torque_t_ns (p,) in Unix nanoseconds; each may be empty."""
 
     path: Path
     source: str
     notes: dict[str, str]
     sides: dict[str, SideFrames]
-    torque_t_ns: IntArray
-    torque_nm: FloatArray
-    # Which tool a calibrated gripper told of from when on (Unix ns), None where it held nothing.
+    torque_t_ns: NDArray[np.int64]
+    torque_nm: NDArray[np.float64]
+    # The tools that a calibrated gripper held: since when (Unix ns), and the diameter or None for no tool.
     tools: tuple[tuple[int, Measured | None], ...] = ()
 
 
-def read_recording(path: str | Path) -> Recording:
-    """Read a recording whole; raises UserError, naming the file, for one that cannot be used."""
-    path = Path(path)
-    with opened(path) as recording:
-        metadata = recording.metadata()
-        _check(path, metadata.get(METADATA))
-        inputs = {input_topic(topic.removeprefix(f"{FRAME_TOPIC}.")) for topic in recording.counts}
-        wanted = [
-            topic
-            for topic in recording.counts
-            if topic == LOAD_TOPIC or topic.startswith(f"{FRAME_TOPIC}.") or topic in inputs
-        ]
-        # Most of what the inputs hold is the lines once more.
-        messages = [
-            (channel, message)
-            for channel, message in recording.messages(wanted)
-            if channel.topic not in inputs or _TELLS_OF_A_TOOL in message.data
-        ]
-    named = metadata.get(EXPERIMENT_METADATA, {})
-    told = {DIAMETER_NOTE: named[DIAMETER_NOTE]} if DIAMETER_NOTE in named else {}
-    return _sorted(path, {**metadata[METADATA], **told}, messages)
+class OpenRecording:
+    """An open recording: its topics, metadata, attachments and messages."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        """Check that the file was closed and matches its checksums; raises McapError or ValueError."""
+        _check_checksums(file)
+        file.seek(0)
+        self._reader = make_reader(file, validate_crcs=True)
+        summary = self._reader.get_summary()
+        if summary is None or summary.statistics is None:
+            raise McapError("it has no index")
+        self.summary: Summary = summary
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """The number of messages of each topic."""
+        counts = self.summary.statistics.channel_message_counts if self.summary.statistics is not None else {}
+        return {channel.topic: counts.get(channel.id, 0) for channel in self.summary.channels.values()}
+
+    def metadata(self) -> dict[str, dict[str, str]]:
+        """Return the metadata records by name."""
+        return {record.name: dict(record.metadata) for record in self._reader.iter_metadata()}
+
+    def attachments(self) -> dict[str, bytes]:
+        """Return the attached files by name."""
+        return {one.name: one.data for one in self._reader.iter_attachments()}
+
+    def messages(
+        self, topics: Iterable[str] | None = None, *, by_time: bool = True
+    ) -> Iterator[tuple[Channel, Message]]:
+        """Yield the messages of some topics or of all, by log time or in the order of the file."""
+        for _, channel, message in self._reader.iter_messages(topics, log_time_order=by_time):
+            yield channel, message
 
 
-def _check(path: Path, identities: dict[str, str] | None) -> None:
-    if identities is None:
+@contextmanager
+def reading(path: Path) -> Iterator[None]:
+    """Turn each error of the block into a UserError: a damaged file raises many types of exceptions."""
+    try:
+        yield
+    except UserError:
+        raise
+    except OSError as error:
+        raise UserError(f"{path}: the recording cannot be read: {error.strerror or error}") from error
+    except Exception as error:
+        detail = str(error) if isinstance(error, McapError | ValueError) and str(error) else repr(error)
+        raise UserError(
+            f"{path}: the recording was not closed, or is damaged ({detail}); "
+            f"`shearloop recording repair {path}` saves the intact part"
+        ) from error
+
+
+@contextmanager
+def open_recording(path: Path) -> Iterator[OpenRecording]:
+    """Open a closed recording; raises UserError, also for errors while it is read in the block."""
+    with reading(path), path.open("rb") as file:
+        check_magic(path, file)
+        yield OpenRecording(file)
+
+
+def check_magic(path: Path, file: IO[bytes]) -> None:
+    """Raise UserError for a file that is not MCAP; leaves it after the magic bytes."""
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        raise UserError(f"{path}: this is not an MCAP file, or is empty; there is nothing to read")
+
+
+def check_identity(path: Path, identity: dict[str, str] | None) -> dict[str, str]:
+    """Return the identity of a recording; raises UserError for other files and other versions."""
+    if identity is None:
         raise _unusable(path, "it is an MCAP file, but not a recording of shearloop")
-    if identities.get("format_version") != FORMAT_VERSION:
-        raise _unusable(path, f"it has format version {identities.get('format_version')}, expected {FORMAT_VERSION}")
-    found = str(identities.get("channel_table_hash"))
+    if identity.get("format_version") != FORMAT_VERSION:
+        raise _unusable(path, f"it has format version {identity.get('format_version')}, expected {FORMAT_VERSION}")
+    found = str(identity.get("channel_table_hash"))
     if found != CHANNEL_TABLE_HASH:
-        raise _unusable(
-            path, f"it was made under the channel table {found[:12]}…, and this is {CHANNEL_TABLE_HASH[:12]}…"
-        )
+        raise _unusable(path, f"it has the channel table {found[:12]}…, expected {CHANNEL_TABLE_HASH[:12]}…")
+    return identity
 
 
-def _sorted(path: Path, identities: dict[str, str], messages: list[tuple[Channel, Message]]) -> Recording:
+def read_recording(path: str | Path) -> Recording:
+    """Read the frames, torques and tools of a recording; raises UserError for a file that cannot be used."""
+    path = Path(path)
     frames: dict[str, list[tuple[int, int, list[float]]]] = {}
     torques: list[tuple[int, float]] = []
     tools: list[tuple[int, Measured | None]] = []
-    for channel, message in messages:
-        content = _content(path, channel, message)
-        try:
-            if channel.topic == LOAD_TOPIC:
-                # What the driver took for no load at all, or had no number for, is no truth to calibrate on.
-                if "torque_nm" in content and _is_believed(content):
-                    torques.append((message.log_time, float(content["torque_nm"])))
-            elif channel.topic.startswith(f"{FRAME_TOPIC}."):
-                line = content["line"]
-                if len(line) != N_LINE_VALUES:
-                    raise ValueError(f"a line of {len(line)} values")
-                side = channel.topic.removeprefix(f"{FRAME_TOPIC}.")
-                frames.setdefault(side, []).append((message.log_time, int(content["arrival_unix_ns"]), line))
-            else:
-                tools.append((message.log_time, tool_from_bytes(input_of(content).data)[1]))
-        except (KeyError, TypeError, ValueError) as error:
-            raise _unusable(path, f"a message on {channel.topic} is not what its schema says ({error!r})") from error
-    torques.sort(key=lambda pair: pair[0])
-    sides = {}
-    for side, found in frames.items():
-        found.sort(key=lambda row: row[0])
-        # A line that is the one before to the last digit is an old frame sent again; live it is refused.
-        rows = [found[0], *(row for before, row in pairwise(found) if row[2] != before[2])]
-        sides[side] = SideFrames(
-            np.array([row[0] for row in rows], dtype=np.int64),
-            np.array([row[1] for row in rows], dtype=np.int64),
-            np.array([row[2] for row in rows], dtype=np.float64),
-        )
-    notes = {key: value for key, value in identities.items() if key not in _IDENTITIES}
+    with open_recording(path) as recording:
+        metadata = recording.metadata()
+        identity = check_identity(path, metadata.get(METADATA))
+        frame_topics = [topic for topic in recording.counts if topic.startswith(f"{FRAME_TOPIC}.")]
+        sides = {topic: topic.removeprefix(f"{FRAME_TOPIC}.") for topic in frame_topics}
+        inputs = [input_topic(side) for side in sides.values()]
+        for channel, message in recording.messages([LOAD_TOPIC, *sides, *inputs]):
+            topic, t_ns = channel.topic, message.log_time
+            try:
+                content = _json_object(message.data)
+                if topic == LOAD_TOPIC:
+                    if "torque_nm" in content and content.get("valid", True):
+                        torques.append((t_ns, float(content["torque_nm"])))
+                elif topic in sides:
+                    line = content["line"]
+                    if len(line) != N_LINE_VALUES:
+                        raise ValueError(f"a line of {len(line)} values")
+                    rows = frames.setdefault(sides[topic], [])
+                    # The board repeated an old frame.
+                    if not rows or rows[-1][2] != line:
+                        rows.append((t_ns, int(content["arrival_unix_ns"]), line))
+                elif content["kind"] == InputKind.TOOL.value:
+                    tools.append((t_ns, tool_from_bytes(input_event(content).data)[1]))
+            except (KeyError, TypeError, ValueError) as error:
+                raise _unusable(path, f"a message on {topic} does not match its schema ({error!r})") from error
+    notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}
+    experiment = metadata.get(EXPERIMENT_METADATA, {})
+    if DIAMETER_NOTE in experiment:
+        notes[DIAMETER_NOTE] = experiment[DIAMETER_NOTE]
     return Recording(
         path,
         notes.pop("source", ""),
         notes,
-        sides,
+        {side: _side_frames(rows) for side, rows in frames.items()},
         np.array([t for t, _ in torques], dtype=np.int64),
         np.array([torque for _, torque in torques], dtype=np.float64),
-        tuple(sorted(tools, key=lambda pair: pair[0])),
+        tuple(tools),
     )
 
 
-def _is_believed(load: Mapping[str, Any]) -> bool:
-    """Return whether a reading of the load cell is one; those recorded before they said so have two flags alone."""
-    return bool(load.get("valid", not (load.get("saturated") or load.get("spike"))))
+def _side_frames(rows: list[tuple[int, int, list[float]]]) -> SideFrames:
+    t_mid_ns, arrival_ns, lines = zip(*rows, strict=True)
+    return SideFrames(np.array(t_mid_ns, np.int64), np.array(arrival_ns, np.int64), np.array(lines, np.float64))
 
 
-def _content(path: Path, channel: Channel, message: Message) -> dict[str, Any]:
-    try:
-        content = json.loads(message.data)
-    except ValueError as error:
-        raise _unusable(path, f"a message on {channel.topic} is not JSON") from error
+def _json_object(data: bytes) -> dict[str, Any]:
+    content = json.loads(data)
     if not isinstance(content, dict):
-        raise _unusable(path, f"a message on {channel.topic} is not a JSON object")
+        raise TypeError("not a JSON object")
     return content
 
 
-def _unusable(path: Path, why: str) -> UserError:
+def _check_checksums(file: IO[bytes]) -> None:
+    """Raise McapError for a file that was not closed, ValueError for one that does not match its checksums."""
+    with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, memoryview(mapped) as content:
+        size = len(content)
+        if size < len(MCAP0_MAGIC) + _END.size:
+            raise McapError(f"it ends after {size} bytes")
+        opcode, length, summary_start, _, summary_crc, magic = _END.unpack_from(content, size - _END.size)
+        if (opcode, length, magic) != (_FOOTER_OPCODE, _FOOTER_BYTES, MCAP0_MAGIC) or not summary_start:
+            raise McapError("it has no index at its end")
+        if summary_crc and zlib.crc32(content[summary_start : size - _AFTER_CHECKSUM]) != summary_crc:
+            raise ValueError("its index does not match its checksum")
+        data_end = summary_start - _DATA_END.size
+        opcode, _, data_crc = _DATA_END.unpack_from(content, data_end)
+        if opcode != _DATA_END_OPCODE or (data_crc and zlib.crc32(content[:data_end]) != data_crc):
+            raise ValueError("its data does not match its checksum")
+
+
+def _unusable(path: Path, reason: str) -> UserError:
     return UserError(
-        f"{path}: this recording cannot be used: {why}; record it again, or import it with `shearloop import`"
+        f"{path}: this recording cannot be used: {reason}; record it again, or import it again with `shearloop import`"
     )

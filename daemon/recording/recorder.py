@@ -1,7 +1,7 @@
-"""Records a running daemon: every message and every raw input, without ever making the loop wait for a disk.
+"""Records a running daemon: every message and every raw input, without blocking the event loop.
 
-What is recorded waits in a queue with a bound; twice a second a thread turns it into JSON and writes it as one
-chunk. A file begins with the daemon and with every further experiment, and in any case after an hour without one.
+Items wait in a bounded queue. Twice a second a thread writes them to the file as one chunk. A new file begins with the
+daemon, with each further experiment, and after an hour without an experiment.
 """
 
 import asyncio
@@ -19,28 +19,31 @@ from typing import Any, TypeAlias
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import Scalar
-from shearloop.daemon.recording.content import NoJsonError, as_json, input_json, message_json
-from shearloop.daemon.recording.identity import Attached, Identity
-from shearloop.daemon.recording.mcap_file import McapFile
+from shearloop.daemon.recording.identity import AttachedFile, Identity
 from shearloop.daemon.recording.schema import (
     CLOCK_TOPIC,
     END_METADATA,
     EXPERIMENT_METADATA,
     METADATA,
+    NoJsonError,
+    as_json,
+    input_json,
     input_topic,
+    message_json,
     recorded_topic,
 )
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap
+from shearloop.daemon.recording.writer import McapFile
+from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent
 
-# A kill costs what came since the last flush: below a second, and so even where the machine is busy.
+# A kill loses the data since the last flush, less than a second even on a busy computer.
 FLUSH_S = 0.5
-# What may wait for a disk that is slow or full: minutes at rated speed. Beyond it things are dropped, and counted.
-MOST_WAITING_BYTES = 32 << 20
+# Limit of the queue for a slow or full disk: minutes at rated speed. Further items are dropped and counted.
+MAX_WAITING_BYTES = 32 << 20
 LONGEST_IDLE_FILE_S = 3600.0
-# What a message costs beside its arrays: the map and its scalars.
+# Memory of a message apart from its arrays.
 _OVERHEAD_BYTES = 1000
 # Files that begin in the same second.
-_MOST_ALIKE = 100
+_MAX_PER_SECOND = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,14 +57,14 @@ class _Message:
 @dataclass(frozen=True, slots=True)
 class _Input:
     source: str
-    told: RawEvent
+    event: RawEvent
     offset_ns: int
 
 
 @dataclass(frozen=True, slots=True)
 class _Experiment:
     name: str
-    attached: tuple[Attached, ...]
+    attached: tuple[AttachedFile, ...]
     notes: Mapping[str, str]
     t_unix_ns: int
 
@@ -70,7 +73,7 @@ _Item: TypeAlias = _Message | _Input | _Experiment
 
 
 class Recorder:
-    """Writes into files of a folder. `record`, `tap` and `experiment` are called in the event loop and never wait."""
+    """Writes files in a folder. `record_message`, `input_recorder` and `record_experiment` never block."""
 
     def __init__(
         self,
@@ -78,72 +81,71 @@ class Recorder:
         identity: Identity,
         clock: Clock,
         *,
-        busy: Callable[[], bool] = lambda: False,
+        is_busy: Callable[[], bool] = lambda: False,
         on_failure: Callable[[str], None] = lambda _: None,
-        opener: Callable[[Path], McapFile] = McapFile,
-        most_waiting_bytes: int = MOST_WAITING_BYTES,
+        open_file: Callable[[Path], McapFile] = McapFile,
+        max_waiting_bytes: int = MAX_WAITING_BYTES,
     ) -> None:
-        """Begin the first file; raises UserError where that is not possible.
+        """Begin the first file; raises UserError if that is not possible.
 
-        `busy` says whether an experiment is running; `on_failure` hears why nothing can be written, or an empty text.
+        `is_busy` returns whether an experiment is running. `on_failure` receives the error after each flush, empty
+        without an error.
         """
         self._folder = folder
         self._identity = identity
         self._clock = clock
-        self._busy = busy
+        self._is_busy = is_busy
         self._on_failure = on_failure
-        self._opener = opener
-        self._most_waiting_bytes = most_waiting_bytes
-        # Each with its size, and how many had been dropped before it.
+        self._open_file = open_file
+        self._max_waiting_bytes = max_waiting_bytes
+        # Each item with its size and the number of items dropped before it.
         self._queue: deque[tuple[_Item, int, int]] = deque()
-        # Each is counted up by one thread alone; what waits is their difference.
-        self._taken_bytes = 0
+        # One thread counts each of these up. Their difference is the size of the queue.
+        self._queued_bytes = 0
         self._done_bytes = 0
         self._dropped = 0
-        # What has no JSON form, and why the last one had none.
+        # Messages without a JSON form, and the latest error.
         self._unwritable = 0
         self._last_unwritable = ""
-        # How many of both before the file being written began.
+        # Items lost before the current file began.
         self._lost_before = 0
-        # Which tool each source was told of last.
+        # The latest tool event of each source.
         self._tools: dict[str, RawEvent] = {}
-        # One thread at a time writes: a flush that was cancelled may still be under way when the end comes.
-        self._writing = threading.Lock()
-        self._ended = False
+        # A flush may still run in its thread when the recorder is closed.
+        self._lock = threading.Lock()
+        self._closed = False
         self.failure = ""
         self.finished: list[Path] = []
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._begin()
+            self._begin_file()
         except OSError as error:
-            raise UserError(
-                f"{folder}: nothing can be recorded there: {error.strerror}; choose another folder"
-            ) from error
+            raise UserError(f"{folder}: cannot record there: {error.strerror}; choose another folder") from error
 
     @property
     def path(self) -> Path:
-        """The file being written."""
+        """The current file."""
         return self._file.partial
 
-    def record(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Take in a published message, as it goes on the wire."""
-        # In JSON the four bytes of a float32 become some eight.
+    def record_message(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Queue a published message."""
+        # A float32 becomes about eight bytes of JSON.
         size = _OVERHEAD_BYTES + 2 * sum(len(value) for value in content.values() if isinstance(value, bytes))
-        self._add(_Message(topic, content, self._clock.offset_ns, self._clock.now_ns()), size)
+        self._enqueue(_Message(topic, content, self._clock.offset_ns, self._clock.now_ns()), size)
 
-    def tap(self, source: str) -> Tap:
-        """Return what hears of all that a source's parser is told."""
+    def input_recorder(self, source: str) -> OnRaw:
+        """Return a function that records the raw input of one source."""
 
-        def hear(told: RawEvent) -> None:
-            self._add(_Input(source, told, self._clock.offset_ns), _OVERHEAD_BYTES + len(told.data))
+        def record_input(event: RawEvent) -> None:
+            self._enqueue(_Input(source, event, self._clock.offset_ns), _OVERHEAD_BYTES + len(event.data))
 
-        return hear
+        return record_input
 
-    def experiment(
-        self, name: str, attached: tuple[Attached, ...] = (), notes: Mapping[str, str] = MappingProxyType({})
+    def record_experiment(
+        self, name: str, attached: tuple[AttachedFile, ...] = (), notes: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        """Take note that an experiment was started: another file begins, unless this one has had none yet."""
-        self._add(_Experiment(name, attached, notes, self._clock.now_ns() + self._clock.offset_ns), _OVERHEAD_BYTES)
+        """Record the start of an experiment: a new file begins, unless the current one has no experiment yet."""
+        self._enqueue(_Experiment(name, attached, notes, self._clock.now_ns() + self._clock.offset_ns), _OVERHEAD_BYTES)
 
     async def run(self) -> None:
         """Write every FLUSH_S until cancelled."""
@@ -155,8 +157,8 @@ class Recorder:
             await asyncio.to_thread(self.write)
             self._on_failure(self.failure)
 
-    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return what health tells of the recording."""
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return the recorder's state for `health`."""
         return {
             "file": str(self.path),
             "files": len(self.finished) + 1,
@@ -164,55 +166,53 @@ class Recorder:
             "file_bytes": self._file.bytes_written,
             "waiting_bytes": self._waiting_bytes,
             "errors": {kind: n for kind, n in (("dropped", self._dropped), ("unwritable", self._unwritable)) if n},
-            "trouble": self.failure or self._last_unwritable,
+            "error": self.failure or self._last_unwritable,
         }
 
     def write(self) -> None:
-        """Write all that waits. A disk that does not take it is told in `failure`, and is tried again next time."""
-        with self._writing:
-            if not self._ended:
+        """Write the queue to the disk; an error is stored in `failure`, and the next call tries again."""
+        with self._lock:
+            if not self._closed:
                 self._write()
 
     def close(self) -> None:
-        """Write what is left and give the file its name; where that fails, `failure` says so."""
-        with self._writing:
-            if not self._ended:
-                self._ended = True
-                try:
-                    self._write()
-                finally:
-                    self._end()
-
-    def _end(self) -> None:
-        if self._file.messages or self._experiment:
-            self._finish(self._file, self._experiment, self._dropped + self._unwritable - self._lost_before)
-        else:
-            # A daemon that did not get as far as its first message has nothing to keep.
+        """Write the queue and close the file; an error is stored in `failure`."""
+        with self._lock:
+            if self._closed:
+                return
+            self._closed = True
             try:
-                self._file.discard()
-            except OSError as error:
-                self.failure = f"{self.path}: {error.strerror}"
+                self._write()
+            finally:
+                if self._file.messages or self._experiment:
+                    self._finish_file(self._file, self._experiment, self._dropped + self._unwritable)
+                else:
+                    # The daemon stopped before its first message.
+                    try:
+                        self._file.discard()
+                    except OSError as error:
+                        self.failure = f"{self.path}: {error.strerror}"
 
     @property
     def _waiting_bytes(self) -> int:
-        return self._taken_bytes - self._done_bytes + self._file.bytes_waiting
+        return self._queued_bytes - self._done_bytes + self._file.bytes_waiting
 
-    def _add(self, item: _Item, size: int) -> None:
-        if self._waiting_bytes + size > self._most_waiting_bytes:
+    def _enqueue(self, item: _Item, size: int) -> None:
+        if self._waiting_bytes + size > self._max_waiting_bytes:
             self._dropped += 1
             return
-        self._taken_bytes += size
+        self._queued_bytes += size
         self._queue.append((item, size, self._dropped))
 
     def _write(self) -> None:
         self.failure = ""
-        # What comes meanwhile waits for the next time.
+        # Items that arrive meanwhile wait for the next flush.
         for _ in range(len(self._queue)):
             item, size, dropped = self._queue.popleft()
-            if self._begins_another(item):
-                self._begin_another(dropped)
+            if self._needs_new_file(item):
+                self._change_file(dropped)
             try:
-                self._put(item)
+                self._add(item)
             finally:
                 self._done_bytes += size
         self._flush()
@@ -225,38 +225,36 @@ class Recorder:
             return False
         return True
 
-    def _begins_another(self, item: _Item) -> bool:
+    def _needs_new_file(self, item: _Item) -> bool:
         if isinstance(item, _Experiment):
             return bool(self._experiment)
-        return (self._clock.now_ns() - self._began_ns) / 1e9 > LONGEST_IDLE_FILE_S and not self._busy()
+        return (self._clock.now_ns() - self._began_ns) / 1e9 > LONGEST_IDLE_FILE_S and not self._is_busy()
 
-    def _begin_another(self, dropped: int) -> None:
-        """Go on in another file; where none can be begun, in the same one. So many were dropped until now."""
+    def _change_file(self, dropped: int) -> None:
+        """Begin the next file; on failure continue with the current one. `dropped` counts the drops so far."""
         if not self._flush():
             return
-        lost = dropped + self._unwritable
-        finished = self._file, self._experiment, lost - self._lost_before
+        previous, experiment = self._file, self._experiment
         try:
-            self._begin()
+            self._begin_file()
         except OSError as error:
             self.failure = f"{self._folder}: {error.strerror}"
             return
-        self._lost_before = lost
-        self._finish(*finished)
-        for source, told in self._tools.items():
-            # It is held on, and a replay of this file has heard of it nowhere else.
-            self._put(_Input(source, replace(told, t_ns=self._began_ns), self._clock.offset_ns))
+        self._finish_file(previous, experiment, dropped + self._unwritable)
+        for source, event in self._tools.items():
+            # The tool is still held, and a replay of this file must know it.
+            self._add(_Input(source, replace(event, t_ns=self._began_ns), self._clock.offset_ns))
 
-    def _begin(self) -> None:
+    def _begin_file(self) -> None:
         now_ns, offset_ns = self._clock.now_ns(), self._clock.offset_ns
-        file = self._opened(datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ"))
+        file = self._create_file(datetime.fromtimestamp((now_ns + offset_ns) / 1e9, UTC).strftime("%Y-%m-%dT%H-%M-%SZ"))
         try:
-            file.metadata(METADATA, self._identity.metadata)
+            file.add_metadata(METADATA, self._identity.metadata)
             for one in self._identity.attached:
                 file.attach(one.name, one.media_type, one.data, now_ns + offset_ns)
             file.flush()
         except OSError:
-            # What says nothing of a run is in the way of those who look for one, and is tried again soon.
+            # The next flush tries again.
             with suppress(OSError):
                 file.discard()
             raise
@@ -264,51 +262,52 @@ class Recorder:
         self._offset_ns: int | None = None
         self._experiment = ""
 
-    def _opened(self, name: str) -> McapFile:
-        for number in range(2, _MOST_ALIKE):
+    def _create_file(self, name: str) -> McapFile:
+        for number in range(2, _MAX_PER_SECOND):
             try:
-                return self._opener(self._folder / f"{name}.mcap")
+                return self._open_file(self._folder / f"{name}.mcap")
             except FileExistsError:
                 name = f"{name.partition('Z')[0]}Z-{number}"
-        raise FileExistsError(17, f"there are {_MOST_ALIKE} files of this second")
+        raise FileExistsError(17, f"there are {_MAX_PER_SECOND} files of this second")
 
-    def _finish(self, file: McapFile, experiment: str, lost: int) -> None:
-        """Close a file, under a name that tells its experiment; what cannot be closed stays PARTIAL, to be repaired."""
+    def _finish_file(self, file: McapFile, experiment: str, lost: int) -> None:
+        """Close a file under a name with its experiment; if that fails, the PARTIAL file stays for a repair."""
         slug = re.sub(r"[^a-z0-9.]+", "-", experiment.lower()).strip("-.")
         if slug:
             file.path = file.path.with_name(f"{file.path.stem}_{slug}.mcap")
         try:
-            file.metadata(END_METADATA, {"dropped": str(lost)})
+            file.add_metadata(END_METADATA, {"dropped": str(lost - self._lost_before)})
             self.finished.append(file.close())
         except OSError as error:
             self.failure = f"{file.partial}: {error.strerror}"
+        self._lost_before = lost
 
-    def _put(self, item: _Item) -> None:
+    def _add(self, item: _Item) -> None:
         match item:
             case _Message(topic, content, offset_ns, now_ns):
-                self._put_clock(now_ns, offset_ns)
+                self._add_clock(now_ns, offset_ns)
                 name = recorded_topic(topic, content["source"])
                 try:
                     data = message_json(topic, content, offset_ns)
                 except NoJsonError as error:
                     self._unwritable += 1
-                    self._last_unwritable = f"a message of {name} is left out, for it has no JSON form: {error}"
+                    self._last_unwritable = f"a message of {name} has no JSON form and is left out: {error}"
                     return
                 self._file.add(name, content["t_mono_ns"] + offset_ns, now_ns + offset_ns, data)
-            case _Input(source, told, offset_ns):
-                if told.kind is InputKind.TOOL:
-                    self._tools[source] = told
-                self._put_clock(told.t_ns, offset_ns)
-                t_unix_ns = told.t_ns + offset_ns
-                self._file.add(input_topic(source), t_unix_ns, t_unix_ns, input_json(told))
+            case _Input(source, event, offset_ns):
+                if event.kind is InputKind.TOOL:
+                    self._tools[source] = event
+                self._add_clock(event.t_ns, offset_ns)
+                t_unix_ns = event.t_ns + offset_ns
+                self._file.add(input_topic(source), t_unix_ns, t_unix_ns, input_json(event))
             case _Experiment(name, attached, notes, t_unix_ns):
                 self._experiment = name
-                self._file.metadata(EXPERIMENT_METADATA, {**notes, "name": name, "t_unix_ns": str(t_unix_ns)})
+                self._file.add_metadata(EXPERIMENT_METADATA, {**notes, "name": name, "t_unix_ns": str(t_unix_ns)})
                 for one in attached:
                     if one not in self._identity.attached:
                         self._file.attach(one.name, one.media_type, one.data, t_unix_ns)
 
-    def _put_clock(self, now_ns: int, offset_ns: int) -> None:
+    def _add_clock(self, now_ns: int, offset_ns: int) -> None:
         if offset_ns == self._offset_ns:
             return
         self._offset_ns = offset_ns

@@ -1,160 +1,396 @@
-"""Replay: what was recorded goes through parsers and estimators again, and is published as if it happened now.
+"""Replay: the raw input of a recording passes through parsers and estimators again and is published as if live.
 
-All times are the recording's own, so the result does not depend on how fast it is replayed; the wall clock only says
-when the next input is due.
+All times are the recording's own, so the result does not depend on the replay's speed. The same code gives the same
+estimates bit for bit.
 """
 
 import asyncio
 import json
 import math
+import tempfile
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
+from shearloop.bank.eit.channels import N_LINE_VALUES, ZERO_SLOTS
+from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.messages import EitHeatmap
+from shearloop.daemon.config import DaemonConfig
+from shearloop.daemon.config_file import mistakes
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.recording.content import message_json
-from shearloop.daemon.recording.recorded_run import RecordedEvent, RecordedRun
-from shearloop.daemon.recording.replay_pipeline import MADE_ANEW, ReplayPipeline
-from shearloop.daemon.recording.schema import CLOCK_TOPIC, recorded_topic
+from shearloop.daemon.recording.identity import map_paths
+from shearloop.daemon.recording.reader import check_identity, open_recording, reading
+from shearloop.daemon.recording.schema import (
+    CLOCK_TOPIC,
+    CONFIGURATION,
+    FRAME_TOPIC,
+    INPUT,
+    METADATA,
+    input_event,
+    input_topic,
+    message_json,
+    recorded_topic,
+    schema_name,
+    with_missing_keys,
+)
+from shearloop.daemon.rig import load_cell_calibration
+from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.fingertip_task import FramePairing, estimate_message, frame_message
+from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
+from shearloop.daemon.sensing.skin_task import SKIN, RecordedSkin
+from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
+from shearloop.drivers.eit_kit import Frame, FrameParser
+from shearloop.drivers.load_cell import LoadParser
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
-# These two say when a message was made and by which reading of the clocks, and not what was measured.
-NOT_COMPARED = ("latency_s", "timestamp")
-# An inequality is shown with so many examples.
-_MOST_SHOWN = 5
+# Topics that a replay computes. All others are sent as they were recorded.
+COMPUTED_TOPICS = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topic)
+# These depend on the computer, not on the measurement.
+NOT_COMPARED = ("latency_s", "timestamp", "arrival_unix_ns", "seq")
+_MAX_EXAMPLES = 5
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedEvent:
+    """One entry of a recording: a message under its live topic, or a raw input (`raw`)."""
+
+    topic: str
+    t_mono_ns: int
+    content: Mapping[str, Any]
+    source: str = ""
+    raw: RawEvent | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayEvents:
+    """Events that the frames do not contain: tares and tools by source and frame number.
+
+    `frame_numbers` holds the frames' numbers by source and arrival; they continue from file to file.
+    """
+
+    tares: dict[str, set[int]] = field(default_factory=dict)
+    tools: dict[str, dict[int, Measured | None]] = field(default_factory=dict)
+    frame_numbers: dict[str, dict[int, int]] = field(default_factory=dict)
+
+    def add(self, event: RecordedEvent) -> None:
+        """Store an event if it is a tare, a tool or a frame."""
+        if event.topic == EitFrame.topic:
+            arrival_ns = event.content["t_mono_ns"] + round(event.content["age_s"] * 1e9)
+            self.frame_numbers.setdefault(event.source, {})[arrival_ns] = event.content["frame"]
+        elif event.raw is None:
+            return
+        elif event.raw.kind is InputKind.TARE and event.raw.data.isdigit():
+            self.tares.setdefault(event.source, set()).add(int(event.raw.data))
+        elif event.raw.kind is InputKind.TOOL:
+            frame, tool = tool_from_bytes(event.raw.data)
+            self.tools.setdefault(event.source, {})[frame] = tool
+
+
+class RecordedRun:
+    """A recording as a sequence of events; raises UserError for a file that cannot be replayed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        with open_recording(path) as recording:
+            self.counts = recording.counts
+            self.metadata = check_identity(path, recording.metadata().get(METADATA))
+            self._attached = recording.attachments()
+
+    @property
+    def has_inputs(self) -> bool:
+        """Whether it holds raw input; an imported recording holds only lines."""
+        return any(topic.startswith(f"{INPUT}.") and topic != CLOCK_TOPIC for topic in self.counts)
+
+    @property
+    def messages(self) -> int:
+        """The number of messages."""
+        return sum(self.counts.values())
+
+    @contextmanager
+    def configuration(self) -> Iterator[DaemonConfig]:
+        """Yield the recorded configuration, with the attached files in a temporary folder."""
+        if CONFIGURATION not in self._attached:
+            raise UserError(
+                f"{self.path} has no configuration because no daemon recorded it; give one with --config CONFIG"
+            )
+        with reading(self.path):
+            content = json.loads(self._attached[CONFIGURATION])
+        try:
+            config = DaemonConfig.model_validate(content)
+        except ValidationError as error:
+            raise UserError(
+                f"{self.path}: its configuration does not fit this version: {mistakes(error, DaemonConfig)}; "
+                "give one with --config CONFIG"
+            ) from error
+        with tempfile.TemporaryDirectory(prefix="shearloop-replay-") as folder:
+            files: dict[Path, Path] = {}
+            for number, (name, data) in enumerate(self._attached.items()):
+                files[Path(name)] = Path(folder) / f"{number}-{Path(name).name}"
+                files[Path(name)].write_bytes(data)
+            yield map_paths(config, lambda _, path: files.get(path, path))
+
+    def events(self) -> Iterator[RecordedEvent]:
+        """Yield the events in recorded order."""
+        with open_recording(self.path) as recording:
+            # An imported recording has one side after the other, a live one is in order.
+            messages = recording.messages(by_time=not self.has_inputs)
+            for number, (channel, message) in enumerate(messages):
+                content = json.loads(message.data)
+                if self.has_inputs:
+                    yield _live_event(channel.topic, content)
+                else:
+                    yield _imported_event(channel.topic, content, message.log_time, number)
+
+    def replay_events(self) -> ReplayEvents:
+        """Return the events that the frames do not contain."""
+        found = ReplayEvents()
+        if self.has_inputs:
+            for event in self.events():
+                with reading(self.path):
+                    found.add(event)
+        return found
+
+
+class ReplayPipeline:
+    """The parsers and estimators of one configuration, fed with one raw input at a time."""
+
+    def __init__(self, config: DaemonConfig, events: ReplayEvents, publisher: Publisher) -> None:
+        """Open all files of the configuration; raises BankError or UserError."""
+        self._publisher = publisher
+        self._events = events
+        # Per source: the difference between recorded and replayed frame numbers, and the latest frame.
+        self._number_offset: dict[str, int] = {}
+        self._latest_frame: dict[str, int] = {}
+        self._estimators: dict[str, LiveEstimator] = {
+            name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
+        }
+        self._pairing: FramePairing[Frame] | None = None
+        if config.combined is not None:
+            self._estimators[COMBINED] = combined = open_combined(config.combined, config.fingertips)
+            sides = combined.calibration.sides
+            self._pairing = FramePairing(sides, round(config.fingertips[sides[0]].frame_period_s * 1e9))
+        self._frame_parsers = {
+            name: FrameParser(ZERO_SLOTS, nominal_period_ns=round(fingertip.frame_period_s * 1e9))
+            for name, fingertip in config.fingertips.items()
+        }
+        self._load_parser: LoadParser | None = None
+        if config.load_cell is not None:
+            self._load_parser = LoadParser(load_cell_calibration(config.load_cell), config.load_cell.rate_hz)
+        self._skin = RecordedSkin(config.skin) if config.skin is not None else None
+
+    @property
+    def published_sources(self) -> tuple[str, ...]:
+        """The sources of the messages that are computed."""
+        load_cell = (LOAD_CELL,) if self._load_parser is not None else ()
+        return (*self._estimators, *load_cell, *((SKIN,) if self._skin is not None else ()))
+
+    async def process(self, source: str, event: RawEvent) -> None:
+        """Publish the messages that follow from a raw input; an input of another source is ignored."""
+        if source in self._frame_parsers:
+            for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
+                self._publisher.publish(frame_message(source, frame))
+                await self._estimate(source, frame)
+                pair = self._pairing.add(source, frame.t_mid_ns, frame) if self._pairing is not None else None
+                if pair is not None:
+                    await self._estimate(COMBINED, *pair[1])
+        elif source == LOAD_CELL and self._load_parser is not None:
+            for sample in self._load_parser.handle(event):
+                self._publisher.publish(load_message(sample))
+        elif self._skin is not None and source in self._skin.sources:
+            for message in self._skin.handle(source, event):
+                self._publisher.publish(message)
+
+    def _renumbered(self, source: str, frames: list[Frame]) -> list[Frame]:
+        """Return frames with their recorded numbers: a later file of a run continues to count."""
+        if frames and source not in self._number_offset:
+            # The first of several frames may have begun in the file before.
+            last, numbers = frames[-1], self._events.frame_numbers.get(source, {})
+            self._number_offset[source] = numbers.get(last.t_arrival_ns, last.seq) - last.seq
+        offset = self._number_offset.get(source, 0)
+        return [replace(frame, seq=frame.seq + offset) for frame in frames] if offset else frames
+
+    async def _estimate(self, source: str, *frames: Frame) -> None:
+        estimator, number = self._estimators[source], frames[0].seq
+        if number in self._events.tares.get(source, ()):
+            estimator.tare()
+        tools = self._events.tools.get(source, {})
+        due = [first for first in tools if self._latest_frame.get(source, -1) < first <= number]
+        if due:
+            estimator.set_tool(tools[max(due)])
+        self._latest_frame[source] = number
+        estimate = await asyncio.to_thread(estimator.estimate, *frames)
+        # The replayed latency is 0; the recording holds the live one.
+        arrival_ns = max(frame.t_arrival_ns for frame in frames)
+        self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
 
 
 class ReplayClock(Clock):
-    """The recording's own time."""
+    """A clock that shows the recording's own time."""
 
     def __init__(self) -> None:
-        """Begin where a recording says."""
+        """Start at zero until the first event sets the time."""
         self._offset_ns = 0
         self._now_ns = 0
 
     def now_ns(self) -> int:
-        """Return the time of what is being replayed."""
+        """Return the time of the current event."""
         return self._now_ns
 
     def synchronise(self) -> float:
-        """Do nothing: the recording says how its clocks were to each other."""
+        """Do nothing: the recording holds the offset of its clocks."""
         return 0.0
 
     def set(self, now_ns: int, offset_ns: int | None = None) -> None:
-        """Go on to a time, and to another offset where one was recorded."""
+        """Set the time, and the offset to Unix time if it is given."""
         self._now_ns = now_ns
         if offset_ns is not None:
             self._offset_ns = offset_ns
 
 
 @dataclass(slots=True)
-class Comparison:
-    """What was made anew beside what was recorded, message by message, bit for bit.
+class ReplayComparison:
+    """Compares computed messages with recorded ones, bit for bit.
 
-    `unrecorded` counts, when all is replayed, the messages that were made now and not recorded, as those of the moment
-    in which the daemon was stopped. `there` are the recording's topics: what is in none of them is counted, not kept.
+    `recorded_topics` are the topics of the recording. Computed messages of other topics are only counted.
     """
 
-    there: Collection[str] = ()
+    recorded_topics: Collection[str] = ()
     compared: Counter[str] = field(default_factory=Counter)
     different: Counter[str] = field(default_factory=Counter)
     examples: list[str] = field(default_factory=list)
     _foreign: int = 0
-    _made: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
+    _computed: dict[tuple[str, str], deque[Mapping[str, Any]]] = field(default_factory=dict)
 
-    def made(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Take in a message as it was published now."""
-        if topic not in MADE_ANEW:
+    def add_computed(self, topic: str, content: Mapping[str, Any]) -> None:
+        """Store a message that the replay published."""
+        if topic not in COMPUTED_TOPICS:
             return
-        if recorded_topic(topic, content["source"]) not in self.there:
+        if recorded_topic(topic, content["source"]) not in self.recorded_topics:
             self._foreign += 1
         else:
             plain = json.loads(message_json(topic, content, 0))
-            self._made.setdefault((topic, content["source"]), deque()).append(plain)
+            self._computed.setdefault((topic, content["source"]), deque()).append(plain)
 
-    def recorded(self, happened: RecordedEvent) -> None:
-        """Take in a message as it was recorded, after all that led to it."""
-        waiting = self._made.get((happened.topic, happened.source))
-        self.compared[happened.topic] += 1
+    def compare(self, event: RecordedEvent) -> None:
+        """Compare a recorded message with the oldest computed one of its topic and source."""
+        waiting = self._computed.get((event.topic, event.source))
+        self.compared[event.topic] += 1
         if not waiting:
-            self._differs(happened, "it was not made again")
+            self._add_difference(event, "the replay did not compute it")
             return
-        made = waiting.popleft()
-        keys = [key for key in happened.content if key not in (*NOT_COMPARED, "arrival_unix_ns", "seq")]
-        unlike = [key for key in keys if made.get(key) != happened.content[key]]
-        if unlike:
-            self._differs(
-                happened,
-                ", ".join(f"{key} was {_short(happened.content[key])}, is {_short(made.get(key))}" for key in unlike),
-            )
+        computed = waiting.popleft()
+        keys = [key for key in event.content if key not in NOT_COMPARED and computed.get(key) != event.content[key]]
+        if keys:
+            changes = (f"{key} was {_short(event.content[key])}, is {_short(computed.get(key))}" for key in keys)
+            self._add_difference(event, ", ".join(changes))
 
     @property
     def unrecorded(self) -> int:
-        """Messages made now that were not recorded."""
-        return self._foreign + sum(map(len, self._made.values()))
+        """Computed messages that are not in the recording, such as those at the moment of the daemon's stop."""
+        return self._foreign + sum(map(len, self._computed.values()))
 
-    def _differs(self, happened: RecordedEvent, why: str) -> None:
-        self.different[happened.topic] += 1
-        if len(self.examples) < _MOST_SHOWN:
-            self.examples.append(f"{happened.topic} of {happened.source}, number {happened.content['seq']}: {why}")
+    def _add_difference(self, event: RecordedEvent, text: str) -> None:
+        self.different[event.topic] += 1
+        if len(self.examples) < _MAX_EXAMPLES:
+            self.examples.append(f"{event.topic} of {event.source}, number {event.content['seq']}: {text}")
 
 
 class Replay:
-    """Replays one recording through a chain, to a publisher whose clock is `clock`."""
+    """Replays a recording through a pipeline; `clock` is the publisher's clock."""
 
-    def __init__(self, run: RecordedRun, chain: ReplayPipeline, publisher: Publisher, clock: ReplayClock) -> None:
+    def __init__(self, run: RecordedRun, pipeline: ReplayPipeline, publisher: Publisher, clock: ReplayClock) -> None:
         self._run = run
-        self._chain = chain
+        self._pipeline = pipeline
         self._publisher = publisher
         self._clock = clock
-        self.comparison = Comparison(run.counts)
+        self.comparison = ReplayComparison(run.counts)
         if run.has_inputs:
-            # Of a recording from elsewhere nothing is compared, and what was kept for it would be kept for ever.
-            publisher.listen(self.comparison.made)
+            publisher.add_listener(self.comparison.add_computed)
 
     async def play(self, speed: float, progress: Callable[[int], None] = lambda _: None) -> None:
-        """Replay all of it, `speed` times as fast as it happened; math.inf waits for nothing."""
+        """Replay all events `speed` times as fast as they happened; math.inf does not wait at all."""
         loop = asyncio.get_running_loop()
         began_s, first_ns = loop.time(), None
-        for number, happened in enumerate(self._run.happenings(), 1):
-            # A message speaks of a time before it was sent; only an input says when it came.
-            if happened.told is not None or not self._run.has_inputs:
-                first_ns = happened.t_mono_ns if first_ns is None else first_ns
+        for number, event in enumerate(self._run.events(), 1):
+            # The time of a message lies before its sending. Only a raw input has its arrival time.
+            if event.raw is not None or not self._run.has_inputs:
+                first_ns = event.t_mono_ns if first_ns is None else first_ns
                 if math.isfinite(speed):
-                    due_s = began_s + (happened.t_mono_ns - first_ns) / 1e9 / speed
+                    due_s = began_s + (event.t_mono_ns - first_ns) / 1e9 / speed
                     await asyncio.sleep(max(0.0, due_s - loop.time()))
-            await self._happen(happened)
+            await self._process(event)
             progress(number)
             if number % 100 == 0:
-                # Signals and sockets have their turn.
+                # Let signals and sockets run.
                 await asyncio.sleep(0)
 
-    async def _happen(self, happened: RecordedEvent) -> None:
-        if happened.topic == CLOCK_TOPIC:
-            self._clock.set(happened.t_mono_ns, int(happened.content["offset_ns"]))
-        elif happened.told is not None:
-            self._clock.set(happened.t_mono_ns)
-            await self._chain.take(happened.source, happened.told)
-        elif happened.topic in MADE_ANEW and self._run.has_inputs and happened.source in self._chain.publishes:
-            self.comparison.recorded(happened)
-        elif happened.topic != EitHeatmap.topic:
-            self._publisher.forward(happened.topic, wire_map_of(happened.content))
+    async def _process(self, event: RecordedEvent) -> None:
+        if event.topic == CLOCK_TOPIC:
+            self._clock.set(event.t_mono_ns, int(event.content["offset_ns"]))
+        elif event.raw is not None:
+            self._clock.set(event.t_mono_ns)
+            await self._pipeline.process(event.source, event.raw)
+        elif event.topic in COMPUTED_TOPICS and self._run.has_inputs and self._is_computed(event.source):
+            self.comparison.compare(event)
+        elif event.topic != EitHeatmap.topic:
+            self._publisher.forward(event.topic, restored_wire_map(event.content))
+
+    def _is_computed(self, source: str) -> bool:
+        return source in self._pipeline.published_sources
 
 
-def wire_map_of(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the map that goes on the wire of a recorded message: its lists as float32 with their shapes."""
-    on_wire: dict[str, Any] = {}
+def restored_wire_map(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the live map of a recorded message: lists as float32 with their shapes."""
+    restored: dict[str, Any] = {}
     for key, value in content.items():
         if isinstance(value, list):
             array = np.array([np.nan if one is None else one for one in value], "<f4")
-            on_wire[key], on_wire[f"{key}_shape"] = array.tobytes(), list(array.shape)
+            restored[key], restored[f"{key}_shape"] = array.tobytes(), list(array.shape)
         else:
-            on_wire[key] = value
-    return on_wire
+            restored[key] = value
+    return restored
+
+
+def _live_event(topic: str, content: dict[str, Any]) -> RecordedEvent:
+    if topic == CLOCK_TOPIC:
+        return RecordedEvent(topic, content["t_mono_ns"], content)
+    if topic.startswith(f"{INPUT}."):
+        raw = input_event(content)
+        return RecordedEvent(topic, raw.t_ns, content, topic.removeprefix(f"{INPUT}."), raw)
+    live = schema_name(topic)
+    return RecordedEvent(live, content["t_mono_ns"], with_missing_keys(live, content), content["source"])
+
+
+def _imported_event(topic: str, content: dict[str, Any], log_ns: int, number: int) -> RecordedEvent:
+    if topic.startswith(f"{FRAME_TOPIC}."):
+        # The line as the board sent it: four decimals, each followed by a comma and a space.
+        values = np.asarray(content["line"], dtype=np.float64)
+        if values.shape != (N_LINE_VALUES,):
+            raise ValueError(f"a line of {values.size} values")
+        text = "".join(f"{value:.4f}, " for value in values.tolist()) + "\r\n"
+        side, t_ns = topic.removeprefix(f"{FRAME_TOPIC}."), int(content["arrival_unix_ns"])
+        return RecordedEvent(input_topic(side), t_ns, {}, side, RawEvent(InputKind.DATA, t_ns, text.encode()))
+    complete = {
+        "source": topic.partition(".")[0],
+        "raw": content.get("torque_nm"),
+        "saturated": False,
+        "spike": False,
+        "valid": True,
+        "reason": "",
+        **content,
+        "timestamp": log_ns / 1e9,
+        "t_mono_ns": log_ns,
+        "seq": number,
+    }
+    return RecordedEvent(topic, log_ns, complete, complete["source"])
 
 
 def _short(value: object) -> str:

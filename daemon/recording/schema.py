@@ -1,18 +1,18 @@
-"""What stands in a recording: topics, their JSON schemas, and the metadata that says what it was made with.
+"""The format of a recording: topics, JSON schemas, metadata, and messages as JSON.
 
-A recording is an MCAP file (mcap.dev). Log times are Unix nanoseconds: of a message the time that it speaks of (of a
-frame the middle of its acquisition), of a raw input when it arrived. Any MCAP tool can show and plot one; the schemas
-describe every key.
+A recording is an MCAP file (mcap.dev) that any MCAP tool can show. Log times are Unix nanoseconds: for a message the
+time of its measurement (for a frame the middle of its acquisition), for a raw input its arrival.
 
-The schemas keep to what Foxglove takes of JSON Schema, which refuses a topic for anything more: each key has one type,
-every object names its properties. So a value that there is none of is not null; its key is left out.
+Topics have the names of the live messages. Topics that each fingertip sends end in the source: `eit.frame.right`.
+`input.SOURCE` holds the raw input of a parser as Latin-1 text, so that each byte is one character. `input.clock` holds
+the offset between the monotonic clock and Unix time. Replay needs only these two.
 
-Topics are those of the wire; where several fingertips send one, its source follows: `eit.frame.right`. `input.SOURCE`
-holds all that a parser was told, bytes as text (Latin-1, so that each byte is one character), and `input.clock` how the
-monotonic clock was translated into Unix time: from these two a recording can be replayed.
+The schemas use the part of JSON Schema that Foxglove supports: each key has one type, every object lists its
+properties. A key without a value is therefore left out instead of null.
 """
 
 import dataclasses
+import math
 import types
 import typing
 from collections.abc import Mapping
@@ -20,37 +20,43 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_json
 
-from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame, EitHeatmap, LoadTorque
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
+FORMAT_VERSION = "2"
 FRAME_TOPIC = EitFrame.topic
 LOAD_TOPIC = LoadTorque.topic
 INPUT = "input"
 CLOCK_TOPIC = f"{INPUT}.clock"
-# MCAP metadata record with the identities; a reader refuses a file without it.
+# MCAP metadata record of every recording: format, software, channel table.
 METADATA = "shearloop"
-# One more for each experiment that was started.
+# One metadata record for each experiment, and one at the end of a closed recording.
 EXPERIMENT_METADATA = "shearloop.experiment"
-# And one at the end of a recording that was closed.
 END_METADATA = "shearloop.end"
 CONFIGURATION = "configuration.json"
-FORMAT_VERSION = "1"
 PROFILE = "shearloop"
 SIDES = ("right", "left")
-# The note that tells the tool's diameter in mm, where it was known: of an imported recording, or of the experiment in
-# one of a daemon. The gripper opens no wider.
+# Metadata key of the tool's diameter in mm. The gripper opens no wider than the largest.
 DIAMETER_NOTE = "diameter_mm"
 LARGEST_DIAMETER_MM = 140.0
 
-_OF_FINGERTIPS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
-_NAMES = {float: "number", int: "integer", str: "string", bool: "boolean"}
+_FINGERTIP_TOPICS = (EitFrame.topic, EitEstimate.topic, EitHeatmap.topic)
+_SCALARS = {float: "number", int: "integer", str: "string", bool: "boolean"}
 _TIME = {"type": "integer", "description": "CLOCK_MONOTONIC in ns"}
+# Decimals of array elements: a microvolt, a microradian.
+_DECIMALS = 6
+_SHAPE = "_shape"
+
+
+class NoJsonError(ValueError):
+    """A value cannot be written as JSON."""
 
 
 def recorded_topic(topic: str, source: str) -> str:
     """Return the topic under which a message is recorded."""
-    return f"{topic}.{source}" if topic in _OF_FINGERTIPS else topic
+    return f"{topic}.{source}" if topic in _FINGERTIP_TOPICS else topic
 
 
 def frame_topic(side: str) -> str:
@@ -59,85 +65,134 @@ def frame_topic(side: str) -> str:
 
 
 def input_topic(source: str) -> str:
-    """Return the topic of what a source's parser was told."""
+    """Return the topic of a source's raw input."""
     return f"{INPUT}.{source}"
 
 
-def schema_of(topic: str) -> str:
-    """Return the name of a recorded topic's schema; raises KeyError for a topic that is never recorded."""
+def schema_name(topic: str) -> str:
+    """Return the name of a recorded topic's schema; raises KeyError for an unknown topic."""
     if topic == CLOCK_TOPIC or topic in TOPICS:
         return topic
     if topic.startswith(f"{INPUT}."):
         return INPUT
-    for wire in _OF_FINGERTIPS:
-        if topic.startswith(f"{wire}."):
-            return wire
+    for live in _FINGERTIP_TOPICS:
+        if topic.startswith(f"{live}."):
+            return live
     raise KeyError(topic)
 
 
 @cache
 def schemas() -> Mapping[str, dict[str, Any]]:
-    """Return the JSON schema of each name that `schema_of` gives."""
+    """Return the JSON schemas by name."""
     raw = {
         INPUT: {
             "t_mono_ns": _TIME,
             "kind": {"type": "string", "description": "opened or started (the board), asked, data, tare, or tool"},
-            "data": {"type": "string", "description": "the bytes as Latin-1 text, or what belongs to a tare or a tool"},
+            "data": {"type": "string", "description": "the bytes as Latin-1 text, or the argument of a tare or a tool"},
         },
         CLOCK_TOPIC: {
             "t_mono_ns": _TIME,
-            "offset_ns": {"type": "integer", "description": "Unix time less CLOCK_MONOTONIC in ns, from now on"},
+            "offset_ns": {"type": "integer", "description": "Unix time minus CLOCK_MONOTONIC in ns, from now on"},
         },
     }
     return {
         **{name: _object(name, properties, list(properties)) for name, properties in raw.items()},
-        **{topic: _of_message(topic) for topic in TOPICS},
+        **{topic: _message_schema(topic) for topic in TOPICS},
     }
 
 
-def completed(topic: str, content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a recorded message of a wire topic with None for each value that there was none of."""
-    # A recording that was brought in from elsewhere has no source, and never had more keys than are there.
+def with_missing_keys(topic: str, content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a recorded message with None for the keys that were left out."""
+    # An imported message has no source and never had the other keys.
     absent = _optional_keys(topic) if topic in TOPICS and "source" in content else ()
     return {**content, **{key: None for key in absent if key not in content}}
 
 
+def message_json(topic: str, content: Mapping[str, Any], offset_ns: int) -> bytes:
+    """Return a message's map as JSON: arrays as flat lists, without keys that have no value."""
+    plain: dict[str, Any] = {}
+    for key, value in content.items():
+        if isinstance(value, float):
+            if math.isfinite(value):
+                plain[key] = value
+        elif isinstance(value, bytes):
+            rounded = np.round(np.frombuffer(value, "<f4").astype(np.float64), _DECIMALS)
+            # Elements that are not finite become null.
+            plain[key] = rounded.tolist()
+        elif value is not None and not key.endswith(_SHAPE):
+            plain[key] = value
+    if topic == EitFrame.topic:
+        plain["arrival_unix_ns"] = content["t_mono_ns"] + round(content["age_s"] * 1e9) + offset_ns
+    return as_json(plain)
+
+
+def input_json(event: RawEvent) -> bytes:
+    """Return a raw input as JSON, each byte as one character."""
+    return as_json({"t_mono_ns": event.t_ns, "kind": event.kind.value, "data": event.data.decode("latin-1")})
+
+
+def input_event(content: Mapping[str, Any]) -> RawEvent:
+    """Return the raw input of a recorded message; raises KeyError, TypeError or ValueError for other content."""
+    return RawEvent(InputKind(content["kind"]), int(content["t_mono_ns"]), content["data"].encode("latin-1"))
+
+
+def as_json(content: Mapping[str, Any]) -> bytes:
+    """Return compact JSON, with null for numbers that are not finite.
+
+    Raises NoJsonError for text that is not UTF-8, for other objects, and for more than 250 levels.
+    """
+    try:
+        return to_json(content, inf_nan_mode="null", fallback=_mapping_as_dict)
+    except (ValueError, TypeError) as error:
+        raise NoJsonError(str(error)) from error
+
+
+def _mapping_as_dict(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f"{type(value).__name__} is no JSON type")
+
+
 @cache
 def _optional_keys(topic: str) -> tuple[str, ...]:
-    """Return the keys of a wire topic that a message is without where there is no value, or none that is finite."""
+    """Return the keys that a message leaves out if they have no finite value."""
     hints = typing.get_type_hints(TOPICS[topic])
     fields = [item.name for item in dataclasses.fields(TOPICS[topic])]
     return tuple(name for name in fields if hints[name] is float or type(None) in typing.get_args(hints[name]))
 
 
-def _of_message(topic: str) -> dict[str, Any]:
+def _message_schema(topic: str) -> dict[str, Any]:
     properties: dict[str, Any] = {
-        "timestamp": {"type": "number", "description": "Unix time in s that the message speaks of"},
+        "timestamp": {"type": "number", "description": "Unix time in s of the measurement"},
         "seq": {"type": "integer", "description": "number of the message, without gaps, per topic and source"},
     }
     hints = typing.get_type_hints(TOPICS[topic])
     for item in dataclasses.fields(TOPICS[topic]):
         unit, meaning = item.metadata.get("unit", ""), item.metadata.get("meaning", "")
-        properties[item.name] = {**_type(hints[item.name]), "description": f"{meaning} ({unit})" if unit else meaning}
+        properties[item.name] = {
+            **json_type(hints[item.name]),
+            "description": f"{meaning} ({unit})" if unit else meaning,
+        }
     required = [name for name in properties if name not in _optional_keys(topic)]
     if topic == FRAME_TOPIC:
-        properties["arrival_unix_ns"] = {"type": "integer", "description": "when the last byte of the line was read"}
-        # A recording that was brought in from elsewhere has no more of a frame.
+        properties["arrival_unix_ns"] = {"type": "integer", "description": "arrival of the line's last byte"}
+        # An imported frame has no other keys.
         required = ["arrival_unix_ns", "line"]
     elif topic == LOAD_TOPIC:
         required = []
     return _object(topic, properties, required)
 
 
-def _type(hint: Any) -> dict[str, Any]:
+def json_type(hint: Any) -> dict[str, Any]:
+    """Return the JSON schema of a message field's type: a scalar, a mapping or an array, each maybe optional."""
     if typing.get_origin(hint) in (typing.Union, types.UnionType):
         hint = next(part for part in typing.get_args(hint) if part is not type(None))
-    if hint in _NAMES:
-        return {"type": _NAMES[hint]}
-    if typing.get_origin(hint) in (np.ndarray, tuple):
-        # An element that is NaN has no JSON form and is null, for which there is no word that Foxglove takes.
-        return {"type": "array", "items": {"type": "number"}}
-    return {"type": "object", "properties": {}}
+    if hint in _SCALARS:
+        return {"type": _SCALARS[hint]}
+    if typing.get_origin(hint) is Mapping:
+        return {"type": "object", "properties": {}}
+    # A NaN element becomes null, which a schema for Foxglove cannot express.
+    return {"type": "array", "items": {"type": "number"}}
 
 
 def _object(title: str, properties: dict[str, Any], required: list[str]) -> dict[str, Any]:

@@ -1,57 +1,186 @@
-"""Writes a recording message by message, from data that is there already; a live one is `recorder`'s business."""
+"""Writes MCAP files: each flush is safe against a kill, and a full disk does not damage the file."""
 
 import io
+import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import IO, Self, cast
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.content import as_json
 from shearloop.daemon.recording.identity import basic_identity
-from shearloop.daemon.recording.mcap_file import PARTIAL, McapFile
-from shearloop.daemon.recording.schema import LOAD_TOPIC, METADATA, frame_topic
+from shearloop.daemon.recording.schema import (
+    LOAD_TOPIC,
+    METADATA,
+    PROFILE,
+    as_json,
+    frame_topic,
+    schema_name,
+    schemas,
+)
+from shearloop.files import sync_directory
 
+PARTIAL = ".partial"
+# Larger than the data between two flushes, so that each flush writes one chunk.
+_CHUNK_BYTES = 1 << 24
 # Decimals of a volt: the board sends four.
 _DECIMALS = 6
-# A chunk of a megabyte or so.
+# Messages in a chunk of about a megabyte.
 _FLUSH_EVERY = 128
 
 
-class RecordingWriter:
-    """Appends messages in any order of time; a context manager that gives the file its name when all went well."""
+def new_writer(stream: IO[bytes]) -> Writer:
+    """Return a started MCAP writer that stores checksums of all its data."""
+    writer = Writer(stream, _CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(profile=PROFILE, library="shearloop")
+    return writer
 
-    def __init__(self, path: str | Path, source: str, notes: dict[str, str] | None = None) -> None:
-        """Create `path`.partial; `source` says in words where the data is from. Raises UserError where it cannot be."""
+
+class _RetryStream:
+    """Keeps data that the disk did not take, so that a later flush can write it."""
+
+    def __init__(self, file: io.FileIO) -> None:
+        self.file = file
+        self.pending = bytearray()
+        self.written = 0
+
+    def write(self, data: bytes) -> int:
+        self.pending += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self.written + len(self.pending)
+
+    def flush(self) -> None:
+        """Write all pending data; on OSError cut the file back to the last successful flush."""
+        with memoryview(self.pending) as data:
+            done = 0
+            try:
+                while done < len(data):
+                    done += self.file.write(data[done:])
+            except OSError:
+                self.file.truncate(self.written)
+                self.file.seek(self.written)
+                raise
+        self.written += done
+        self.pending.clear()
+
+
+class McapFile:
+    """Writes PATH.partial and renames it to PATH when it is closed as complete.
+
+    `flush` writes the messages so far as one chunk. If that fails (OSError), no data is lost and the next flush tries
+    again. Not thread-safe.
+    """
+
+    def __init__(self, path: Path, file: io.FileIO | None = None) -> None:
+        """Create PATH.partial, or write to an open `file`; raises OSError, FileExistsError if it exists."""
+        self.path = path
+        self.partial = path.with_name(path.name + PARTIAL)
+        self._file = file if file is not None else io.FileIO(self.partial, "xb")
+        self._stream = _RetryStream(self._file)
+        # The MCAP writer calls only write, tell and flush.
+        self._writer = new_writer(cast(IO[bytes], self._stream))
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._sequence: dict[str, int] = {}
+        self.messages = 0
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes on the disk."""
+        return self._stream.written
+
+    @property
+    def bytes_waiting(self) -> int:
+        """Bytes that the last flush could not write."""
+        return len(self._stream.pending)
+
+    def add_metadata(self, name: str, content: Mapping[str, str]) -> None:
+        """Append a metadata record."""
+        self._writer.add_metadata(name, dict(content))
+
+    def attach(self, name: str, media_type: str, data: bytes, t_unix_ns: int) -> None:
+        """Append an attachment, such as the configuration."""
+        self._writer.add_attachment(t_unix_ns, t_unix_ns, name, media_type, data)
+
+    def add(self, topic: str, log_ns: int, publish_ns: int, data: bytes) -> None:
+        """Append a message to the open chunk; `data` is JSON of the topic's schema."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._channels[topic] = self._register(topic)
+        sequence = self._sequence.get(topic, 0)
+        self._sequence[topic] = sequence + 1
+        self._writer.add_message(channel, log_time=log_ns, publish_time=publish_ns, sequence=sequence, data=data)
+        self.messages += 1
+
+    def flush(self) -> None:
+        """End the chunk and write it to the disk; raises OSError, after which a later flush tries again."""
+        self._writer.flush()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
+
+    def close(self, complete: bool = True) -> Path:
+        """Write the index and return the file's path: PATH if it is complete, else PATH.partial.
+
+        Raises OSError if the disk is full; the flushed data then stays readable as PATH.partial.
+        """
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
+            self._stream.flush()
+            os.fsync(self._file.fileno())
+        finally:
+            self._file.close()
+        if not complete:
+            return self.partial
+        self.partial.replace(self.path)
+        sync_directory(self.path.parent)
+        return self.path
+
+    def discard(self) -> None:
+        """Close and delete the file."""
+        self._file.close()
+        self.partial.unlink(missing_ok=True)
+
+    def _register(self, topic: str) -> int:
+        name = schema_name(topic)
+        if name not in self._schemas:
+            text = json.dumps(schemas()[name], sort_keys=True, ensure_ascii=False).encode()
+            self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
+        return self._writer.register_channel(topic, "json", self._schemas[name])
+
+
+class RecordingWriter:
+    """Writes frames and torques in any order of time; a context manager that keeps NAME.partial after an error."""
+
+    def __init__(self, path: str | Path, source: str, notes: Mapping[str, str] | None = None) -> None:
+        """Create `path`.partial; `source` describes the origin of the data. Raises UserError on failure."""
         self.path = Path(path)
         try:
             partial = self.path.with_name(self.path.name + PARTIAL)
             self._file = McapFile(self.path, io.FileIO(partial, "wb"))
         except OSError as error:
-            raise self._unwritable(error) from error
-        self._file.metadata(METADATA, {**basic_identity(source), **(notes or {})})
+            raise self._write_error(error) from error
+        self._file.add_metadata(METADATA, {**basic_identity(source), **(notes or {})})
 
-    def frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
+    def add_frame(self, side: str, t_mid_unix_ns: int, arrival_unix_ns: int, line: NDArray[np.float64]) -> None:
         """Append one frame: the (1024,) values of its line in volts."""
-        values = np.asarray(line, dtype=np.float64)
-        # A board's lines have fewer decimals, and are as they should be: a tenth of the time.
-        rounded = values.tolist()
-        if not np.array_equal(np.round(values, _DECIMALS), values):
-            rounded = [round(value, _DECIMALS) for value in rounded]
-        self._add(frame_topic(side), t_mid_unix_ns, {"arrival_unix_ns": arrival_unix_ns, "line": rounded})
+        values = [round(value, _DECIMALS) for value in line.tolist()]
+        self._add(frame_topic(side), t_mid_unix_ns, {"arrival_unix_ns": arrival_unix_ns, "line": values})
 
-    def torque(self, t_unix_ns: int, torque_nm: float) -> None:
+    def add_torque(self, t_unix_ns: int, torque_nm: float) -> None:
         """Append one torque of the load cell in N·m."""
         self._add(LOAD_TOPIC, t_unix_ns, {"torque_nm": torque_nm})
 
     def close(self, complete: bool = True) -> None:
-        """Finish the file, flush it to the disk and, when it is complete, give it its name."""
+        """Write the index, flush to the disk and, if complete, rename the file."""
         try:
             self._file.close(complete)
         except OSError as error:
-            raise self._unwritable(error) from error
+            raise self._write_error(error) from error
 
     def __enter__(self) -> Self:
         """Return the writer itself."""
@@ -60,7 +189,7 @@ class RecordingWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close; after an error what was written stays under the name NAME.partial."""
+        """Close the file, as complete if there was no error."""
         self.close(complete=kind is None)
 
     def _add(self, topic: str, time_ns: int, content: dict[str, object]) -> None:
@@ -69,7 +198,7 @@ class RecordingWriter:
             try:
                 self._file.flush()
             except OSError as error:
-                raise self._unwritable(error) from error
+                raise self._write_error(error) from error
 
-    def _unwritable(self, error: OSError) -> UserError:
+    def _write_error(self, error: OSError) -> UserError:
         return UserError(f"{self.path}: the recording cannot be written: {error.strerror}; choose another --out")

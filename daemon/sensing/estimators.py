@@ -16,8 +16,8 @@ from shearloop.bank.estimation.session import REPEATED_FRAME
 from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS
-from shearloop.daemon.sensing.skin_setup import skin_source
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
+from shearloop.daemon.sensing.skin_task import skin_source
 from shearloop.drivers.eit_kit import Frame
 
 # Source of the estimate from several fingertips together.

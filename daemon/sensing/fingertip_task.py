@@ -16,7 +16,7 @@ from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.estimators import LiveEstimator
 from shearloop.daemon.sensing.tool_diameter import OnDiameter, tool_as_bytes
 from shearloop.drivers.eit_kit import EitKit, Frame
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
+from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
 
 Item = TypeVar("Item")
 
@@ -70,7 +70,7 @@ class EstimatorTask:
         on_torque: Callable[[TorqueSample], None],
         on_diameter: OnDiameter | None = None,
         held_tool: Callable[[int], Measured | None] = lambda _: None,
-        on_raw: Tap = no_tap,
+        on_raw: OnRaw = ignore_raw,
     ) -> None:
         """Take the estimator and its consumers; `period_s` gives the present frame period.
 
@@ -142,7 +142,7 @@ class EstimatorTask:
         now_ns = self._clock.now_ns()
         message = estimate_message(self.name, frames, estimate, now_ns)
         lag_ns = round(1e9 * estimate.lag_s)
-        self._on_torque(TorqueSample(self.name, estimate.torque_nm, message.why, message.t_mono_ns - lag_ns, now_ns))
+        self._on_torque(TorqueSample(self.name, estimate.torque_nm, message.reason, message.t_mono_ns - lag_ns, now_ns))
         if self._on_diameter is not None:
             self._on_diameter(self.name, _diameter(estimate), now_ns)
         self._publisher.publish(message)
@@ -226,17 +226,17 @@ class FingertipTask:
         """Estimate from every frame in order, and publish heatmaps, until cancelled."""
         while True:
             (frame,), _ = await self.estimator_task.next()
-            wanted = self.always_heatmap or self._publisher.wanted(EitHeatmap.topic)
+            wanted = self.always_heatmap or self._publisher.has_subscriber(EitHeatmap.topic)
             if wanted and not self.estimator_task.backlog:
                 await self._publish_heatmap(frame)
 
     def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values for the health message."""
-        facts = self._board.facts()
+        facts = self._board.diagnostics()
         return {
             **facts,
             "rate_hz": facts["measured_hz"],
-            "trouble": facts["last_refusal"] if facts["connected"] else facts["last_loss"],
+            "error": facts["last_frame_error"] if facts["connected"] else facts["last_loss"],
             "estimates": self.estimator_task.count,
             "backlog": self.estimator_task.backlog,
         }
@@ -281,7 +281,7 @@ def estimate_message(name: str, frames: tuple[Frame, ...], estimate: Estimate, n
         score=estimate.score,
         runner_up=estimate.runner_up,
         valid=estimate.valid,
-        why="; ".join(estimate.reasons),
+        reason="; ".join(estimate.reasons),
         frame=frames[0].seq,
         latency_s=(now_ns - max(frame.t_arrival_ns for frame in frames)) / 1e9,
     )

@@ -1,4 +1,4 @@
-"""The task of the load cell: read it, publish it, take its zero."""
+"""The load cell's task: reads it, publishes its torque, takes its zero."""
 
 import contextlib
 from collections.abc import Callable, Mapping
@@ -10,38 +10,40 @@ from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
 from shearloop.daemon.messaging.messages import LoadTorque, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.waiting import Waiting
-from shearloop.drivers.hx711 import LoadSample
-from shearloop.drivers.load_cell import LoadCell
+from shearloop.drivers.load_cell import LoadCell, LoadSample
 
 LOAD_CELL = "load_cell"
-# Two seconds at 10.9 Hz; their mean is known ten times better than one reading moves.
+# Two seconds at 10.9 Hz.
 ZERO_SAMPLES = 22
-# So many conversions a reading is of, the last of them its own: an HX711 settles within four (data sheet, "Output
-# settling time": 400 ms at 10 a second, 50 ms at 80).
+# An HX711 settles within four conversions (data sheet, "Output settling time": 400 ms at 10 a second, 50 ms at 80).
 SETTLING_PERIODS = 4
-# A zero takes two seconds; what keeps it for longer than this does not go away by waiting. Of a board that is slower it
-# takes longer: then it is twice the time that the readings need.
-ZERO_DEADLINE_S = 15.0
+# A zero takes two seconds; with a slower board twice the time of its readings.
+ZERO_TIMEOUT_S = 15.0
 
 
 class LoadCellTask:
-    """Ties the load cell's board to the publisher and to whoever goes by its torque."""
+    """Connects the load cell's board to the publisher and the control loop."""
 
     def __init__(
-        self, board: LoadCell, publisher: Publisher, clock: Clock, hear: Callable[[TorqueSample], None], rate_hz: float
+        self,
+        board: LoadCell,
+        publisher: Publisher,
+        clock: Clock,
+        on_torque: Callable[[TorqueSample], None],
+        rate_hz: float,
     ) -> None:
         self.source = TorqueSource(name=LOAD_CELL, period_s=1.0 / rate_hz)
-        self._zero_within_s = max(ZERO_DEADLINE_S, 2.0 * (ZERO_SAMPLES + SETTLING_PERIODS) / rate_hz)
+        self._timeout_s = max(ZERO_TIMEOUT_S, 2.0 * (ZERO_SAMPLES + SETTLING_PERIODS) / rate_hz)
         self._board = board
         self._publisher = publisher
         self._clock = clock
-        self._hear = hear
+        self._on_torque = on_torque
+        # The raw values of a zero in progress, and the times between which it is taken.
         self._zeroing: list[float] | None = None
-        # From when on and until when a zero is taken, and why the last one was not.
         self._zero_from_ns = self._zero_until_ns = 0
-        self._untaken = ""
-        self._waiting = Waiting()
-        self._why = ""
+        self._zero_error = ""
+        self._zero_waiters = Waiting()
+        self._reason = ""
 
     async def read(self) -> None:
         """Publish every sample and pass it on, until cancelled."""
@@ -49,63 +51,60 @@ class LoadCellTask:
             async for sample in samples:
                 self._publisher.publish(load_message(sample))
                 torque_nm = sample.torque_nm if sample.trusted else None
-                self._hear(TorqueSample(LOAD_CELL, torque_nm, _why(sample), sample.t_mid_ns, self._clock.now_ns()))
+                self._reason = _reason(sample)
+                now_ns = self._clock.now_ns()
+                self._on_torque(TorqueSample(LOAD_CELL, torque_nm, self._reason, sample.t_mid_ns, now_ns))
                 self._take_zero(sample)
 
     def tare(self) -> None:
-        """Take the mean of the samples that are measured from now on for zero.
-
-        Those under way know of the load before; with those that come too late for it, it would be of any load.
-        """
-        self._zeroing, self._untaken = [], ""
+        """Make the mean of samples measured from now on the zero; samples under way belong to the load before."""
+        self._zeroing, self._zero_error = [], ""
         now_ns = self._clock.now_ns()
-        # The middle of the first reading that knows of nothing before.
+        # The middle of the first settled reading.
         self._zero_from_ns = now_ns + round((SETTLING_PERIODS - 0.5) * self.source.period_s * 1e9)
-        self._zero_until_ns = now_ns + round(self._zero_within_s * 1e9)
+        self._zero_until_ns = now_ns + round(self._timeout_s * 1e9)
 
     async def zero(self) -> str:
-        """Take the mean of the next samples for zero; return why it could not be done, or an empty text."""
+        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
         try:
-            # Who waits for a zero that was asked for before waits for this one, which is later still.
-            return await self._waiting.wait(self._zero_within_s)
+            # Earlier waiters get this zero too.
+            return await self._zero_waiters.wait(self._timeout_s)
         except TimeoutError:
-            why = self._why or "nothing came"
-            return f"the load cell's zero could not be taken within {self._zero_within_s:g} s: {why}"
+            reason = self._reason or "nothing came"
+            return f"the load cell's zero could not be taken within {self._timeout_s:g} s: {reason}"
         finally:
-            if not self._waiting:
-                # A zero that nobody waits for any longer would be taken at whatever load comes.
+            if not self._zero_waiters:
+                # A zero taken later could be of any load.
                 self._zeroing = None
 
-    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return what health tells of the board."""
-        facts = self._board.facts()
-        told = {"expected_hz": 1.0 / self.source.period_s}
-        return {**facts, **told, "trouble": self._untaken if facts["connected"] else facts["last_loss"]}
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return the board's values for `health`."""
+        found = self._board.diagnostics()
+        error = self._zero_error if found["connected"] else found["last_loss"]
+        return {**found, "expected_hz": 1.0 / self.source.period_s, "error": error}
 
     def _take_zero(self, sample: LoadSample) -> None:
-        self._why = _why(sample)
         if self._zeroing is None:
             return
         if sample.t_arrival_ns > self._zero_until_ns:
             self._zeroing = None
-            self._untaken = (
-                f"a zero that was asked for was not taken within {self._zero_within_s:g} s, and is not taken any more; "
-                "see what the load cell says, and tare again"
+            self._zero_error = (
+                f"the zero was not taken within {self._timeout_s:g} s and is given up; "
+                "see the reason of the load cell's readings, and tare again"
             )
-            structlog.get_logger().warning(self._untaken)
+            structlog.get_logger().warning(self._zero_error)
             return
         if sample.trusted and sample.t_mid_ns >= self._zero_from_ns:
             self._zeroing.append(sample.raw)
         if len(self._zeroing) == ZERO_SAMPLES:
-            mean = sum(self._zeroing) / ZERO_SAMPLES
-            self._board.tare(mean)
+            self._board.tare(sum(self._zeroing) / ZERO_SAMPLES)
             self._zeroing = None
-            self._waiting.tell("")
+            self._zero_waiters.tell("")
 
 
 def load_message(sample: LoadSample) -> LoadTorque:
-    """Return what is published of a sample."""
+    """Return the published message of a sample."""
     return LoadTorque(
         source=LOAD_CELL,
         t_mono_ns=sample.t_mid_ns,
@@ -114,12 +113,12 @@ def load_message(sample: LoadSample) -> LoadTorque:
         saturated=sample.saturated,
         spike=sample.spike,
         valid=sample.trusted,
-        why=_why(sample),
+        reason=_reason(sample),
     )
 
 
-def _why(sample: LoadSample) -> str:
-    """Return what speaks against a reading, or an empty text."""
+def _reason(sample: LoadSample) -> str:
+    """Return why a reading is not trusted, or an empty text."""
     if sample.trusted:
         return ""
     flags = {
@@ -128,4 +127,4 @@ def _why(sample: LoadSample) -> str:
         "the same for two seconds": sample.stuck,
         "perhaps the end of a longer line": sample.partial,
     }
-    return "the reading is " + " and ".join(what for what, is_so in flags.items() if is_so)
+    return "the reading is " + " and ".join(text for text, is_set in flags.items() if is_set)

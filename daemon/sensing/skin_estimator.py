@@ -1,33 +1,129 @@
-"""From resistances to a shear force: zero, equation (1), friction and calibration. A plain object without I/O.
+"""Estimates shear force from a skin's resistances: zero, equation (1), friction and calibration. No I/O.
 
-Yin et al. 2017, section 3. What is not known is not left out but added to the interval: the zero's own uncertainty,
-the drift since it was taken, and a gauge that reads what it cannot.
+Yin et al. 2017, section 3. The interval includes the zero's uncertainty, the drift since it was taken, and readings
+that no load explains. All changes are relative: 1 % of one resistance is a response of 0.01, a tenth of a newton.
 """
 
+import math
 from dataclasses import dataclass
 
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+import numpy as np
+from numpy.typing import NDArray
+
+# scipy.stats would cost the daemon 40 MB and half of its start-up time.
+from scipy.special import chdtri
+
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.bank.skin.calibration import SkinCalibration
 from shearloop.bank.skin.membrane import Direction, ShearInterval
 from shearloop.bank.skin.tracking import DirectionFinder, ForceFollower
-from shearloop.daemon.sensing.skin_zero import RefusedZero, Zero, ZeroTaker
-from shearloop.drivers.shear_skin.judge import SkinSample
+from shearloop.drivers.shear_skin import SkinSample
 
-# The gauge on the slack side is never stretched, and compressed by at most so much of the other's stretch (the 2-D
-# reference gives 0.125, see docs/skin-models.md).
-MOST_COMPRESSION = 0.15
-# Outside of that by more than this, and the zero is no longer one.
-MOST_ASTRAY = 0.02
+# The slack gauge is compressed by at most this share of the other's stretch (0.125 in the 2-D reference, see
+# docs/skin-models.md).
+MAX_COMPRESSION = 0.15
+# A larger deviation from that makes the zero invalid.
+MAX_DEVIATION = 0.02
 # The paper's drift, 1.48e-4 over an hour, as a 95 % bound.
 DRIFT_PER_HOUR = TWO_SIDED_95 * 1.48e-4
+# A larger trend while the zero is taken means that the skin was touched or drifts (the paper's noise: 1e-4).
+MAX_TREND = 1e-3
+MAX_NOISE = 5e-3
+# The noise of the best converters and gauges.
+MIN_NOISE = 2e-5
+# The change of both gauges over 20 K; a load that looks like swapped gauges stretches more.
+MAX_COMMON_CHANGE = 0.015
+# A skin that changed more since its calibration is refused: a quarter of a newton.
+MAX_CHANGE = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class SkinZero:
+    """Resistances at rest in Ω, the noise of one response, and the zero's own uncertainty (95 %)."""
+
+    r1_ohm: float
+    r2_ohm: float
+    noise: float
+    uncertainty: float
+
+    def changes(self, r1_ohm: float, r2_ohm: float) -> tuple[float, float]:
+        """Return ΔR/R₀ of both gauges."""
+        return r1_ohm / self.r1_ohm - 1.0, r2_ohm / self.r2_ohm - 1.0
+
+
+class SkinZeroTaker:
+    """Averages resistances until they make a zero, or a reason against it."""
+
+    def __init__(self, n_samples: int, rest_ohm: tuple[float, float], slope_per_n: float) -> None:
+        """Use the number of samples, and the calibration's resistances at rest and response per newton."""
+        self.n_samples = n_samples
+        self._rest_ohm = rest_ohm
+        self._slope_per_n = slope_per_n
+        self._samples: list[tuple[float, float]] = []
+
+    @property
+    def progress(self) -> str:
+        """The number of samples taken, of those needed."""
+        return f"{len(self._samples)} of {self.n_samples}"
+
+    def add(self, r1_ohm: float, r2_ohm: float) -> SkinZero | str | None:
+        """Add a sample; return the zero once there are enough, or the reason to refuse it, and start again."""
+        self._samples.append((r1_ohm, r2_ohm))
+        if len(self._samples) < self.n_samples:
+            return None
+        ohm = np.array(self._samples)
+        self._samples.clear()
+        return self._check_rest(ohm) or self._check_calibration(*ohm.mean(axis=0).tolist()) or self._zero(ohm)
+
+    def _check_rest(self, ohm: NDArray[np.float64]) -> str | None:
+        relative = ohm / ohm.mean(axis=0) - 1.0
+        place = np.linspace(-0.5, 0.5, len(ohm))
+        trends = place @ relative / (place @ place)
+        noises = np.std(relative - np.outer(place, trends), axis=0, ddof=2)
+        for number, (trend, noise) in enumerate(zip(trends, noises, strict=True), start=1):
+            # Noise alone gives a slope of noise/√Σx², and Σx² is n/12.
+            if abs(trend) > MAX_TREND + 4.0 * noise * math.sqrt(12.0 / len(ohm)):
+                return (
+                    f"gauge {number} changed by {100 * trend:+.2f} % while the zero was taken; "
+                    "leave the skin alone, or see whether the gauge drifts"
+                )
+            if noise > MAX_NOISE:
+                return f"gauge {number} scatters by {100 * noise:.1f} %; see its contacts and the shield of its wires"
+        return None
+
+    def _check_calibration(self, r1_ohm: float, r2_ohm: float) -> str | None:
+        """Compare the ratio of both with the calibration's: current and temperature cancel."""
+        known, found = _log_ratio(*self._rest_ohm), _log_ratio(r1_ohm, r2_ohm)
+        if abs(found - known) <= MAX_CHANGE:
+            return None
+        seen = f"R₁ {r1_ohm:.2f} Ω and R₂ {r2_ohm:.2f} Ω"
+        common = 0.5 * math.log(r1_ohm * r2_ohm / math.prod(self._rest_ohm))
+        if abs(found + known) < min(MAX_CHANGE, abs(found - known)) and abs(common) < MAX_COMMON_CHANGE:
+            return f"{seen} are those of the calibration the other way round: the wires of the gauges are swapped"
+        return (
+            f"{seen} are not those of the skin at rest: a shear force of about "
+            f"{(found - known) / self._slope_per_n:+.2f} N would look like that; take the load off, or calibrate again"
+        )
+
+    def _zero(self, ohm: NDArray[np.float64]) -> SkinZero:
+        r1_ohm, r2_ohm = ohm.mean(axis=0).tolist()
+        # The upper bound of the noise that a few samples allow.
+        bound = math.sqrt((len(ohm) - 1) / float(chdtri(len(ohm) - 1, 0.95)))
+        noise = max(bound * float(np.std(ohm[:, 0] / r1_ohm - ohm[:, 1] / r2_ohm, ddof=1)), MIN_NOISE)
+        change = abs(_log_ratio(r1_ohm, r2_ohm) - _log_ratio(*self._rest_ohm))
+        return SkinZero(r1_ohm, r2_ohm, noise, change + 2.0 * noise / math.sqrt(len(ohm)))
+
+
+def _log_ratio(r1_ohm: float, r2_ohm: float) -> float:
+    return math.log(r1_ohm / r2_ohm)
 
 
 @dataclass(frozen=True, slots=True)
 class SkinReading:
-    """What one sample said: both gauges' changes, the response, the force with its interval, and what speaks against.
+    """The estimate of one sample: both gauges' changes, the response, and the force with its interval.
 
-    `band` is the force and what friction alone leaves open around it, without width where the direction is known;
-    `interval` holds the force with 95 % beside that. Both are None unless nothing speaks against them.
+    `band` is the force and the range that friction leaves open, without width if the direction is known. `interval`
+    holds the force with 95 %. With `reasons` both are None.
     """
 
     response_1: float | None = None
@@ -35,16 +131,16 @@ class SkinReading:
     band: ShearInterval | None = None
     interval: ShearInterval | None = None
     direction: Direction = Direction.UNKNOWN
-    why: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
 
     @property
     def valid(self) -> bool:
-        """Whether nothing speaks against it."""
-        return not self.why
+        """Whether there are no reasons against it."""
+        return not self.reasons
 
     @property
     def shear_n(self) -> float | None:
-        """The shear force, where friction most plausibly has it."""
+        """The most plausible shear force, N."""
         return None if self.band is None else self.band.shear_n
 
     @property
@@ -56,7 +152,7 @@ class SkinReading:
 
 
 class SkinEstimator:
-    """Turns the samples of one skin into readings, one for each sample, in order."""
+    """Turns the samples of one skin into readings, one by one, in order."""
 
     def __init__(
         self,
@@ -66,109 +162,99 @@ class SkinEstimator:
         zero_samples: int = 20,
         drift_per_hour: float = DRIFT_PER_HOUR,
     ) -> None:
-        """Take the calibration, the normal force that friction goes by (N), and how the zero is taken and ages."""
+        """Use the calibration, the normal force behind the friction (N), and the zero's samples and drift."""
         self._calibration = calibration
         self._normal_n = normal_n
         self._zero_samples = zero_samples
         self._drift_per_s = drift_per_hour / 3600.0
         self._zero_s = 0.0
-        self._last: tuple[Zero, float] | None = None
+        self._last: tuple[SkinZero, float] | None = None
         self.tare()
 
     def tare(self, from_ns: int = 0) -> None:
-        """Take a new zero from the samples to come that are measured from then on (monotonic clock)."""
+        """Take a new zero from samples measured after `from_ns` (monotonic clock)."""
         self._zero_from_ns = from_ns
-        self._taker = ZeroTaker(self._zero_samples, self._calibration.rest_ohm, self._calibration.slope_per_n)
-        self._zero: Zero | None = None
+        self._taker = SkinZeroTaker(self._zero_samples, self._calibration.rest_ohm, self._calibration.slope_per_n)
+        self.zero: SkinZero | None = None
         self.refused = ""
 
     @property
-    def zero(self) -> Zero | None:
-        """The resistances at rest, once they have been taken."""
-        return self._zero
-
-    @property
     def drift_per_hour(self) -> float:
-        """By how much a response is held to drift: as told, or faster where two zeros have shown it."""
+        """The assumed drift of a response: as configured, or more if two zeros have shown it."""
         return self._drift_per_s * 3600.0
 
     def update(self, sample: SkinSample) -> SkinReading:
-        """Return what the sample says; one that says nothing comes back with the reasons."""
+        """Return the reading of a sample; an invalid one comes with reasons."""
         if sample.r1_ohm is None or sample.r2_ohm is None:
             self._forget_direction()
-            return SkinReading(why=tuple(map(str, sample.faults)))
-        if self._zero is None:
-            # It is measured as long before its middle as after it, and was there then or later.
+            return SkinReading(reasons=tuple(map(str, sample.faults)))
+        if self.zero is None:
+            # The measurement lasts as long before its middle as after it.
             if 2 * sample.t_mid_ns - sample.t_arrival_ns < self._zero_from_ns:
-                return SkinReading(why=("measured before the zero was asked for",))
-            waits = self._take_zero(sample.r1_ohm, sample.r2_ohm, sample.t_mid_ns)
-            if waits or self._zero is None:
-                return SkinReading(why=(waits,))
+                return SkinReading(reasons=("measured before the zero was asked for",))
+            if (waiting := self._take_zero(sample.r1_ohm, sample.r2_ohm, sample.t_mid_ns)) or self.zero is None:
+                return SkinReading(reasons=(waiting,))
         if sample.missed:
             self._forget_direction()
-        response_1, response_2 = self._zero.changes(sample.r1_ohm, sample.r2_ohm)
+        response_1, response_2 = self.zero.changes(sample.r1_ohm, sample.r2_ohm)
         response = response_1 - response_2
         time_s = sample.t_mid_ns / 1e9
         direction = self._finder.update(time_s, response)
-        astray, why = _astray(response_1, response_2)
-        wider = self._zero.uncertainty + self._drift_per_s * (time_s - self._zero_s) + astray
+        deviation, reasons = _deviation(response_1, response_2)
+        wider = self.zero.uncertainty + self._drift_per_s * (time_s - self._zero_s) + deviation
         interval = self._calibration.shear_from_response(response, self._normal_n, direction, wider)
-        if abs(interval.low_n) == float("inf") or abs(interval.high_n) == float("inf"):
-            why = (*why, "the response is beyond the calibrated curve; take load off, or calibrate further")
-        if why:
-            return SkinReading(response_1, response_2, direction=direction, why=why)
+        if math.isinf(interval.low_n) or math.isinf(interval.high_n):
+            reasons = (*reasons, "the response is beyond the calibrated curve; take load off, or calibrate further")
+        if reasons:
+            return SkinReading(response_1, response_2, direction=direction, reasons=reasons)
         band = self._follower.update(response, self._normal_n, direction)
         interval = ShearInterval(band.shear_n, min(interval.low_n, band.shear_n), max(interval.high_n, band.shear_n))
         return SkinReading(response_1, response_2, band, interval, direction)
 
     def _take_zero(self, r1_ohm: float, r2_ohm: float, t_mid_ns: int) -> str:
-        """Take one more sample for the zero; return what is waited for, or nothing once it is there."""
+        """Use a sample for the zero; return the reason to wait, empty once the zero is there."""
         found = self._taker.add(r1_ohm, r2_ohm)
-        if isinstance(found, Zero):
-            self._zero, self._zero_s, self.refused = found, t_mid_ns / 1e9, ""
-            self._learn_drift()
+        if isinstance(found, SkinZero):
+            self.zero, self._zero_s, self.refused = found, t_mid_ns / 1e9, ""
+            self._learn_drift(found)
             self._finder = DirectionFinder(found.noise)
             self._follower = ForceFollower(self._calibration, self._finder.threshold)
             return ""
-        if isinstance(found, RefusedZero):
-            self.refused = found.why
+        if found is not None:
+            self.refused = found
         if self.refused:
             return f"the zero was refused and is taken again: {self.refused}"
-        return f"taking the zero, {self._taker.taken} of {self._taker.wanted}"
+        return f"taking the zero, {self._taker.progress}"
 
-    def _learn_drift(self) -> None:
-        """See what the last zero has become: a load comes and goes in between, a drift stays."""
-        if self._zero is None:
-            return
+    def _learn_drift(self, zero: SkinZero) -> None:
+        """Compare with the last zero: loads come and go in between, a drift stays."""
         if self._last is not None:
             before, before_s = self._last
-            change_1, change_2 = before.changes(self._zero.r1_ohm, self._zero.r2_ohm)
-            by_noise = 4.0 * (before.noise + self._zero.noise) / self._zero_samples**0.5
+            change_1, change_2 = before.changes(zero.r1_ohm, zero.r2_ohm)
             drifted = abs(change_1 - change_2)
-            if drifted > by_noise:
+            if drifted > 4.0 * (before.noise + zero.noise) / self._zero_samples**0.5:
                 self._drift_per_s = max(self._drift_per_s, drifted / max(self._zero_s - before_s, 1.0))
-        self._last = (self._zero, self._zero_s)
+        self._last = (zero, self._zero_s)
 
     def _forget_direction(self) -> None:
-        if self._zero is not None:
+        if self.zero is not None:
             self._finder.restart()
 
 
-def _astray(response_1: float, response_2: float) -> tuple[float, tuple[str, ...]]:
-    """Return how far a gauge is from anything that a skin can do to it, and what that means where it is too far.
+def _deviation(response_1: float, response_2: float) -> tuple[float, tuple[str, ...]]:
+    """Return how far the gauges deviate from any load, and the reasons if that is too far.
 
-    One gauge is stretched and the other slack: it reads its zero, or a little less. What it reads beyond that is the
-    zero's error or a drift, which the response cannot be told from.
+    One gauge is stretched, the slack one reads its zero or a little less. The rest is an error of the zero or a drift.
     """
     slack, stretched = sorted((response_1, response_2))
-    lowest = -MOST_COMPRESSION * max(stretched, 0.0)
-    if slack > MOST_ASTRAY:
-        why = f"both gauges read at least {100 * slack:.1f} % longer than at their zero: one drifts, or it is warmer"
-    elif slack < lowest - MOST_ASTRAY:
-        why = (
+    lowest = -MAX_COMPRESSION * max(stretched, 0.0)
+    if slack > MAX_DEVIATION:
+        reason = f"both gauges read at least {100 * slack:.1f} % longer than at their zero: one drifts, or it is warmer"
+    elif slack < lowest - MAX_DEVIATION:
+        reason = (
             f"gauge {1 if response_1 < response_2 else 2} reads {-100 * slack:.1f} % shorter than at its zero, "
             "which no load does: the zero was taken under load, or the gauge drifts"
         )
     else:
         return max(slack, lowest - slack, 0.0), ()
-    return 0.0, (f"{why}; take the load off and tare",)
+    return 0.0, (f"{reason}; take the load off and tare",)

@@ -1,48 +1,74 @@
-"""The tasks of the shear skin: keep its source going, read its voltages, publish the shear force, take its zero."""
+"""The shear skin's task: builds instruments and estimator, publishes the shear force, takes the zero, replays."""
 
 import contextlib
 from collections.abc import Callable, Mapping
+from functools import partial
 
+from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
+from shearloop.bank.skin.membrane import joule_heating_k
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.control.loop_inputs import TorqueSample
+from shearloop.daemon.config import InstrumentSocket, SerialDevice, SkinConfig
+from shearloop.daemon.control.loop_inputs import TorqueSample, TorqueSource
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.logs import log_link
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.waiting import Waiting
-from shearloop.drivers.raw_event import InputKind, RawEvent, Tap, no_tap
-from shearloop.drivers.shear_skin.judge import SkinSample
-from shearloop.drivers.shear_skin.skin import ShearSkin
+from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkEvent, SerialLink, TcpLink
+from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
+from shearloop.drivers.shear_skin.instruments import (
+    SOURCE_PERIOD_S,
+    AdcBoard,
+    Daq,
+    Keithley6430,
+    PairParser,
+    ScpiScanner,
+    SourceReading,
+    Voltages,
+    recorded_scanner,
+    recorded_source,
+)
+from shearloop.drivers.shear_skin.scpi import RecordedInstrument
+from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinSample
 
 SKIN = "skin"
-# What its instruments are called in health and in recordings.
+# The instruments' names in health and in recordings.
 SKIN_SOURCE, SKIN_DAQ = f"{SKIN}.source", f"{SKIN}.daq"
-# A zero takes two seconds; what keeps it for longer than this does not go away by waiting.
-ZERO_DEADLINE_S = 15.0
+# A zero takes two seconds.
+ZERO_TIMEOUT_S = 15.0
+# The paper's bound.
+MAX_WARMING_K = 5.0
 
 
 class SkinTask:
-    """Ties the skin's instruments and its estimator to the publisher and to whoever goes by its torque."""
+    """Connects the skin's instruments and its estimator to the publisher and the control loop."""
 
     def __init__(
         self,
-        skin: ShearSkin,
-        estimator: SkinEstimator,
+        config: SkinConfig,
         publisher: Publisher,
         clock: Clock,
-        hear: Callable[[TorqueSample], None] = lambda _: None,
-        tool_radius_mm: float | None = None,
-        tap: Tap = no_tap,
+        on_torque: Callable[[TorqueSample], None] = lambda _: None,
+        on_raw: Callable[[str], OnRaw] = lambda _: ignore_raw,
     ) -> None:
-        """Take what is to be tied together; `tap` hears of each tare."""
-        self._tap = tap
-        self._skin = skin
-        self._estimator = estimator
+        """Build everything, not yet open; `on_raw` returns the callback for a source's raw events, by its name.
+
+        Raises BankError for an unusable calibration and UserError if the instruments cannot measure these gauges.
+        """
+        calibration = load_calibration(config.calibration)
+        check_circuit(config, calibration)
+        self._skin = ShearSkin(
+            _current_source(config, on_raw(SKIN_SOURCE)), _daq(config, on_raw(SKIN_DAQ)), _gauge_ohm(calibration)
+        )
+        self._estimator = _estimator(config, calibration)
         self._publisher = publisher
         self._clock = clock
-        self._hear = hear
-        self._radius_m = None if tool_radius_mm is None else tool_radius_mm * 1e-3
-        self._waiting = Waiting()
-        self._why = ""
+        self._on_torque = on_torque
+        self._on_raw = on_raw(SKIN)
+        self._radius_m = _radius_m(config)
+        self._zero_waiters = Waiting()
+        self._reason = ""
         self._valid = 0
 
     async def watch_source(self) -> None:
@@ -55,57 +81,91 @@ class SkinTask:
             async for sample in samples:
                 reading = self._estimator.update(sample)
                 self._publish(sample, reading)
-                self._tell_zero()
+                if self._estimator.refused:
+                    self._zero_waiters.tell(f"the skin's zero was refused: {self._estimator.refused}")
+                elif self._estimator.zero is not None:
+                    self._zero_waiters.tell("")
 
     def tare(self) -> None:
-        """Take a new zero, beginning with the first sample that is measured from now on."""
+        """Take a new zero from samples measured from now on."""
         now_ns = self._clock.now_ns()
-        self._tap(RawEvent(InputKind.TARE, now_ns))
+        self._on_raw(RawEvent(InputKind.TARE, now_ns))
         self._estimator.tare(now_ns)
 
     async def zero(self) -> str:
-        """Take a new zero and wait until it is there; return why it could not be taken, or an empty text."""
+        """Take a new zero and wait until it is done; return the reason of a failure, else an empty text."""
         self.tare()
         try:
-            # Who waits for a zero that was asked for before waits for this one, which is later still.
-            return await self._waiting.wait(ZERO_DEADLINE_S)
+            # Earlier waiters get this zero too.
+            return await self._zero_waiters.wait(ZERO_TIMEOUT_S)
         except TimeoutError:
-            return f"the skin's zero could not be taken within {ZERO_DEADLINE_S:g} s: {self._why or 'nothing came'}"
+            reason = self._reason or "nothing came"
+            return f"the skin's zero could not be taken within {ZERO_TIMEOUT_S:g} s: {reason}"
 
-    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return what health tells of the voltages, the zero and the force."""
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return the values of voltages, zero and force for `health`."""
         zero = self._estimator.zero
         return {
-            **self._skin.facts(),
+            **self._skin.diagnostics(),
             "valid": self._valid,
-            "trouble": self._why,
+            "error": self._reason,
             "zero_1_ohm": zero.r1_ohm if zero is not None else None,
             "zero_2_ohm": zero.r2_ohm if zero is not None else None,
             "drift_per_hour": self._estimator.drift_per_hour,
         }
 
-    def source_facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
-        """Return what health tells of the current source."""
-        return self._skin.source_facts()
-
-    def _tell_zero(self) -> None:
-        if self._estimator.refused:
-            self._waiting.tell(f"the skin's zero was refused: {self._estimator.refused}")
-        elif self._estimator.zero is not None:
-            self._waiting.tell("")
+    def source_diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+        """Return the values of the current source for `health`."""
+        return self._skin.source_diagnostics()
 
     def _publish(self, sample: SkinSample, reading: SkinReading) -> None:
         now_ns = self._clock.now_ns()
         message = shear_message(sample, reading, self._radius_m, now_ns)
-        self._why = message.why
+        self._reason = message.reason
         self._valid += reading.valid
         if self._radius_m is not None:
-            self._hear(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
+            self._on_torque(skin_torque(reading, self._radius_m, sample.t_mid_ns, now_ns))
         self._publisher.publish(message)
 
 
+class RecordedSkin:
+    """The skin's parsers, validator and estimator, for the replay of recorded events."""
+
+    sources = (SKIN, SKIN_SOURCE, SKIN_DAQ)
+
+    def __init__(self, config: SkinConfig) -> None:
+        """Raises BankError for an unusable calibration."""
+        calibration = load_calibration(config.calibration)
+        self._estimator = _estimator(config, calibration)
+        current_a = config.source.current_ma * 1e-3
+        daq_period_s = 1.0 / config.daq.rate_hz
+        self._validator = SampleValidator(current_a, SOURCE_PERIOD_S, daq_period_s, _gauge_ohm(calibration))
+        self._radius_m = _radius_m(config)
+        self._source = recorded_source()
+        adc = config.daq.adc
+        self._daq: RecordedInstrument[Voltages] | PairParser = (
+            recorded_scanner() if adc is None else PairParser(config.daq.rate_hz, adc.full_scale_v)
+        )
+        self._latest: SourceReading | None = None
+
+    def handle(self, source: str, event: RawEvent) -> list[SkinShear]:
+        """Return the messages that a source's event leads to, without processing time."""
+        if source == SKIN_SOURCE:
+            readings = self._source.handle(event)
+            self._latest = readings[-1] if readings else self._latest
+        elif source == SKIN_DAQ:
+            samples = (self._validator.sample(voltages, self._latest) for voltages in self._daq.handle(event))
+            return [
+                shear_message(sample, self._estimator.update(sample), self._radius_m, sample.t_arrival_ns)
+                for sample in samples
+            ]
+        elif event.kind is InputKind.TARE:
+            self._estimator.tare(event.t_ns)
+        return []
+
+
 def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | None, now_ns: int) -> SkinShear:
-    """Return what is published of a sample; without a radius there is no torque."""
+    """Return the published message of a sample; without a radius there is no torque."""
     interval = reading.interval
     torque = None if radius_m is None else skin_torque(reading, radius_m, sample.t_mid_ns, now_ns)
     return SkinShear(
@@ -123,7 +183,7 @@ def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | No
         deadband=interval is not None and interval.in_deadband,
         direction=reading.direction.value,
         valid=reading.valid,
-        why="; ".join(reading.why),
+        reason="; ".join(reading.reasons),
         sample=sample.seq,
         missed=sample.missed,
         latency_s=(now_ns - sample.t_arrival_ns) / 1e9,
@@ -131,8 +191,87 @@ def shear_message(sample: SkinSample, reading: SkinReading, radius_m: float | No
 
 
 def skin_torque(reading: SkinReading, radius_m: float, t_mid_ns: int, now_ns: int) -> TorqueSample:
-    """Return the torque of a shear force at a radius, with the band that friction leaves to it."""
+    """Return the torque of a shear force at a radius, with the band that friction leaves."""
     if reading.band is None:
-        return TorqueSample(SKIN, None, "; ".join(reading.why), t_mid_ns, now_ns)
+        return TorqueSample(SKIN, None, "; ".join(reading.reasons), t_mid_ns, now_ns)
     force_nm, low_nm, high_nm = (force_n * radius_m for force_n in reading.band)
     return TorqueSample(SKIN, force_nm, "", t_mid_ns, now_ns, low_nm, high_nm)
+
+
+def skin_source(config: SkinConfig) -> TorqueSource | None:
+    """Return the skin as a source of torque; None without a radius."""
+    if config.tool_radius_mm is None:
+        return None
+    return TorqueSource(name=SKIN, period_s=1.0 / config.daq.rate_hz, has_friction_band=True)
+
+
+def check_circuit(config: SkinConfig, calibration: SkinCalibration) -> None:
+    """Raise UserError if the gauges would get too warm, or their voltages exceed source or converter."""
+    current_a = config.source.current_ma * 1e-3
+    max_ohm = max(calibration.rest_ohm) * (1.0 + max(calibration.response[-1], -calibration.response[0]))
+    gauge_v, whole_v = max_ohm * current_a, (max_ohm + min(calibration.rest_ohm)) * current_a
+    warming_k = joule_heating_k(max(calibration.rest_ohm) * current_a**2)
+    setting = f"`skin.source.current_ma`: {config.source.current_ma:g} mA"
+    if warming_k > MAX_WARMING_K:
+        raise UserError(
+            f"{setting} warm a gauge of {max(calibration.rest_ohm):.1f} Ω by {warming_k:.1f} K, more than the "
+            f"{MAX_WARMING_K:g} K that are allowed; take 5"
+        )
+    if whole_v > config.source.compliance_v:
+        raise UserError(
+            f"{setting} need {whole_v:.2f} V at the end of the calibration, and `skin.source.compliance_v` is "
+            f"{config.source.compliance_v:g}; raise that, or lower the current"
+        )
+    adc, scanner = config.daq.adc, config.daq.scanner
+    at_end = f"{setting} make {gauge_v:.2f} V of a gauge at the end of the calibration, and"
+    if adc is not None and gauge_v >= adc.full_scale_v:
+        raise UserError(
+            f"{at_end} `skin.daq.adc.full_scale_v` is {adc.full_scale_v:g}; set the converter's gain lower, or the "
+            "current"
+        )
+    if scanner is not None and gauge_v > scanner.range_v:
+        raise UserError(f"{at_end} `skin.daq.scanner.range_v` is {scanner.range_v:g}; take the next range")
+
+
+def _radius_m(config: SkinConfig) -> float | None:
+    return None if config.tool_radius_mm is None else config.tool_radius_mm * 1e-3
+
+
+def _gauge_ohm(calibration: SkinCalibration) -> float:
+    return sum(calibration.rest_ohm) / 2.0
+
+
+def _estimator(config: SkinConfig, calibration: SkinCalibration) -> SkinEstimator:
+    return SkinEstimator(
+        calibration,
+        normal_n=config.normal_n,
+        zero_samples=config.zero_samples,
+        drift_per_hour=config.drift_per_hour,
+    )
+
+
+def _current_source(config: SkinConfig, on_raw: OnRaw) -> Keithley6430:
+    source = config.source
+    link = _link(source.socket, source.serial, source.baud, partial(log_link, "skin source"))
+    return Keithley6430(link, source.current_ma * 1e-3, source.compliance_v, SOURCE_PERIOD_S, on_raw=on_raw)
+
+
+def _daq(config: SkinConfig, on_raw: OnRaw) -> Daq:
+    rate_hz, scanner, adc = config.daq.rate_hz, config.daq.scanner, config.daq.adc
+    on_event = partial(log_link, "skin daq")
+    if scanner is not None:
+        link = _link(scanner.socket, None, DEFAULT_BAUD, on_event)
+        return ScpiScanner(link, scanner.channels, rate_hz, scanner.range_v, on_raw=on_raw)
+    if adc is not None:
+        return AdcBoard(_link(None, adc.device, DEFAULT_BAUD, on_event), rate_hz, adc.full_scale_v, on_raw)
+    raise ValueError("a skin needs an instrument that reads its voltages")
+
+
+def _link(
+    socket: InstrumentSocket | None, serial: SerialDevice | None, baud: int, on_event: Callable[[LinkEvent], None]
+) -> Link:
+    if socket is not None:
+        return TcpLink(socket.host, socket.port, on_event=on_event)
+    if serial is None:
+        raise ValueError("an instrument needs a socket or a serial port")
+    return SerialLink(serial_number=serial.serial_number, path=serial.path, baud=baud, on_event=on_event)

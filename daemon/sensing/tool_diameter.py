@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TypeAlias
 
 from shearloop.bank.estimation import Measured, combine
-from shearloop.daemon.messaging.topics import stale_after_s
+from shearloop.daemon.messaging.messages import stale_after_s
 
 # Takes a source, its diameter or None, and the time in ns.
 OnDiameter: TypeAlias = Callable[[str, Measured | None, int], None]

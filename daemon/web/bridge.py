@@ -11,12 +11,10 @@ import zmq
 import zmq.asyncio
 
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.addresses import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
+from shearloop.daemon.messaging.client import connect, decode_reply, no_reply
 from shearloop.daemon.messaging.keys import ClientKeys
-from shearloop.daemon.messaging.messages import EitFrame, EitHeatmap, decode, encode
-from shearloop.daemon.messaging.patience import COMMAND_TIMEOUT_S, UNLOCK_TIMEOUT_S
-from shearloop.daemon.messaging.request import no_reply, reply_of
-from shearloop.daemon.messaging.subscriber import connect
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.messages import TOPICS, EitFrame, EitHeatmap, decode, encode
 from shearloop.daemon.web.latest import LatestMessages
 
 # The largest message is a heatmap of 200 × 200 float32.
@@ -125,7 +123,7 @@ class Bridge:
                     data = await socket.recv()
             except TimeoutError as error:
                 raise no_reply(address, timeout_s, self._address.keys) from error
-        return reply_of(data, address)
+        return decode_reply(data, address)
 
     @contextmanager
     def _command_socket(self, address: str) -> "Iterator[zmq.asyncio.Socket]":

@@ -13,8 +13,7 @@ from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.bank.eit.matching import best_match
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.errors import MatchingError
-from shearloop.daemon.messaging.messages import EitEstimate, EitHeatmap
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitHeatmap
 
 # Pairs of topic and source. A rig has nine topics and two fingertips.
 MAX_STREAMS = 64

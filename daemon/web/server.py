@@ -12,7 +12,7 @@ from aiohttp import WSCloseCode, web
 
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.topics import STALE_AFTER_PERIODS, TOPICS, stale_after_s
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS, TOPICS, stale_after_s
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.web.access import host_allowed, origin_allowed, token_valid
 from shearloop.daemon.web.bridge import Bridge, BusyError, DaemonAddress
@@ -124,8 +124,8 @@ async def _check_access(
 
 
 def _refuse(status: int, reason: str) -> web.Response:
-    structlog.get_logger().warning("request refused", status=status, why=reason)
-    return web.json_response({"ok": False, "why": reason}, status=status, headers=HEADERS)
+    structlog.get_logger().warning("request refused", status=status, reason=reason)
+    return web.json_response({"ok": False, "reason": reason}, status=status, headers=HEADERS)
 
 
 class _Page:
@@ -181,8 +181,8 @@ class _Page:
             return _refuse(429, "too many commands at once; wait for their answers")
         except UserError as error:
             return _refuse(503, str(error))
-        structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), why=reply.get("why"))
-        content = {key: reply[key] for key in ("ok", "why", "stopped", "tared", "experiment") if key in reply}
+        structlog.get_logger().info("command answered", command=name, ok=reply.get("ok"), reason=reply.get("reason"))
+        content = {key: reply[key] for key in ("ok", "reason", "stopped", "tared", "experiment") if key in reply}
         return web.json_response(content, status=200 if reply.get("ok") else 409)
 
     async def stream(self, request: web.Request) -> web.StreamResponse:

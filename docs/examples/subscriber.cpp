@@ -12,6 +12,6 @@ int main() {
     while (zmq_recv(socket, topic, sizeof topic, 0) >= 0) {
         const int size = zmq_recv(socket, payload, sizeof payload, 0);
         const auto message = nlohmann::json::from_msgpack(payload, payload + size);
-        std::cout << message["timestamp"] << ' ' << message["torque_nm"] << ' ' << message["why"] << std::endl;
+        std::cout << message["timestamp"] << ' ' << message["torque_nm"] << ' ' << message["reason"] << std::endl;
     }
 }

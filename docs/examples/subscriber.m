@@ -9,6 +9,6 @@ while true
     if message.valid
         fprintf("%.3f  %+.4f N·m\n", message.timestamp, message.torque_nm);
     else
-        fprintf("%.3f  no estimate: %s\n", message.timestamp, string(message.why));
+        fprintf("%.3f  no estimate: %s\n", message.timestamp, string(message.reason));
     end
 end

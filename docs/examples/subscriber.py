@@ -11,9 +11,8 @@ while True:
     topic, payload = socket.recv_multipart()
     message = msgpack.unpackb(payload)
     if topic == b"eit.estimate":
-        print(
-            message["timestamp"], message["source"], message["torque_nm"], message["valid"], message["why"], flush=True
-        )
+        print(message["timestamp"], message["source"], message["torque_nm"], message["valid"], end=" ")
+        print(message["reason"], flush=True)
     elif topic == b"eit.frame":
         channels = np.frombuffer(message["channels"], "<f4").reshape(message["channels_shape"])
         print(message["timestamp"], message["source"], channels.max(), flush=True)

@@ -1,48 +1,61 @@
-"""The gripper as the loop uses it, whichever way its bytes go."""
+"""The gripper: activation, motion, state, reconnection, over either connection."""
 
 import asyncio
 import math
 import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
+from dataclasses import dataclass, field
+from enum import Enum, auto
 from typing import TypeVar
 
+from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.robotiq.faults import GripperFaultError, GripperRefusedError, fault_of
 from shearloop.drivers.robotiq.messages import (
+    FIRST_MAJOR_CODE,
     FORCE_MAX_N,
     FORCE_MIN_N,
     MA_PER_COUNT,
     SPEED_MAX_MM_S,
     SPEED_MIN_MM_S,
+    Activate,
     ActivationStatus,
     GripperClient,
     GripperCommand,
+    GripperFaultError,
     GripperHalt,
     GripperMove,
+    GripperRefusedError,
     GripperState,
     ObjectStatus,
     Readout,
     Request,
     Reset,
     SentCommand,
+    fault_of,
 )
-from shearloop.drivers.robotiq.sequences import ActivationSequence, MotionWatch, blocking_fault, object_status
 from shearloop.drivers.robotiq.width import COUNTS_MAX, WidthCalibration
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy
 
 T = TypeVar("T")
 
 POLL_S = 0.1
-# Of so many polls of a gripper that stands one asks for the current too.
-ASKED_WHOLE_EVERY = 5
+# The pause between reset and activation that Robotiq's own clients keep.
+PAUSE_NS = 500_000_000
+RESET_DEADLINE_NS = 3_000_000_000
+# The fingers open and close once; a real gripper takes two to four seconds.
+ACTIVATION_DEADLINE_NS = 15_000_000_000
+# The full stroke at the slowest speed takes 4.7 s.
+MOTION_DEADLINE_NS = 10_000_000_000
+_OVER_TEMPERATURE, _NO_COMMUNICATION = 8, 9
+# Faults below this are normal during an activation, as is a silence before it.
+_LEAST_ACTIVATION_FAULT = 8
 
 
 class RobotiqGripper:
-    """One gripper: activation, motion, state, reconnection.
+    """One gripper.
 
-    Commands and polling may come from different tasks: each exchange with the gripper is whole, that of a command also
-    where who gave it is cancelled. A lost connection raises DeviceLostError in the call that meets it, and `latest` is
-    None from then on until new registers were read.
+    Commands and polling may come from different tasks. Each exchange with the gripper is whole, also when its caller
+    is cancelled. A lost connection raises DeviceLostError in the call that meets it; `latest` is None until the next
+    read.
     """
 
     def __init__(
@@ -55,7 +68,7 @@ class RobotiqGripper:
         on_event: Callable[[LinkEvent], None] = lambda _: None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        """Name the way to the gripper and what its counts mean; nothing is opened yet."""
+        """Take a connection and the meaning of its counts; nothing is opened yet."""
         self._client = client
         self._calibration = calibration
         self._poll_s = poll_s
@@ -64,34 +77,29 @@ class RobotiqGripper:
         self._clock_ns = clock_ns
         self._exchange = asyncio.Lock()
         self._seq = 0
-        self._last_request: GripperMove | None = None
-        self._openings = 0
-        # The latest readout of a gripper that stands and of which nothing was asked since.
-        self._standing: Readout | None = None
-        # When everything was asked for last, current included.
-        self._whole_ns = 0
-        self._polls = 0
+        self._last_move: GripperMove | None = None
+        self._connections = 0
         self._loss: DriverError | None = None
         self.connected = False
         self.last_error = ""
         self.latest: GripperState | None = None
 
-    def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
-        """Return what health tells of the gripper; counts are since the process began."""
+    def diagnostics(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
+        """Return the gripper's part of `health`; counts are since the process began."""
         return {
             "connected": self.connected,
             "states": self._seq,
-            "openings": self._openings,
+            "openings": self._connections,
             "last_loss": self.last_error,
         }
 
     async def connect(self) -> GripperState:
         """Open the connection and return the first state; DeviceNotFoundError or DeviceLostError."""
         await self._client.connect()
-        self._openings += 1
+        self._connections += 1
         self.connected, self._loss = True, None
-        # What was asked for over an earlier connection may have been changed from elsewhere since.
-        self._last_request = None
+        # Another program may have commanded the gripper since.
+        self._last_move = None
         return await self.read()
 
     async def close(self) -> None:
@@ -100,27 +108,18 @@ class RobotiqGripper:
         await self._client.close()
 
     async def read(self) -> GripperState:
-        """Return the gripper's state, asked for now."""
+        """Return the gripper's present state."""
         readout, t_ns = await self._read()
         self.latest = self._state(readout, t_ns)
         return self.latest
 
-    async def _poll(self) -> GripperState:
-        """Return the gripper's state, asked for now; while it stands, its current only now and then."""
-        self._polls += 1
-        readout, t_ns = await self._read(again=self._polls % ASKED_WHOLE_EVERY != 0)
-        self.latest = self._state(readout, t_ns)
-        if self.latest.object is not ObjectStatus.MOVING:
-            self._standing = readout
-        return self.latest
-
     async def activate(self, *, operator_confirmed: bool = False) -> GripperState:
-        """Return the state of the active gripper; when it is not active yet, the fingers open and close once.
+        """Return the state of the active gripper; one that is not active opens and closes its fingers once.
 
-        After a major fault the operator has to say that the fingers are clear: only then, with `operator_confirmed`,
-        is ACT raised again, and in any state. Raises GripperFaultError when it is refused or fails.
+        After a major fault the operator has to confirm that the fingers are clear. `operator_confirmed` activates in
+        any state. Raises GripperFaultError when the activation is refused or fails.
         """
-        readout, t_ns = await _whole(self._read())
+        readout, t_ns = await _uninterrupted(self._read())
         fault = fault_of(readout.flt)
         if not operator_confirmed:
             if fault.needs_activation:
@@ -131,65 +130,62 @@ class RobotiqGripper:
         while not sequence.done:
             request = sequence.step(readout, t_ns)
             if request is not None:
-                self._last_request = None
-                await _whole(self._write(request))
+                self._last_move = None
+                await _uninterrupted(self._write(request))
             elif not sequence.done:
                 await asyncio.sleep(self._poll_s)
             if not sequence.done:
-                readout, t_ns = await _whole(self._read())
+                readout, t_ns = await _uninterrupted(self._read())
         return self._state(readout, t_ns)
 
     async def move(self, command: GripperCommand) -> SentCommand:
-        """Start a motion and return what was really sent; `finish` waits for its end.
+        """Start a motion and return the command as sent; `finish` waits for its end.
 
-        Raises GripperRefusedError for a command that is no number, GripperFaultError when the gripper would not move.
+        Raises GripperRefusedError for a command that is not finite, GripperFaultError when the gripper would not move.
         """
         sent = self.clip(command)
-        readout, _ = await _whole(self._read())
+        readout, _ = await _uninterrupted(self._read())
         blocking = blocking_fault(readout)
         if blocking is not None:
             raise GripperFaultError(blocking)
-        self._last_request = sent.request
-        await _whole(self._write(sent.request))
+        self._last_move = sent.request
+        await _uninterrupted(self._write(sent.request))
         return sent
 
     async def finish(self, sent: SentCommand) -> GripperState:
-        """Return the state in which the motion ended: at its target, or on an object."""
+        """Return the state at the end of the motion: at its target, or on an object."""
         watch = MotionWatch(sent.request, self._clock_ns())
         while True:
-            readout, t_ns = await _whole(self._read())
-            if self._last_request is not sent.request:
+            readout, t_ns = await _uninterrupted(self._read())
+            if self._last_move is not sent.request:
                 raise GripperRefusedError("Another command took over before the gripper had finished its motion.")
-            if watch.finished(readout, t_ns):
+            if watch.has_finished(readout, t_ns):
                 return self._state(readout, t_ns)
             await asyncio.sleep(self._poll_s)
 
     async def halt(self) -> None:
-        """Stop the fingers where they are; they keep holding what they hold.
-
-        An activation moves them by itself, and is ended by a reset: the gripper has to be activated again.
-        """
-        self._last_request = None
-        await _whole(self._write(GripperHalt()))
-        readout, _ = await _whole(self._read())
+        """Stop the fingers where they are; they keep their grip. An activation is ended by a reset."""
+        self._last_move = None
+        await _uninterrupted(self._write(GripperHalt()))
+        readout, _ = await _uninterrupted(self._read())
         if readout.sta is ActivationStatus.ACTIVATING:
-            await _whole(self._write(Reset()))
+            await _uninterrupted(self._write(Reset()))
 
     async def states(self) -> AsyncGenerator[GripperState]:
-        """Yield a state every poll period, for ever, whatever becomes of the gripper meanwhile.
+        """Yield a state every poll period and reconnect after losses, for ever.
 
-        Iterate within `contextlib.aclosing`, so that the connection is closed when the iteration is left.
+        Iterate within `contextlib.aclosing`, which closes the connection at the end.
         """
         loop = asyncio.get_running_loop()
         due_s = loop.time()
         try:
             while True:
-                # A period that was missed is left out, not made up for.
+                # A missed period is skipped.
                 due_s = max(due_s + self._poll_s, loop.time())
                 try:
                     state = await self._next_state()
                 except DriverError as error:
-                    await self._lost(error)
+                    await self._wait_after(error)
                     continue
                 yield state
                 await asyncio.sleep(due_s - loop.time())
@@ -198,7 +194,7 @@ class RobotiqGripper:
 
     async def _next_state(self) -> GripperState:
         if self.connected:
-            return await self._poll()
+            return await self.read()
         if self._loss is not None:
             raise self._loss
         state = await self.connect()
@@ -206,7 +202,7 @@ class RobotiqGripper:
         self._on_event(LinkEvent(up=True, sentence=f"The gripper answers at {self._client.name}.", repeated=False))
         return state
 
-    async def _lost(self, error: DriverError) -> None:
+    async def _wait_after(self, error: DriverError) -> None:
         await self.close()
         self._loss = None
         self.last_error = str(error)
@@ -215,7 +211,7 @@ class RobotiqGripper:
         await asyncio.sleep(retry.wait_s)
 
     def clip(self, command: GripperCommand) -> SentCommand:
-        """Return what a command comes to on this gripper: within its limits, in whole counts."""
+        """Return the command clipped to this gripper's limits and rounded to counts."""
         if not all(map(math.isfinite, (command.width_mm, command.speed_mm_s, command.force_n))):
             raise GripperRefusedError(f"{command} is no command: width, speed and force must be finite numbers.")
         clipped: list[str] = []
@@ -237,25 +233,17 @@ class RobotiqGripper:
             clipped=tuple(clipped),
         )
 
-    async def _read(self, *, again: bool = False) -> tuple[Readout, int]:
+    async def _read(self) -> tuple[Readout, int]:
         async with self._exchange:
             t_ns = self._clock_ns()
-            standing, self._standing = self._standing, None
             try:
-                if again and standing is not None:
-                    readout = await self._client.read_again(standing)
-                else:
-                    readout = await self._client.read()
+                return await self._client.read(), t_ns
             except DriverError as error:
                 self._note_loss(error)
                 raise
-            if readout is not standing:
-                self._whole_ns = t_ns
-            return readout, t_ns
 
     async def _write(self, request: Request) -> None:
         async with self._exchange:
-            self._standing = None
             try:
                 await self._client.write(request)
             except DriverError as error:
@@ -264,7 +252,7 @@ class RobotiqGripper:
 
     def _note_loss(self, error: DriverError) -> None:
         if self.connected:
-            # Whichever call meets a loss, `states` tells it.
+            # `states` reports it, whichever call meets it.
             self._loss = error
         self.connected, self.latest = False, None
 
@@ -276,18 +264,112 @@ class RobotiqGripper:
             target_counts=readout.pre,
             width_mm=self._calibration.width_mm(readout.pos),
             width_std_mm=self._calibration.width_std_mm,
-            object=object_status(readout, self._last_request),
+            object=object_status(readout, self._last_move),
             activation=readout.sta,
             current_ma=None if readout.current is None else readout.current * MA_PER_COUNT,
-            current_t_ns=self._whole_ns,
             fault=fault_of(readout.flt),
         )
         self._seq += 1
         return state
 
 
-async def _whole(exchange: Coroutine[object, object, T]) -> T:
-    """Return what an exchange does, which is not broken off with who waits for it: that would cost the connection."""
+class _Phase(Enum):
+    START = auto()
+    RESETTING = auto()
+    PAUSE = auto()
+    ACTIVATING = auto()
+    DONE = auto()
+
+
+@dataclass(slots=True)
+class ActivationSequence:
+    """Reset, wait, pause, activate, wait: a rising edge of ACT, which also ends every fault. No clock."""
+
+    _phase: _Phase = field(default=_Phase.START, init=False)
+    _since_ns: int = field(default=0, init=False)
+
+    @property
+    def done(self) -> bool:
+        """Whether the gripper is active."""
+        return self._phase is _Phase.DONE
+
+    def step(self, readout: Readout, t_ns: int) -> Request | None:
+        """Return the request to send now, if any. Raises GripperFaultError when the activation fails or hangs."""
+        match self._phase:
+            case _Phase.START:
+                self._enter(_Phase.RESETTING, t_ns)
+                return Reset()
+            case _Phase.RESETTING:
+                if not readout.act and readout.sta is ActivationStatus.RESET:
+                    self._enter(_Phase.PAUSE, t_ns)
+                elif t_ns - self._since_ns > RESET_DEADLINE_NS:
+                    raise GripperFaultError("The gripper does not take the reset; check that nothing else commands it.")
+            case _Phase.PAUSE:
+                if t_ns - self._since_ns >= PAUSE_NS:
+                    self._enter(_Phase.ACTIVATING, t_ns)
+                    return Activate()
+            case _Phase.ACTIVATING:
+                self._await_active(readout, t_ns)
+            case _Phase.DONE:
+                pass
+        return None
+
+    def _enter(self, phase: _Phase, t_ns: int) -> None:
+        self._phase, self._since_ns = phase, t_ns
+
+    def _await_active(self, readout: Readout, t_ns: int) -> None:
+        if readout.act and readout.flt >= _LEAST_ACTIVATION_FAULT and readout.flt != _NO_COMMUNICATION:
+            raise GripperFaultError(fault_of(readout.flt).sentence)
+        if readout.act and readout.sta is ActivationStatus.ACTIVE:
+            self._enter(_Phase.DONE, t_ns)
+        elif t_ns - self._since_ns > ACTIVATION_DEADLINE_NS:
+            raise GripperFaultError("The gripper's activation does not end; clear the fingers and activate it again.")
+
+
+@dataclass(slots=True)
+class MotionWatch:
+    """Detects the end of a motion that began at `since_ns`. No clock."""
+
+    request: GripperMove
+    since_ns: int
+
+    def has_finished(self, readout: Readout, t_ns: int) -> bool:
+        """Return whether the fingers stopped, at the target or on an object; GripperFaultError if they never will."""
+        blocking = blocking_fault(readout)
+        if blocking is not None:
+            raise GripperFaultError(blocking)
+        if object_status(readout, self.request) is not ObjectStatus.MOVING:
+            return True
+        if t_ns - self.since_ns > MOTION_DEADLINE_NS:
+            raise GripperFaultError("The gripper does not finish its motion; check that nothing else commands it.")
+        return False
+
+
+def object_status(readout: Readout, last: GripperMove | None) -> ObjectStatus:
+    """Return what the fingers met in the last motion requested.
+
+    Until the gripper has taken up a target (GTO is 1 and the echo PRE equals it), OBJ belongs to the motion before.
+    """
+    if readout.sta is not ActivationStatus.ACTIVE:
+        return ObjectStatus.UNKNOWN
+    if last is not None and not (readout.gto and readout.pre == last.position):
+        return ObjectStatus.MOVING
+    return readout.obj if readout.gto else ObjectStatus.UNKNOWN
+
+
+def blocking_fault(readout: Readout) -> str | None:
+    """Return why the gripper would not move now, as a sentence, or None."""
+    if readout.flt >= FIRST_MAJOR_CODE or readout.flt == _OVER_TEMPERATURE:
+        return fault_of(readout.flt).sentence
+    if readout.sta is ActivationStatus.ACTIVATING:
+        return fault_of(5).sentence
+    if not readout.act or readout.sta is not ActivationStatus.ACTIVE:
+        return fault_of(7).sentence
+    return None
+
+
+async def _uninterrupted(exchange: Coroutine[object, object, T]) -> T:
+    """Await an exchange that goes on when its caller is cancelled: breaking it off would cost the connection."""
     return await asyncio.shield(asyncio.ensure_future(exchange))
 
 

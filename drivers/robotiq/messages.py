@@ -1,19 +1,67 @@
-"""What goes to the gripper and what comes back: registers as numbers, states and commands as the loop needs them."""
+"""Requests to the gripper, its status registers, states and faults (instruction manual of the 2F-140)."""
 
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
 
-from shearloop.drivers.robotiq.faults import GripperFault
+from shearloop.drivers.errors import DriverError
 
-# Instruction manual of the 2F-140, specifications; the counts between are taken as evenly spaced.
+# The manual's specifications; speed and force are taken as linear in counts.
 SPEED_MIN_MM_S, SPEED_MAX_MM_S = 30.0, 250.0
 FORCE_MIN_N, FORCE_MAX_N = 10.0, 125.0
 MA_PER_COUNT = 10.0
+# From this fault code on the gripper takes no command before a new activation: a rising edge of ACT.
+FIRST_MAJOR_CODE = 10
+
+
+class GripperFaultError(DriverError):
+    """The gripper reports a fault that prevents the request."""
+
+
+class GripperRefusedError(DriverError):
+    """A command that is invalid, or invalid now; nothing was sent."""
+
+
+@dataclass(frozen=True, slots=True)
+class GripperFault:
+    """A fault's code and name, and a sentence with its meaning and cure."""
+
+    code: int
+    name: str
+    sentence: str
+
+    @property
+    def needs_activation(self) -> bool:
+        """Whether only a new activation, requested by the operator, ends it."""
+        return self.code >= FIRST_MAJOR_CODE
+
+
+_FAULTS = {
+    0: ("none", ""),
+    5: ("activation not finished", "The gripper is still activating; wait until it has opened and closed."),
+    7: ("not activated", "The gripper has to be activated before it moves."),
+    8: ("over-temperature", "The gripper is too hot; let it cool down, it takes commands again by itself."),
+    9: ("no communication", "The gripper received nothing for a second; check its cable and other programs using it."),
+    10: ("undervoltage", "The gripper's supply is too low; check its 24 V, then activate it again."),
+    11: ("automatic release running", "The gripper is releasing automatically; wait, then activate it again."),
+    12: ("internal fault", "The gripper reports an internal fault; activate it again, else ask its maker."),
+    13: ("activation fault", "The activation failed; clear what blocks the fingers, then activate it again."),
+    14: ("overcurrent", "The motor drew too much current; clear the fingers, then activate the gripper again."),
+    15: ("automatic release done", "The gripper has released automatically; activate it again."),
+}
+
+
+def fault_of(code: int) -> GripperFault:
+    """Return the fault with this code (gFLT, 0…15); a code that is not in the manual is called unknown."""
+    if code in _FAULTS:
+        return GripperFault(code, *_FAULTS[code])
+    cure = "activate it again" if code >= FIRST_MAJOR_CODE else "wait or activate it again"
+    sentence = f"The gripper reports the fault {code}, which is not in its manual; {cure}."
+    return GripperFault(code, f"unknown fault {code}", sentence)
 
 
 class ObjectStatus(IntEnum):
-    """gOBJ: what the fingers met. Values are the register's, which means nothing while GTO is 0: then UNKNOWN."""
+    """gOBJ: what the fingers met. The register means nothing while GTO is 0: then UNKNOWN."""
 
     UNKNOWN = -1
     MOVING = 0
@@ -23,12 +71,12 @@ class ObjectStatus(IntEnum):
 
     @property
     def text(self) -> str:
-        """The same in words."""
+        """The status in words."""
         return self.name.replace("_", " ").lower()
 
 
 class ActivationStatus(IntEnum):
-    """gSTA: how far the activation is. Values are the register's; 2 is not used by the gripper."""
+    """gSTA: the state of the activation; the gripper does not use 2."""
 
     RESET = 0
     ACTIVATING = 1
@@ -38,7 +86,7 @@ class ActivationStatus(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Readout:
-    """The gripper's status registers, all from one exchange; `current` is None where the way in has none."""
+    """The status registers of one exchange; `current` is None where the connection has none."""
 
     act: bool
     gto: bool
@@ -67,7 +115,7 @@ class GripperHalt:
 
 @dataclass(frozen=True, slots=True)
 class GripperMove:
-    """Go to a position (0 open … 255 closed) at a speed and up to a force, in counts of 0…255."""
+    """Go to a position (0 open … 255 closed) with a speed and a force limit, in counts of 0…255."""
 
     position: int
     speed: int
@@ -78,35 +126,28 @@ Request = Reset | Activate | GripperHalt | GripperMove
 
 
 class GripperClient(Protocol):
-    """A way to the gripper. Every call has a deadline; DeviceLostError closes the connection, and nothing repeats."""
+    """A connection to the gripper. Each call has a deadline; DeviceLostError closes the connection."""
 
     @property
     def name(self) -> str:
-        """Where the gripper is, for sentences."""
+        """The gripper's address, for messages."""
 
     async def connect(self) -> None:
         """Open the connection."""
 
     async def close(self) -> None:
-        """Close it; closing twice is allowed."""
+        """Close the connection; closing twice is allowed."""
 
     async def read(self) -> Readout:
         """Return the status registers."""
 
-    async def read_again(self, before: Readout) -> Readout:
-        """Return the status of a gripper that stood at `before`, and of which nothing was asked since.
-
-        It is `before` itself where nothing has changed but what is of no consequence then, current and ACT; those may
-        be as old as that.
-        """
-
     async def write(self, request: Request) -> None:
-        """Send a request and wait until it is acknowledged; what becomes of it shows in the status."""
+        """Send a request and wait for its acknowledgement; the status shows its effect."""
 
 
 @dataclass(frozen=True, slots=True)
 class GripperCommand:
-    """A width to go to, mm, with a speed and the largest force."""
+    """A target width, a speed, and the largest force."""
 
     width_mm: float
     speed_mm_s: float = SPEED_MAX_MM_S
@@ -115,7 +156,7 @@ class GripperCommand:
 
 @dataclass(frozen=True, slots=True)
 class SentCommand:
-    """What was really sent, after clipping and rounding to counts; `clipped` says in sentences what was changed."""
+    """The command as sent, after clipping and rounding to counts; `clipped` has a sentence for each change."""
 
     width_mm: float
     speed_mm_s: float
@@ -126,12 +167,10 @@ class SentCommand:
 
 @dataclass(frozen=True, slots=True)
 class GripperState:
-    """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were asked for). It is never repeated as a new one.
+    """The gripper at `t_ns` (CLOCK_MONOTONIC, when its registers were requested).
 
-    The current alone may be older: it is of `current_t_ns`.
-
-    width_mm ± width_std_mm is between the fingertips. While the fingers stand on an object, closing, diameter_mm is
-    that width: a measurement of the object. `object` is MOVING until the gripper has taken up the last command.
+    width_mm ± width_std_mm is the width between the fingertips. `object` is MOVING until the gripper has taken up the
+    last command.
     """
 
     t_ns: int
@@ -143,15 +182,14 @@ class GripperState:
     object: ObjectStatus
     activation: ActivationStatus
     current_ma: float | None
-    current_t_ns: int
     fault: GripperFault
 
     @property
     def diameter_mm(self) -> float | None:
-        """The diameter of the object between the fingers, mm; None without one."""
+        """The diameter of the object between the fingers, or None: the width at which they stopped while closing."""
         return self.width_mm if self.object is ObjectStatus.CONTACT_CLOSING else None
 
     @property
     def diameter_std_mm(self) -> float | None:
-        """The standard deviation of the diameter, mm; None without one."""
+        """The standard deviation of the diameter, or None."""
         return self.width_std_mm if self.object is ObjectStatus.CONTACT_CLOSING else None

@@ -1,30 +1,73 @@
-"""The gripper by way of its USB adapter: Modbus RTU with pymodbus, as the paper's authors drove it."""
+"""The gripper over its USB adapter: Modbus RTU with pymodbus (manual, "Gripper register mapping")."""
 
 import asyncio
 import logging
-from collections.abc import Awaitable
+from collections.abc import Awaitable, Sequence
 from typing import TypeVar
 
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.exceptions import ModbusException
 from pymodbus.pdu import ModbusPDU
 
+from shearloop.drivers.connection import find_port
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, ProtocolError
-from shearloop.drivers.robotiq import registers
-from shearloop.drivers.robotiq.messages import GripperMove, Readout, Request
-from shearloop.drivers.serial_port import find_port
+from shearloop.drivers.robotiq.messages import (
+    Activate,
+    ActivationStatus,
+    GripperHalt,
+    GripperMove,
+    ObjectStatus,
+    Readout,
+    Request,
+    Reset,
+)
 
 T = TypeVar("T")
 
-# What it would say of a late or broken answer is told here, by the error that it leads to.
+# Errors carry what pymodbus would log.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
 # An exchange takes 3 ms; a USB adapter may hold bytes back for 16 ms.
 REPLY_DEADLINE_S = 0.3
+BAUD_RATE = 115200
+DEVICE_ID = 9
+FIRST_COMMAND_REGISTER, FIRST_STATUS_REGISTER, N_STATUS_REGISTERS = 0x03E8, 0x07D0, 3
+_ACT, _GTO = 1 << 0, 1 << 3
+
+
+def command_registers(request: Request, last: GripperMove) -> list[int]:
+    """Return the three registers from 0x03E8 for a request; one without a target keeps the last target."""
+    match request:
+        case Reset():
+            action = 0
+        case Activate() | GripperHalt():
+            action = _ACT
+        case GripperMove():
+            action, last = _ACT | _GTO, request
+    return [action << 8, last.position, last.speed << 8 | last.force]
+
+
+def readout_of(registers: Sequence[int]) -> Readout:
+    """Return the readout of the three registers from 0x07D0; ProtocolError for another number of them."""
+    if len(registers) != N_STATUS_REGISTERS:
+        raise ProtocolError(f"The gripper answered with {len(registers)} registers instead of {N_STATUS_REGISTERS}.")
+    status, fault_and_echo, position_and_current = registers
+    gripper = status >> 8
+    return Readout(
+        act=bool(gripper & _ACT),
+        gto=bool(gripper & _GTO),
+        sta=ActivationStatus(gripper >> 4 & 3),
+        obj=ObjectStatus(gripper >> 6 & 3),
+        # The upper four bits belong to an optional controller that a USB gripper does not have.
+        flt=fault_and_echo >> 8 & 0x0F,
+        pre=fault_and_echo & 0xFF,
+        pos=position_and_current >> 8,
+        current=position_and_current & 0xFF,
+    )
 
 
 class ModbusClient:
-    """One serial connection. Any failure closes it: Modbus RTU cannot tell a late answer from the next one's."""
+    """One serial connection. Any failure closes it: Modbus RTU cannot tell a late answer from the next one."""
 
     def __init__(
         self,
@@ -44,27 +87,27 @@ class ModbusClient:
 
     @property
     def name(self) -> str:
-        """Where the gripper is, for sentences."""
+        """The gripper's address, for messages."""
         return self._path or f"the USB adapter {self._serial_number}"
 
     async def connect(self) -> None:
-        """Find the port and open it; DeviceNotFoundError when it is not there or not to be had."""
+        """Find the port and open it; DeviceNotFoundError when it is absent or in use."""
         await self.close()
         path = find_port(serial_number=self._serial_number, path=self._path)
-        # No retries and no reconnecting of its own: whoever waits for an answer is told at once.
+        # No retries inside pymodbus: the caller reconnects.
         client = AsyncModbusSerialClient(
-            path, baudrate=registers.BAUD_RATE, timeout=self._deadline_s, retries=0, reconnect_delay=0
+            path, baudrate=BAUD_RATE, timeout=self._deadline_s, retries=0, reconnect_delay=0
         )
         try:
-            there = await _heeded(client.connect())
+            opened = await _cancellable(client.connect())
         except BaseException:
             client.close()
             raise
-        if not there:
+        if not opened:
             client.close()
             raise DeviceNotFoundError(f"{path} cannot be opened; is another program using the gripper?")
         self._client = client
-        # The registers are written together: the target in them has to be the gripper's own, not ours from before.
+        # The registers are written together, so that the first write has to repeat the gripper's present target.
         try:
             readout = await self.read()
         except BaseException:
@@ -81,15 +124,11 @@ class ModbusClient:
     async def read(self) -> Readout:
         """Return the status registers; DeviceLostError or ProtocolError."""
         response = await self._exchange(None)
-        return registers.readout_of(response.registers)
-
-    async def read_again(self, before: Readout) -> Readout:  # noqa: ARG002 - it all comes in one exchange
-        """Return what `read` does."""
-        return await self.read()
+        return readout_of(response.registers)
 
     async def write(self, request: Request) -> None:
         """Write the command registers; DeviceLostError or ProtocolError."""
-        await self._exchange(registers.command_registers(request, self._last))
+        await self._exchange(command_registers(request, self._last))
         if isinstance(request, GripperMove):
             self._last = request
 
@@ -98,41 +137,37 @@ class ModbusClient:
         client = self._client
         if client is None:
             raise DeviceLostError(f"There is no connection to the gripper at {self.name} at present.")
-        whole = False
+        succeeded = False
         try:
             if command is None:
                 request = client.read_holding_registers(
-                    registers.FIRST_STATUS_REGISTER,
-                    count=registers.N_STATUS_REGISTERS,
-                    device_id=registers.DEVICE_ID,
+                    FIRST_STATUS_REGISTER, count=N_STATUS_REGISTERS, device_id=DEVICE_ID
                 )
             else:
-                request = client.write_registers(
-                    registers.FIRST_COMMAND_REGISTER, command, device_id=registers.DEVICE_ID
-                )
-            response = await _heeded(request)
-            whole = not response.isError()
+                request = client.write_registers(FIRST_COMMAND_REGISTER, command, device_id=DEVICE_ID)
+            response = await _cancellable(request)
+            succeeded = not response.isError()
         except (ModbusException, OSError) as error:
             raise DeviceLostError(
                 f"The gripper at {self.name} did not answer within {self._deadline_s:g} s: "
                 "unplugged, without power, or another program uses the port."
             ) from error
         finally:
-            if not whole:
+            if not succeeded:
                 await self.close()
         if response.isError():
             raise ProtocolError(f"The gripper at {self.name} refused a Modbus request: {response}.")
         return response
 
 
-async def _heeded(waiting: Awaitable[T]) -> T:
-    """Return what is waited for; raises CancelledError where this task was told to end meanwhile, whatever came of it.
+async def _cancellable(awaitable: Awaitable[T]) -> T:
+    """Await a call of pymodbus and honour a cancellation that arrives together with its result.
 
-    pymodbus waits by asyncio.wait_for, which before Python 3.12 loses a cancellation that comes with the answer.
+    pymodbus uses asyncio.wait_for, which before Python 3.12 loses such a cancellation.
     """
     task = asyncio.current_task()
     before = task.cancelling() if task is not None else 0
-    result = await waiting
+    result = await awaitable
     if task is not None and task.cancelling() > before:
         raise asyncio.CancelledError
     return result

@@ -1,5 +1,17 @@
-"""The microfluidic shear skin: two gauges in series with a current source, and two voltages.
+"""The microfluidic shear skin: two gauges in series with a current source, and two voltages."""
 
-`source` is the Keithley 6430 that feeds them, `scanner` and `adc_board` are two ways to read the voltages, `judge`
-turns both into resistances and names what is wrong, `skin` ties them together.
-"""
+from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner, SourceReading, Voltages
+from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinFault, SkinSample
+
+__all__ = [
+    "AdcBoard",
+    "Daq",
+    "Keithley6430",
+    "SampleValidator",
+    "ScpiScanner",
+    "ShearSkin",
+    "SkinFault",
+    "SkinSample",
+    "SourceReading",
+    "Voltages",
+]

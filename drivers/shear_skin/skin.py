@@ -1,54 +1,256 @@
-"""The shear skin as a device: a current source, two voltages, and what they say of the two gauges."""
+"""The shear skin as a device: two voltages and a current become two resistances, or named faults."""
 
 import contextlib
+import math
+from collections import Counter
 from collections.abc import AsyncGenerator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
 
-from shearloop.drivers.shear_skin.daq import Daq
-from shearloop.drivers.shear_skin.judge import CircuitLimits, SampleValidator, SkinSample
-from shearloop.drivers.shear_skin.source import Keithley6430, SourceReading
+from shearloop.drivers.connection import Diagnostics
+from shearloop.drivers.shear_skin.instruments import Daq, Keithley6430, SourceReading, Voltages
+
+# The resistance of the paper's gauges.
+GAUGE_OHM = 25.0
+# Shares of that: a gauge at rest may be made 40 % smaller, a stretched one has at most twice its resistance.
+MIN_SHARE, MAX_SHARE = 0.6, 2.0
+SHORT_SHARE, OPEN_SHARE = 0.1, 4.0
+# Largest relative error of the current.
+CURRENT_TOLERANCE = 0.01
+# Leads and contacts in series with the gauges.
+LEAD_OHM = 5.0
+# What the load may change between a source reading and a scan.
+SUM_TOLERANCE = 0.1
+# A source reading older than this is stale.
+SOURCE_STALE_PERIODS = 4.0
+# Relative change of a resistance between two readings: three newtons within a tenth of a second.
+MAX_CHANGE = 0.25
+SETTLE_READINGS = 3
+# A live converter's noise moves its last digit.
+STUCK_AFTER = 50
+
+
+class SkinFault(StrEnum):
+    """Faults of the circuit; the text is for the person at the bench."""
+
+    SOURCE_LOST = "the current source does not answer: see its cable, its address and whether it is on"
+    SOURCE_OFF = "the current source's output is off: press its OUTPUT key, or see what opened its interlock"
+    COMPLIANCE = "the current source is in compliance: the circuit is open or a contact is bad, follow the two leads"
+    CURRENT = "the current is not the one that was set: see whether the source was set by hand"
+    OPEN_1 = "gauge 1 is open: its channel or one of its wires is broken"
+    OPEN_2 = "gauge 2 is open: its channel or one of its wires is broken"
+    SHORT_1 = "gauge 1 is shorted, or its sense wires are off: there is no voltage across it"
+    SHORT_2 = "gauge 2 is shorted, or its sense wires are off: there is no voltage across it"
+    OVERRANGE_1 = "the voltage of gauge 1 is beyond the range of its channel"
+    OVERRANGE_2 = "the voltage of gauge 2 is beyond the range of its channel"
+    REVERSED_1 = "the sense wires of gauge 1 are reversed: its voltage is negative"
+    REVERSED_2 = "the sense wires of gauge 2 are reversed: its voltage is negative"
+    IMPLAUSIBLE_1 = "gauge 1 has a resistance that it cannot have: see that its own wires are on its channel"
+    IMPLAUSIBLE_2 = "gauge 2 has a resistance that it cannot have: see that its own wires are on its channel"
+    SUM = "the two voltages do not add up to the source's: see the contacts, and that each channel has its gauge"
+    STUCK_1 = "the voltage of gauge 1 has not changed for seconds: its converter stands still"
+    STUCK_2 = "the voltage of gauge 2 has not changed for seconds: its converter stands still"
+    SPIKE = "the resistances jumped by more than a skin can: the reading is taken for a disturbance"
+
+    @classmethod
+    def of_gauge(cls, kind: str, gauge: int) -> "SkinFault":
+        """Return the fault of a kind, `OPEN` for instance, of gauge 0 or 1."""
+        return cls[f"{kind}_{gauge + 1}"]
+
+
+@dataclass(frozen=True, slots=True)
+class SkinSample:
+    """Both gauges at one time: resistances in Ω, or None with the faults.
+
+    Every reading of the voltages becomes one. `missed` readings are missing right before it; `seq` counts from 0.
+    """
+
+    r1_ohm: float | None
+    r2_ohm: float | None
+    v1_v: float
+    v2_v: float
+    current_a: float | None
+    t_mid_ns: int
+    t_arrival_ns: int
+    seq: int
+    missed: int = 0
+    faults: tuple[SkinFault, ...] = ()
+
+    @property
+    def trusted(self) -> bool:
+        """Whether there are no faults."""
+        return not self.faults
+
+    @property
+    def reason(self) -> str:
+        """The faults, in sentences."""
+        return "; ".join(self.faults)
+
+
+class SampleValidator:
+    """Turns readings of voltages and current into samples, one by one. No I/O; times are passed in."""
+
+    def __init__(
+        self, current_a: float, source_period_s: float, daq_period_s: float, gauge_ohm: float = GAUGE_OHM
+    ) -> None:
+        """Expect the current that was set, the periods of source and voltages, and gauges of `gauge_ohm` at rest."""
+        self.faults: Counter[str] = Counter()
+        self.missed = 0
+        self.expected_hz = 1.0 / daq_period_s
+        self._current_a = current_a
+        self._gauge_v = gauge_ohm * current_a
+        self._stale_ns = round(SOURCE_STALE_PERIODS * source_period_s * 1e9)
+        self._period_ns = round(daq_period_s * 1e9)
+        self._seq = 0
+        self._last: Voltages | None = None
+        self._repeats = [1, 1]
+        self._good: tuple[float, float] | None = None
+        self._candidates: list[tuple[float, float]] = []
+        # The last fault of the source, and the time since when it works.
+        self._source_fault = SkinFault.SOURCE_LOST
+        self._source_since_ns: int | None = None
+
+    def sample(self, voltages: Voltages, source: SourceReading | None) -> SkinSample:
+        """Return the sample of a reading of the voltages, with the latest reading of the source."""
+        missed = self._count_missed(voltages)
+        faults = self._find_faults(voltages, source)
+        r1_ohm = r2_ohm = None
+        if not faults and source is not None:
+            pair = voltages.v1_v / source.current_a, voltages.v2_v / source.current_a
+            if self._is_spike(pair, missed):
+                faults = [SkinFault.SPIKE]
+            else:
+                r1_ohm, r2_ohm = pair
+        self.faults.update(fault.name.lower() for fault in faults)
+        sample = SkinSample(
+            r1_ohm=r1_ohm,
+            r2_ohm=r2_ohm,
+            v1_v=voltages.v1_v,
+            v2_v=voltages.v2_v,
+            current_a=source.current_a if source is not None and source.output_on else None,
+            t_mid_ns=voltages.t_mid_ns,
+            t_arrival_ns=voltages.t_arrival_ns,
+            seq=self._seq,
+            missed=missed,
+            faults=tuple(faults),
+        )
+        self._seq += 1
+        return sample
+
+    def _count_missed(self, voltages: Voltages) -> int:
+        last, self._last = self._last, voltages
+        if last is None:
+            return 0
+        for i, same in enumerate((voltages.v1_v == last.v1_v, voltages.v2_v == last.v2_v)):
+            self._repeats[i] = self._repeats[i] + 1 if same else 1
+        missed = max(round((voltages.t_mid_ns - last.t_mid_ns) / self._period_ns) - 1, 0)
+        self.missed += missed
+        return missed
+
+    def _find_faults(self, voltages: Voltages, source: SourceReading | None) -> list[SkinFault]:
+        if source is None or voltages.t_arrival_ns - source.t_ns > self._stale_ns:
+            self._source_fault, self._source_since_ns = SkinFault.SOURCE_LOST, None
+            return [SkinFault.SOURCE_LOST]
+        if not source.output_on:
+            self._source_fault, self._source_since_ns = SkinFault.SOURCE_OFF, None
+            return [SkinFault.SOURCE_OFF]
+        if self._source_since_ns is None:
+            self._source_since_ns = source.t_ns
+        if voltages.t_mid_ns < self._source_since_ns:
+            # Measured before the current flowed: intact gauges would look like shorts.
+            return [self._source_fault]
+        gauges = self._gauge_faults(voltages)
+        if source.compliance:
+            # Compliance is the cause; an open gauge is the place.
+            opened = [fault for fault in gauges if fault in (SkinFault.OPEN_1, SkinFault.OPEN_2)]
+            return [SkinFault.COMPLIANCE, *opened]
+        if abs(source.current_a - self._current_a) > CURRENT_TOLERANCE * self._current_a:
+            return [SkinFault.CURRENT, *gauges]
+        if gauges:
+            return gauges
+        stuck = [SkinFault.of_gauge("STUCK", i) for i, repeats in enumerate(self._repeats) if repeats >= STUCK_AFTER]
+        if stuck:
+            return stuck
+        across_v = voltages.v1_v + voltages.v2_v
+        slack_v = SUM_TOLERANCE * across_v
+        leads_v = LEAD_OHM * self._current_a
+        adds_up = -slack_v <= source.voltage_v - across_v <= leads_v + slack_v
+        return [] if adds_up else [SkinFault.SUM]
+
+    def _gauge_faults(self, voltages: Voltages) -> list[SkinFault]:
+        values = (voltages.v1_v, voltages.v2_v)
+        overranges = (voltages.over_1, voltages.over_2)
+        is_open = [over or abs(v) > OPEN_SHARE * self._gauge_v for v, over in zip(values, overranges, strict=True)]
+        is_short = [abs(v) < SHORT_SHARE * self._gauge_v for v in values]
+        found = []
+        for i, (v, over) in enumerate(zip(values, overranges, strict=True)):
+            if is_open[i] and is_short[1 - i]:
+                # Without a current the whole compliance lies across the open gauge and nothing across the other.
+                found.append(SkinFault.of_gauge("OPEN", i))
+            elif over:
+                found.append(SkinFault.of_gauge("OVERRANGE", i))
+            elif is_short[i]:
+                if not is_open[1 - i]:
+                    found.append(SkinFault.of_gauge("SHORT", i))
+            elif v < 0:
+                found.append(SkinFault.of_gauge("REVERSED", i))
+            elif not MIN_SHARE * self._gauge_v <= v <= MAX_SHARE * self._gauge_v:
+                found.append(SkinFault.of_gauge("IMPLAUSIBLE", i))
+        return found
+
+    def _is_spike(self, pair: tuple[float, float], missed: int) -> bool:
+        """Detect a disturbance; a few readings that agree with each other become the new level."""
+        if self._good is not None and not _reachable(self._good, pair, missed):
+            if self._candidates and not _reachable(self._candidates[-1], pair, missed):
+                self._candidates.clear()
+            self._candidates.append(pair)
+            if len(self._candidates) < SETTLE_READINGS:
+                return True
+        self._good, self._candidates = pair, []
+        return False
+
+
+def _reachable(before: tuple[float, float], after: tuple[float, float], missed: int) -> bool:
+    most = (1 + missed) * math.log1p(MAX_CHANGE)
+    return all(abs(math.log(now / then)) <= most for then, now in zip(before, after, strict=True))
 
 
 class ShearSkin:
-    """Source and DAQ of one skin. Run `watch_source` beside `samples`: without it every sample says so."""
+    """Source and DAQ of one skin. Run `watch_source` next to `samples`: without it every sample has a fault."""
 
-    def __init__(self, source: Keithley6430, daq: Daq, limits: CircuitLimits | None = None) -> None:
-        """Take both instruments; nothing is opened yet."""
+    def __init__(self, source: Keithley6430, daq: Daq, gauge_ohm: float = GAUGE_OHM) -> None:
+        """Use both instruments, not yet open."""
         self._source = source
         self._daq = daq
-        self._judge = SampleValidator(source.current_a, source.period_s, daq.period_s, limits)
+        self._validator = SampleValidator(source.current_a, source.period_s, daq.period_s, gauge_ohm)
         self._latest: SourceReading | None = None
         self._samples = 0
 
-    @property
-    def period_s(self) -> float:
-        """How often a sample is to be expected."""
-        return self._daq.period_s
-
     async def watch_source(self) -> None:
-        """Set the source up and read it, until cancelled; then its output is switched off."""
+        """Set the source up and read it until cancelled; then switch its output off."""
         async with contextlib.aclosing(self._source.readings()) as readings:
             async for reading in readings:
                 self._latest = reading
 
     async def samples(self) -> AsyncGenerator[SkinSample]:
-        """Yield a sample for every reading of the voltages, for ever, whatever becomes of the instruments meanwhile.
-
-        Iterate within `contextlib.aclosing`, so that the port is closed when the iteration is left.
-        """
+        """Yield a sample for every reading of the voltages, without end; iterate within `contextlib.aclosing`."""
         async with contextlib.aclosing(self._daq.readings()) as readings:
             async for voltages in readings:
                 self._samples += 1
-                yield self._judge.sample(voltages, self._latest)
+                yield self._validator.sample(voltages, self._latest)
 
-    def facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
-        """Return what health tells of the voltages; counts are since the process began."""
-        facts = dict(self._daq.facts())
-        errors = facts.get("errors")
-        if isinstance(errors, Mapping):
-            facts["errors"] = {**errors, **self._judge.faults}
-        facts["expected_hz"] = self._judge.expected_hz
-        return {**facts, "samples": self._samples, "missed": self._judge.missed}
+    def diagnostics(self) -> Diagnostics:
+        """Return the values of voltages and gauges for `health`; counts are since the process began."""
+        found = dict(self._daq.diagnostics())
+        errors = found.get("errors")
+        return {
+            **found,
+            "errors": {**(errors if isinstance(errors, Mapping) else {}), **self._validator.faults},
+            "expected_hz": self._validator.expected_hz,
+            "samples": self._samples,
+            "missed": self._validator.missed,
+        }
 
-    def source_facts(self) -> Mapping[str, bool | int | float | str | Mapping[str, int] | None]:
-        """Return what health tells of the current source."""
-        return self._source.facts()
+    def source_diagnostics(self) -> Diagnostics:
+        """Return the values of the current source for `health`."""
+        return self._source.diagnostics()

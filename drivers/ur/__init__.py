@@ -1,8 +1,42 @@
-"""The UR arm: `UrRobot` in the daemon's loop, ur-rtde in a process of its own behind a small typed pipe.
+"""The UR arm: `UrRobot` in the daemon's event loop, and ur-rtde in a worker process behind a pipe.
 
-client.py    the daemon's end: starts the process, sends commands, keeps the latest state, starts it again
-messages.py  what crosses the pipe
-child.py     the process: 125 cycles a second, an alarm before everything that may hang
-pilot.py     what is sent and what is refused, without I/O; limits.py and recovery.py are its two hard parts
-arm.py       ur-rtde itself
+`worker` runs 125 cycles a second; `CommandHandler` decides in each what the robot is sent; `UrArm` wraps ur-rtde.
 """
+
+from shearloop.drivers.ur.client import UrLinkEvent, UrRobot, ignore_state
+from shearloop.drivers.ur.controller import ControllerInfo, query_controller
+from shearloop.drivers.ur.messages import (
+    ARRIVED,
+    STOPPED_ON_COMMAND,
+    Command,
+    CommandReply,
+    Enable,
+    MoveLinear,
+    RobotState,
+    Stop,
+    Unlock,
+    WristSpeed,
+    ZeroForceTorque,
+)
+from shearloop.drivers.ur.settings import UrSettings, read_settings
+
+__all__ = [
+    "ARRIVED",
+    "STOPPED_ON_COMMAND",
+    "Command",
+    "CommandReply",
+    "ControllerInfo",
+    "Enable",
+    "MoveLinear",
+    "RobotState",
+    "Stop",
+    "Unlock",
+    "UrLinkEvent",
+    "UrRobot",
+    "UrSettings",
+    "WristSpeed",
+    "ZeroForceTorque",
+    "ignore_state",
+    "query_controller",
+    "read_settings",
+]

@@ -1,133 +1,119 @@
-"""ur-rtde behind a port of our own. The only module that imports it, and only the child process imports this module.
+"""The arm through ur-rtde. Only this module imports ur-rtde, and only the worker process imports this module.
 
-The client is not thread-safe and blocks for up to 301 s, its constructors hold the interpreter lock and some never
-return, and it crashes its process when RTDE is lost: hence a process for it alone, with an alarm set before each call.
+ur-rtde is not thread-safe. Its calls block for up to 301 s, its constructors hold the interpreter lock, and it crashes
+its process when RTDE is lost. So it has a process of its own, with an alarm before each call.
 """
 
+import contextlib
 import ctypes
 import os
+import socket
+import stat
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import dashboard_client
 import rtde_control
 import script_client
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.connections import connections_to
-from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, WristSpeed
-from shearloop.drivers.ur.probe import RTDE_PORT
-from shearloop.drivers.ur.ready import Ready
-from shearloop.drivers.ur.receiver import Receiver
-from shearloop.drivers.ur.sample_age import SampleAge
-from shearloop.drivers.ur.script import in_a_file, watched
+from shearloop.drivers.ur.controller import RTDE_PORT, RtdeReceiver, SampleAge, ScriptReadiness
+from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Sample, WristSpeed
 from shearloop.drivers.ur.settings import UrSettings
 
-# A thread of the client asks its socket for data, sleeps for 0.1 ms, and asks again: 5 % of a core. Woken up to so much
-# later it takes two samples at a time. What is sent over and over (a wrist speed, a sign of life) does not wait for it.
-# What is done once (beginning or stopping a straight move, ending the turning of a wrist at rest, zeroing the wrench,
-# setting the watchdog) waits until it has seen that done, and what comes next until it has seen the robot ready again
-# (see `shearloop.drivers.ur.ready`): each so much longer at most, and a robot that hears nothing meanwhile has
-# patience for six.
-_LONGEST_POLL_SLACK_NS, _SLACKS_IN_PATIENCE = 16_000_000, 6
+# A thread of ur-rtde polls its socket every 0.1 ms, which takes 5 % of a core. With this timer slack it wakes once per
+# two samples. One-time commands wait for that thread, so that the slack is at most a sixth of the watchdog's time.
+_LONGEST_POLL_SLACK_NS, _SLACKS_PER_WATCHDOG = 16_000_000, 6
 _PR_SET_TIMERSLACK = 29
+# The line before the loop in ur-rtde 1.6.5's control script.
+_BEFORE_LOOP = "        keep_running = True\n"
 
 
 class DashboardRefusedError(DriverError):
-    """The dashboard server did not do what it was asked."""
+    """The dashboard server refused a request."""
 
 
 class UrArm:
-    """One connection to a controller for reading, one for control; the dashboard when needed."""
+    """A connection for samples, one for control, and the dashboard when needed."""
 
     def __init__(self, settings: UrSettings, version: str) -> None:
-        """Connect without starting a program, so that a robot in a protective stop can be connected to as well.
-
-        `version` is the controller's, as 5.17.3.0.
+        """Connect without starting a program, so that this works in a protective stop. `version` is like 5.17.3.0.
 
         Raises:
-            RuntimeError: whatever ur-rtde says.
+            RuntimeError: ur-rtde failed.
             ProbeError: the controller does not send its state.
         """
         self._settings = settings
         major, minor = map(int, version.split(".")[:2])
-        # Not connected: it is asked for the text alone.
-        self._script = watched(script_client.ScriptClient("", major, minor).getScript(), settings.watchdog_hz)
+        self._script = arm_watchdog_in(script_client.ScriptClient("", major, minor).getScript(), settings.watchdog_hz)
         if not self._script:
-            sys.stderr.write(
-                "The control script of this ur-rtde has another form: a command alone arms its watchdog.\n"
-            )
-        self._receiver = Receiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
+            sys.stderr.write("This ur-rtde has an unknown control script: only a command arms the script's watchdog.\n")
+        self._receiver = RtdeReceiver(settings.host, settings.rate_hz, settings.connect_timeout_s / 3)
         kind, ours = rtde_control.RTDEControlInterface, connections_to(RTDE_PORT)
-        patience_ns = 1e9 / settings.watchdog_hz
-        with _woken_late(min(_LONGEST_POLL_SLACK_NS, int(patience_ns / _SLACKS_IN_PATIENCE))):
+        watchdog_ns = 1e9 / settings.watchdog_hz
+        with _timer_slack(min(_LONGEST_POLL_SLACK_NS, int(watchdog_ns / _SLACKS_PER_WATCHDOG))):
             self._control = kind(settings.host, settings.rate_hz, int(kind.FLAG_NO_WAIT))
-        self._its_connections = connections_to(RTDE_PORT) - ours
+        self._control_connections = connections_to(RTDE_PORT) - ours
         self._takes_scripts = True
-        # Whether a straight move may be under way: one was begun, and the wrist has not been turned since.
+        # A linear move was begun, and the wrist has not turned since.
         self._may_move_linearly = False
         self._age = SampleAge()
-        self._ready = Ready(self._receiver, 1.0 / settings.watchdog_hz)
+        self._script_readiness = ScriptReadiness(self._receiver, 1.0 / settings.watchdog_hz)
 
     def read(self) -> RtdeSample:
         """Return the controller's latest sample and its age."""
         sample = self._receiver.latest()
         now_ns = time.monotonic_ns()
         return RtdeSample(
-            sample.timestamp_s,
-            sample.q_rad,
-            sample.qd_rad_per_s,
-            sample.tcp_pose,
-            sample.wrench,
-            sample.robot_mode,
-            sample.safety_mode,
-            sample.runtime_state,
-            sample.speed_scaling,
-            now_ns,
-            self._age.age_ns(sample.timestamp_s, now_ns),
-            self._connected,
-            # Two calls that wrap an object: not in each cycle in which the answer is known.
-            self._may_move_linearly and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
+            **{name: getattr(sample, name) for name in Sample.__slots__},
+            t_mono_ns=now_ns,
+            age_ns=self._age.age_ns(sample.timestamp_s, now_ns),
+            connected=self._connected,
+            moving_linearly=self._may_move_linearly
+            and self._control.getAsyncOperationProgressEx().isAsyncOperationRunning(),
         )
 
     @property
     def _connected(self) -> bool:
-        theirs = self._takes_scripts and self._control.isConnected()
-        return self._receiver.connected and theirs and all(one.lasts for one in self._its_connections)
+        control = self._takes_scripts and self._control.isConnected()
+        return self._receiver.connected and control and all(one.is_open for one in self._control_connections)
 
     def wrist(self, command: WristSpeed) -> bool:
-        """Turn wrist 3, the other joints held; of an arm that is on no straight move."""
+        """Turn wrist 3 and hold the other joints; not during a linear move."""
         self._may_move_linearly = False
         speeds = [0.0, 0.0, 0.0, 0.0, 0.0, command.rad_per_s]
-        return self._ready.wait() and bool(self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0))
+        return self._script_readiness.wait() and bool(
+            self._control.speedJ(speeds, command.acceleration_rad_per_s2, 0.0)
+        )
 
     def end_speed(self, deceleration_rad_per_s2: float) -> bool:
-        """End the script's speed thread; blocks until the arm rests, so only for an arm that does."""
-        return self._once(self._control.speedStop, deceleration_rad_per_s2)
+        """End the script's speed thread. It blocks until the arm rests, so call it at rest."""
+        return self._send_once(self._control.speedStop, deceleration_rad_per_s2)
 
     def move(self, command: MoveLinear) -> bool:
-        """Begin a linear move; `RtdeSample.moving_linearly` tells its end."""
+        """Begin a linear move; `RtdeSample.moving_linearly` shows its end."""
         self._may_move_linearly = True
         speed, acceleration = command.speed_m_per_s, command.acceleration_m_per_s2
-        return self._once(self._control.moveL, [*command.pose], speed, acceleration, asynchronous=True)
+        return self._send_once(self._control.moveL, [*command.pose], speed, acceleration, asynchronous=True)
 
     def stop_move(self, deceleration_rad_per_s2: float) -> bool:
         """Begin to end a linear move."""
-        # The client does not say whether the stop was taken; whether the program takes what comes after it, it does.
-        self._once(self._control.stopJ, deceleration_rad_per_s2, asynchronous=True)
-        return self.kick()
+        # ur-rtde does not report whether the stop was taken; the heartbeat after it does.
+        self._send_once(self._control.stopJ, deceleration_rad_per_s2, asynchronous=True)
+        return self.send_heartbeat()
 
-    def kick(self) -> bool:
-        """Tell the robot's watchdog that we live."""
-        return self._ready.wait() and bool(self._control.kickWatchdog())
+    def send_heartbeat(self) -> bool:
+        """Feed the robot's watchdog."""
+        return self._script_readiness.wait() and bool(self._control.kickWatchdog())
 
     def clear_command(self) -> bool:
-        """See that the register which holds the last command moves nothing any more, while no program runs.
+        """Clear the register with the last command while no program runs; False: try again later.
 
-        The client has no call for it, but clears the register before it says that it cannot send. False: it does not
-        know yet that no program runs, and would wait for that to be ready.
+        ur-rtde has no call for it, but clears the register before it reports that it cannot send. False means that it
+        does not know yet that no program runs, and would wait for the program.
         """
         if self._control.isProgramRunning():
             return False
@@ -135,63 +121,62 @@ class UrArm:
         return True
 
     def zero_wrench(self) -> bool:
-        """Take the present wrench as zero."""
-        return self._once(self._control.zeroFtSensor)
+        """Make the present wrench zero."""
+        return self._send_once(self._control.zeroFtSensor)
 
     def upload(self) -> bool:
-        """Send the control script; the program then starts by itself, and ends when it hears nothing."""
+        """Send the control script; the program starts by itself, and ends when it receives nothing."""
         try:
             if self._script:
-                with in_a_file(self._script) as path:
-                    # Sends it, too.
+                with _memory_file(self._script) as path:
                     self._control.setCustomScriptFile(path)
             else:
                 self._control.reuploadScript()
         except RuntimeError as error:
-            # The controller has closed the connection for scripts, or restarts: ur-rtde does not open it again.
+            # The controller closed the script connection, and ur-rtde does not reopen it.
             sys.stderr.write(f"The control script could not be sent: {error}.\n")
             self._takes_scripts = False
-        self._ready.called()
+        self._script_readiness.command_sent()
         return self._takes_scripts
 
     def arm_watchdog(self) -> bool:
-        """Have the robot end its program when it hears nothing; after every upload, which it shows to have taken."""
-        return self._once(self._control.setWatchdog, self._settings.watchdog_hz)
+        """Arm the robot's watchdog after an upload; taken only by a program that answers."""
+        return self._send_once(self._control.setWatchdog, self._settings.watchdog_hz)
 
     def end_program(self) -> None:
-        """End the control script, unless it is not ready for that: the robot's watchdog ends it then."""
-        if self._ready.wait():
+        """End the control script; one that is not ready is left to its watchdog."""
+        if self._script_readiness.wait():
             self._control.stopScript()
 
-    def _once(self, call: Callable[..., object], *arguments: object, **options: object) -> bool:
-        """Have a command carried out that the script says to be done with."""
-        if not self._ready.wait():
+    def _send_once(self, call: Callable[..., object], *arguments: object, **options: object) -> bool:
+        """Send a command that the script carries out once."""
+        if not self._script_readiness.wait():
             return False
         done = bool(call(*arguments, **options))
-        self._ready.called()
+        self._script_readiness.command_sent()
         return done
 
     def unlock(self) -> None:
         """Unlock a protective stop; `DashboardRefusedError` in its first 5 s."""
-        self._ask("unlockProtectiveStop")
+        self._ask_dashboard("unlockProtectiveStop")
 
     def close_popups(self) -> None:
-        """Close what the pendant shows."""
-        self._ask("closeSafetyPopup", "closePopup")
+        """Close the pendant's popups."""
+        self._ask_dashboard("closeSafetyPopup", "closePopup")
 
     def power_on(self) -> None:
-        """Begin to switch the arm's power on."""
-        self._ask("powerOn")
+        """Begin to power the arm."""
+        self._ask_dashboard("powerOn")
 
     def release_brakes(self) -> None:
         """Begin to release the brakes."""
-        self._ask("brakeRelease")
+        self._ask_dashboard("brakeRelease")
 
     def stop_program(self) -> None:
-        """Stop whatever program runs or is paused."""
-        self._ask("stop")
+        """Stop any program that runs or is paused."""
+        self._ask_dashboard("stop")
 
-    def _ask(self, *requests: str) -> None:
+    def _ask_dashboard(self, *requests: str) -> None:
         dashboard = dashboard_client.DashboardClient(self._settings.host)
         try:
             dashboard.connect()
@@ -203,22 +188,73 @@ class UrArm:
             dashboard.disconnect()
 
 
-@contextmanager
-def _woken_late(slack_ns: int) -> Iterator[None]:
-    """Let the kernel wake the threads that are started meanwhile up to so much later than they ask (prctl(2)).
+def arm_watchdog_in(script: str, watchdog_hz: float) -> str:
+    """Return ur-rtde's script with its watchdog armed before the loop, or "" when the place is not found.
 
-    A thread with real-time priority is woken on time all the same. Where the kernel does not let us, threads are woken
-    on time too: that costs processor time and nothing else.
+    ur-rtde arms the watchdog by a command once the script runs. Until then a script would outlive its client. URScript
+    manual, `rtde_set_watchdog`: a program's watchdogs end with it.
     """
+    if script.count(_BEFORE_LOOP) != 1:
+        return ""
+    armed = f'        rtde_set_watchdog("input_int_register_0", {watchdog_hz:g}, "stop")\n'
+    return f"def rtde_control():\n{script.replace(_BEFORE_LOOP, armed + _BEFORE_LOOP)}end\n"
+
+
+@contextmanager
+def _memory_file(program: str) -> Iterator[str]:
+    descriptor = os.memfd_create("control.script")
+    try:
+        with os.fdopen(os.dup(descriptor), "w") as file:
+            file.write(program)
+        yield f"/proc/self/fd/{descriptor}"
+    finally:
+        os.close(descriptor)
+
+
+class TcpConnection(NamedTuple):
+    """A connection of this process: its descriptor and the kernel's inode, which a reused descriptor does not keep.
+
+    ur-rtde reconnects silently in a thread of its own. Commands on such a connection crash the process, so that a new
+    connection counts as a lost controller.
+    """
+
+    descriptor: int
+    inode: int
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the descriptor still belongs to this connection."""
+        try:
+            return os.fstat(self.descriptor).st_ino == self.inode
+        except OSError:
+            return False
+
+
+def connections_to(port: int) -> set[TcpConnection]:
+    """Return this process's TCP connections to a port."""
+    found = set()
+    for name in os.listdir("/proc/self/fd"):
+        # The descriptor may have been closed, or the socket may not be connected.
+        with contextlib.suppress(OSError):
+            status = os.fstat(int(name))
+            if stat.S_ISSOCK(status.st_mode):
+                with socket.socket(fileno=os.dup(int(name))) as one:
+                    if one.family == socket.AF_INET and one.getpeername()[1] == port:
+                        found.add(TcpConnection(int(name), status.st_ino))
+    return found
+
+
+@contextmanager
+def _timer_slack(slack_ns: int) -> Iterator[None]:
+    """Give threads started meanwhile this timer slack (prctl(2)); without the right to, they only cost more."""
     _set_timer_slack(slack_ns)
     try:
         yield
     finally:
-        # Of this thread, the default again.
-        _set_timer_slack(0)
+        _set_timer_slack(0)  # this thread's default
 
 
 def _set_timer_slack(slack_ns: int) -> None:
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0) != 0:
-        sys.stderr.write(f"The robot's threads are woken more often than needed: {os.strerror(ctypes.get_errno())}.\n")
+        sys.stderr.write(f"The robot's threads wake more often than needed: {os.strerror(ctypes.get_errno())}.\n")

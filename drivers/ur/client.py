@@ -1,8 +1,6 @@
-"""The daemon's end of the robot: one process that may die at any time, and one object that outlives it.
+"""The daemon's end of the robot: `UrRobot` runs the worker process and replaces it when it dies.
 
-`UrRobot.run` belongs in the daemon's task group. It starts the process, keeps the latest state, ends a process that
-hangs, and starts the next one with growing pauses. A new process has motion disabled: no command is ever sent twice,
-and nothing moves until someone says `Enable` (or `Unlock`) anew.
+A new worker has motion disabled. No command is sent twice, and nothing moves before the next `Enable` or `Unlock`.
 """
 
 import asyncio
@@ -15,20 +13,18 @@ from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from shearloop.drivers.cancelled import is_cancelled
-from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur import error_messages as sentences
+from shearloop.drivers.errors import DriverError, is_cancelled
+from shearloop.drivers.ur import error_messages
 from shearloop.drivers.ur.messages import Command, CommandReply, Failed, Message, RobotState
 from shearloop.drivers.ur.settings import UrSettings
-from shearloop.drivers.ur.wire import encode
-from shearloop.drivers.ur.worker_connection import Descriptor, LossKind, LostError, WorkerConnection, output
+from shearloop.drivers.ur.worker_connection import Descriptor, LossKind, LostError, WorkerConnection, output_pipe
 
 LinkStatus = Literal["starting", "up", "down"]
 
 PAUSES_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
-# After so long without a loss the next one is a first one again.
+# After this time without a loss the pauses start again with the shortest.
 STEADY_S = 30.0
-# So long after the loss of a process what runs on the robot is taken for the program that it left behind.
+# A program found this soon after a loss counts as left behind by the lost worker.
 TAKES_OVER_S = 10.0
 
 
@@ -44,182 +40,165 @@ class UrLinkEvent:
 
 
 class UrRobot:
-    """A UR arm: `run` in a task, `send` commands, look at `state`."""
+    """A UR arm: `run` in a task of the daemon, `send` commands, read `state`."""
 
     def __init__(self, settings: UrSettings, on_link: Callable[[UrLinkEvent], None] | None = None) -> None:
-        """Take the settings; `on_link` hears of every loss and every return."""
+        """Take the settings; `on_link` receives each loss and each return."""
         self.settings = settings
         self.link = UrLinkEvent(time.monotonic_ns(), "starting", "The robot's process has not been started.")
         self.losses: Counter[str] = Counter()
         self.pid: int | None = None
-        self._on_link = on_link or (lambda _event: None)
-        # Called with each state where it is read, and with whether no newer one was read along with it.
+        # How many states have come, and how many times our program was paused and did not stop on request.
+        self.states = 0
+        self.failed_program_stops = 0
+        # Receives each state, and whether it is the newest of those that were read at once.
         self.on_state: Callable[[RobotState, bool], None] = ignore_state
+        self._on_link = on_link or (lambda _event: None)
         self._state: RobotState | None = None
-        self._stdin: asyncio.StreamWriter | None = None
-        # When the process was told anything last: whatever it hears is a sign of life.
-        self.told_s = -math.inf
-        self._waiting: dict[int, Callable[[CommandReply], None]] = {}
+        self._connection: WorkerConnection | None = None
+        self._replies: dict[int, Callable[[CommandReply], None]] = {}
         self._number = 0
         self._lost_s = -math.inf
-        # How many times our program was paused, asked to stop, and did not.
-        self.stops_in_vain = 0
-        # How many states have come since the beginning.
-        self.states = 0
-        # Done with the next state; made when somebody waits for it.
         self._next: asyncio.Future[RobotState] | None = None
 
     @property
     def takes_over(self) -> bool:
-        """Whether the connection was lost just now, so that a program of ours may have been left on the robot."""
+        """Whether the connection was just lost, so that a program of ours may still be on the robot."""
         return time.monotonic() - self._lost_s < TAKES_OVER_S
 
     @property
     def state(self) -> RobotState | None:
-        """The latest state, or None while there is no connection: an old state is no state."""
+        """The latest state, or None while there is no connection."""
         return self._state
 
     async def next_state(self) -> RobotState:
-        """Return the next state that arrives; waits through losses of the connection."""
+        """Return the next state; waits through losses of the connection."""
         if self._next is None:
             self._next = asyncio.get_running_loop().create_future()
         return await asyncio.shield(self._next)
 
     async def send(self, command: Command) -> CommandReply:
-        """Return the one reply to a command; `tell` says which."""
+        """Send a command and return its reply."""
         replied: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
 
-        def answered(reply: CommandReply) -> None:
+        def on_reply(reply: CommandReply) -> None:
             if not replied.done():
                 replied.set_result(reply)
 
-        self.tell(command, answered)
+        self.send_nowait(command, on_reply)
         return await replied
 
-    def tell(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
-        """Send a command; `answered` hears the one reply: what is sent after clipping, or why nothing is.
+    def send_nowait(self, command: Command, on_reply: Callable[[CommandReply], None]) -> None:
+        """Send a command and pass its reply to `on_reply`.
 
-        A command whose process dies before it replied is answered as refused, and is not sent again. What `answered`
-        raises ends the conversation with the process; where that is over already, the event loop's handler hears of it.
+        A command whose worker dies first is refused and not sent again. An exception in `on_reply` ends the connection;
+        where that has ended, it goes to the event loop's handler.
         """
-        if self._stdin is None or self._state is None:
-            answered(CommandReply(refused=f"The robot is not connected. {self.link.sentence}"))
+        if self._connection is None or self._state is None:
+            on_reply(CommandReply(refusal=f"The robot is not connected. {self.link.sentence}"))
             return
         self._number += 1
-        self._waiting[self._number] = answered
-        self._write(self._stdin, encode(command, self._number))
-
-    def _write(self, stdin: asyncio.StreamWriter, data: bytes) -> None:
-        self.told_s = time.monotonic()
-        stdin.write(data)
+        self._replies[self._number] = on_reply
+        self._connection.send(command, self._number)
 
     async def run(self) -> None:
-        """Keep the robot connected until cancelled; then stop it and let it go.
+        """Keep the robot connected until cancelled; then stop it and disconnect.
 
         Raises:
-            DriverError: ur-rtde is not installed, which no attempt would change.
+            DriverError: ur-rtde is not installed.
         """
         if importlib.util.find_spec("rtde_control") is None:
-            raise DriverError(sentences.NOT_INSTALLED)
+            raise DriverError(error_messages.NOT_INSTALLED)
         attempts = 0
         while True:
             started_s = time.monotonic()
             try:
-                await self._one_process()
+                with output_pipe() as (stdout, its_stdout):
+                    await self._run_worker(stdout, its_stdout)
             except LostError as loss:
                 if loss.kind == "not-installed":
                     raise DriverError(str(loss)) from loss
                 attempts = 1 if time.monotonic() - started_s > STEADY_S else attempts + 1
                 self.losses[loss.kind] += 1
-                self._tell("down", str(loss), loss.kind)
+                self._notify_link("down", str(loss), loss.kind)
             await asyncio.sleep(PAUSES_S[min(attempts, len(PAUSES_S)) - 1])
 
-    # ---- one process ----------------------------------------------------------------------------------------------
-
-    async def _one_process(self) -> None:
-        with output() as (stdout, its_stdout):
-            await self._converse(stdout, its_stdout)
-
-    async def _converse(self, stdout: int, its_stdout: Descriptor) -> None:
+    async def _run_worker(self, stdout: int, its_stdout: Descriptor) -> None:
         process = await asyncio.create_subprocess_exec(
             sys.executable, "-m", "shearloop.drivers.ur.worker",
             stdin=asyncio.subprocess.PIPE, stdout=its_stdout.number, stderr=asyncio.subprocess.PIPE,
         )  # fmt: skip
-        # Held by the process alone, it ends with it.
+        # The worker alone holds it, so that it closes with the worker.
         its_stdout.close()
         self.pid = process.pid
-        conversation = WorkerConnection(self, process, stdout)
+        connection = WorkerConnection(self.settings, process, stdout, self.handle_messages, takes_over=self.takes_over)
+        self._connection = connection
         loss: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as tasks:
-                tasks.create_task(conversation.keep_alive())
-                tasks.create_task(conversation.collect_stderr())
-                await conversation.listen()
+                tasks.create_task(connection.keep_alive())
+                tasks.create_task(connection.collect_stderr())
+                await connection.listen()
         except* LostError as group:
             loss = group.exceptions[0]
         finally:
-            self._disconnected()
-            # Cancelled: let it stop the arm. Lost: there is nothing to wait for.
-            await _in_any_case(conversation.end())
+            self._disconnect()
+            await _finish(connection.end())
             self.pid = None
         if loss is not None:
             if is_cancelled():
                 raise asyncio.CancelledError
             raise loss
 
-    def connected(self, stdin: asyncio.StreamWriter) -> None:
-        """Send commands there from now on."""
-        self._stdin = stdin
-
-    def _disconnected(self) -> None:
-        self._stdin = None
+    def _disconnect(self) -> None:
+        self._connection = None
         if self._state is not None:
-            # A network that failed makes no program ours.
-            self._lost_s = time.monotonic() if self._state.ours else -math.inf
+            # A lost network does not make a foreign program ours.
+            self._lost_s = time.monotonic() if self._state.owns_program else -math.inf
         self._state = None
-        waiting, self._waiting = self._waiting, {}
-        for answered in waiting.values():
+        replies, self._replies = self._replies, {}
+        for on_reply in replies.values():
             try:
-                answered(CommandReply(refused="The robot's process ended before it answered; nothing is sent again."))
-            except Exception as error:  # noqa: BLE001 - the others are told all the same, and the process is ended
-                said = {"message": "who waited for a reply of the robot's process died of its end", "exception": error}
-                asyncio.get_running_loop().call_exception_handler(said)
+                on_reply(CommandReply(refusal="The robot's process ended before it answered; nothing is sent again."))
+            except Exception as error:  # noqa: BLE001 - the others get their replies, and the worker ends, all the same
+                context = {"message": "a callback for a reply of the robot's process failed", "exception": error}
+                asyncio.get_running_loop().call_exception_handler(context)
 
-    def take_all(self, messages: Sequence[tuple[int, Message]]) -> None:
-        """Act on what was read of the process at once, in order."""
+    def handle_messages(self, messages: Sequence[tuple[int, Message]]) -> None:
+        """Handle the messages of one read, in order."""
         newest = next((message for _, message in reversed(messages) if isinstance(message, RobotState)), None)
         for number, message in messages:
-            self.take(number, message, newest=message is newest)
+            match message:
+                case RobotState():
+                    self._handle_state(message, newest=message is newest)
+                case CommandReply():
+                    on_reply = self._replies.pop(number, None)
+                    if on_reply is not None:
+                        on_reply(message)
+                case Failed():
+                    raise LostError(message.kind, message.sentence)
 
-    def take(self, number: int, message: Message, *, newest: bool = True) -> None:
-        """Act on a message of the process; `newest`: no later state was read along with it."""
-        match message:
-            case RobotState():
-                before = self._state
-                self._state = message
-                # Each process counts from zero.
-                self.stops_in_vain += message.stops_in_vain - (before.stops_in_vain if before is not None else 0)
-                if before is None:
-                    self._tell("up", f"The robot at {self.settings.host} is connected. {message.blocked}".strip())
-                self.states += 1
-                self.on_state(message, newest)
-                if self._next is not None:
-                    self._next.set_result(message)
-                    self._next = None
-            case CommandReply():
-                answered = self._waiting.pop(number, None)
-                if answered is not None:
-                    answered(message)
-            case Failed():
-                raise LostError(message.kind, message.sentence)
+    def _handle_state(self, state: RobotState, *, newest: bool) -> None:
+        before, self._state = self._state, state
+        # Each worker counts from zero.
+        self.failed_program_stops += state.failed_program_stops
+        if before is None:
+            self._notify_link("up", f"The robot at {self.settings.host} is connected. {state.blocked}".strip())
+        else:
+            self.failed_program_stops -= before.failed_program_stops
+        self.states += 1
+        self.on_state(state, newest)
+        if self._next is not None:
+            self._next.set_result(state)
+            self._next = None
 
-    def _tell(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
+    def _notify_link(self, status: LinkStatus, sentence: str, kind: LossKind | None = None) -> None:
         self.link = UrLinkEvent(time.monotonic_ns(), status, sentence, kind, self.losses.total())
         self._on_link(self.link)
 
 
-async def _in_any_case(ending: Coroutine[None, None, None]) -> None:
-    """Await it to its end, also where we are cancelled only meanwhile: nobody else would wait for it."""
+async def _finish(ending: Coroutine[None, None, None]) -> None:
+    """Await to the end, also when cancelled meanwhile."""
     task = asyncio.ensure_future(ending)
     try:
         await asyncio.shield(task)

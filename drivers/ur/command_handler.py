@@ -1,11 +1,13 @@
-"""What is sent to the robot and what is refused: commands, readings and the time in; calls on the arm and replies out.
+"""Decides in the worker which commands are sent to the robot, and refuses the others with a reason.
 
-No clock, no pipe, no ur-rtde: the arm is a port and the time an argument, so that every rule here is tested without a
-robot. One cycle is `tick`; commands come between cycles through `request`. Whatever ends a motion, nothing begins one
-but a command given after it.
+No clock, no pipe, no ur-rtde: the arm and the time are arguments. `tick` runs one cycle; `request` takes commands
+between cycles. After a motion has ended, only a new command begins one.
 """
 
-from shearloop.drivers.ur import error_messages as sentences
+from dataclasses import fields
+from typing import TYPE_CHECKING, Final
+
+from shearloop.drivers.ur import error_messages
 from shearloop.drivers.ur.limits import violation
 from shearloop.drivers.ur.messages import (
     RUNTIME_STOPPED,
@@ -23,284 +25,278 @@ from shearloop.drivers.ur.messages import (
     WristSpeed,
     ZeroForceTorque,
 )
-from shearloop.drivers.ur.motion import tool_axis_torque
-from shearloop.drivers.ur.motion_executor import MotionExecutor
-from shearloop.drivers.ur.paused import ForeignProgramDetector, PausedProgram
-from shearloop.drivers.ur.ports import PilotArm
-from shearloop.drivers.ur.recovery import ENDS_ITSELF_S, Outcome, Recovery
+from shearloop.drivers.ur.motion_executor import MotionExecutor, tool_axis_torque
+from shearloop.drivers.ur.recovery import (
+    ENDS_ITSELF_S,
+    ForeignProgramDetector,
+    Outcome,
+    PausedProgramStopper,
+    Recovery,
+)
 from shearloop.drivers.ur.settings import UrSettings
+
+if TYPE_CHECKING:
+    from shearloop.drivers.ur.arm import UrArm
+
+_SAMPLE_FIELDS: Final = tuple(field.name for field in fields(RtdeSample))
 
 
 class CommandHandler:
-    """Applies the latest command, within the limits, while everything is well."""
+    """Applies the latest command within the limits."""
 
-    def __init__(self, settings: UrSettings, arm: PilotArm, now_ns: int, *, takes_over: bool = False) -> None:
-        """Begin with motion not enabled, and with starting the control program where the robot lets us.
+    def __init__(self, settings: UrSettings, arm: "UrArm", now_ns: int, *, takes_over: bool = False) -> None:
+        """Begin with motion disabled, and start the control program where the robot allows it.
 
-        `takes_over`: a program that is there, and does not go on and on, is one that a process before has left behind.
+        `takes_over`: a paused program on the robot was left behind by the worker before this one.
         """
         self._settings = settings
         self._limits = settings.limits
         self._arm = arm
-        self._held = sentences.NOT_ENABLED
+        self._held_reason = error_messages.NOT_ENABLED
         self._leaving = False
-        # Whether a program that is there was started here, or left behind by a process before; not while one is begun.
-        self._ours = takes_over
-        # When one was being started here last: an upload may take after the recovery that sent it was given up.
+        self._owns_program = takes_over
+        # When a program was being started last: an upload may take effect after its recovery was given up.
         self._starting_ns: int | None = None
-        self._paused, self._unkicked = PausedProgram(arm), ForeignProgramDetector()
-        # Whether it is stopped in the next cycle, of which the daemon learns beforehand that it may take long.
+        self._paused_program = PausedProgramStopper(arm)
+        self._foreign_program = ForeignProgramDetector()
+        # The next cycle stops a paused program; the state before it announces that the cycle may take long.
         self._stops_paused = False
-        self._mover = MotionExecutor(settings, arm, now_ns)
-        self._heard_ns = now_ns
+        self._executor = MotionExecutor(settings, arm, now_ns)
+        self._daemon_alive_ns = now_ns
         self._recovery: Recovery | None = Recovery(
             arm, now_ns, settings.recover_timeout_s, operator_asked=False, takes_over=takes_over
         )
         self._unlock_number: int | None = None
-        self._judged: RtdeSample | None = None
-        self._beyond = ""
 
     @property
     def at_rest(self) -> bool:
         """Whether no motion is under way."""
-        return self._mover.kind == "idle"
+        return self._executor.motion == "idle"
 
     @property
     def recovering(self) -> bool:
-        """Whether calls may take seconds: the dashboard's, and the first one to a new program."""
+        """Whether calls may take seconds: to the dashboard, or the first one to a new program."""
         return self._recovery is not None or self._stops_paused
 
     @property
-    def ours(self) -> bool:
-        """Whether a program on the robot is one that was started here, or that a process before has left behind."""
-        return self._ours or (self._recovery is not None and self._recovery.starts)
+    def owns_program(self) -> bool:
+        """Whether a program on the robot was started by this worker or the one before it."""
+        return self._owns_program or (self._recovery is not None and self._recovery.starts_program)
 
-    def may_be_ours(self, now_ns: int) -> bool:
-        """Return whether a program that plays is ours, or may be: one was being started here just now."""
+    def may_own_program(self, now_ns: int) -> bool:
+        """Return whether a program that plays is ours or may be, because one was just being started."""
         just_now = self._starting_ns is not None and now_ns - self._starting_ns <= ENDS_ITSELF_S * 1e9
-        return self.ours or just_now
+        return self.owns_program or just_now
 
-    def puzzled(self) -> bool:
-        """Return, once, whether the robot did not take something: the next reading may say why.
+    def owns_paused_program(self, sample: RtdeSample) -> bool:
+        """Return whether a program of ours is paused and could be resumed at the pendant."""
+        return self.owns_program and sample.program_paused
 
-        The connection that commands may see the end of the program before the one that reads.
+    def take_command_rejected(self) -> bool:
+        """Return, once, whether the robot rejected a command.
+
+        The control connection may see the end of the program before the sample does. The next sample may say why.
         """
-        puzzled, self._mover.puzzled = self._mover.puzzled, False
-        return puzzled
+        rejected, self._executor.command_rejected = self._executor.command_rejected, False
+        return rejected
 
-    def left_paused(self, reading: RtdeSample) -> bool:
-        """Whether a program of ours is paused, and could be resumed by anybody."""
-        return self.ours and reading.program_paused
+    def note_daemon_alive(self, now_ns: int) -> None:
+        """Note that the daemon sent something."""
+        self._daemon_alive_ns = now_ns
 
-    def heard(self, now_ns: int) -> None:
-        """Note a sign of life of the daemon."""
-        self._heard_ns = now_ns
-
-    def request(self, number: int, command: Command, reading: RtdeSample, now_ns: int) -> CommandReply | None:
-        """Return the reply to a command; None when it comes later, from `tick` (`Unlock`)."""
+    def request(self, number: int, command: Command, sample: RtdeSample, now_ns: int) -> CommandReply | None:
+        """Return the reply to a command; None when `tick` returns it later (`Unlock`)."""
         if self._leaving and not isinstance(command, Stop | Disconnect):
-            return CommandReply(refused=sentences.LEAVING)
+            return CommandReply(refusal=error_messages.LEAVING)
         match command:
             case Stop():
-                return self._stop_on_command(number, command, reading, now_ns)
+                return self._stop(number, command, sample, now_ns)
             case Enable():
-                return self._enable(reading)
+                return self._enable(sample)
             case Unlock():
-                return self._unlock(number, reading, now_ns)
+                return self._unlock(number, sample, now_ns)
             case ZeroForceTorque():
-                return self._zero_wrench(reading)
+                return self._zero_wrench(sample)
             case WristSpeed():
-                return self._turn(number, command, reading, now_ns)
+                return self._turn(number, command, sample, now_ns)
             case MoveLinear():
-                return self._move(number, command, reading, now_ns)
+                return self._move(number, command, sample, now_ns)
             case Disconnect():
-                return self._leave(reading, now_ns)
+                return self._leave(sample, now_ns)
 
-    def tick(self, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
-        """Let one cycle pass: judge the reading, send what is due; return the reply to an `Unlock` that is decided."""
-        self._mover.watch(reading, now_ns)
+    def tick(self, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
+        """Run one cycle: check the sample and send what is due; return the reply to an `Unlock` that has ended."""
+        self._executor.watch(sample, now_ns)
         announced, self._stops_paused = self._stops_paused, False
-        if self._recovery is not None and self._recovery.starts:
+        if self._recovery is not None and self._recovery.starts_program:
             self._starting_ns = now_ns
-        left = self._recovery is not None or self._mover.barred
-        plays = bool(left) and reading.program_running and self._is_new(reading)
-        if reading.runtime_state == RUNTIME_STOPPED or self._unkicked.outlives(now_ns, plays=plays):
-            # What is there next may be anybody's; and ours may have ended while nothing was read.
-            self._ours = False
-            self._paused.forget()
+        without_us = self._recovery is not None or bool(self._executor.disabled_reason)
+        foreign = self._foreign_program.update(
+            now_ns, plays_without_us=without_us and sample.program_running and self._is_recent(sample)
+        )
+        if sample.runtime_state == RUNTIME_STOPPED or foreign:
+            # The next program may be anyone's, and ours may have ended between two samples.
+            self._owns_program = False
+            self._paused_program.reset()
         if self._recovery is not None:
-            return self._recover(self._recovery, reading, now_ns)
-        trouble = self._unfit(reading)
-        if trouble:
-            # Nothing can be sent. The arm stops by itself, or by its watchdog, which is no longer kicked.
-            self._held = trouble
+            return self._recover(self._recovery, sample, now_ns)
+        unfit = self._why_unfit(sample)
+        if unfit:
+            # Nothing can be sent. The arm stops by itself, or by its watchdog, which is not fed now.
+            self._held_reason = unfit
             if not self.at_rest:
-                # The program turns the wrist on where it knows of no trouble, and again when it is resumed.
-                self._mover.let_go(trouble)
-            if not reading.program_running:
-                self._mover.barred = sentences.NOT_OURS
-                self._end_what_is_paused(reading, now_ns, announced=announced)
+                # The program may turn the wrist on, also when it is resumed.
+                self._executor.leave_to_watchdog(unfit)
+            if not sample.program_running:
+                self._executor.disabled_reason = error_messages.NOT_OURS
+                self._stop_paused_program(sample, now_ns, announced=announced)
             return None
-        beyond = self._violation(reading)
+        beyond = violation(sample, self._limits)
         if beyond:
-            self._held = beyond
-            self._mover.stop(reading, now_ns, beyond)
-        elif now_ns - self._heard_ns > self._settings.silence_timeout_s * 1e9:
-            self._mover.stop(reading, now_ns, f"the daemon was silent for {self._settings.silence_timeout_s:g} s")
-        self._mover.keep(reading, now_ns)
+            self._held_reason = beyond
+            self._executor.stop(sample, now_ns, beyond)
+        elif now_ns - self._daemon_alive_ns > self._settings.silence_timeout_s * 1e9:
+            silent = f"the daemon was silent for {self._settings.silence_timeout_s:g} s"
+            self._executor.stop(sample, now_ns, silent)
+        self._executor.keep(sample, now_ns)
         return None
 
-    def state(self, reading: RtdeSample, cycle: int) -> RobotState:
-        """Return the reading of a cycle with everything that this pilot adds to it."""
+    def state(self, sample: RtdeSample, cycle: int) -> RobotState:
+        """Return the sample with the state of the driver."""
+        executor = self._executor
         return RobotState(
-            reading.timestamp_s,
-            reading.q_rad,
-            reading.qd_rad_per_s,
-            reading.tcp_pose,
-            reading.wrench,
-            reading.robot_mode,
-            reading.safety_mode,
-            reading.runtime_state,
-            reading.speed_scaling,
-            reading.t_mono_ns,
-            reading.age_ns,
-            reading.connected,
-            reading.moving_linearly,
-            wrist_torque_nm=tool_axis_torque(reading),
-            protective_stop=reading.safety_mode == SAFETY_PROTECTIVE_STOP,
-            emergency_stop=reading.safety_mode in SAFETY_EMERGENCY_STOPS,
-            blocked=self._blocked(reading),
+            **{name: getattr(sample, name) for name in _SAMPLE_FIELDS},
+            wrist_torque_nm=tool_axis_torque(sample),
+            protective_stop=sample.safety_mode == SAFETY_PROTECTIVE_STOP,
+            emergency_stop=sample.safety_mode in SAFETY_EMERGENCY_STOPS,
+            blocked=self._why_blocked(sample),
             recovering=self.recovering,
-            motion=self._mover.kind,
-            motion_id=self._mover.number,
-            ended=self._mover.ended,
-            sent=self._mover.sent,
-            clipped=self._mover.clipped,
+            motion=executor.motion,
+            motion_id=executor.motion_id,
+            end_reason=executor.end_reason,
+            sent=executor.sent,
+            clipped=executor.clipped,
             cycle=cycle,
-            ours=self.ours,
-            stops_in_vain=self._paused.in_vain,
+            owns_program=self.owns_program,
+            failed_program_stops=self._paused_program.failed_stops,
         )
 
     # ---- commands -------------------------------------------------------------------------------------------------
 
-    def _turn(self, number: int, asked: WristSpeed, reading: RtdeSample, now_ns: int) -> CommandReply:
-        why = self._blocked(reading)
-        if not why and asked.acceleration_rad_per_s2 <= 0:
-            why = f"An acceleration of {asked.acceleration_rad_per_s2:g} rad/s² is not above 0."
-        if not why and self._mover.kind == "stopping":
-            why = "The arm is still stopping."
-        if not why and self._mover.kind == "linear":
-            why = "A linear move is under way: stop it."
-        if why:
-            return CommandReply(refused=why)
-        return self._reply(taken=self._mover.turn(number, asked, reading, now_ns))
+    def _turn(self, number: int, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> CommandReply:
+        refusal = self._why_blocked(sample)
+        if not refusal and asked.acceleration_rad_per_s2 <= 0:
+            refusal = f"An acceleration of {asked.acceleration_rad_per_s2:g} rad/s² is not above 0."
+        if not refusal and self._executor.motion == "stopping":
+            refusal = "The arm is still stopping."
+        if not refusal and self._executor.motion == "linear":
+            refusal = "A linear move is under way: stop it."
+        if refusal:
+            return CommandReply(refusal=refusal)
+        return self._reply(taken=self._executor.turn(number, asked, sample, now_ns))
 
-    def _move(self, number: int, asked: MoveLinear, reading: RtdeSample, now_ns: int) -> CommandReply:
-        why = self._blocked(reading)
-        if not why and min(asked.speed_m_per_s, asked.acceleration_m_per_s2) <= 0:
-            why = "A linear move needs a speed and an acceleration above 0."
-        if not why and not (self._mover.kind in ("idle", "wrist") and reading.rests):
-            why = "The arm moves: stop it before a linear move."
-        if why:
-            return CommandReply(refused=why)
-        return self._reply(taken=self._mover.move(number, asked, reading, now_ns))
+    def _move(self, number: int, asked: MoveLinear, sample: RtdeSample, now_ns: int) -> CommandReply:
+        refusal = self._why_blocked(sample)
+        if not refusal and min(asked.speed_m_per_s, asked.acceleration_m_per_s2) <= 0:
+            refusal = "A linear move needs a speed and an acceleration above 0."
+        if not refusal and not (self._executor.motion in ("idle", "wrist") and sample.rests):
+            refusal = "The arm moves: stop it before a linear move."
+        if refusal:
+            return CommandReply(refusal=refusal)
+        return self._reply(taken=self._executor.move(number, asked, sample, now_ns))
 
     def _reply(self, *, taken: bool) -> CommandReply:
-        return (
-            CommandReply(sent=self._mover.sent, clipped=self._mover.clipped)
-            if taken
-            else CommandReply(refused=self._mover.barred)
-        )
+        if not taken:
+            return CommandReply(refusal=self._executor.disabled_reason)
+        return CommandReply(sent=self._executor.sent, clipped=self._executor.clipped)
 
-    def _stop_on_command(self, number: int, asked: Stop, reading: RtdeSample, now_ns: int) -> CommandReply:
+    def _stop(self, number: int, asked: Stop, sample: RtdeSample, now_ns: int) -> CommandReply:
         if asked.deceleration_rad_per_s2 <= 0:
-            return CommandReply(refused=f"A deceleration of {asked.deceleration_rad_per_s2:g} rad/s² is not above 0.")
+            return CommandReply(refusal=f"A deceleration of {asked.deceleration_rad_per_s2:g} rad/s² is not above 0.")
         if self._recovery is not None and self._unlock_number is not None:
             self._recovery.give_up("Unlocking was ended by a stop.")
-        trouble = self._unfit(reading)
-        if trouble:
-            return CommandReply(refused=f"Nothing can be sent, and the arm stops by itself. {trouble}")
-        self._mover.stop_as_asked(number, asked, reading, now_ns)
-        return self._reply(taken=not self._mover.barred)
+        unfit = self._why_unfit(sample)
+        if unfit:
+            return CommandReply(refusal=f"Nothing can be sent, and the arm stops by itself. {unfit}")
+        self._executor.stop_on_command(number, asked, sample, now_ns)
+        return self._reply(taken=not self._executor.disabled_reason)
 
-    def _leave(self, reading: RtdeSample, now_ns: int) -> CommandReply:
+    def _leave(self, sample: RtdeSample, now_ns: int) -> CommandReply:
         self._leaving = True
         if self._recovery is not None:
-            self._recovery.give_up(sentences.LEAVING)
-        self._mover.stop_now(reading, now_ns, "the daemon disconnects")
+            self._recovery.give_up(error_messages.LEAVING)
+        self._executor.stop_now(sample, now_ns, "the daemon disconnects")
         return CommandReply()
 
-    def _enable(self, reading: RtdeSample) -> CommandReply:
-        why = self._unfit(reading) or self._violation(reading)
+    def _enable(self, sample: RtdeSample) -> CommandReply:
+        refusal = self._why_unfit(sample) or violation(sample, self._limits)
         if self._recovery is not None:
-            why = sentences.BEING_MADE_READY
-        if not why:
-            self._held = ""
-        return CommandReply(refused=why)
+            refusal = error_messages.BEING_MADE_READY
+        if not refusal:
+            self._held_reason = ""
+        return CommandReply(refusal=refusal)
 
-    def _unlock(self, number: int, reading: RtdeSample, now_ns: int) -> CommandReply | None:
+    def _unlock(self, number: int, sample: RtdeSample, now_ns: int) -> CommandReply | None:
         if self._unlock_number is not None:
-            return CommandReply(refused="Unlocking is under way.")
-        if not self._unfit(reading):
-            return self._enable(reading)
-        self._mover.bar(self._unfit(reading), self._mover.barred or sentences.NOT_OURS)
+            return CommandReply(refusal="Unlocking is under way.")
+        unfit = self._why_unfit(sample)
+        if not unfit:
+            return self._enable(sample)
+        self._executor.disable(unfit, self._executor.disabled_reason or error_messages.NOT_OURS)
         self._unlock_number = number
-        self._ours = self.ours
+        self._owns_program = self.owns_program
         self._recovery = Recovery(self._arm, now_ns, self._settings.recover_timeout_s, operator_asked=True)
         return None
 
-    def _zero_wrench(self, reading: RtdeSample) -> CommandReply:
-        # What is beyond a limit stays so: a new zero would only hide it.
-        why = self._unfit(reading) or self._violation(reading)
-        if not why and not (self.at_rest and reading.rests):
-            why = "The wrench is zeroed only at rest: stop the arm first."
-        if not why and not self._arm.zero_wrench():
-            why = "The robot did not zero its force-torque sensor."
-        return CommandReply(refused=why)
+    def _zero_wrench(self, sample: RtdeSample) -> CommandReply:
+        # A new zero would only hide a value beyond its limit.
+        refusal = self._why_unfit(sample) or violation(sample, self._limits)
+        if not refusal and not (self.at_rest and sample.rests):
+            refusal = "The wrench is zeroed only at rest: stop the arm first."
+        if not refusal and not self._arm.zero_wrench():
+            refusal = "The robot did not zero its force-torque sensor."
+        return CommandReply(refusal=refusal)
 
-    # ---- judging --------------------------------------------------------------------------------------------------
+    # ---- conditions -----------------------------------------------------------------------------------------------
 
-    def _unfit(self, reading: RtdeSample) -> str:
-        return sentences.unfit(reading, self._settings.host, self._settings.state_timeout_s) or self._mover.barred
+    def _why_unfit(self, sample: RtdeSample) -> str:
+        """Return why nothing can be sent to the robot, or the empty string."""
+        unfit = error_messages.why_unfit(sample, self._settings.host, self._settings.state_timeout_s)
+        return unfit or self._executor.disabled_reason
 
-    def _violation(self, reading: RtdeSample) -> str:
-        """Return `violation` of a reading, which several rules ask for in one cycle."""
-        if reading is not self._judged:
-            self._judged, self._beyond = reading, violation(reading, self._limits)
-        return self._beyond
-
-    def _blocked(self, reading: RtdeSample) -> str:
+    def _why_blocked(self, sample: RtdeSample) -> str:
+        """Return why motion is refused, or the empty string."""
         if self._recovery is not None:
-            return sentences.BEING_MADE_READY
-        why = self._unfit(reading) or self._violation(reading) or self._held
-        return f"{why} {self._paused.why}" if self._paused.why else why
+            return error_messages.BEING_MADE_READY
+        reason = self._why_unfit(sample) or violation(sample, self._limits) or self._held_reason
+        return f"{reason} {self._paused_program.failure}" if self._paused_program.failure else reason
 
-    def _end_what_is_paused(self, reading: RtdeSample, now_ns: int, *, announced: bool) -> None:
-        """Stop a program of ours that is paused, in the cycle after the one that has announced it."""
-        if self._leaving or not (self._ours and reading.program_paused and self._is_new(reading)):
+    def _stop_paused_program(self, sample: RtdeSample, now_ns: int, *, announced: bool) -> None:
+        """Stop a paused program of ours, in the cycle after the one that has announced it."""
+        if self._leaving or not (self._owns_program and sample.program_paused and self._is_recent(sample)):
             return
-        if self._paused.due(now_ns):
+        if self._paused_program.is_due(now_ns):
             if announced:
-                self._paused.stop(now_ns)
+                self._paused_program.stop(now_ns)
             self._stops_paused = not announced
 
-    def _is_new(self, reading: RtdeSample) -> bool:
-        return reading.connected and reading.age_ns <= self._settings.state_timeout_s * 1e9
+    def _is_recent(self, sample: RtdeSample) -> bool:
+        return sample.connected and sample.age_ns <= self._settings.state_timeout_s * 1e9
 
-    def _recover(self, recovery: Recovery, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
-        # States may stay old for minutes, and not so old that the connection is given up: the operator is answered.
-        if not self._is_new(reading) and not recovery.ended(now_ns):
+    def _recover(self, recovery: Recovery, sample: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
+        # Samples may stay old for minutes without counting as lost; the operator gets an answer all the same.
+        if not self._is_recent(sample) and not recovery.has_ended(now_ns):
             return None
-        outcome = recovery.advance(reading, now_ns)
+        outcome = recovery.advance(sample, now_ns)
         if outcome is Outcome.UNDER_WAY:
             return None
-        self._ours, self._recovery = self.ours, None
+        self._owns_program, self._recovery = self.owns_program, None
         if outcome is Outcome.DONE:
-            self._mover.barred = ""
+            self._executor.disabled_reason = ""
         number, self._unlock_number = self._unlock_number, None
         if number is None:
-            self._held = recovery.why or self._held
+            self._held_reason = recovery.refusal or self._held_reason
             return None
         if outcome is Outcome.DONE:
-            self._held = ""
-        return number, CommandReply(refused=recovery.why)
+            self._held_reason = ""
+        return number, CommandReply(refusal=recovery.refusal)

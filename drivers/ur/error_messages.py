@@ -1,4 +1,4 @@
-"""What the person at the bench is told: why motion is not possible, and what to do about it."""
+"""Messages for the operator: why motion is not possible, and what to do about it."""
 
 from shearloop.drivers.ur.messages import (
     ROBOT_MODE_RUNNING,
@@ -19,14 +19,12 @@ LEAVING = "The daemon disconnects from the robot: start it again to go on."
 NOT_OURS = (
     "A program runs on the robot that someone else started or resumed: unlock to start the control program instead."
 )
-NOT_STOPPING = (
-    "The arm did not come to rest in time after it was told to stop: keep clear of it, look at the teach pendant."
-)
+NOT_STOPPING = "The arm did not come to rest in time after a stop: keep clear of it, look at the teach pendant."
 PAUSED = (
     "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach pendant, "
     "or unlock, which stops it and starts the control program."
 )
-ASTRAY = "The arm moved although nothing was asked of it: look whether somebody or something else moves it."
+ASTRAY = "The arm moved without a command: check whether a person or another program moves it."
 
 _SAFETY = {
     4: "The robot is in recovery mode: move it back within its safety limits at the teach pendant.",
@@ -36,31 +34,31 @@ _SAFETY = {
 }
 
 
-def unreachable(host: str, why: str) -> str:
-    """Return the sentence for a controller that does not accept connections."""
+def unreachable(host: str, reason: str) -> str:
+    """Return the message for a controller that does not accept connections."""
     return (
-        f"No UR controller at {host}: {why}. Check that it is switched on and that this computer is in its network "
+        f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its network "
         "(Settings → System → Network at the teach pendant)."
     )
 
 
-def silent(host: str, seconds: float, doing: str) -> str:
-    """Return the sentence for a controller that keeps connections open and says nothing."""
+def silent(host: str, seconds: float, activity: str) -> str:
+    """Return the message for a controller that accepts connections and does not answer."""
     return (
-        f"The UR controller at {host} said nothing for {seconds:.1f} s while {doing}: it is starting, hangs, or "
+        f"The UR controller at {host} said nothing for {seconds:.1f} s while {activity}: it is starting, hangs, or "
         "something else listens on its ports. Look at the teach pendant."
     )
 
 
 def version_refused(host: str, version: str) -> str:
-    """Return the sentence for a controller without RTDE protocol 2."""
+    """Return the message for a controller without RTDE protocol 2."""
     return (
         f"The UR controller at {host} ({version}) refuses protocol 2 of RTDE: it needs PolyScope 3.10 or 5.4, or newer."
     )
 
 
 def registers_in_use(host: str) -> str:
-    """Return the sentence for input registers that someone else writes."""
+    """Return the message for input registers that another client writes."""
     return (
         f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
         "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus."
@@ -68,52 +66,51 @@ def registers_in_use(host: str) -> str:
 
 
 def local_control(host: str) -> str:
-    """Return the sentence for a robot that takes no commands from the network."""
+    """Return the message for a robot that takes no commands from the network."""
     return f"The robot at {host} is in local control: switch it to remote control, top right on the teach pendant."
 
 
 def refused_by_client(host: str, text: str) -> str:
-    """Return the sentence for what ur-rtde says in its own words."""
+    """Return the message for an error of ur-rtde, in its own words."""
     return f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”."
 
 
-def not_taken(what: str) -> str:
-    """Return the sentence for a command that the control program did not take."""
-    return f"The robot did not take the {what}: its control program does not answer."
+def not_taken(command: str) -> str:
+    """Return the message for a command that the control program did not take."""
+    return f"The robot did not take the {command}: its control program does not answer."
 
 
-def left_to_watchdog(why: str) -> str:
-    """Return the sentence for a control program that is sent nothing any more, for the reason in a sentence."""
-    return f"{why} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
+def left_to_watchdog(reason: str) -> str:
+    """Return the message for a control program that receives nothing more; `reason` is a sentence."""
+    return f"{reason} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
 
 
-def still_paused(why: str) -> str:
-    """Return the sentence for a program of ours that is paused and could not be stopped."""
-    why = why.strip().removesuffix(".")
-    return f"The program that is paused could not be stopped ({why}): stop it at the teach pendant, do not resume it."
+def still_paused(reason: str) -> str:
+    """Return the message for a paused program of ours that did not stop."""
+    reason = reason.strip().removesuffix(".")
+    return f"The paused program could not be stopped ({reason}): stop it at the teach pendant, do not resume it."
 
 
-def unfit(reading: RtdeSample, host: str, state_timeout_s: float) -> str:
+def why_unfit(sample: RtdeSample, host: str, state_timeout_s: float) -> str:
     """Return why the controller cannot take motion commands, or the empty string."""
-    if not reading.connected:
+    if not sample.connected:
         return f"The connection to the robot at {host} is lost."
-    if reading.age_ns > state_timeout_s * 1e9:
+    if sample.age_ns > state_timeout_s * 1e9:
         return (
-            f"The controller at {host} has sent nothing newer than a state that is {reading.age_ns / 1e9:.2f} s old: "
-            "look at its cable, what else uses the network, and with a simulator whether its clock is slower than "
-            "real time."
+            f"The latest state from the controller at {host} is {sample.age_ns / 1e9:.2f} s old: check its cable, "
+            "other traffic on the network, and with a simulator whether its clock is slower than real time."
         )
-    if reading.safety_mode == SAFETY_PROTECTIVE_STOP:
+    if sample.safety_mode == SAFETY_PROTECTIVE_STOP:
         return "Protective stop: look for its cause, clear the workspace, then unlock (not in the first 5 s)."
-    if reading.safety_mode in SAFETY_EMERGENCY_STOPS:
+    if sample.safety_mode in SAFETY_EMERGENCY_STOPS:
         return "Emergency stop: make the cell safe, release the button, then unlock."
-    if reading.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
-        return _SAFETY.get(reading.safety_mode, f"The robot's safety system is in mode {reading.safety_mode}.")
-    if reading.robot_mode != ROBOT_MODE_RUNNING:
-        return f"The arm is not powered and released (robot mode {reading.robot_mode}): unlock to power it."
-    if reading.program_paused:
+    if sample.safety_mode not in (SAFETY_NORMAL, SAFETY_REDUCED):
+        return _SAFETY.get(sample.safety_mode, f"The robot's safety system is in mode {sample.safety_mode}.")
+    if sample.robot_mode != ROBOT_MODE_RUNNING:
+        return f"The arm is not powered and released (robot mode {sample.robot_mode}): unlock to power it."
+    if sample.program_paused:
         return PAUSED
-    if not reading.program_running:
+    if not sample.program_running:
         return (
             "The control program on the robot does not run: it was stopped at the pendant, or by the watchdog when "
             "commands came late. Unlock to start it again."

@@ -1,46 +1,44 @@
-"""Commands and measured states held against the limits; pure functions, every reason told."""
+"""Commands clipped to the limits, and measured states checked against them."""
 
 import math
-from operator import le
 from typing import NamedTuple
 
 from shearloop.drivers.ur.messages import MoveLinear, RtdeSample, Stop, WristSpeed
 from shearloop.drivers.ur.settings import Bound, UrLimits
 
 WRIST = 5
-# However gently a stop is asked for.
+# The longest stop, however gentle the command.
 LONGEST_STOP_S = 1.0
-# Close to the end the speed is distance/t, taking hold late by the reaction time: x'(s) = -x(s - reaction)/t, which
-# creeps up to the end without passing it only for t ≥ e·reaction.
+# Near the end of the range the speed is distance/t and takes effect after the reaction time:
+# x'(s) = -x(s - reaction)/t, which approaches the end without overshoot only for t ≥ e·reaction.
 _NO_OVERSHOOT = math.e
 
 
-class Clipped(NamedTuple):
-    """A wrist speed as it may be sent, and every reason for its not being what was asked."""
+class ClippedSpeed(NamedTuple):
+    """A wrist speed as it may be sent, and every reason for changing it."""
 
     sent: WristSpeed
     reasons: tuple[str, ...]
 
 
 class ClippedMove(NamedTuple):
-    """A linear move as it may be sent, and every reason for its not being what was asked."""
+    """A linear move as it may be sent, and every reason for changing it."""
 
     sent: MoveLinear
     reasons: tuple[str, ...]
 
 
-def clip_wrist(asked: WristSpeed, reading: RtdeSample, limits: UrLimits, reaction_s: float) -> Clipped:
-    """Return the wrist speed that keeps speed, acceleration, force and the wrist's range.
+def clip_wrist(asked: WristSpeed, sample: RtdeSample, limits: UrLimits, reaction_s: float) -> ClippedSpeed:
+    """Return the wrist speed clipped to the limits of speed, acceleration, force and range.
 
-    Near the end of the range the speed is what can still be braked within it, the brake taking hold late:
-    v·t + v²/2a = distance, with t = e·`reaction_s`. Between the inner and the hard limit of force or torque the speed
-    fades to nothing.
+    Near the end of the range the speed is the one that can still be braked within it: v·t + v²/2a = distance, with
+    t = e·`reaction_s`. Between the inner and the hard limit of force or torque the speed falls linearly to zero.
     """
     reasons: list[str] = []
     acceleration, slower = _at_most(asked.acceleration_rad_per_s2, limits.wrist_acceleration_rad_per_s2, "acceleration")
     reasons += slower
     braking = limits.wrist_acceleration_rad_per_s2.inner
-    room = max(_room(asked.rad_per_s, reading, limits), 0.0)
+    room = max(_room(asked.rad_per_s, sample, limits), 0.0)
     lag_s = _NO_OVERSHOOT * reaction_s
     brakeable = braking * (math.sqrt(lag_s**2 + 2 * room / braking) - lag_s)
     top = limits.wrist_speed_rad_per_s.inner
@@ -50,32 +48,32 @@ def clip_wrist(asked: WristSpeed, reading: RtdeSample, limits: UrLimits, reactio
         reasons.append(f"wrist speed is limited to {top:g} rad/s")
     if brakeable < speed:
         speed = brakeable
-        reasons.append(f"wrist 3 at {reading.wrist_rad:.3f} rad is near the end of its range")
-    for part, reason in _fading(reading, limits):
-        if top * part < speed:
-            speed = top * part
+        reasons.append(f"wrist 3 at {sample.wrist_rad:.3f} rad is near the end of its range")
+    for share, reason in _fading(sample, limits):
+        if top * share < speed:
+            speed = top * share
             reasons.append(reason)
     target = math.copysign(speed, asked.rad_per_s)
-    ramp = _safe_ramp(acceleration, target, reading, limits, reaction_s)
+    ramp = _safe_ramp(acceleration, target, sample, limits, reaction_s)
     if ramp > acceleration:
-        reasons.append(f"wrist 3 at {reading.wrist_rad:.3f} rad has to brake harder to stay within its range")
-    return Clipped(WristSpeed(target, ramp), tuple(reasons))
+        reasons.append(f"wrist 3 at {sample.wrist_rad:.3f} rad has to brake harder to stay within its range")
+    return ClippedSpeed(WristSpeed(target, ramp), tuple(reasons))
 
 
-def clip_stop(asked: Stop, reading: RtdeSample, limits: UrLimits, reaction_s: float) -> Stop:
-    """Return the stop with a deceleration between what is needed and the hard limit of acceleration.
+def clip_stop(asked: Stop, sample: RtdeSample, limits: UrLimits, reaction_s: float) -> Stop:
+    """Return the stop with a deceleration between the needed one and the hard limit.
 
-    Needed is what keeps the wrist's range, and what ends the fastest joint's motion within `LONGEST_STOP_S`.
+    The needed one keeps the wrist within its range and ends the fastest joint's motion within `LONGEST_STOP_S`.
     """
-    brisk = max(asked.deceleration_rad_per_s2, reading.fastest_rad_per_s / LONGEST_STOP_S)
-    safe = _safe_ramp(brisk, 0.0, reading, limits, reaction_s)
+    brisk = max(asked.deceleration_rad_per_s2, sample.fastest_rad_per_s / LONGEST_STOP_S)
+    safe = _safe_ramp(brisk, 0.0, sample, limits, reaction_s)
     return Stop(min(safe, limits.wrist_acceleration_rad_per_s2.hard))
 
 
 def clip_linear(asked: MoveLinear, limits: UrLimits) -> ClippedMove:
-    """Return the linear move with its end within the inner workspace and its speed and acceleration within theirs.
+    """Return the linear move with its end in the inner workspace and its speed and acceleration within their limits.
 
-    The box is convex: a line to a point inside it, from a point inside it, stays inside.
+    The box is convex: a line between two points inside it stays inside.
     """
     box, reasons = limits.workspace, []
     position = []
@@ -94,64 +92,41 @@ def clip_linear(asked: MoveLinear, limits: UrLimits) -> ClippedMove:
     return ClippedMove(MoveLinear((x, y, z, *asked.pose[3:]), speed, acceleration), tuple(reasons))
 
 
-def violation(reading: RtdeSample, limits: UrLimits) -> str:
-    """Return a sentence naming the hard limit that the measured state is beyond, or the empty string."""
-    return "" if within(reading, limits) else beyond(reading, limits)
-
-
-def beyond(reading: RtdeSample, limits: UrLimits) -> str:
-    """Return what `violation` does; it looks at every value in turn, which is worth while only when one is beyond."""
-    if not all(map(math.isfinite, (*reading.q_rad, *reading.qd_rad_per_s, *reading.tcp_pose, *reading.wrench))):
+def violation(sample: RtdeSample, limits: UrLimits) -> str:
+    """Return a sentence that names the hard limit that the sample exceeds, or the empty string."""
+    if not all(map(math.isfinite, (*sample.q_rad, *sample.qd_rad_per_s, *sample.tcp_pose, *sample.wrench))):
         return "The controller reports values that are no numbers."
     joints, box = limits.joints, limits.workspace
-    for number, (q, low, high) in enumerate(zip(reading.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
+    for number, (q, low, high) in enumerate(zip(sample.q_rad, joints.lower_rad, joints.upper_rad, strict=True), 1):
         if not low <= q <= high:
             return f"Joint {number} is at {q:.3f} rad, beyond its hard limits of {low:g} and {high:g} rad."
-    for axis, value, low, high in zip("xyz", reading.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
+    for axis, value, low, high in zip("xyz", sample.tcp_pose[:3], box.lower_m, box.upper_m, strict=True):
         if not low <= value <= high:
             return f"The tool is at {axis} = {value:.3f} m, beyond the workspace's {low:g} to {high:g} m."
     for name, value, bound, unit in (
-        ("Wrist speed", abs(reading.qd_rad_per_s[WRIST]), limits.wrist_speed_rad_per_s, "rad/s"),
-        ("Force", _norm(reading.wrench[:3]), limits.force_n, "N"),
-        ("Torque", _norm(reading.wrench[3:]), limits.torque_nm, "N m"),
+        ("Wrist speed", abs(sample.qd_rad_per_s[WRIST]), limits.wrist_speed_rad_per_s, "rad/s"),
+        ("Force", math.hypot(*sample.wrench[:3]), limits.force_n, "N"),
+        ("Torque", math.hypot(*sample.wrench[3:]), limits.torque_nm, "N m"),
     ):
         if value > bound.hard:
             return f"{name} is {value:.2f} {unit}, beyond the hard limit of {bound.hard:g} {unit}."
     return ""
 
 
-def within(reading: RtdeSample, limits: UrLimits) -> bool:
-    """Return whether all is finite and within the hard limits, at a tenth of the price of saying what is not."""
-    joints, box, wrench = limits.joints, limits.workspace, reading.wrench
-    position = reading.tcp_pose[:3]
-    # Of what is no number all comparisons are false, and so is a sum with it among others finite.
-    return (
-        math.isfinite(sum(reading.q_rad) + sum(reading.qd_rad_per_s) + sum(reading.tcp_pose) + sum(wrench))
-        and all(map(le, joints.lower_rad, reading.q_rad))
-        and all(map(le, reading.q_rad, joints.upper_rad))
-        and all(map(le, box.lower_m, position))
-        and all(map(le, position, box.upper_m))
-        and abs(reading.qd_rad_per_s[WRIST]) <= limits.wrist_speed_rad_per_s.hard
-        and _norm(wrench[:3]) <= limits.force_n.hard
-        and _norm(wrench[3:]) <= limits.torque_nm.hard
-    )
+def line_violation(sample: RtdeSample, limits: UrLimits) -> str:
+    """Return a sentence that names the inner limit that a linear move has reached, or the empty string.
 
-
-def line_violation(reading: RtdeSample, limits: UrLimits) -> str:
-    """Return a sentence naming the inner limit that a linear move has come to, or the empty string.
-
-    Where a line takes the joints and what it meets is known only under way, so that it is watched and stopped at the
-    inner limits, short of the hard ones.
+    The joint angles and forces along a line are not known in advance, so that the move stops at the inner limits.
     """
     joints = limits.joints
     braking = limits.wrist_acceleration_rad_per_s2.inner
     for number, (q, qd, low, high) in enumerate(
-        zip(reading.q_rad, reading.qd_rad_per_s, joints.lower_rad, joints.upper_rad, strict=True), 1
+        zip(sample.q_rad, sample.qd_rad_per_s, joints.lower_rad, joints.upper_rad, strict=True), 1
     ):
-        comes_to = q + math.copysign(qd * qd / (2 * braking), qd)
-        if (qd > 0 and comes_to > high - joints.margin_rad) or (qd < 0 and comes_to < low + joints.margin_rad):
+        stops_at = q + math.copysign(qd * qd / (2 * braking), qd)
+        if (qd > 0 and stops_at > high - joints.margin_rad) or (qd < 0 and stops_at < low + joints.margin_rad):
             return f"joint {number} at {q:.3f} rad came to the inner limit of its range"
-    fading = _fading(reading, limits)
+    fading = _fading(sample, limits)
     return fading[0][1] if fading else ""
 
 
@@ -161,36 +136,32 @@ def _at_most(asked: float, bound: Bound, name: str) -> tuple[float, list[str]]:
     return bound.inner, [f"{name} is limited to {bound.inner:g}"]
 
 
-def _safe_ramp(asked: float, target: float, reading: RtdeSample, limits: UrLimits, reaction_s: float) -> float:
-    """Return the acceleration asked for, or the full braking one where the gentle one would end beyond the range."""
-    speed = reading.qd_rad_per_s[WRIST]
+def _safe_ramp(asked: float, target: float, sample: RtdeSample, limits: UrLimits, reaction_s: float) -> float:
+    """Return the acceleration asked for, or full braking where the gentle ramp would leave the range."""
+    speed = sample.qd_rad_per_s[WRIST]
     if target * math.copysign(1.0, speed) >= abs(speed):
         return asked
-    room = _room(speed, reading, limits) - abs(speed) * _NO_OVERSHOOT * reaction_s
+    room = _room(speed, sample, limits) - abs(speed) * _NO_OVERSHOOT * reaction_s
     needed = math.inf if room <= 0 else speed * speed / (2 * room)
-    # Twice, because it only gets steeper: what a gentle ramp does not do now must be done in less room.
+    # Twice, because the needed braking only grows as the room shrinks.
     return asked if asked >= 2 * needed else max(asked, limits.wrist_acceleration_rad_per_s2.inner)
 
 
-def _room(direction: float, reading: RtdeSample, limits: UrLimits) -> float:
+def _room(direction: float, sample: RtdeSample, limits: UrLimits) -> float:
     margin = limits.joints.margin_rad
     if direction >= 0:
-        return limits.joints.upper_rad[WRIST] - margin - reading.wrist_rad
-    return reading.wrist_rad - limits.joints.lower_rad[WRIST] - margin
+        return limits.joints.upper_rad[WRIST] - margin - sample.wrist_rad
+    return sample.wrist_rad - limits.joints.lower_rad[WRIST] - margin
 
 
-def _fading(reading: RtdeSample, limits: UrLimits) -> list[tuple[float, str]]:
+def _fading(sample: RtdeSample, limits: UrLimits) -> list[tuple[float, str]]:
+    """Return the share of the speed left, and the reason, for each of force and torque above its inner limit."""
     found = []
     for name, value, bound, unit in (
-        ("force", _norm(reading.wrench[:3]), limits.force_n, "N"),
-        ("torque", _norm(reading.wrench[3:]), limits.torque_nm, "N m"),
+        ("force", math.hypot(*sample.wrench[:3]), limits.force_n, "N"),
+        ("torque", math.hypot(*sample.wrench[3:]), limits.torque_nm, "N m"),
     ):
         if value > bound.inner:
-            part = max(0.0, (bound.hard - value) / (bound.hard - bound.inner))
-            found.append((part, f"{name} of {value:.2f} {unit} is above the inner limit of {bound.inner:g} {unit}"))
+            share = max(0.0, (bound.hard - value) / (bound.hard - bound.inner))
+            found.append((share, f"{name} of {value:.2f} {unit} is above the inner limit of {bound.inner:g} {unit}"))
     return found
-
-
-def _norm(vector: tuple[float, ...]) -> float:
-    x, y, z = vector
-    return math.sqrt(x * x + y * y + z * z)

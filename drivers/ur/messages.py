@@ -1,18 +1,46 @@
-"""What crosses the pipe between the daemon and the robot's own process, as values; `shearloop.drivers.ur.wire` has
-the bytes."""
+"""The messages between the daemon and the robot's worker process, and their bytes in msgpack.
 
-from dataclasses import dataclass
-from typing import Final, Literal
+On the pipe each message is `[number, message]`. A dataclass is an extension type with its fields in order.
+"""
 
-from shearloop.drivers.ur.settings import Six, UrSettings
+import math
+from dataclasses import dataclass, fields
+from operator import attrgetter
+from typing import Any, Final, Literal
+
+import msgpack
+
+from shearloop.drivers.errors import ProtocolError
+from shearloop.drivers.ur.settings import Bound, JointRange, Six, UrLimits, UrSettings, Workspace
 
 MotionKind = Literal["idle", "wrist", "linear", "stopping"]
 FailureKind = Literal["not-installed", "unreachable", "silent", "version", "registers-in-use", "local-control", "lost"]
 
+# `RobotState.end_reason` of a motion that ended as commanded; any other reason is a sentence.
+ARRIVED: Final = "arrived"
+STOPPED_ON_COMMAND: Final = "stopped on command"
+
+# A joint slower than this is at rest: the noise of a real arm's speed signal is lower.
+REST_RAD_PER_S: Final = 2e-3
+
+# The longest cycle during recovery: the dashboard client waits 2.5 s for a reply, the control client 3 s for a program.
+RECOVERY_HANG_S: Final = 6.0
+
+ROBOT_MODE_POWER_OFF: Final = 3
+ROBOT_MODE_IDLE: Final = 5
+ROBOT_MODE_RUNNING: Final = 7
+RUNTIME_STOPPING: Final = 0
+RUNTIME_STOPPED: Final = 1
+RUNTIME_PLAYING: Final = 2
+SAFETY_NORMAL: Final = 1
+SAFETY_REDUCED: Final = 2
+SAFETY_PROTECTIVE_STOP: Final = 3
+SAFETY_EMERGENCY_STOPS: Final = (6, 7)
+
 
 @dataclass(frozen=True, slots=True)
 class WristSpeed:
-    """Turn the tool about its axis; holds for `command_timeout_s`, then has to be commanded again."""
+    """Turn the tool about its axis. Repeat the command within `command_timeout_s` or the wrist stops."""
 
     rad_per_s: float
     acceleration_rad_per_s2: float
@@ -20,7 +48,7 @@ class WristSpeed:
 
 @dataclass(frozen=True, slots=True)
 class MoveLinear:
-    """Move the tool on a straight line to a pose: x, y, z in m and the rotation vector in rad, in the base frame."""
+    """Move the tool on a straight line to a pose: x, y, z in m and a rotation vector in rad, in the base frame."""
 
     pose: Six
     speed_m_per_s: float
@@ -29,29 +57,29 @@ class MoveLinear:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Slow every joint down to rest, whatever moves."""
+    """Slow every joint down to rest."""
 
     deceleration_rad_per_s2: float
 
 
 @dataclass(frozen=True, slots=True)
 class ZeroForceTorque:
-    """Take the present wrench as zero; only at rest."""
+    """Make the present wrench zero; accepted only at rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class Enable:
-    """Allow motion: after every start of the robot's process, and after everything that stopped the arm."""
+    """Allow motion: needed after each start of the worker and after everything that stopped the arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unlock:
-    """The operator's word after a protective or emergency stop: unlock, power, start the control program, enable."""
+    """Recover from a stop on the operator's request: unlock, power on, start the control program, enable."""
 
 
 @dataclass(frozen=True, slots=True)
 class Disconnect:
-    """Stop, end the control program, go."""
+    """Stop the arm, end the control program, exit."""
 
 
 Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | Disconnect
@@ -59,23 +87,23 @@ Command = WristSpeed | MoveLinear | Stop | ZeroForceTorque | Enable | Unlock | D
 
 @dataclass(frozen=True, slots=True)
 class CommandReply:
-    """The one answer to a command: what is sent to the robot after clipping, or why nothing is."""
+    """The reply to a command: what goes to the robot after clipping, or why the command is refused."""
 
-    refused: str = ""
+    refusal: str = ""
     sent: WristSpeed | MoveLinear | Stop | None = None
     clipped: tuple[str, ...] = ()
 
     @property
     def accepted(self) -> bool:
         """Whether the command is carried out."""
-        return not self.refused
+        return not self.refusal
 
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """What the controller says of itself at one time: SI units, base frame, joints from base to wrist 3."""
+    """The state that the controller reports: SI units, base frame, joints from base to wrist 3."""
 
-    # By the controller's own clock.
+    # By the controller's clock.
     timestamp_s: float
     q_rad: Six
     qd_rad_per_s: Six
@@ -89,10 +117,10 @@ class Sample:
 
 @dataclass(frozen=True, slots=True)
 class RtdeSample(Sample):
-    """The controller's latest sample as it was read here, and what is known of the connection."""
+    """The controller's latest sample, its age, and the state of the connection."""
 
     t_mono_ns: int
-    # How long ago the controller made the sample, by its own clock: it can be new to us, and have waited.
+    # Time since the controller made the sample, by its own clock.
     age_ns: int
     connected: bool
     moving_linearly: bool
@@ -104,13 +132,13 @@ class RtdeSample(Sample):
 
     @property
     def program_paused(self) -> bool:
-        """Whether a program is there that neither plays nor ends: it was paused, or is on its way there or back."""
+        """Whether a program is paused, or is pausing or resuming."""
         return self.runtime_state not in (RUNTIME_STOPPING, RUNTIME_STOPPED, RUNTIME_PLAYING)
 
     @property
     def rests(self) -> bool:
-        """Whether every joint rests."""
-        return all(abs(speed) < REST_RAD_PER_S for speed in self.qd_rad_per_s)
+        """Whether every joint is at rest."""
+        return self.fastest_rad_per_s < REST_RAD_PER_S
 
     @property
     def fastest_rad_per_s(self) -> float:
@@ -125,7 +153,7 @@ class RtdeSample(Sample):
 
 @dataclass(frozen=True, slots=True)
 class RobotState(RtdeSample):
-    """A reading and what the driver makes of it; published as `robot.state`."""
+    """A sample and the state of the driver; published as `robot.state`."""
 
     # Torque about the tool's own axis, from wrench and pose.
     wrist_torque_nm: float
@@ -136,26 +164,26 @@ class RobotState(RtdeSample):
     # Whether the robot is being unlocked, powered or started.
     recovering: bool
     motion: MotionKind
-    # Number of the command that the motion belongs to, and why its motion ended ("arrived" when as asked).
+    # Number of the command that began the motion, and why the motion ended (`ARRIVED` when as commanded).
     motion_id: int
-    ended: str
-    # What was last sent to the robot, after clipping, and every reason for clipping it.
+    end_reason: str
+    # The last command sent to the robot, after clipping, and every reason for clipping it.
     sent: WristSpeed | MoveLinear | Stop | None
     clipped: tuple[str, ...]
-    # Number of the process's cycle.
+    # Number of the worker's cycle.
     cycle: int
-    # Whether a program on the robot is one that was started here, or that a process before has left behind.
-    ours: bool
-    # How many times such a program was paused, asked to stop, and did not.
-    stops_in_vain: int
+    # Whether this worker, or the one before it, started the program on the robot.
+    owns_program: bool
+    # How many times our program was paused and did not stop on request.
+    failed_program_stops: int
 
 
 @dataclass(frozen=True, slots=True)
 class Configure:
-    """The first message to the process."""
+    """The first message to the worker."""
 
     settings: UrSettings
-    # Whether a program that runs on the robot is one that a process before this one has just left behind.
+    # Whether a worker that has just ended may have left a program on the robot.
     takes_over: bool = False
 
 
@@ -165,40 +193,80 @@ class Heartbeat:
 
 
 @dataclass(frozen=True, slots=True)
-class RobotPhase:
-    """What the process is about to do, said before doing it: it may hang or crash there."""
+class WorkerPhase:
+    """What the worker is about to do; sent first, because it may hang or crash there."""
 
-    doing: str
+    activity: str
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """Why the process ends."""
+    """Why the worker exits."""
 
     kind: FailureKind
     sentence: str
 
 
-Message = Command | CommandReply | RobotState | Configure | Heartbeat | RobotPhase | Failed
+Message = Command | CommandReply | RobotState | Configure | Heartbeat | WorkerPhase | Failed
 
-# Why a motion ended that did as it was asked, or was told to stop; any other reason is a sentence of its own.
-ARRIVED: Final = "arrived"
-STOPPED_ON_COMMAND: Final = "stopped on command"
+# The largest message, a state with every reason for clipping, has about 2 kB.
+LARGEST_MESSAGE: Final = 1 << 16
 
-# Slower than this, a joint rests: below it lies the noise of a real arm's speed signal.
-REST_RAD_PER_S: Final = 2e-3
+_MOTIONS: Final = (WristSpeed, MoveLinear, Stop)
+_TYPES: Final[tuple[Any, ...]] = (
+    *_MOTIONS, ZeroForceTorque, Enable, Unlock, Disconnect, CommandReply, RobotState, Configure, Heartbeat, WorkerPhase,
+    Failed, UrSettings, UrLimits, Bound, JointRange, Workspace,
+)  # fmt: skip
+_CODES: Final = {kind: code for code, kind in enumerate(_TYPES)}
+_NAMES: Final = {kind: [field.name for field in fields(kind)] for kind in _TYPES}
+# An attrgetter is ten times as fast as a loop, but returns no tuple of fewer than two.
+_GETTERS: Final = {kind: attrgetter(*names) for kind, names in _NAMES.items() if len(names) > 1}
 
-# How long a cycle may take while recovering: the dashboard's client waits 2.5 s for an answer, the control client 3 s
-# for a ready program.
-RECOVERY_HANG_S: Final = 6.0
 
-ROBOT_MODE_POWER_OFF: Final = 3
-ROBOT_MODE_IDLE: Final = 5
-ROBOT_MODE_RUNNING: Final = 7
-RUNTIME_STOPPING: Final = 0
-RUNTIME_STOPPED: Final = 1
-RUNTIME_PLAYING: Final = 2
-SAFETY_NORMAL: Final = 1
-SAFETY_REDUCED: Final = 2
-SAFETY_PROTECTIVE_STOP: Final = 3
-SAFETY_EMERGENCY_STOPS: Final = (6, 7)
+def encode(message: Message, number: int = 0) -> bytes:
+    """Return the bytes of a message; `number` pairs a command with its reply."""
+    packed: bytes = msgpack.packb((number, message), default=_packed, buf_size=4096)
+    return packed
+
+
+def _packed(value: Any) -> msgpack.ExtType:
+    kind = type(value)
+    content = _GETTERS[kind](value) if kind in _GETTERS else [getattr(value, name) for name in _NAMES[kind]]
+    return msgpack.ExtType(_CODES[kind], msgpack.packb(content, default=_packed, buf_size=4096))
+
+
+def _unpacked(code: int, data: bytes) -> Any:
+    content = msgpack.unpackb(data, use_list=False, ext_hook=_unpacked)
+    kind = _TYPES[code]
+    if kind in _MOTIONS and not _is_finite(content):
+        raise ValueError(f"{kind.__name__} {content} is not finite")
+    return kind(*content)
+
+
+def _is_finite(value: Any) -> bool:
+    return all(map(_is_finite, value)) if isinstance(value, tuple) else math.isfinite(value)
+
+
+class MessageDecoder:
+    """Splits a byte stream into messages."""
+
+    def __init__(self) -> None:
+        self._unpacker = msgpack.Unpacker(use_list=False, ext_hook=_unpacked, max_buffer_size=2 * LARGEST_MESSAGE)
+
+    def feed(self, data: bytes) -> list[tuple[int, Message]]:
+        """Return the (number, message) pairs that are complete now.
+
+        Raises:
+            ProtocolError: the stream holds something else, or a motion command that is not finite.
+        """
+        try:
+            self._unpacker.feed(data)
+            pairs = list(self._unpacker)
+        except (ValueError, TypeError, IndexError, RecursionError, msgpack.UnpackException) as error:
+            raise ProtocolError(f"The pipe to the robot's worker carries an invalid message: {error}.") from error
+        for pair in pairs:
+            match pair:
+                case (int(), message) if isinstance(message, Message):
+                    continue
+            raise ProtocolError(f"The pipe to the robot's worker carries {pair!r}, which is no message.")
+        return pairs

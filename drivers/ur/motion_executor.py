@@ -1,10 +1,13 @@
-"""The motion under way: begun, kept within the limits cycle by cycle, and ended. Which may begin is the pilot's to say.
+"""Executes one motion at a time: begins it, keeps it within the limits in each cycle, and ends it.
 
-No clock and no ur-rtde: the arm is a port and the time an argument. A motion that does not end as it should ends by the
-robot's watchdog: nothing is sent to the program any more, and only another one may move the arm again.
+No clock and no ur-rtde: the arm and the time are arguments. A motion that does not end as it should is left to the
+robot's watchdog: nothing more is sent to the program, and only a new program may move the arm.
 """
 
-from shearloop.drivers.ur import error_messages as sentences
+import math
+from typing import TYPE_CHECKING
+
+from shearloop.drivers.ur import error_messages
 from shearloop.drivers.ur.limits import clip_linear, clip_stop, clip_wrist, line_violation
 from shearloop.drivers.ur.messages import (
     ARRIVED,
@@ -15,35 +18,41 @@ from shearloop.drivers.ur.messages import (
     Stop,
     WristSpeed,
 )
-from shearloop.drivers.ur.motion import is_close, longest_move_s, longest_stop_s
-from shearloop.drivers.ur.ports import PilotArm
 from shearloop.drivers.ur.settings import Six, UrSettings
 
-# A linear move may be too short to be seen under way: who rests at its end (in m and rad) after so long has arrived.
+if TYPE_CHECKING:
+    from shearloop.drivers.ur.arm import UrArm
+
+# A short linear move may never be seen moving: an arm at rest within this distance of the end (m, rad) has arrived.
 CLOSE, ARRIVED_AFTER_S = 2e-3, 0.2
-# An arm that nothing was asked of may tremble, but not move as fast as this for so long.
+# An idle arm may tremble, but not move this fast for this long.
 ASTRAY_RAD_PER_S, ASTRAY_S = 0.02, 0.2
+# The time allowed for a linear move, and for a stop: nominal time × factor + constant.
+MOVE_SLACK, MOVE_SLACK_S = 1.5, 2.0
+STOP_SLACK, STOP_SLACK_S = 1.5, 1.0
+# The pendant's speed slider slows everything; below this a motion would have no end.
+SLOWEST_SCALING = 0.05
 
 
 class MotionExecutor:
-    """Turns the wrist, moves along lines, stops; `kind` is what it is at, and idle means that the arm rests.
+    """Turns the wrist, moves along lines, and stops.
 
-    `number` is the command's that the motion belongs to, `ended` why it ended, `sent` and `clipped` what was last sent
-    for it. `barred` is why nothing may be sent to the program on the robot, and empty while it may.
+    `disabled_reason` is why nothing may be sent to the program on the robot; empty while it may.
     """
 
-    def __init__(self, settings: UrSettings, arm: PilotArm, now_ns: int) -> None:
+    def __init__(self, settings: UrSettings, arm: "UrArm", now_ns: int) -> None:
         self._settings = settings
         self._limits = settings.limits
         self._arm = arm
-        self.kind: MotionKind = "idle"
-        self.number = 0
-        self.ended = ""
+        self.motion: MotionKind = "idle"
+        # The command that began the motion, why the motion ended, and what was last sent for it.
+        self.motion_id = 0
+        self.end_reason = ""
         self.sent: WristSpeed | MoveLinear | Stop | None = None
         self.clipped: tuple[str, ...] = ()
-        self.barred = sentences.NOT_OURS
-        # Whether the robot did not take something since this was last set back.
-        self.puzzled = False
+        self.disabled_reason = error_messages.NOT_OURS
+        # Whether the robot rejected a command; the caller clears it.
+        self.command_rejected = False
         self._asked, self._braking = WristSpeed(0.0, 0.0), Stop(0.0)
         self._speed_thread = False
         self._asked_ns = self._rested_ns = now_ns
@@ -51,153 +60,146 @@ class MotionExecutor:
         self._move_seen = False
         self._move_end: Six = (0.0,) * 6
 
-    # ---- what is asked of it --------------------------------------------------------------------------------------
+    # ---- commands -------------------------------------------------------------------------------------------------
 
-    def turn(self, number: int, asked: WristSpeed, reading: RtdeSample, now_ns: int) -> bool:
-        """Turn the wrist so from now on; return whether the robot took it."""
-        self._begin("wrist", number)
+    def turn(self, motion_id: int, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> bool:
+        """Turn the wrist at this speed from now on; return whether the robot took it."""
+        self.motion, self.motion_id, self.end_reason = "wrist", motion_id, ""
         self._asked, self._asked_ns = asked, now_ns
-        return self._send_wrist(reading)
+        return self._send_clipped_speed(sample)
 
-    def move(self, number: int, asked: MoveLinear, reading: RtdeSample, now_ns: int) -> bool:
-        """Begin a linear move of an arm that rests; return whether the robot took it."""
+    def move(self, motion_id: int, asked: MoveLinear, sample: RtdeSample, now_ns: int) -> bool:
+        """Begin a linear move of an arm at rest; return whether the robot took it."""
         self._end_speed_thread()
         sent, clipped = clip_linear(asked, self._limits)
-        self._begin("linear", number)
+        self.motion, self.motion_id, self.end_reason = "linear", motion_id, ""
         self.sent, self.clipped = sent, clipped
-        self._deadline_ns = now_ns + int(1e9 * longest_move_s(sent, reading))
+        self._deadline_ns = now_ns + int(1e9 * _longest_move_s(sent, sample))
         self._move_seen = False
         self._move_ns, self._move_end = now_ns, sent.pose
         taken = self._arm.move(sent)
         if not taken:
-            self._not_taken("linear move")
+            self._reject("linear move")
         return taken
 
-    def stop_as_asked(self, number: int, asked: Stop, reading: RtdeSample, now_ns: int) -> None:
-        """Stop at once, as hard as asked within what is needed and allowed."""
-        sent = clip_stop(asked, reading, self._limits, self._settings.reaction_s)
-        if self.kind == "stopping":
+    def stop_on_command(self, motion_id: int, asked: Stop, sample: RtdeSample, now_ns: int) -> None:
+        """Stop at once, as hard as commanded within the needed and the allowed deceleration."""
+        sent = clip_stop(asked, sample, self._limits, self._settings.reaction_s)
+        if self.motion == "stopping":
             sent = _harder(sent, self._braking)
-        self.number = number
+        self.motion_id = motion_id
         self.sent, self.clipped = sent, ()
-        self.stop_now(reading, now_ns, STOPPED_ON_COMMAND, sent)
+        self.stop_now(sample, now_ns, STOPPED_ON_COMMAND, sent)
 
-    def stop_now(self, reading: RtdeSample, now_ns: int, why: str, stop: Stop | None = None) -> None:
-        """Begin to stop, and send it: the next cycle may be a whole one away."""
-        self.stop(reading, now_ns, why, stop)
-        if self.kind == "stopping" and self._speed_thread:
-            self._keep_stopping(reading, now_ns)
+    def stop_now(self, sample: RtdeSample, now_ns: int, reason: str, stop: Stop | None = None) -> None:
+        """Begin to stop and send it at once, without waiting for the next cycle."""
+        self.stop(sample, now_ns, reason, stop)
+        if self.motion == "stopping" and self._speed_thread:
+            self._keep_stopping(sample, now_ns)
 
-    def stop(self, reading: RtdeSample, now_ns: int, why: str, stop: Stop | None = None) -> None:
-        """Begin to stop, as hard as may be unless told how; of two stops the harder one counts."""
+    def stop(self, sample: RtdeSample, now_ns: int, reason: str, stop: Stop | None = None) -> None:
+        """Begin to stop, by default as hard as allowed; the harder of two stops counts."""
         asked = stop or Stop(self._limits.wrist_acceleration_rad_per_s2.hard)
-        if self.kind == "idle" or (self.kind == "stopping" and _harder(self._braking, asked) is self._braking):
+        if self.motion == "idle" or (self.motion == "stopping" and _harder(self._braking, asked) is self._braking):
             return
-        if self.kind != "stopping":
-            self.ended = why
-        self.kind = "stopping"
+        if self.motion != "stopping":
+            self.end_reason = reason
+        self.motion = "stopping"
         self._braking = asked
-        self._deadline_ns = now_ns + int(1e9 * longest_stop_s(asked, reading))
+        self._deadline_ns = now_ns + int(1e9 * _longest_stop_s(asked, sample))
         if not self._speed_thread and not self._arm.stop_move(asked.deceleration_rad_per_s2):
-            self._not_taken("stop")
+            self._reject("stop")
 
-    def let_go(self, why: str) -> None:
-        """Send nothing to this program any more: whatever it does now, the robot's watchdog ends it."""
-        self.bar(why, sentences.left_to_watchdog(why))
+    def leave_to_watchdog(self, reason: str) -> None:
+        """Send nothing more to this program, so that the robot's watchdog ends it."""
+        self.disable(reason, error_messages.left_to_watchdog(reason))
 
-    def bar(self, why_ended: str, why_barred: str) -> None:
-        """Take a motion under way for ended, and send nothing to the program on the robot."""
-        if self.kind not in ("idle", "stopping"):
-            self.ended = why_ended
-        self.kind = "idle"
+    def disable(self, end_reason: str, disabled_reason: str) -> None:
+        """End the present motion on paper, and send nothing to the program on the robot."""
+        if self.motion not in ("idle", "stopping"):
+            self.end_reason = end_reason
+        self.motion = "idle"
         self._speed_thread = False
-        self.barred = why_barred
+        self.disabled_reason = disabled_reason
 
     # ---- cycle by cycle -------------------------------------------------------------------------------------------
 
-    def watch(self, reading: RtdeSample, now_ns: int) -> None:
-        """Note in every cycle, whatever else is done in it, whether the arm moves although it should rest."""
-        if self.kind != "idle" or reading.fastest_rad_per_s < ASTRAY_RAD_PER_S:
+    def watch(self, sample: RtdeSample, now_ns: int) -> None:
+        """Note whether an idle arm rests; call this in every cycle."""
+        if self.motion != "idle" or sample.fastest_rad_per_s < ASTRAY_RAD_PER_S:
             self._rested_ns = now_ns
 
-    def keep(self, reading: RtdeSample, now_ns: int) -> None:
-        """Send what is due in this cycle."""
-        if self.barred:
+    def keep(self, sample: RtdeSample, now_ns: int) -> None:
+        """Send what this cycle needs."""
+        if self.disabled_reason:
             return
-        match self.kind:
+        match self.motion:
             case "wrist":
-                self._keep_turning(reading, now_ns)
+                self._keep_turning(sample, now_ns)
             case "linear":
-                self._keep_moving(reading, now_ns)
+                self._keep_moving(sample, now_ns)
             case "stopping":
-                self._keep_stopping(reading, now_ns)
+                self._keep_stopping(sample, now_ns)
+            case "idle" if now_ns - self._rested_ns > ASTRAY_S * 1e9:
+                self.end_reason = "it moved without a command"
+                self.leave_to_watchdog(error_messages.ASTRAY)
             case "idle":
-                self._keep_resting(now_ns)
+                self._arm.send_heartbeat()
 
-    def _keep_turning(self, reading: RtdeSample, now_ns: int) -> None:
+    def _keep_turning(self, sample: RtdeSample, now_ns: int) -> None:
         if now_ns - self._asked_ns > self._settings.command_timeout_s * 1e9:
             late = f"the wrist speed was not renewed within {self._settings.command_timeout_s:g} s"
-            self.stop_now(reading, now_ns, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
+            self.stop_now(sample, now_ns, late, Stop(self._limits.wrist_acceleration_rad_per_s2.inner))
         else:
-            self._send_wrist(reading)
+            self._send_clipped_speed(sample)
 
-    def _keep_moving(self, reading: RtdeSample, now_ns: int) -> None:
-        self._move_seen = self._move_seen or reading.moving_linearly
-        why = line_violation(reading, self._limits)
+    def _keep_moving(self, sample: RtdeSample, now_ns: int) -> None:
+        self._move_seen = self._move_seen or sample.moving_linearly
+        reason = line_violation(sample, self._limits)
         if now_ns > self._deadline_ns:
-            why = "the linear move did not end within its time"
-        # The end of the move and the joints' speeds come over two connections, of which one may lag.
-        if not reading.moving_linearly and reading.rests and (self._move_seen or self._is_there(reading, now_ns)):
-            self.kind, self.ended = "idle", ARRIVED
-        elif why:
-            self.stop(reading, now_ns, why)
+            reason = "the linear move did not end within its time"
+        # The end of the move and the joint speeds come over two connections, and one may lag.
+        if not sample.moving_linearly and sample.rests and (self._move_seen or self._is_at_end(sample, now_ns)):
+            self.motion, self.end_reason = "idle", ARRIVED
+        elif reason:
+            self.stop(sample, now_ns, reason)
             return
-        self._arm.kick()
+        self._arm.send_heartbeat()
 
-    def _is_there(self, reading: RtdeSample, now_ns: int) -> bool:
+    def _is_at_end(self, sample: RtdeSample, now_ns: int) -> bool:
         waited = now_ns - self._move_ns > ARRIVED_AFTER_S * 1e9
-        return waited and is_close(reading.tcp_pose, self._move_end, CLOSE)
+        return waited and is_close(sample.tcp_pose, self._move_end, CLOSE)
 
-    def _keep_stopping(self, reading: RtdeSample, now_ns: int) -> None:
+    def _keep_stopping(self, sample: RtdeSample, now_ns: int) -> None:
         if now_ns > self._deadline_ns:
-            self.let_go(sentences.NOT_STOPPING)
+            self.leave_to_watchdog(error_messages.NOT_STOPPING)
         elif self._speed_thread:
-            braking = clip_stop(self._braking, reading, self._limits, self._settings.reaction_s)
-            if self._speed(WristSpeed(0.0, braking.deceleration_rad_per_s2)) and reading.rests:
+            braking = clip_stop(self._braking, sample, self._limits, self._settings.reaction_s)
+            if self._send_speed(WristSpeed(0.0, braking.deceleration_rad_per_s2)) and sample.rests:
                 self._end_speed_thread()
-                self.kind = "idle"
+                self.motion = "idle"
         else:
-            if not reading.moving_linearly and reading.rests:
-                self.kind = "idle"
-            self._arm.kick()
-
-    def _keep_resting(self, now_ns: int) -> None:
-        if now_ns - self._rested_ns > ASTRAY_S * 1e9:
-            self.ended = "it moved although nothing was asked of it"
-            self.let_go(sentences.ASTRAY)
-        else:
-            self._arm.kick()
+            if not sample.moving_linearly and sample.rests:
+                self.motion = "idle"
+            self._arm.send_heartbeat()
 
     # ---- calls on the arm -----------------------------------------------------------------------------------------
 
-    def _begin(self, kind: MotionKind, number: int) -> None:
-        self.kind, self.number, self.ended = kind, number, ""
+    def _send_clipped_speed(self, sample: RtdeSample) -> bool:
+        self.sent, self.clipped = clip_wrist(self._asked, sample, self._limits, self._settings.reaction_s)
+        return self._send_speed(self.sent)
 
-    def _send_wrist(self, reading: RtdeSample) -> bool:
-        self.sent, self.clipped = clip_wrist(self._asked, reading, self._limits, self._settings.reaction_s)
-        return self._speed(self.sent)
-
-    def _speed(self, command: WristSpeed) -> bool:
+    def _send_speed(self, command: WristSpeed) -> bool:
         self._speed_thread = True
         taken = self._arm.wrist(command)
         if not taken:
             # An earlier speed may still hold.
-            self._not_taken("wrist speed")
+            self._reject("wrist speed")
         return taken
 
-    def _not_taken(self, what: str) -> None:
-        self.puzzled = True
-        self.let_go(sentences.not_taken(what))
+    def _reject(self, command: str) -> None:
+        self.command_rejected = True
+        self.leave_to_watchdog(error_messages.not_taken(command))
 
     def _end_speed_thread(self) -> None:
         if self._speed_thread:
@@ -207,3 +209,46 @@ class MotionExecutor:
 
 def _harder(one: Stop, other: Stop) -> Stop:
     return one if one.deceleration_rad_per_s2 >= other.deceleration_rad_per_s2 else other
+
+
+def _longest_move_s(move: MoveLinear, sample: RtdeSample) -> float:
+    distance_m = math.dist(move.pose[:3], sample.tcp_pose[:3])
+    # At most half a turn; a move that only turns takes its speed as rad/s.
+    way = max(distance_m, math.pi if distance_m < 1e-3 else 0.0)
+    nominal_s = way / move.speed_m_per_s + move.speed_m_per_s / move.acceleration_m_per_s2
+    return MOVE_SLACK * nominal_s / max(SLOWEST_SCALING, sample.speed_scaling) + MOVE_SLACK_S
+
+
+def _longest_stop_s(stop: Stop, sample: RtdeSample) -> float:
+    nominal_s = sample.fastest_rad_per_s / stop.deceleration_rad_per_s2
+    if not math.isfinite(nominal_s):
+        return STOP_SLACK_S
+    return STOP_SLACK * nominal_s / max(SLOWEST_SCALING, sample.speed_scaling) + STOP_SLACK_S
+
+
+def tool_axis_torque(sample: RtdeSample) -> float:
+    """Return the torque about the tool's z axis: the third column of the pose's rotation, times the torque."""
+    x, y, z = sample.tcp_pose[3:]
+    angle = math.hypot(x, y, z)
+    if angle < 1e-12:
+        return sample.wrench[5]
+    x, y, z = x / angle, y / angle, z / angle
+    sine, versine = math.sin(angle), 1 - math.cos(angle)
+    _, _, _, tx, ty, tz = sample.wrench
+    return (x * z * versine + y * sine) * tx + (y * z * versine - x * sine) * ty + (1 - (x * x + y * y) * versine) * tz
+
+
+def is_close(pose: Six, other: Six, within: float) -> bool:
+    """Return whether two poses are less than `within` metres and radians apart.
+
+    A turn has several rotation vectors: at half a turn, as of a tool that points down, both signs are the same.
+    """
+    same = abs(sum(a * b for a, b in zip(_quaternion(pose), _quaternion(other), strict=True)))
+    return math.dist(pose[:3], other[:3]) < within and 2.0 * math.acos(min(same, 1.0)) < within
+
+
+def _quaternion(pose: Six) -> tuple[float, float, float, float]:
+    x, y, z = pose[3:]
+    angle = math.hypot(x, y, z)
+    share = math.sin(angle / 2) / angle if angle > 0.0 else 0.5
+    return math.cos(angle / 2), x * share, y * share, z * share

@@ -1,7 +1,7 @@
-"""What the robot may do and how long things may take: read from YAML, checked before anything is connected.
+"""Settings of the robot's driver: address, limits and deadlines, read from YAML.
 
-A `hard` limit is one that the arm must never pass: a *measured* value beyond it stops the motion. `inner` is where
-commands are clipped to, so that the hard limit is never reached by a command. All limits are magnitudes.
+All limits are magnitudes. A measured value beyond a `hard` limit stops the motion. Commands are clipped to the `inner`
+limit, so that no command reaches the hard one.
 """
 
 import math
@@ -22,7 +22,7 @@ _CLIENT_BOUNDS = {
     "linear_acceleration_m_per_s2": 150.0,
 }
 
-# How long a robot may go on by itself: no setting allows more, whatever is mistyped. (The watchdog: a second.)
+# The longest time the robot may go on without commands, whatever the file says.
 _LONGEST_S = {"command_timeout_s": 1.0, "silence_timeout_s": 1.0, "state_timeout_s": 1.0, "reaction_s": 0.5}
 _LEAST_WATCHDOG_HZ = 1.0
 
@@ -31,7 +31,7 @@ _CHECKED: dict[str, object] = {"extra": "forbid", "allow_inf_nan": False}
 
 @dataclass(frozen=True, slots=True)
 class Bound:
-    """A magnitude that commands keep at or below `inner`, and measured values below `hard`."""
+    """A limit: commands stay at or below `inner`, measured values below `hard`."""
 
     __pydantic_config__: ClassVar = _CHECKED
 
@@ -39,14 +39,14 @@ class Bound:
     hard: float
 
     def __post_init__(self) -> None:
-        """Refuse a margin that is none."""
+        """Refuse limits in the wrong order."""
         if not 0 < self.inner < self.hard:
             raise ValueError(f"inner ({self.inner:g}) must be above 0 and below hard ({self.hard:g})")
 
 
 @dataclass(frozen=True, slots=True)
 class JointRange:
-    """How far each joint may turn: hard ends in rad, and the margin within them that commands keep."""
+    """The hard ends of each joint's range in rad, and the margin that commands keep from them."""
 
     __pydantic_config__: ClassVar = _CHECKED
 
@@ -55,13 +55,13 @@ class JointRange:
     margin_rad: float
 
     def __post_init__(self) -> None:
-        """Refuse ranges without room between the margins."""
+        """Refuse a range without room between the margins."""
         _check_range(self.lower_rad, self.upper_rad, self.margin_rad)
 
 
 @dataclass(frozen=True, slots=True)
 class Workspace:
-    """The box for the tool centre point, in m in the robot's base frame, and the margin that commands keep."""
+    """The box for the tool centre point in m, in the base frame, and the margin that commands keep from its faces."""
 
     __pydantic_config__: ClassVar = _CHECKED
 
@@ -76,7 +76,7 @@ class Workspace:
 
 @dataclass(frozen=True, slots=True)
 class UrLimits:
-    """Everything that a command or a measured state is held against."""
+    """The limits on commands and on measured states."""
 
     __pydantic_config__: ClassVar = _CHECKED
 
@@ -90,7 +90,7 @@ class UrLimits:
     torque_nm: Bound
 
     def __post_init__(self) -> None:
-        """Refuse what ur-rtde would: it raises on a command beyond its own bounds, which would end the process."""
+        """Refuse what ur-rtde would: it raises on a command beyond its own bounds, which would end the worker."""
         for name, largest in _CLIENT_BOUNDS.items():
             bound = getattr(self, name)
             # A stop brakes up to the hard limit of acceleration.
@@ -108,23 +108,23 @@ class UrSettings:
     host: str
     limits: UrLimits
     rate_hz: float = 125.0
-    # The robot ends its program when it hears nothing for 1/watchdog_hz.
+    # The robot ends its program when it receives nothing for 1/watchdog_hz.
     watchdog_hz: float = 10.0
-    # A wrist speed holds for so long; then it has to be commanded again.
+    # A wrist speed holds for this long; then the wrist stops.
     command_timeout_s: float = 0.3
-    # Motion stops when nothing at all was heard from the daemon for so long.
+    # Motion stops when the daemon sends nothing for this long.
     silence_timeout_s: float = 0.3
-    # A controller's timestamp older than this is not believed; twice as old again, and the connection is given up.
+    # A sample older than this blocks motion; at three times this age the connection counts as lost.
     state_timeout_s: float = 0.25
     connect_timeout_s: float = 10.0
-    # A cycle that takes longer is a hang (blocking calls of the client last up to 301 s), and its process is ended.
+    # A cycle that takes longer is a hang, and the worker is ended: calls of ur-rtde block for up to 301 s.
     hang_timeout_s: float = 1.5
     recover_timeout_s: float = 30.0
-    # How late a commanded speed may take effect; distances to the joint limits allow for it.
+    # Delay until a commanded speed takes effect; distances to the joint limits allow for it.
     reaction_s: float = 0.04
 
     def __post_init__(self) -> None:
-        """Refuse a robot that is nowhere, and deadlines that contradict each other."""
+        """Refuse an empty host, and deadlines that contradict each other."""
         if not self.host.strip():
             raise ValueError("host is empty; give the robot's address")
         for name in self.__dataclass_fields__:
@@ -135,12 +135,12 @@ class UrSettings:
             value = getattr(self, name)
             if value > longest_s:
                 raise ValueError(
-                    f"{name} must be at most {longest_s:g} s, not {value:g}: so long the robot goes on alone"
+                    f"{name} must be at most {longest_s:g} s, not {value:g}: the robot goes on that long alone"
                 )
         if self.watchdog_hz < _LEAST_WATCHDOG_HZ:
             raise ValueError(
-                f"watchdog_hz must be at least {_LEAST_WATCHDOG_HZ:g}, not {self.watchdog_hz:g}: a robot without its "
-                "daemon goes on for 1/watchdog_hz"
+                f"watchdog_hz must be at least {_LEAST_WATCHDOG_HZ:g}, not {self.watchdog_hz:g}: "
+                "without its daemon the robot goes on for 1/watchdog_hz"
             )
         if self.rate_hz < 3 * self.watchdog_hz:
             raise ValueError(
@@ -161,24 +161,20 @@ def read_settings(path: Path) -> UrSettings:
     """Return the robot's settings from a YAML file.
 
     Raises:
-        DriverError: the file cannot be read, or settings are wrong; all mistakes are named together.
+        DriverError: the file cannot be read, or settings are wrong; the message names every mistake.
     """
     from pydantic import TypeAdapter, ValidationError
 
-    from shearloop.drivers.yaml_file import read_yaml
+    from shearloop.drivers.yaml_files import read_yaml
 
     content = read_yaml(path)
     try:
         return TypeAdapter(UrSettings).validate_python(content)
     except ValidationError as error:
+        known = {"missing": "it is missing", "unexpected_keyword_argument": "this is not a known key"}
         mistakes = "; ".join(
-            f"{'.'.join(str(part) for part in mistake['loc']) or 'the file'}: {_told(mistake['type'], mistake['msg'])}"
+            f"{'.'.join(map(str, mistake['loc'])) or 'the file'}: "
+            + known.get(mistake["type"], mistake["msg"].removeprefix("Value error, "))
             for mistake in error.errors()
         )
         raise DriverError(f"{path}: {mistakes}.") from error
-
-
-def _told(kind: str, message: str) -> str:
-    """Return what pydantic has found as an operator would say it."""
-    said = {"missing": "it is missing", "unexpected_keyword_argument": "this is not a known key"}
-    return said.get(kind, message.removeprefix("Value error, "))

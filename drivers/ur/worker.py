@@ -1,10 +1,8 @@
-"""The robot's own process, `python -m shearloop.drivers.ur.worker`: commands on stdin, states and replies on stdout.
+"""The robot's worker process, `python -m shearloop.drivers.ur.worker`: commands on stdin, states and replies on stdout.
 
-It goes through 125 cycles a second, and tells the state of each.
-
-It may hang or crash in ur-rtde at any time and holds nothing worth saving. Before every stretch that may hang it sets
-an alarm that the kernel answers by ending it, whatever holds the interpreter lock; the robot's watchdog then ends the
-motion. When stdin ends the daemon is gone: it stops the arm and goes too.
+It runs 125 cycles a second and sends the state of each. ur-rtde may hang or crash at any time, so that the worker
+holds nothing worth saving. Before each stretch that may hang it sets an alarm with which the kernel ends it; the
+robot's watchdog then ends the motion. When stdin ends the daemon is gone: the worker stops the arm and exits.
 """
 
 import contextlib
@@ -16,8 +14,9 @@ import time
 import traceback
 from typing import TYPE_CHECKING, NoReturn
 
-from shearloop.drivers.ur import error_messages as sentences
+from shearloop.drivers.ur import error_messages
 from shearloop.drivers.ur.command_handler import CommandHandler
+from shearloop.drivers.ur.controller import ProbeError, probe_controller
 from shearloop.drivers.ur.messages import (
     RECOVERY_HANG_S,
     Command,
@@ -28,41 +27,39 @@ from shearloop.drivers.ur.messages import (
     FailureKind,
     Heartbeat,
     Message,
+    MessageDecoder,
     MoveLinear,
-    RobotPhase,
     RtdeSample,
     Stop,
+    WorkerPhase,
     WristSpeed,
+    encode,
 )
-from shearloop.drivers.ur.probe import ProbeError, probe
 from shearloop.drivers.ur.settings import UrSettings
-from shearloop.drivers.ur.wire import Decoder, encode
 
 if TYPE_CHECKING:
     from shearloop.drivers.ur.arm import UrArm
 
 EXIT_DONE, EXIT_FAILED = 0, 3
-COMMANDS = Command.__args__
-# Motion that the daemon leaves behind is braked in this time; the robot's watchdog ends what is not.
+# On exit, the time to brake a motion; the robot's watchdog ends what remains.
 FAREWELL_S = 1.0
-# States that a slow daemon does not fetch are dropped, as the latest counts; replies wait, within this bound.
+# The bound on unsent replies. States that a slow daemon does not read are dropped.
 MOST_UNSENT = 1 << 16
 
 
 class Pipe:
-    """The two ends to the daemon, neither of which ever blocks."""
+    """Both directions of the pipe to the daemon; neither ever blocks."""
 
     def __init__(self, stdin: int, stdout: int) -> None:
-        """Take over both descriptors."""
         self._in, self._out = stdin, stdout
-        self._decoder = Decoder()
+        self._decoder = MessageDecoder()
         self._unsent = b""
         self.open = True
         os.set_blocking(stdin, False)
         os.set_blocking(stdout, False)
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait for input, and return whether there is any."""
+        """Wait for input and return whether there is any."""
         return bool(select.select([self._in], [], [], timeout_s)[0])
 
     def receive(self) -> list[tuple[int, Message]]:
@@ -82,7 +79,7 @@ class Pipe:
             self.open = False
 
     def send_latest(self, message: Message) -> None:
-        """Send a message unless others are still waiting."""
+        """Send a message, or drop it while earlier ones are unsent."""
         self._flush()
         if not self._unsent:
             self.send(message)
@@ -99,26 +96,26 @@ class Pipe:
 
 
 def main() -> NoReturn:
-    """Run until told to go, until the daemon is gone, or until the controller is."""
+    """Run until disconnected, or until the daemon or the controller is gone."""
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
-    # Ctrl-C at the terminal and its end reach the daemon too, as does a service manager's; it then says when to stop.
+    # The daemon receives the terminal's and the service manager's signals too, and decides when to stop.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
-    # What the client prints must not get between the messages.
+    # Keep ur-rtde's prints out of the messages.
     stdout = os.dup(1)
     os.dup2(2, 1)
     pipe = Pipe(0, stdout)
     try:
-        configured = _configuration(pipe)
+        configured = _receive_configuration(pipe)
         if configured is None:
-            _leave(EXIT_DONE)
-        _fly(pipe, configured, _connect(pipe, configured.settings))
-    except Exception:  # noqa: BLE001 - told, and the end of the process all the same
+            _exit(EXIT_DONE)
+        _control(pipe, configured, _connect(pipe, configured.settings))
+    except Exception:  # noqa: BLE001 - printed, and the process exits all the same
         traceback.print_exc()
-        _leave(EXIT_FAILED)
+        _exit(EXIT_FAILED)
 
 
-def _configuration(pipe: Pipe) -> Configure | None:
+def _receive_configuration(pipe: Pipe) -> Configure | None:
     while pipe.open:
         pipe.wait(60.0)
         for _, message in pipe.receive():
@@ -128,125 +125,116 @@ def _configuration(pipe: Pipe) -> Configure | None:
 
 
 def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
-    _alarm(settings.connect_timeout_s)
-    pipe.send(RobotPhase("loading ur-rtde"))
+    _set_alarm(settings.connect_timeout_s)
+    pipe.send(WorkerPhase("loading ur-rtde"))
     try:
         from shearloop.drivers.ur.arm import UrArm
     except ImportError:
-        _fail(pipe, "not-installed", sentences.NOT_INSTALLED)
-    pipe.send(RobotPhase("greeting the controller"))
+        _fail(pipe, "not-installed", error_messages.NOT_INSTALLED)
     try:
-        version = probe(settings.host, settings.connect_timeout_s / 3)
-    except ProbeError as error:
-        _fail(pipe, error.kind, str(error))
-    pipe.send(RobotPhase("connecting"))
-    try:
+        pipe.send(WorkerPhase("greeting the controller"))
+        version = probe_controller(settings.host, settings.connect_timeout_s / 3)
+        pipe.send(WorkerPhase("connecting"))
         return UrArm(settings, version)
     except ProbeError as error:
         _fail(pipe, error.kind, str(error))
     except RuntimeError as error:
-        _fail(pipe, *_explain(settings.host, str(error)))
+        text = str(error)
+        if "already in use" in text:
+            _fail(pipe, "registers-in-use", error_messages.registers_in_use(settings.host))
+        if "remote control" in text:
+            _fail(pipe, "local-control", error_messages.local_control(settings.host))
+        _fail(pipe, "unreachable", error_messages.refused_by_client(settings.host, text))
 
 
-def _explain(host: str, text: str) -> tuple[FailureKind, str]:
-    if "already in use" in text:
-        return "registers-in-use", sentences.registers_in_use(host)
-    if "remote control" in text:
-        return "local-control", sentences.local_control(host)
-    return "unreachable", sentences.refused_by_client(host, text)
-
-
-def _fly(pipe: Pipe, configured: Configure, arm: "UrArm") -> NoReturn:
+def _control(pipe: Pipe, configured: Configure, arm: "UrArm") -> NoReturn:
     settings = configured.settings
-    pilot = CommandHandler(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
+    handler = CommandHandler(settings, arm, time.monotonic_ns(), takes_over=configured.takes_over)
     period_s, due_s, cycle = 1.0 / settings.rate_hz, time.monotonic(), 0
-    leaving_s = 0.0
+    leave_s = 0.0
     while True:
-        _alarm(settings.hang_timeout_s)
-        reading = arm.read()
-        if not reading.connected or reading.age_ns > 3 * settings.state_timeout_s * 1e9:
-            _fail(pipe, "lost", sentences.unfit(reading, settings.host, settings.state_timeout_s))
-        if _obey(pipe, pilot, reading):
-            leaving_s = time.monotonic() + FAREWELL_S
-        if not pipe.open and not leaving_s:
-            pilot.request(0, Disconnect(), reading, time.monotonic_ns())
-            leaving_s = time.monotonic() + FAREWELL_S
-        if pilot.recovering:
-            # The daemon learns beforehand that this cycle may take long.
-            pipe.send_latest(pilot.state(reading, cycle))
-            _alarm(RECOVERY_HANG_S)
-        decided = pilot.tick(reading, time.monotonic_ns())
-        if decided is not None:
-            pipe.send(decided[1], decided[0])
-        if not pilot.puzzled():
-            pipe.send_latest(pilot.state(reading, cycle))
-        if leaving_s and (pilot.at_rest or time.monotonic() > leaving_s):
-            _end_program(settings, pilot, arm)
-            _leave(EXIT_DONE)
-        # A late cycle begins at once, and is not caught up with.
+        _set_alarm(settings.hang_timeout_s)
+        sample = arm.read()
+        if not sample.connected or sample.age_ns > 3 * settings.state_timeout_s * 1e9:
+            _fail(pipe, "lost", error_messages.why_unfit(sample, settings.host, settings.state_timeout_s))
+        if _handle_commands(pipe, handler, sample):
+            leave_s = time.monotonic() + FAREWELL_S
+        if not pipe.open and not leave_s:
+            handler.request(0, Disconnect(), sample, time.monotonic_ns())
+            leave_s = time.monotonic() + FAREWELL_S
+        if handler.recovering:
+            # Announce a cycle that may take long.
+            pipe.send_latest(handler.state(sample, cycle))
+            _set_alarm(RECOVERY_HANG_S)
+        ended = handler.tick(sample, time.monotonic_ns())
+        if ended is not None:
+            pipe.send(ended[1], ended[0])
+        if not handler.take_command_rejected():
+            pipe.send_latest(handler.state(sample, cycle))
+        if leave_s and (handler.at_rest or time.monotonic() > leave_s):
+            _end_program(settings, handler, arm)
+            _exit(EXIT_DONE)
+        # A late cycle begins at once; missed ones are skipped.
         due_s, cycle = max(due_s + period_s, time.monotonic()), cycle + 1
         while (left_s := due_s - time.monotonic()) > 0:
-            if leaving_s or not pipe.open:
+            if leave_s or not pipe.open:
                 time.sleep(left_s)
-            # A command is carried out when it comes: waiting for the next cycle would be a delay in the loop.
-            elif pipe.wait(left_s) and _obey(pipe, pilot, arm.read()):
-                leaving_s = time.monotonic() + FAREWELL_S
+            # Carry a command out on arrival: waiting for the next cycle would delay the loop.
+            elif pipe.wait(left_s) and _handle_commands(pipe, handler, arm.read()):
+                leave_s = time.monotonic() + FAREWELL_S
 
 
-def _end_program(settings: UrSettings, pilot: CommandHandler, arm: "UrArm") -> None:
-    """Leave no program of ours behind: none that a late upload has started, and none that waits to be resumed.
-
-    What is somebody else's plays on: only the operator stops it, with `unlock`.
-    """
-    _alarm(settings.hang_timeout_s)
-    reading = arm.read()
-    if reading.program_running:
-        if pilot.may_be_ours(time.monotonic_ns()):
+def _end_program(settings: UrSettings, handler: CommandHandler, arm: "UrArm") -> None:
+    """End our program: also one that a late upload has started, and one that is paused. Leave other clients' alone."""
+    _set_alarm(settings.hang_timeout_s)
+    sample = arm.read()
+    if sample.program_running:
+        if handler.may_own_program(time.monotonic_ns()):
             arm.end_program()
-    elif pilot.left_paused(reading):
-        _alarm(FAREWELL_S + settings.hang_timeout_s)
+    elif handler.owns_paused_program(sample):
+        _set_alarm(FAREWELL_S + settings.hang_timeout_s)
         arm.stop_program()
 
 
-def _obey(pipe: Pipe, pilot: CommandHandler, reading: RtdeSample) -> bool:
-    """Carry out what the daemon has sent; return whether it says to go."""
-    goes = False
-    for number, command in _newest(pipe, pilot):
-        reply = pilot.request(number, command, reading, time.monotonic_ns())
+def _handle_commands(pipe: Pipe, handler: CommandHandler, sample: RtdeSample) -> bool:
+    """Carry out the daemon's commands; return whether it disconnects."""
+    disconnects = False
+    for number, command in _newest_commands(pipe, handler):
+        reply = handler.request(number, command, sample, time.monotonic_ns())
         if reply is not None:
             pipe.send(reply, number)
-        goes = goes or isinstance(command, Disconnect)
-    return goes
+        disconnects = disconnects or isinstance(command, Disconnect)
+    return disconnects
 
 
-def _newest(pipe: Pipe, pilot: CommandHandler) -> list[tuple[int, Command]]:
-    """Return the commands to carry out in this cycle: of motions only the latest, the others answered as overtaken."""
+def _newest_commands(pipe: Pipe, handler: CommandHandler) -> list[tuple[int, Command]]:
+    """Return the commands to carry out; of several motions only the latest, the others are refused as overtaken."""
     commands: list[tuple[int, Command]] = []
     for number, message in pipe.receive():
-        pilot.heard(time.monotonic_ns())
-        if isinstance(message, COMMANDS):
+        handler.note_daemon_alive(time.monotonic_ns())
+        if isinstance(message, Command):
             commands.append((number, message))
         elif not isinstance(message, Heartbeat):
             raise TypeError(f"the daemon sent a {type(message).__name__}, which is no command")
     motions = [n for n, (_, command) in enumerate(commands) if isinstance(command, WristSpeed | MoveLinear | Stop)]
-    # A stop is never overtaken: what comes after it finds the arm stopping.
+    # A stop is never overtaken: a later motion finds the arm stopping.
     overtaken = [n for n in motions[:-1] if not isinstance(commands[n][1], Stop)]
     for index in overtaken:
-        pipe.send(CommandReply(refused="A newer command came before this one could be sent."), commands[index][0])
+        pipe.send(CommandReply(refusal="A newer command came before this one could be sent."), commands[index][0])
     return [entry for index, entry in enumerate(commands) if index not in overtaken]
 
 
-def _alarm(seconds: float) -> None:
+def _set_alarm(seconds: float) -> None:
     signal.setitimer(signal.ITIMER_REAL, seconds)
 
 
 def _fail(pipe: Pipe, kind: FailureKind, sentence: str) -> NoReturn:
     pipe.send(Failed(kind, sentence))
-    _leave(EXIT_FAILED)
+    _exit(EXIT_FAILED)
 
 
-def _leave(status: int) -> NoReturn:
-    # Not through the interpreter's end: the client's destructors hang and abort, and the kernel closes sockets as well.
+def _exit(status: int) -> NoReturn:
+    # Without ur-rtde's destructors, which hang and abort; the kernel closes the sockets.
     with contextlib.suppress(OSError):
         sys.stderr.flush()
     os._exit(status)

@@ -1,16 +1,16 @@
-"""The pipe to one process of the robot: its beginning, what it says, how it ends and what is told of that."""
+"""The pipe to one worker process: its start, its messages, its end, and the reason for that."""
 
 import asyncio
 import contextlib
 import os
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError
-from shearloop.drivers.ur import error_messages as sentences
+from shearloop.drivers.ur import error_messages
 from shearloop.drivers.ur.messages import (
     RECOVERY_HANG_S,
     Configure,
@@ -18,163 +18,145 @@ from shearloop.drivers.ur.messages import (
     FailureKind,
     Heartbeat,
     Message,
-    RobotPhase,
+    MessageDecoder,
     RobotState,
+    WorkerPhase,
+    encode,
 )
 from shearloop.drivers.ur.settings import UrSettings
-from shearloop.drivers.ur.wire import Decoder, encode
 
 LossKind = FailureKind | Literal["crashed", "hung", "garbled"]
 
-# A process being told to go stops the arm (1 s) and ends the program; then it is ended.
+# A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
 FAREWELL_S = 3.0
-# Beyond its own alarms a process gets so long: they end it at a known place, and first.
+# The worker's own alarms end it at a known place; the daemon kills it this much later.
 GRACE_S = 1.0
-# What a stuck process leaves unread; some hundred commands.
+# The bound on bytes that a stuck worker leaves unread: some hundred commands.
 MOST_UNSENT = 1 << 15
-# Of what a process prints the end is kept: enough for the last lines of a traceback, and for one sentence.
-LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
-# What a process printed before its end arrives after that at times, but no later than this.
-LAST_WORDS_S = 0.5
+# The end of the worker's output that a message quotes, and the wait for it after the worker's end.
+LAST_WORDS_BYTES, LAST_WORDS_LINES, LAST_WORDS_S = 1024, 8, 0.5
 HEARTBEAT: Final = encode(Heartbeat())
 
 
 class LostError(DeviceLostError):
-    """The process is of no more use."""
+    """The worker has to be replaced; `kind` says why."""
 
     def __init__(self, kind: LossKind, sentence: str) -> None:
         super().__init__(sentence)
         self.kind: LossKind = kind
 
 
-class Outliving(Protocol):
-    """Who holds conversations one after the other, and outlives each."""
-
-    # When the process was told anything last, by time.monotonic.
-    told_s: float
-
-    @property
-    def settings(self) -> UrSettings:
-        """The robot's settings, as a process is given them at its beginning."""
-
-    @property
-    def takes_over(self) -> bool:
-        """Whether the process before this one may have left a program of ours on the robot."""
-
-    @property
-    def state(self) -> RobotState | None:
-        """The latest state of this process, None before its first."""
-
-    def connected(self, stdin: asyncio.StreamWriter) -> None:
-        """Take the pipe for commands: the process controls the robot from now on."""
-
-    def take_all(self, messages: Sequence[tuple[int, Message]]) -> None:
-        """Act on what was read of the process at once, in order."""
-
-
 class WorkerConnection:
-    """The pipe to one process."""
+    """The pipe to one worker process."""
 
-    def __init__(self, robot: Outliving, process: asyncio.subprocess.Process, stdout: int) -> None:
+    def __init__(
+        self,
+        settings: UrSettings,
+        process: asyncio.subprocess.Process,
+        stdout: int,
+        on_messages: Callable[[Sequence[tuple[int, Message]]], None],
+        *,
+        takes_over: bool = False,
+    ) -> None:
+        """Configure the worker. `on_messages` receives all messages of one read, in order."""
         if process.stdin is None or process.stderr is None:
             raise DriverError("The robot's process was started without pipes.")
-        self._robot = robot
-        self._settings = robot.settings
+        self._settings = settings
         self._process = process
         self._stdin, self._stdout, self._stderr = process.stdin, stdout, process.stderr
-        self._decoder = Decoder()
-        self._heard_s = time.monotonic()
-        # Done when the process has no more to say, or has said what ends the conversation: then with the error, as its
-        # result, for asyncio complains of an exception where nobody listens any more.
-        self._over: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
-        self._said = b""
-        self._said_all = asyncio.Event()
-        self._doing = "starting"
-        self._controls = False
-        self._stdin.write(encode(Configure(robot.settings, robot.takes_over)))
+        self._on_messages = on_messages
+        self._decoder = MessageDecoder()
+        self._received_s = self._sent_s = time.monotonic()
+        # Done at the end of the output (None), or with the error that ends the connection. The error is a result,
+        # because asyncio complains about exceptions that are never retrieved.
+        self._closed: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
+        self._stderr_tail = b""
+        self._stderr_ended = asyncio.Event()
+        self._activity = "starting"
+        self._state: RobotState | None = None
+        self.send(Configure(settings, takes_over))
+
+    def send(self, message: Message, number: int = 0) -> None:
+        """Send a message to the worker."""
+        self._sent_s = time.monotonic()
+        self._stdin.write(encode(message, number))
 
     async def listen(self) -> None:
-        """Take messages until the process has no more; a silent process is ended."""
-        asyncio.get_running_loop().add_reader(self._stdout, self._hear)
-        try:
-            while not self._over.done():
-                patience_s = self._patience_s()
-                silent_s = time.monotonic() - self._heard_s
-                if silent_s >= patience_s:
-                    self._kill()
-                    raise LostError("hung", self._hung(patience_s))
-                await asyncio.wait([self._over], timeout=min(patience_s - silent_s, self._settings.hang_timeout_s))
-        finally:
-            self._turn_away()
-        wrong = self._over.result()
-        raise wrong if wrong is not None else await self._died()
+        """Pass messages on until the worker's output ends; kill a worker that is silent for too long.
 
-    def _hear(self) -> None:
-        """Take what the process has said, as it arrives: up to 125 times a second, so that no task is woken for it."""
+        Raises:
+            LostError: always, in the end.
+        """
+        asyncio.get_running_loop().add_reader(self._stdout, self._read)
+        try:
+            while not self._closed.done():
+                timeout_s = self._timeout_s()
+                silent_s = time.monotonic() - self._received_s
+                if silent_s >= timeout_s:
+                    self._kill()
+                    raise LostError("hung", self._hung_sentence(timeout_s))
+                await asyncio.wait([self._closed], timeout=min(timeout_s - silent_s, self._settings.hang_timeout_s))
+        finally:
+            self._stop_reading()
+        error = self._closed.result()
+        raise error if error is not None else await self._died()
+
+    def _read(self) -> None:
+        # A callback of the event loop: waking a task for each of 125 states a second costs as much as handling them.
         try:
             data = os.read(self._stdout, 1 << 16)
-            self._heard_s = time.monotonic()
+            self._received_s = time.monotonic()
             messages = self._decoder.feed(data)
-            if not self._controls:
-                self._begin_with(messages)
-            self._robot.take_all(messages)
+            for _, message in messages:
+                if isinstance(message, WorkerPhase):
+                    self._activity = message.activity
+                elif isinstance(message, RobotState):
+                    self._state, self._activity = message, "controlling"
+            self._on_messages(messages)
         except BlockingIOError:
             return
         except ProtocolError as error:
             self._kill()
-            self._end_with(LostError("garbled", str(error)))
-        except Exception as error:  # noqa: BLE001 - raised again by `listen`, whose task it ends
-            self._end_with(error)
+            self._close(LostError("garbled", str(error)))
+        except Exception as error:  # noqa: BLE001 - raised again by `listen`
+            self._close(error)
         else:
             if not data:
-                self._end_with(None)
+                self._close(None)
 
-    def _begin_with(self, messages: list[tuple[int, Message]]) -> None:
-        """Follow how far the process has come; from its first state on it controls the robot, and takes commands."""
-        for _, message in messages:
-            if isinstance(message, RobotState):
-                self._controls = True
-                self._doing = "controlling"
-                self._robot.connected(self._stdin)
-            elif isinstance(message, RobotPhase):
-                self._doing = message.doing
-
-    def _turn_away(self) -> None:
+    def _stop_reading(self) -> None:
         asyncio.get_running_loop().remove_reader(self._stdout)
 
-    def _end_with(self, error: Exception | None) -> None:
-        self._turn_away()
-        if not self._over.done():
-            self._over.set_result(error)
+    def _close(self, error: Exception | None) -> None:
+        self._stop_reading()
+        if not self._closed.done():
+            self._closed.set_result(error)
 
     async def keep_alive(self) -> None:
-        """Give signs of life four times in the time after which motion would be stopped.
-
-        A command is one too, and as long as they come there is no need of others: each wakes the process once more.
-        """
+        """Send heartbeats four times within the silence timeout, unless commands go out as often."""
         longest_s = self._settings.silence_timeout_s / 4
         while True:
-            left_s = longest_s - (time.monotonic() - self._robot.told_s)
+            left_s = longest_s - (time.monotonic() - self._sent_s)
             if left_s <= 0:
-                self._robot.told_s, left_s = time.monotonic(), longest_s
+                self._sent_s, left_s = time.monotonic(), longest_s
                 self._stdin.write(HEARTBEAT)
             await asyncio.sleep(left_s)
             if self._stdin.transport.get_write_buffer_size() > MOST_UNSENT:
                 self._kill()
-                raise LostError("hung", self._hung(self._settings.silence_timeout_s))
+                raise LostError("hung", self._hung_sentence(self._settings.silence_timeout_s))
 
     async def collect_stderr(self) -> None:
-        """Keep the end of what the process printed: after a crash it is all there is."""
+        """Keep the end of the worker's error output: after a crash it is the only trace."""
         while data := await self._stderr.read(1 << 16):
-            self._said = (self._said + data)[-LAST_WORDS_BYTES:]
-        self._said_all.set()
+            self._stderr_tail = (self._stderr_tail + data)[-LAST_WORDS_BYTES:]
+        self._stderr_ended.set()
 
     async def end(self) -> None:
-        """End the process: in good order while it listens, and in any case within `FAREWELL_S`."""
+        """Disconnect the worker, and kill it after `FAREWELL_S`."""
         if self._process.returncode is None:
             with contextlib.suppress(ConnectionError):
                 self._stdin.write(encode(Disconnect()))
-            # The end of its input is its second word to go.
+            # The end of its input disconnects the worker too.
             self._stdin.close()
             try:
                 async with asyncio.timeout(FAREWELL_S), asyncio.TaskGroup() as tasks:
@@ -188,31 +170,30 @@ class WorkerConnection:
         with contextlib.suppress(ProcessLookupError):
             self._process.kill()
 
-    def _patience_s(self) -> float:
-        state = self._robot.state
-        if state is None:
+    def _timeout_s(self) -> float:
+        if self._state is None:
             return self._settings.connect_timeout_s + GRACE_S
-        return (RECOVERY_HANG_S if state.recovering else self._settings.hang_timeout_s) + GRACE_S
+        return (RECOVERY_HANG_S if self._state.recovering else self._settings.hang_timeout_s) + GRACE_S
 
     async def _died(self) -> LostError:
         status = await self._process.wait()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LAST_WORDS_S):
-                await self._said_all.wait()
+                await self._stderr_ended.wait()
         if status == -signal.SIGALRM:
-            return LostError("hung", self._hung(self._settings.hang_timeout_s))
-        died_of = f"died of {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
-        # What ur-rtde does when it loses the controller.
-        why = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
+            return LostError("hung", self._hung_sentence(self._settings.hang_timeout_s))
+        end = f"died of {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+        # ur-rtde crashes like this when it loses the controller.
+        cause = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
         return LostError(
             "crashed",
-            f"The robot's process {died_of} while {self._doing}{why}. The robot's watchdog ends the motion; the "
+            f"The robot's process {end} while {self._activity}{cause}. The robot's watchdog ends the motion; the "
             f"process is started again with motion disabled.{self._last_words()}",
         )
 
-    def _hung(self, seconds: float) -> str:
-        if self._robot.state is None:
-            sentence = sentences.silent(self._settings.host, self._settings.connect_timeout_s, self._doing)
+    def _hung_sentence(self, seconds: float) -> str:
+        if self._state is None:
+            sentence = error_messages.silent(self._settings.host, self._settings.connect_timeout_s, self._activity)
         else:
             sentence = (
                 f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "
@@ -221,9 +202,9 @@ class WorkerConnection:
         return sentence + self._last_words()
 
     def _last_words(self) -> str:
-        lines = [line.strip() for line in self._said.decode("utf-8", "replace").splitlines()]
-        said = " / ".join([line for line in lines if line][-LAST_WORDS_LINES:])
-        return f" Its last words: {said}." if said else ""
+        lines = [line.strip() for line in self._stderr_tail.decode("utf-8", "replace").splitlines()]
+        words = " / ".join([line for line in lines if line][-LAST_WORDS_LINES:])
+        return f" Its last words: {words}." if words else ""
 
 
 async def _drain(stream: asyncio.StreamReader) -> None:
@@ -233,26 +214,26 @@ async def _drain(stream: asyncio.StreamReader) -> None:
 
 @dataclass(slots=True)
 class Descriptor:
-    """An open file, closed once."""
+    """An open file that is closed once."""
 
     number: int
     is_open: bool = True
 
     def close(self) -> None:
-        """Close it, unless it is closed already."""
+        """Close the file, unless it is closed."""
         if self.is_open:
             self.is_open = False
             os.close(self.number)
 
 
 @contextlib.contextmanager
-def output() -> Iterator[tuple[int, Descriptor]]:
-    """Give the end of a pipe that is read here without waiting, and the end that is written by a process."""
+def output_pipe() -> Iterator[tuple[int, Descriptor]]:
+    """Yield a non-blocking end to read, and the end for a process to write."""
     reading, writing = os.pipe()
-    its_end = Descriptor(writing)
+    write_end = Descriptor(writing)
     os.set_blocking(reading, False)
     try:
-        yield reading, its_end
+        yield reading, write_end
     finally:
-        its_end.close()
+        write_end.close()
         os.close(reading)

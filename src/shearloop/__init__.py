@@ -19,7 +19,7 @@ Estimate the torque along a recording:
 
 Follow a running daemon:
 
-    for topic, message in shearloop.subscribe("tcp://127.0.0.1:5556", ["eit.estimate"]):
+    for topic, message in shearloop.subscribe("tcp://127.0.0.1:7761", ["eit.estimate"]):
         print(message["torque_nm"])
 """
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from shearloop.bank.eit.pruned_matching import PrunedMatcher as Matcher
     from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, FrameSeries, TactileFrame, fit
     from shearloop.daemon.analysis.series import read_series
-    from shearloop.daemon.messaging.subscriber import messages as subscribe
+    from shearloop.daemon.messaging.client import receive_messages as subscribe
     from shearloop.daemon.recording.reader import read_recording
 
 __all__ = [
@@ -48,7 +48,7 @@ __all__ = [
     "subscribe",
 ]
 
-# Imported on first use: the command line answers at once.
+# ImportResult on first use: the command line answers at once.
 _HOMES = {
     "Bank": "shearloop.bank.eit.bank_file:Bank",
     "Calibration": "shearloop.bank.estimation:Calibration",
@@ -60,7 +60,7 @@ _HOMES = {
     "fit": "shearloop.bank.estimation:fit",
     "read_recording": "shearloop.daemon.recording.reader:read_recording",
     "read_series": "shearloop.daemon.analysis.series:read_series",
-    "subscribe": "shearloop.daemon.messaging.subscriber:messages",
+    "subscribe": "shearloop.daemon.messaging.client:receive_messages",
 }
 
 

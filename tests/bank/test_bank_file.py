@@ -13,7 +13,7 @@ from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH
 from shearloop.bank.errors import BankFileError, ModelError
 
 GEOMETRY = "ab" * 32
-CURE = "make it anew with `shearloop bank build"
+CURE = "build it with `shearloop bank build"
 
 
 def definition(**changed):

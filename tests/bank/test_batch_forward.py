@@ -1,25 +1,20 @@
 """Many solutions at once against the direct solve of each, and against what a Schur complement is."""
 
-import itertools
 import os
-import shutil
 import subprocess
 import sys
-from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shearloop.bank.eit.batch_forward import LARGEST_LEAK, BatchForwardModel, rounding_leaks
-from shearloop.bank.eit.elimination import Elimination
-from shearloop.bank.eit.fronts import Pattern
+from shearloop.bank.eit.elimination import Elimination, Pattern
+from shearloop.bank.eit.forward import MAX_LEAK, BatchForwardModel, rounding_leaks
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, conductivity
-from shearloop.bank.eit.tiles import LANES
-from shearloop.bank.errors import BankError, ConductivityError, GeometryError
+from shearloop.bank.eit.vector_kernel import LANES
+from shearloop.bank.errors import ConductivityError, GeometryError
 from tests.bank.conftest import rectangle
 
 
@@ -80,16 +75,9 @@ def test_factors_that_are_missing_are_refused():
         elimination.schur_complements(np.ones((1, 3)))
 
 
-def test_without_a_compiler_it_is_said_what_to_do(fingertip, monkeypatch):
-    """It died of a type that numpy does not add."""
-    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
-    with pytest.raises(BankError, match=r"NUMBA_DISABLE_JIT is set.* unset it"):
-        BatchForwardModel(fingertip)
-
-
 # For registers that hold four numbers, whatever this machine's do: prints what is left of some matrices.
 NARROW = """
-from shearloop.bank.eit.tiles import LANES
+from shearloop.bank.eit.vector_kernel import LANES
 from tests.bank.test_batch_forward import what_is_left
 assert LANES == 4
 print(what_is_left().tobytes().hex())
@@ -109,50 +97,6 @@ def test_narrow_registers_give_the_same_bits(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}
     narrow = subprocess.run([sys.executable, "-c", NARROW], env=environment, check=True, capture_output=True, text=True)
     assert narrow.stdout.strip() == what_is_left().tobytes().hex()
-
-
-ELIMINATE = """
-from tests.bank.test_batch_forward import what_is_left
-print(what_is_left().tobytes().hex())
-"""
-
-
-def eliminated(kept_in: Path) -> str:
-    """Return what a process of its own eliminates, with numba's cache in a folder."""
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(kept_in)}
-    command = [sys.executable, "-c", ELIMINATE]
-    return subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout.strip()
-
-
-@pytest.fixture(scope="module")
-def kept_by_numba(tmp_path_factory):
-    """Return a folder in which numba has kept all that an elimination takes."""
-    folder = tmp_path_factory.mktemp("numba")
-    assert eliminated(folder) == what_is_left().tobytes().hex()
-    return folder
-
-
-def test_what_numba_has_kept_is_made_anew_where_it_is_damaged(tmp_path, kept_by_numba):
-    """It was a traceback of pickle's, at each build, until somebody found the file."""
-    shutil.copytree(kept_by_numba, tmp_path, dirs_exist_ok=True)
-    # Everything is compiled anew, which takes seconds: functions take the ways to be damaged by turns.
-    ways = itertools.cycle(
-        [
-            ("nbi", lambda kept: kept[: len(kept) // 2]),
-            ("nbc", lambda kept: kept[: len(kept) // 2]),
-            ("nbi", lambda _: b""),
-            ("nbc", lambda kept: bytes(len(kept))),
-        ]
-    )
-    whole = {}
-    for index, (suffix, damage) in zip(sorted(tmp_path.rglob("*.nbi")), ways, strict=False):
-        for path in index.parent.glob(f"{index.stem}*.{suffix}"):
-            whole[path] = path.read_bytes()
-            path.write_bytes(damage(whole[path]))
-    assert len(whole) > 5
-    assert eliminated(tmp_path) == what_is_left().tobytes().hex()
-    # Kept again, to the size of the stamps in it.
-    assert all(path.stat().st_size > 0.9 * len(kept) for path, kept in whole.items())
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -194,7 +138,7 @@ def test_a_cell_that_rounding_spoils_is_solved_directly(batch, fingertip):
     cells = np.ones((3, len(fingertip.triangles)))
     cells[1, middle[:, 1] > 1.6] = 1e-13
     leaks = rounding_leaks(batch._elimination.schur_complements(cells))
-    assert leaks[1] > LARGEST_LEAK > 1e-13 > max(leaks[0], leaks[2])
+    assert leaks[1] > MAX_LEAK > 1e-13 > max(leaks[0], leaks[2])
     found = batch.voltages(cells)
     np.testing.assert_array_equal(found[1], batch.direct.voltages(cells[1]))
     assert relative(found[0], batch.direct.voltages(cells[0])) < 1e-12

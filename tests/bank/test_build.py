@@ -12,8 +12,7 @@ import pytest
 
 from shearloop.bank.eit import bank_file
 from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, Bank, BankDefinition
-from shearloop.bank.eit.build import RowSolver, build_bank
-from shearloop.bank.eit.journal import RowJournal
+from shearloop.bank.eit.build import RowJournal, RowSolver, build_bank
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import BankFileError, ConductivityError
@@ -121,7 +120,7 @@ def test_a_build_that_is_killed_goes_on_without_solving_a_row_again(finished, fi
     progress, notices = build(fingertip, path)
     assert progress == [(4, 5), (5, 5)]
     assert len(notices) == 1
-    assert "killed.bank.part: taking over 4 of 5 rows" in notices[0]
+    assert "killed.bank.part: resuming, 4 of 5 rows" in notices[0]
     assert path.read_bytes() == finished.read_bytes()
     assert sorted(each.name for each in tmp_path.iterdir()) == ["builder.py", "killed.bank"]
 
@@ -159,7 +158,7 @@ def test_the_rows_of_another_bank_are_not_reused_and_that_is_said(fingertip, int
     progress, notices = build(fingertip, interrupted, sigma=SIGMA + 0.1)
     assert progress[0] == (0, 5)
     assert len(notices) == 1
-    assert "half.bank.part: the rows there belong to another bank and are not reused" in notices[0]
+    assert "half.bank.part: its rows belong to another bank and are discarded" in notices[0]
     np.testing.assert_array_equal(Bank.open(interrupted, verify=True).sigma_grid, SIGMA + 0.1)
 
 
@@ -204,7 +203,7 @@ def test_a_bank_that_the_disk_has_no_room_for_is_written_from_its_journal_when_t
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr(bank_file, "replaced", full)
+        patched.setattr(bank_file, "replace_file", full)
         with pytest.raises(BankFileError, match=r"full\.bank: the bank .*; make room and give the same command again"):
             build(fingertip, path)
     # Nothing is solved again.

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS
-from shearloop.bank.eit.design import ALLOWED, Choice, Scene, Step, _board_choices, designed
+from shearloop.bank.eit.design import ALLOWED, DesignChoice, DesignStep, MeasuredFrames, _board_choices, design_bank
 from shearloop.bank.eit.fingertip import Fingertip
-from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import CalibrationError
 from shearloop.daemon.bank_config import FingertipGeometryConfig
@@ -34,19 +33,21 @@ def clean(fingertip: Fingertip) -> np.ndarray:
     return np.abs([forward.voltages(cell) - homogeneous for cell in cells]) * 0.01
 
 
-def scene(clean: np.ndarray, noise_v: float) -> Scene:
+def scene(clean: np.ndarray, noise_v: float) -> MeasuredFrames:
     rng = np.random.default_rng(3)
-    return Scene(np.abs(clean + rng.normal(0.0, noise_v, clean.shape)), noise_v, np.linspace(0.0, 0.1, len(clean)))
+    return MeasuredFrames(
+        np.abs(clean + rng.normal(0.0, noise_v, clean.shape)), noise_v, np.linspace(0.0, 0.1, len(clean))
+    )
 
 
 @pytest.fixture(scope="module")
 def quiet(clean, fingertip):
-    return designed(scene(clean, 2e-5), fingertip)
+    return design_bank(scene(clean, 2e-5), fingertip)
 
 
 @pytest.fixture(scope="module")
 def noisy(clean, fingertip):
-    return designed(scene(clean, 6e-5), fingertip)
+    return design_bank(scene(clean, 6e-5), fingertip)
 
 
 def test_more_noise_asks_for_less_of_everything(quiet, noisy) -> None:
@@ -83,7 +84,7 @@ def signals_at(fingertip):
     return solved
 
 
-def before(choice: Choice) -> float:
+def before(choice: DesignChoice) -> float:
     """Return the setting before the chosen one."""
     return choice.steps[choice.steps.index(choice.chosen) - 1].setting
 
@@ -147,7 +148,7 @@ def test_injections_cost_what_generalised_least_squares_loses_without_them() -> 
     drift = np.where(CHANNELS[:, 0] % 2 == 0, 2 * slope, 0.2 * slope) + other
     torque, shift = rng.normal(size=(2, 1500))
     frames = 0.1 + np.outer(torque, slope) + np.outer(shift, drift) + rng.normal(0, 3e-3, (1500, 896))
-    _, injections = _board_choices(Scene(frames, 3e-3, torque))
+    _, injections = _board_choices(MeasuredFrames(frames, 3e-3, torque))
 
     def spread(taken: list[int]) -> float:
         rows = np.isin(CHANNELS[:, 0], taken)
@@ -165,7 +166,7 @@ def test_a_model_without_a_sigma_gets_one_cell_along_it(fingertip) -> None:
     forward = ForwardModel(mesh)
     cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 10).tolist()]
     frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
-    design = designed(scene(frames, 4e-4), fingertip)
+    design = design_bank(scene(frames, 4e-4), fingertip)
     assert design.model == "step"
     assert design.sigma_count.chosen.setting == 1
     assert design.sigma_count.enough
@@ -187,12 +188,12 @@ def test_channels_that_drift_as_they_twist_are_not_those_that_are_kept() -> None
     loud = np.arange(896) % 2 == 0
     slope = np.where(loud, 2e-3, 1e-3) * np.where(rng.random(896) < 0.5, 1, -1)
     frames = 0.1 + np.outer(torque, slope) + np.outer(drift, np.where(loud, 10 * slope, 0.0))
-    channels, _ = _board_choices(Scene(frames + rng.normal(0, 1e-3, frames.shape), 1e-3, torque))
+    channels, _ = _board_choices(MeasuredFrames(frames + rng.normal(0, 1e-3, frames.shape), 1e-3, torque))
     assert {step.setting: step.added for step in channels.steps}[448] < ALLOWED
 
 
 def test_a_choice_that_nothing_is_good_enough_for_says_so() -> None:
-    choice = Choice("mesh size", "cm", (Step(0.5, 3.0, "few"), Step(0.1, 1.0, "many")))
+    choice = DesignChoice("mesh size", "cm", (DesignStep(0.5, 3.0, "few"), DesignStep(0.1, 1.0, "many")))
     assert not choice.enough
     assert choice.chosen.setting == 0.1
     assert choice.next_step is None
@@ -200,25 +201,27 @@ def test_a_choice_that_nothing_is_good_enough_for_says_so() -> None:
 
 def test_what_is_good_enough_by_luck_is_not_chosen() -> None:
     """A step falls between the nodes of one mesh as it should, and of the next finer one not."""
-    choice = Choice(
-        "mesh size", "cm", (Step(0.5, 3.0, ""), Step(0.2, 0.1, ""), Step(0.1, 0.5, ""), Step(0.05, 0.2, ""))
+    choice = DesignChoice(
+        "mesh size",
+        "cm",
+        (DesignStep(0.5, 3.0, ""), DesignStep(0.2, 0.1, ""), DesignStep(0.1, 0.5, ""), DesignStep(0.05, 0.2, "")),
     )
     assert choice.chosen.setting == 0.05
-    assert Choice("", "", choice.steps[:3]).chosen.setting == 0.1
+    assert DesignChoice("", "", choice.steps[:3]).chosen.setting == 0.1
 
 
 def test_too_few_frames_are_refused(clean) -> None:
     with pytest.raises(CalibrationError, match="too few to judge a model by"):
-        Scene(clean[:5], 1e-4, None)
+        MeasuredFrames(clean[:5], 1e-4, None)
 
 
 @pytest.mark.parametrize("noise_v", [0.0, 1e-20, np.inf, np.nan])
 def test_frames_without_noise_are_refused_in_a_sentence(clean, noise_v: float) -> None:
     with pytest.raises(CalibrationError, match="no noise to design for"):
-        Scene(clean, noise_v, None)
+        MeasuredFrames(clean, noise_v, None)
 
 
 @pytest.mark.parametrize("scale", [0.0, 1e-200, 1e200])
 def test_frames_of_no_size_are_refused_in_a_sentence(clean, scale: float) -> None:
     with pytest.raises(CalibrationError, match="no noise to design for"):
-        Scene(scale * clean, scale * 1e-5, None)
+        MeasuredFrames(scale * clean, scale * 1e-5, None)

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import MODELS, Conductivities, Variation, averaging_points, conductivity
+from shearloop.bank.eit.models import MODELS, ConductivityModel, Variation, averaging_points, conductivity
 from shearloop.bank.errors import ModelError
 
 
@@ -80,11 +80,11 @@ def test_mistakes_are_refused(fingertip: Mesh):
 @pytest.mark.parametrize("name", MODELS)
 def test_many_conductivities_are_those_of_one_to_the_bit(name, fingertip, paper_mesh):
     for mesh in (fingertip, paper_mesh):
-        many = Conductivities(mesh)
+        many = ConductivityModel(mesh)
         for k, sigma in [(0.7, 0.3), (2.0, 1.1)]:
-            np.testing.assert_array_equal(many.of(name, k, sigma), conductivity(mesh, name, k, sigma))
+            np.testing.assert_array_equal(many.conductivity(name, k, sigma), conductivity(mesh, name, k, sigma))
     with pytest.raises(ModelError, match="finite"):
-        many.of(name, np.nan, 1.0)
+        many.conductivity(name, np.nan, 1.0)
 
 
 @given(amplitude=st.floats(-2, 2), offset=st.floats(-0.5, 2), tilt_deg=st.floats(-80, 80))
@@ -100,7 +100,7 @@ def test_a_variation_scales_adds_and_turns(fingertip, amplitude, offset, tilt_de
     variation = Variation(amplitude, offset, tilt_deg)
     found = conductivity(fingertip, "gaussian_derivative", 1.4, 0.8, variation)
     np.testing.assert_allclose(found, expected, atol=1e-11)
-    many = Conductivities(fingertip, variation).of("gaussian_derivative", 1.4, 0.8)
+    many = ConductivityModel(fingertip, variation).conductivity("gaussian_derivative", 1.4, 0.8)
     np.testing.assert_array_equal(many, found)
 
 

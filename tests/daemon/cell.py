@@ -21,7 +21,7 @@ SPEED_M_PER_S = 0.1
 
 
 class Robot(UrRobot):
-    """The client with the pilot in the same process, and an arm that moves in straight lines too."""
+    """The client with the command handler in the same process, and an arm that moves in straight lines too."""
 
     def __init__(self) -> None:
         super().__init__(SETTINGS)
@@ -37,12 +37,12 @@ class Robot(UrRobot):
         # For how many cycles there is no process yet.
         self.gone_for = 0
 
-    def tell(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
+    def send_nowait(self, command: Command, answered: Callable[[CommandReply], None]) -> None:
         self.commands.append(command)
         if self.dies_of is not None:
             raise self.dies_of
         if self.gone_for:
-            answered(CommandReply(refused="The robot is not connected."))
+            answered(CommandReply(refusal="The robot is not connected."))
             return
         asyncio.get_running_loop().call_soon(self._obey, command, answered)
 
@@ -60,9 +60,9 @@ class Robot(UrRobot):
         """End the process with all that it has not said; the next one is there after so many cycles."""
         self.gone_for = gone_for
         held, self._held, self._unread = self._held, [], []
-        self._disconnected()
+        self._disconnect()
         for answered, _ in held:
-            answered(CommandReply(refused="The robot's process ended before it answered."))
+            answered(CommandReply(refusal="The robot's process ended before it answered."))
 
     def cycle(self, *, read: bool = True) -> None:
         """Let 8 ms pass, and tell who waits for the next state; what is not read now is read with the next one."""
@@ -92,7 +92,7 @@ class Robot(UrRobot):
         held, self._held = self._held, []
         for answered, reply in held:
             answered(reply)
-        self.take_all(self._unread)
+        self.handle_messages(self._unread)
         self._unread.clear()
 
     @property
@@ -163,37 +163,38 @@ class Cell:
     def __init__(self) -> None:
         self.robot, self.gripper, self.published = Robot(), Gripper(), Published()
         source = wrench_source(SETTINGS.rate_hz)
-        self.brain = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
+        self.control_loop = ControlLoop(LoopConfig(), {WRENCH: source}, ("robot",))
         self.died: Mapping[str, str] = {}
 
         async def no_zero() -> str:
             return ""
 
-        self.loop = ControlLoopRunner(
-            self.brain,
+        self.runner = ControlLoopRunner(
+            self.control_loop,
             self.robot,
             self.gripper,  # type: ignore[arg-type]
             no_zero,
             self.published,  # type: ignore[arg-type]
             StepClock(self.robot.flight),
             lambda: self.died,
+            4.0,
         )
         self.task: asyncio.Task[None] | None = None
 
     def drive(self) -> None:
-        self.task = asyncio.create_task(self.loop.drive())
+        self.task = asyncio.create_task(self.runner.run())
 
     async def cycles(self, count: int) -> None:
         for _ in range(count):
-            self.brain.inputs.gripper = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
+            self.control_loop.inputs.gripper = GripperStatus(self.robot.flight.now_ns, 30.0, holding=True, moving=False)
             self.robot.cycle()
             # A state is sensed, decided upon and answered within a few turns of the event loop.
             for _ in range(8):
                 await asyncio.sleep(0)
 
     async def start(self, *steps: Mapping[str, Any]) -> None:
-        file = ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": list(steps)})
-        starting = asyncio.create_task(self.loop.start(file))
+        file = ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": list(steps)})
+        starting = asyncio.create_task(self.runner.start(file))
         while not starting.done():
             await self.cycles(1)
         assert starting.result() is None
@@ -207,13 +208,13 @@ class Cell:
 
     @property
     def phase(self) -> ExperimentPhase:
-        assert self.brain.experiment is not None
-        return self.brain.experiment.phase
+        assert self.control_loop.experiment is not None
+        return self.control_loop.experiment.phase
 
     @property
     def why(self) -> str:
-        assert self.brain.experiment is not None
-        return self.brain.experiment.stop_reason
+        assert self.control_loop.experiment is not None
+        return self.control_loop.experiment.stop_reason
 
     @property
     def state(self) -> RobotState:

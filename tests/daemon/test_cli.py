@@ -18,17 +18,17 @@ import yaml
 import zmq.asyncio
 
 from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.models import MODELS
-from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank.build import MODELS as MODELS_IN_HELP
 from shearloop.daemon.cli.completion import full_parser
-from shearloop.daemon.cli.message_lines import message_json, message_line
+from shearloop.daemon.cli.output import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.sensing.estimators import COMBINED
+from shearloop.daemon.sensing.both import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 
 Write = Callable[..., Path]
@@ -43,25 +43,25 @@ def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return err
 
 
-def test_a_configuration_in_order_is_said_to_be(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_accepts_a_valid_configuration(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["check", str(config())]) == 0
     assert "is in order" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
-def test_a_calibration_of_diameters_alone_is_no_torque_to_drive_by(
+def test_a_calibration_without_torques_cannot_drive_the_loop(
     command: str, config: Write, tiny_bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
-    Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
+    Calibration.fit(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
     section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
     assert main(["check", str(config(fingertips=section))]) == 0
     assert "without torque: its calibration has diameters only" in capsys.readouterr().out
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
-    steps = {"name": "one", "drive": "right", "steps": [{"do": "wait", "wait_s": 1}]}
+    steps = {"name": "one", "torque_source": "right", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     said = mistake(capsys, command, str(config(fingertips=section, robot="ur.yaml", experiment="experiment.yaml")))
-    assert "`drive: right` has a calibration of diameters alone" in said
+    assert "`torque_source: right` has a calibration without torques" in said
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
@@ -79,7 +79,7 @@ def test_a_calibration_of_diameters_alone_is_no_torque_to_drive_by(
         ({"fingertips": {"load_cell": {"device": {"path": "eit"}}}}, ["cannot be named 'load_cell', as another part"]),
     ],
 )
-def test_a_mistake_in_a_configuration_names_file_key_and_cure(
+def test_a_configuration_mistake_names_file_key_and_cure(
     command: str, changes: dict[str, Any], parts: list[str], config: Write, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = config(**changes)
@@ -88,9 +88,9 @@ def test_a_mistake_in_a_configuration_names_file_key_and_cure(
         assert part in said
 
 
-async def test_no_fingertip_bears_the_name_of_another_part(config: Write, tmp_path: Path) -> None:
+async def test_fingertip_names_do_not_collide_with_task_names(config: Write, tmp_path: Path) -> None:
     shutil.copy("config/ur.yaml", tmp_path / "ur.yaml")
-    (tmp_path / "wait.yaml").write_text("{name: one, drive: right, steps: [{do: wait, wait_s: 1}]}")
+    (tmp_path / "wait.yaml").write_text("{name: one, torque_source: right, steps: [{do: wait, wait_s: 1}]}")
     whole = config(
         robot="ur.yaml",
         gripper={"socket": {"host": "127.0.0.1"}},
@@ -125,7 +125,7 @@ def fingertip(**changes: Any) -> dict[str, Any]:
         (fingertip(baseline_frames=0, average_frames=0), ["baseline_frames", "average_frames"]),
     ],
 )
-def test_a_mistake_in_a_fingertip_is_named(
+def test_a_fingertip_mistake_is_named(
     section: dict[str, Any], parts: list[str], config: Write, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = mistake(capsys, "check", str(config(fingertips=section)))
@@ -133,16 +133,16 @@ def test_a_mistake_in_a_fingertip_is_named(
         assert part in said
 
 
-def test_a_calibration_of_another_bank_is_refused_by_name(
+def test_a_calibration_of_another_bank_is_refused(
     config: Write, tiny_bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     import numpy as np
 
-    from shearloop.bank.estimation import Calibration
+    from shearloop.bank.eit.calibration import Calibration
 
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)
-    Calibration.from_matches("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
+    Calibration.fit("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
     section = fingertip(bank=str(tiny_bank), calibration=str(foreign))
     said = mistake(capsys, "check", str(config(fingertips=section)))
     for part in (str(foreign), "made with the bank cdcdcd", "calibrate again"):
@@ -162,14 +162,14 @@ def test_a_calibration_of_another_bank_is_refused_by_name(
         (["listen", "--connect", "here", "--timeout", "1"], "'here' is not an address"),
         (
             ["listen", "--connect", "tcp://127.0.0.1:70000", "--timeout", "0.05"],
-            "tcp://127.0.0.1:70000 ends in no port",
+            "tcp://127.0.0.1:70000 has no valid port",
         ),
         (["command", "stop", "--connect", "tcp://127.0.0.1:7762a", "--timeout", "0.05"], "a whole number up to 65535"),
-        (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "nothing was heard"),
+        (["listen", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no message came"),
         (["command", "tare", "--connect", "ipc:///tmp/nobody-speaks-here", "--timeout", "0.05"], "no daemon answered"),
     ],
 )
-def test_a_mistake_on_the_command_line_is_one_sentence(
+def test_a_command_line_mistake_is_one_sentence(
     arguments: list[str], part: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert part in mistake(capsys, *arguments)
@@ -191,7 +191,7 @@ def default_signals() -> Iterator[None]:
 
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_what_a_signal_interrupts_says_so_except_listening_which_ends_so(
+def test_an_interrupted_command_reports_it_except_listen(
     number: signal.Signals, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(*_: object) -> NoReturn:
@@ -201,12 +201,12 @@ def test_what_a_signal_interrupts_says_so_except_listening_which_ends_so(
     monkeypatch.setattr("shearloop.daemon.cli.evaluate.run", interrupted)
     assert main(["evaluate", "a.cal", "b.mcap"]) == status
     assert capsys.readouterr() == ("", "shearloop evaluate: interrupted before it was done\n")
-    monkeypatch.setattr("shearloop.daemon.messaging.subscriber.messages", interrupted)
+    monkeypatch.setattr("shearloop.daemon.messaging.client.receive_messages", interrupted)
     assert main(["listen"]) == status
     assert capsys.readouterr() == ("", "")
 
 
-def test_at_the_end_of_the_terminal_a_sentence_that_goes_nowhere_is_no_traceback(
+def test_a_closed_terminal_causes_no_traceback(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(_: object) -> NoReturn:
@@ -220,7 +220,7 @@ def test_at_the_end_of_the_terminal_a_sentence_that_goes_nowhere_is_no_traceback
 
 @pytest.mark.usefixtures("default_signals")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_in_what_compiled_code_calls_is_not_lost(
+def test_a_signal_during_a_callback_from_compiled_code_is_not_lost(
     number: signal.Signals, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """So numba calls us for each function that it loads: the command went on after a traceback."""
@@ -238,7 +238,7 @@ def test_a_signal_in_what_compiled_code_calls_is_not_lost(
 @pytest.mark.parametrize(
     ("arguments", "missing"), [([], "COMMAND"), (["chart"], "NAME, --out"), (["bank", "info"], "PATH")]
 )
-def test_what_is_left_out_is_named_in_one_sentence_too(
+def test_missing_arguments_are_named_in_one_sentence(
     arguments: list[str], missing: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as end:
@@ -248,9 +248,7 @@ def test_what_is_left_out_is_named_in_one_sentence_too(
     assert (end.value.code, *capsys.readouterr()) == (2, "", said)
 
 
-def test_a_recording_for_a_configuration_without_an_emulator_is_refused(
-    config: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_recording_option_needs_an_emulator(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
     said = mistake(capsys, "run", str(config()), "--recording", "some.mat")
     assert "has no eit-kit among its `emulators`" in said
 
@@ -265,7 +263,7 @@ def test_every_command_explains_itself(name: str, capsys: pytest.CaptureFixture[
     assert "%%" not in told
 
 
-def test_every_argument_says_what_it_is_and_not_its_default_alone() -> None:
+def test_every_argument_has_a_help_text() -> None:
     def arguments(parser: argparse.ArgumentParser) -> Iterator[str]:
         for action in parser._actions:
             if isinstance(action, argparse._SubParsersAction):
@@ -282,20 +280,21 @@ def test_help_names_all_basis_models() -> None:
     assert MODELS_IN_HELP.replace(" or ", ", ").split(", ") == list(MODELS)
 
 
-def test_an_unknown_command_is_refused_with_those_that_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_command_lists_the_known_ones(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["fly"])
     assert ended.value.code == 2
     assert "'run'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("arguments", [["--help"], *([name, "--help"] for name in COMMANDS)])
-def test_help_loads_nothing_heavy(arguments: list[str]) -> None:
+def test_help_loads_no_heavy_modules() -> None:
     heavy = ("numpy", "scipy", "pydantic", "zmq", "matplotlib", "skfem", "serial", "yaml")
     program = (
-        "import sys; from shearloop.daemon.cli import main\n"
-        f"try: main({arguments!r})\nexcept SystemExit: pass\n"
-        f"print(*[name for name in {heavy!r} if name in sys.modules], file=sys.stderr)"
+        "import sys\nfrom shearloop.daemon.cli import COMMANDS, main\n"
+        "for arguments in [[], *([name] for name in COMMANDS)]:\n"
+        "    try: main([*arguments, '--help'])\n    except SystemExit: pass\n"
+        f"    loaded = [name for name in {heavy!r} if name in sys.modules]\n"
+        "    if loaded: print(arguments, loaded, file=sys.stderr)\n"
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stderr.strip() == ""
@@ -317,18 +316,18 @@ def test_messages_are_readable() -> None:
                 "sigma": 1.5,
                 "score": 0.75,
                 "valid": True,
-                "why": "",
+                "reason": "",
             }
         )
     )
     line = message_line("eit.estimate", content)
     assert "torque +0.0500 N·m [+0.0200, +0.0800]   diameter  31.0 mm   k 3.500  sigma 1.500 cm   score 0.750" in line
     assert message_json("eit.estimate", content).startswith('{"topic": "eit.estimate", "timestamp": 0.0')
-    invalid = {**content, "valid": False, "why": "no signal"}
+    invalid = {**content, "valid": False, "reason": "no signal"}
     assert message_line("eit.estimate", invalid).endswith("no estimate: no signal")
 
 
-def test_an_emulator_or_a_recording_that_cannot_play_is_refused_before_anything_starts(
+def test_invalid_emulators_and_recordings_are_refused_before_the_start(
     config: Write, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     unknown = str(config(emulators=[{"device": "eit-kitt"}]))
@@ -349,9 +348,7 @@ def test_an_emulator_or_a_recording_that_cannot_play_is_refused_before_anything_
     assert "the recording cannot be read" in mistake(capsys, "run", known, "--recording", str(tmp_path / "none.mat"))
 
 
-def test_a_path_that_names_nothing_and_one_address_for_two_are_named(
-    config: Write, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_paths_and_shared_addresses_are_named(config: Write, capsys: pytest.CaptureFixture[str]) -> None:
     assert "`experiment` must be the path of a file, not '.'" in mistake(
         capsys, "check", str(config(experiment="", robot="ur.yaml"))
     )
@@ -360,7 +357,7 @@ def test_a_path_that_names_nothing_and_one_address_for_two_are_named(
     assert f"are both {both}" in mistake(capsys, "check", str(config(publish=both, commands=both)))
 
 
-def test_unlocking_is_waited_for_and_an_absent_daemon_is_told_at_once(
+def test_unlock_waits_and_a_missing_daemon_is_reported_at_once(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked: list[tuple[str, float]] = []
@@ -369,7 +366,7 @@ def test_unlocking_is_waited_for_and_an_absent_daemon_is_told_at_once(
         asked.append((content["command"], timeout_s))
         return {"ok": True}
 
-    monkeypatch.setattr("shearloop.daemon.messaging.request.request", answers)
+    monkeypatch.setattr("shearloop.daemon.messaging.client.send_command", answers)
     assert main(["command", "unlock"]) == 0
     assert main(["command", "unlock", "--timeout", "5"]) == 0
     assert main(["command", "stop"]) == 0

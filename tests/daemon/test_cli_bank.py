@@ -4,14 +4,15 @@ import json
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.build import RowJournal
 from shearloop.bank.eit.forward import ForwardModel
-from shearloop.bank.eit.journal import RowJournal
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.daemon.bank_config import load_bank_plans
@@ -62,18 +63,16 @@ def test_a_build_that_is_interrupted_says_so_and_the_same_command_goes_on(
     capsys.readouterr()
     out = tmp_path / "c.bank"
     build = ["bank", "build", "--config", f"{folder}/bank.yaml", "--out", str(out), "--jobs", "1"]
-    show = build_command._Progress.show
 
-    def interrupted(self, done, total):
-        show(self, done, total)
-        if done == rows_done:
-            signal.raise_signal(signal.SIGINT)
+    @contextmanager
+    def interrupted(*_):
+        yield lambda done: signal.raise_signal(signal.SIGINT) if done == rows_done else None
 
     # A test process may have been told to ignore it.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with monkeypatch.context() as patched:
-            patched.setattr(build_command._Progress, "show", interrupted)
+            patched.setattr(build_command, "progress_bar", interrupted)
             assert main(build) == 130
     finally:
         signal.signal(signal.SIGINT, before)
@@ -120,7 +119,7 @@ def test_banks_that_are_interrupted_in_a_folder_say_what_is_there(folder, tmp_pa
     monkeypatch.setattr(build_command, "_result", interrupted)
     out = tmp_path / "banks"
     assert main(["bank", "build", "--config", f"{folder}/over.yaml", "--out", str(out), "--jobs", "1"]) == 130
-    rest = f"what is finished of its banks and rows is in {out}, and the same command goes on from there"
+    rest = f"its finished banks and rows are in {out}, and the same command resumes from there"
     assert capsys.readouterr().err == f"shearloop bank: interrupted: {rest}\n"
 
 
@@ -154,7 +153,7 @@ def test_banks_over_more_parameters_lie_in_a_folder_and_a_second_build_solves_on
         plain.write_bytes(damaged)
         capsys.readouterr()
         assert main(build) == 0
-        assert f"{plain}: it cannot be used, and is built anew" in capsys.readouterr().err
+        assert f"{plain}: it cannot be used, and is built again" in capsys.readouterr().err
         assert plain.read_bytes() == (folder / "a.bank").read_bytes()
     assert main(["bank", "info", str(half)]) == 0
     assert "amplitude 0.5, offset 0, tilt_deg 0" in capsys.readouterr().out

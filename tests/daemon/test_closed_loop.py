@@ -17,7 +17,7 @@ from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.messaging.request import request
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.run_summary import RunSummary
 from shearloop.daemon.web.bridge import Bridge, DaemonAddress
 from shearloop.daemon.web.latest import LatestMessages
@@ -60,14 +60,14 @@ def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
         load_cell={"device": {"path": "load-cell"}, "rate_hz": 10.9 * SPEED},
         robot="ur.yaml",
         gripper={"socket": {"host": HOST}},
-        loop={"disagreement_nm": 0.2, "jump_nm": 0.3},
+        loop={"disagreement_nm": 0.2, "max_innovation_nm": 0.3},
     )
 
 
 def experiment(folder: Path, *steps: Mapping[str, Any]) -> str:
     path = folder / "experiment.yaml"
     begin = [{"do": "release"}, {"do": "tare"}, {"do": "grip", "width_mm": 5, "force_n": 60}]
-    content = {"name": "test", "drive": "load_cell", "tool_mm": 20, "steps": [*begin, *map(dict, steps)]}
+    content = {"name": "test", "torque_source": "load_cell", "tool_mm": 20, "steps": [*begin, *map(dict, steps)]}
     path.write_text(yaml.safe_dump(content))
     return str(path)
 
@@ -75,7 +75,9 @@ def experiment(folder: Path, *steps: Mapping[str, Any]) -> str:
 def ending_with(rig_config: Path, *steps: Mapping[str, Any]) -> Path:
     """Return a configuration whose experiment, of these steps, begins by itself and ends the daemon."""
     path, folder = rig_config.with_name("ending.yaml"), rig_config.parent
-    (folder / "own.yaml").write_text(yaml.safe_dump({"name": "own", "drive": "wrench", "steps": [*map(dict, steps)]}))
+    (folder / "own.yaml").write_text(
+        yaml.safe_dump({"name": "own", "torque_source": "wrench", "steps": [*map(dict, steps)]})
+    )
     content = yaml.safe_load(rig_config.read_text())
     path.write_text(yaml.safe_dump({**content, "experiment": "own.yaml", "stop_when_done": True}))
     return path
@@ -87,7 +89,7 @@ class Watcher:
     def __init__(self, daemon: Daemon) -> None:
         self.seen: dict[str, list[dict[str, Any]]] = {}
         self._news = asyncio.Event()
-        daemon.publisher.listen(self._take)
+        daemon.publisher.add_listener(self._take)
 
     def _take(self, topic: str, content: dict[str, Any]) -> None:
         self.seen.setdefault(topic, []).append(content)
@@ -125,7 +127,7 @@ async def running_rig(
 
             async def command(name: str, **arguments: Any) -> dict[str, Any]:
                 address = f"ipc://{run_dir}/commands"
-                return await asyncio.to_thread(request, address, {"command": name, **arguments}, DEADLINE_S)
+                return await asyncio.to_thread(send_command, address, {"command": name, **arguments}, DEADLINE_S)
 
             try:
                 async with asyncio.timeout(DEADLINE_S):
@@ -140,7 +142,7 @@ async def running_rig(
 async def started(command: Callable[..., Any], path: str) -> None:
     """Start an experiment as soon as robot and gripper are ready for it: on a busy machine they may be late."""
     reply = await command("start", experiment=path)
-    while not reply["ok"] and ("being made ready" in reply["why"] or "out of date" in reply["why"]):
+    while not reply["ok"] and ("being made ready" in reply["reason"] or "out of date" in reply["reason"]):
         reply = await command("start", experiment=path)
     assert reply["ok"], reply
 
@@ -150,7 +152,7 @@ async def test_a_tool_is_gripped_twisted_and_released(rig_config: Path, tiny_ban
     async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
         await started(command, experiment(tmp_path, twist, {"do": "release"}))
         state = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
-    assert state["phase"] == "done", state["doing"]
+    assert state["phase"] == "done", state["activity"]
     torques = [message["torque_nm"] for message in watcher.seen["load.torque"]]
     # Gel and joint in series, and what a held gel loses.
     assert max(torques) == pytest.approx(0.1 * 0.8 * 20 / 20.8, rel=0.1)
@@ -193,7 +195,7 @@ async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(
         async with http.post(f"{page}/commands/pause") as refused:
             assert refused.status == 403
         # Not whether it runs: a busy computer may hold the wrist. Nor would a pause be seen that a stop comes after.
-        assert (await command("resume")).get("why") == "no experiment is paused", "what was refused was not done"
+        assert (await command("resume")).get("reason") == "no experiment is paused", "what was refused was not done"
         async with http.post(f"{page}/stop") as reply:
             assert await reply.json() == {"ok": True, "stopped": "test"}
         told = watcher.seen["robot.state"][-1]["seq"]
@@ -202,7 +204,7 @@ async def test_a_stop_from_the_page_needs_no_token_and_the_wrist_stands_still(
         )
         later = await watcher.until("robot.state", lambda state: state["seq"] > still["seq"] + 10)
         assert later["wrist_rad"] == pytest.approx(still["wrist_rad"], abs=1e-3)
-        assert (await watcher.until("loop.state", lambda state: state["phase"] == "stopped"))["doing"]
+        assert (await watcher.until("loop.state", lambda state: state["phase"] == "stopped"))["activity"]
         async with http.post(f"{page}/stop") as again:
             assert await again.json() == {"ok": True, "stopped": ""}, "and the daemon goes on"
         await watcher.until("robot.state", lambda state: state["seq"] > later["seq"])
@@ -239,7 +241,7 @@ async def test_a_straight_move_brakes_while_it_is_paused_and_ends_where_it_was_t
 
     move = {"do": "approach", "along_tool_m": -0.05, "speed_m_per_s": 0.05}
     path = tmp_path / "move.yaml"
-    path.write_text(yaml.safe_dump({"name": "move", "drive": "wrench", "steps": [move]}))
+    path.write_text(yaml.safe_dump({"name": "move", "torque_source": "wrench", "steps": [move]}))
     async with running_rig(rig_config, tiny_bank) as (_, watcher, _fault, command):
         first = pose(watcher.seen["robot.state"][-1])
         await started(command, str(path))
@@ -252,7 +254,7 @@ async def test_a_straight_move_brakes_while_it_is_paused_and_ends_where_it_was_t
         assert np.linalg.norm(pose(later) - first) < 0.045, "and is not there yet"
         assert (await command("resume"))["ok"]
         ended = await watcher.until("loop.state", lambda state: state["phase"] in ("done", "stopped"))
-        assert ended["phase"] == "done", ended["doing"]
+        assert ended["phase"] == "done", ended["activity"]
         assert np.linalg.norm(pose(watcher.seen["robot.state"][-1]) - first) == pytest.approx(0.05, abs=2e-3)
 
 
@@ -275,13 +277,13 @@ async def test_a_daemon_that_is_ended_in_mid_experiment_tells_of_it_as_of_every_
     told: list[str] = []
     path = ending_with(rig_config, {"do": "release"}, {"do": "turn_to", "angle_rad": 3.0, "speed_rad_per_s": 0.2})
     async with running_rig(path, tiny_bank) as (daemon, watcher, _cause, _command):
-        daemon.publisher.listen(RunSummary(told.extend))
+        daemon.publisher.add_listener(RunSummary(told.extend))
         await watcher.until("robot.state", lambda state: abs(state["wrist_speed_rad_per_s"]) > 0.1)
         daemon.stop()
         await daemon.stopped()
-    why = "the daemon was told to end: the wrist is stopped, a tool that is gripped stays gripped"
+    why = "the daemon ended: the wrist is stopped, a gripped tool stays gripped"
     assert not daemon.finished
-    assert (watcher.seen["loop.state"][-1]["phase"], watcher.seen["loop.state"][-1]["doing"]) == ("stopped", why)
+    assert (watcher.seen["loop.state"][-1]["phase"], watcher.seen["loop.state"][-1]["activity"]) == ("stopped", why)
     assert any("STOPPED before its end" in line for line in told)
     assert f"  {why}" in told
     assert "the experiment has ended" in log.said
@@ -317,4 +319,4 @@ async def test_each_fault_ends_in_the_tables_response(
         fault(line)
         state = await watcher.until("loop.state", lambda state: sentence in state["reasons"])
         assert state["phase"] in ("held", "stopped")
-        assert state["speed_wanted_rad_per_s"] == 0.0
+        assert state["speed_command_rad_per_s"] == 0.0

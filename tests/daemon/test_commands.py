@@ -21,12 +21,10 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer
+from shearloop.daemon.messaging.client import receive_messages, send_command
+from shearloop.daemon.messaging.command_server import CommandRefusedError, CommandServer, RateLimit
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.messaging.rate_limit import RateLimit
-from shearloop.daemon.messaging.request import request
-from shearloop.daemon.messaging.subscriber import messages
 from shearloop.daemon.rig import Rig
 
 
@@ -48,12 +46,12 @@ class Unbound(CommandServer):
     def __init__(self) -> None:
         self._handlers = handlers()
         self._limit = RateLimit()
-        self._serving = set()
+        self._running = set()
         self.refused = Counter()
 
     async def reply(self, payload: bytes, *, t_ns: int = 0) -> dict[str, Any]:
-        ready = self.accept(b"somebody", [payload], t_ns)
-        return ready if isinstance(ready, dict) else await self.answer(*ready)
+        ready = self.check(b"somebody", [payload], t_ns)
+        return ready if isinstance(ready, dict) else await self.execute(*ready)
 
 
 async def test_each_request_gets_one_reply_with_the_reason_when_it_is_refused() -> None:
@@ -61,19 +59,19 @@ async def test_each_request_gets_one_reply_with_the_reason_when_it_is_refused() 
     assert await server.reply(encode({"command": "tare"})) == {"ok": True, "tared": ["right"]}
     assert await server.reply(encode({"command": "tare", "source": "left"})) == {
         "ok": False,
-        "why": "there is no fingertip 'left'",
+        "reason": "there is no fingertip 'left'",
     }
     assert (await server.reply(encode({"command": "jump"})))[
-        "why"
+        "reason"
     ] == "there is no command 'jump'; the commands are tare, unlock"
-    assert "not a message" in (await server.reply(b"\x92\x01\x02"))["why"]
+    assert "not a message" in (await server.reply(b"\x92\x01\x02"))["reason"]
     assert server.refused == {"tare refused": 1, "unknown command": 1, "malformed request": 1}
 
 
 @given(st.binary(max_size=200))
 def test_no_request_brings_the_server_down(payload: bytes) -> None:
     reply = asyncio.run(Unbound().reply(payload))
-    assert reply["ok"] or reply["why"]
+    assert reply["ok"] or reply["reason"]
 
 
 async def test_requests_over_a_socket_are_answered_to_both_kinds_of_client() -> None:
@@ -81,7 +79,7 @@ async def test_requests_over_a_socket_are_answered_to_both_kinds_of_client() -> 
         server = CommandServer(context, "tcp://127.0.0.1:*", handlers())
         address = server._socket.getsockopt_string(zmq.LAST_ENDPOINT)
         serving = asyncio.create_task(server.run())
-        assert (await asyncio.to_thread(request, address, {"command": "tare"}, 5.0))["tared"] == ["right"]
+        assert (await asyncio.to_thread(send_command, address, {"command": "tare"}, 5.0))["tared"] == ["right"]
         with context.socket(zmq.REQ) as client:
             client.connect(address)
             await client.send(b"\xc1 not msgpack")
@@ -93,7 +91,7 @@ async def test_requests_over_a_socket_are_answered_to_both_kinds_of_client() -> 
 
 def test_no_daemon_is_a_sentence() -> None:
     with pytest.raises(UserError, match=r"no daemon answered at ipc:///nowhere-at-all within 0.01 s; start it with"):
-        request("ipc:///nowhere-at-all", {"command": "status"}, 0.01)
+        send_command("ipc:///nowhere-at-all", {"command": "status"}, 0.01)
 
 
 def test_an_address_in_use_is_a_sentence() -> None:
@@ -108,7 +106,7 @@ def test_an_address_in_use_is_a_sentence() -> None:
 
 async def test_a_handler_that_fails_is_answered_and_leaves_the_server_standing() -> None:
     server = Unbound()
-    assert "unlock failed (ZeroDivisionError" in (await server.reply(encode({"command": "unlock"})))["why"]
+    assert "unlock failed (ZeroDivisionError" in (await server.reply(encode({"command": "unlock"})))["reason"]
     assert server.refused == {"unlock failed": 1}
     assert (await server.reply(encode({"command": "tare"})))["ok"]
 
@@ -117,7 +115,7 @@ def test_an_ipc_address_takes_neither_a_file_nor_a_living_daemons_place(tmp_path
     letter = tmp_path / "letter.txt"
     letter.write_text("dear reader")
     with zmq.Context() as context:
-        with pytest.raises(UserError, match=r"`publish: ipc://.*letter.txt is there and is no socket"):
+        with pytest.raises(UserError, match=r"`publish: ipc://.*letter.txt exists and is no socket"):
             Publisher(context, f"ipc://{letter}", Clock())
         assert letter.read_text() == "dear reader"
         first = Publisher(context, f"ipc://{tmp_path}/publish", Clock())
@@ -137,10 +135,10 @@ def test_what_is_not_a_daemons_is_a_sentence(tmp_path: Path) -> None:
     with zmq.Context() as context, context.socket(zmq.XPUB) as stranger:
         stranger.bind(f"ipc://{tmp_path}/stranger")
         for content in ([b"one frame"], [b"a", b"\xc1"], [b"a", encode({"timestamp": 1.0})], [b"1", b"2", b"3"]):
-            heard = messages(f"ipc://{tmp_path}/stranger", (), 5.0)
+            heard = receive_messages(f"ipc://{tmp_path}/stranger", (), 5.0)
             sending = threading.Thread(target=lambda sent=content: (stranger.recv(), stranger.send_multipart(sent)))
             sending.start()
-            with pytest.raises(UserError, match="is not shearloop's"):
+            with pytest.raises(UserError, match="are not shearloop's"):
                 next(heard)
             sending.join()
             stranger.recv()
@@ -170,18 +168,20 @@ async def test_no_zero_is_taken_while_an_experiment_runs() -> None:
     tared: list[str] = []
     experiment = SimpleNamespace(running=True, file=SimpleNamespace(name="hold"))
     commands = Commands(
-        rig=cast("Rig", SimpleNamespace(brain=SimpleNamespace(experiment=experiment))),
+        rig=cast("Rig", SimpleNamespace(control_loop=SimpleNamespace(experiment=experiment))),
         tares={name: partial(tared.append, name) for name in ("right", "load_cell")},
         fingertips={},
         experiment=None,
-        begin=AsyncMock(),
-        give_up_waiting=lambda: None,
+        start=AsyncMock(),
+        call_off_experiment=lambda: None,
         tasks=dict,
         stop=lambda: None,
     )
     tare = commands.handlers()["tare"]
     for request_ in ({}, {"source": "load_cell"}):
-        with pytest.raises(CommandRefusedError, match="the experiment 'hold' is running, and a new zero would change"):
+        with pytest.raises(
+            CommandRefusedError, match="the experiment 'hold' is running, and a new zero would change its"
+        ):
             await tare(request_)
     assert tared == []
     experiment.running = False

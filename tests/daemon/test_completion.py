@@ -35,7 +35,7 @@ def test_every_shell_has_its_script(capsys: pytest.CaptureFixture[str]) -> None:
         assert "doctor" in capsys.readouterr().out
 
 
-def test_where_a_file_is_meant_files_are_offered() -> None:
+def test_file_arguments_complete_file_names() -> None:
     config = next(action for action in _command("check")._actions if action.dest == "config")
     assert getattr(config, "complete", None)
 

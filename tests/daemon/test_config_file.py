@@ -91,7 +91,7 @@ def test_all_mistakes_are_reported_together_with_key_and_range(tmp_path):
         ("torque_limit_nm: 1\nwhat: 1\n", "`what` is not a known key, known are torque_limit_nm, mode, steps, spare"),
         ("torque_limit_nm: 1\nspare: {hold: 1}\n", "`spare.hold` is not a known key, did you mean `hold_s`?"),
         ("torque_limit_nm: 1\nsteps: 3\n", "`steps` should be a valid tuple (found 3)"),
-        ("1: 2\n", "the key 1 is a number where a name is expected"),
+        ("1: 2\n", "the key 1 is a number; a name is expected"),
         ("torque_limit_nm: 1\nlow: 3\n", ": low must be below high, but low is 3 and high is 1"),
     ],
 )
@@ -120,9 +120,9 @@ def test_no_content_whatever_does_anything_but_load_or_be_refused(tmp_path_facto
 @pytest.mark.parametrize(
     ("step", "said"),
     [
-        ("{do: gripp}", "`steps[0]` has the do 'gripp', which there is not, did you mean 'grip'? (allowed: approach, "),
-        ("{do: 7}", "`steps[0]` has the do '7', which there is not (allowed: approach, "),
-        ("{width_mm: 5}", "`steps[0]` lacks `do`, which says what it is"),
+        ("{do: gripp}", "`steps[0]` has the do 'gripp', which does not exist, did you mean 'grip'? (allowed: approach"),
+        ("{do: 7}", "`steps[0]` has the do '7', which does not exist (allowed: approach, "),
+        ("{width_mm: 5}", "`steps[0]` lacks `do`, its kind"),
     ],
 )
 def test_a_step_of_no_kind_is_told_in_a_sentence(step: str, said: str, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from structlog.testing import capture_logs
 
-from shearloop.daemon.cli.demonstration import Deaths, Happenings, Truth
+from shearloop.daemon.cli.demonstration import EmulatorMonitor, EventInjector, TruthFile
 from shearloop.daemon.config import EmulatorConfig
 from shearloop.daemon.config_file import load_yaml_model
 
@@ -24,31 +24,31 @@ def held(t_s: float, step: int = 7, hold: int = 1, phase: str = "running") -> di
 
 
 def test_what_befalls_the_rig_is_said_once_when_the_step_has_been_held_for_its_time() -> None:
-    rig = emulator(happenings=[{"step": 7, "held_for_s": 12, "say": "kick -0.03"}])
+    rig = emulator(events=[{"step": 7, "held_for_s": 12, "command": "kick -0.03"}])
     process = subprocess.Popen([sys.executable, "-c", "print(input())"], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    happenings = Happenings((rig,), [process])
+    events = EventInjector((rig,), [process])
     for content in (held(0, step=6), held(50, hold=0), held(60), held(71.9), held(73, phase="held")):
-        happenings("loop.state", content)
-    assert happenings.happened == []
-    happenings("loop.state", held(73))
-    happenings("loop.state", held(74))
-    assert [words for _, words in happenings.happened] == ["kick -0.03"]
+        events("loop.state", content)
+    assert events.sent == []
+    events("loop.state", held(73))
+    events("loop.state", held(74))
+    assert [command for _, command in events.sent] == ["kick -0.03"]
     out, _ = process.communicate(timeout=30)
     assert out == b"kick -0.03\n"
 
 
 def test_a_rig_that_has_ended_is_told_nothing() -> None:
-    rig = emulator(happenings=[{"step": 1, "say": "slip"}])
+    rig = emulator(events=[{"step": 1, "command": "slip"}])
     process = subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE)
     process.wait(30)
-    happenings = Happenings((rig,), [process])
-    happenings("loop.state", held(1, step=1))
-    assert happenings.happened == []
+    events = EventInjector((rig,), [process])
+    events("loop.state", held(1, step=1))
+    assert events.sent == []
     process.communicate()
 
 
 def test_a_rig_that_ends_in_this_moment_takes_nobody_along() -> None:
-    rig = emulator(happenings=[{"step": 1, "say": "slip"}])
+    rig = emulator(events=[{"step": 1, "command": "slip"}])
     process = subprocess.Popen(
         [sys.executable, "-c", "import os, signal; os.close(0); os.close(1); signal.pause()"],
         stdin=subprocess.PIPE,
@@ -56,9 +56,9 @@ def test_a_rig_that_ends_in_this_moment_takes_nobody_along() -> None:
     )
     assert process.stdout is not None
     assert process.stdout.read() == b"", "its input is closed, and it lives"
-    happenings = Happenings((rig,), [process])
-    happenings("loop.state", held(1, step=1))
-    assert happenings.happened == []
+    events = EventInjector((rig,), [process])
+    events("loop.state", held(1, step=1))
+    assert events.sent == []
     process.kill()
     with contextlib.suppress(BrokenPipeError):
         process.communicate()
@@ -68,10 +68,10 @@ def test_an_emulated_device_that_dies_is_told_once() -> None:
     with capture_logs() as told:
         living = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
         dead = subprocess.Popen([sys.executable, "-c", "raise SystemExit(3)"], stdin=subprocess.PIPE)
-        deaths = Deaths((emulator(device="eit-kit"), emulator()), [living, dead])
+        monitor = EmulatorMonitor((emulator(device="eit-kit"), emulator()), [living, dead])
         dead.wait(30)
         for topic in ("loop.state", "health", "health"):
-            deaths(topic, {})
+            monitor(topic, {})
         living.communicate(b"\n", timeout=30)
         dead.communicate()
     ((device, status),) = [(entry["device"], entry["status"]) for entry in told]
@@ -79,7 +79,7 @@ def test_an_emulated_device_that_dies_is_told_once() -> None:
 
 
 def test_the_truth_is_read_up_to_its_last_whole_line() -> None:
-    truth = Truth((emulator(),))
+    truth = TruthFile((emulator(),))
     try:
         assert truth.path is not None
         assert truth.arguments == ("--truth", str(truth.path))
@@ -95,14 +95,14 @@ def test_the_truth_is_read_up_to_its_last_whole_line() -> None:
 
 
 def test_without_an_emulated_rig_nobody_knows_the_truth() -> None:
-    truth = Truth((emulator(device="eit-kit"), emulator(arguments=["--truth", "own.jsonl"])))
+    truth = TruthFile((emulator(device="eit-kit"), emulator(arguments=["--truth", "own.jsonl"])))
     assert truth.arguments == ()
     assert truth.torques() is None
     truth.close()
 
 
-def test_a_happening_of_two_lines_is_refused(tmp_path: Path) -> None:
+def test_an_event_of_two_lines_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "emulator.yaml"
-    path.write_text('device: rig\nhappenings: [{step: 1, say: "slip\\nkick 3"}]\n')
-    with pytest.raises(Exception, match="say"):
+    path.write_text('device: rig\nevents: [{step: 1, command: "slip\\nkick 3"}]\n')
+    with pytest.raises(Exception, match="command"):
         load_yaml_model(path, EmulatorConfig)

@@ -14,9 +14,8 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.safety import TABLE
 from shearloop.daemon.docgen import ROOT, pages
 from shearloop.daemon.messaging.addresses import PUBLISH_ADDRESS
-from shearloop.daemon.messaging.messages import EitEstimate, EitFrame
+from shearloop.daemon.messaging.messages import TOPICS, EitEstimate, EitFrame
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.messaging.topics import TOPICS
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.sample_messages import sample
 
@@ -75,7 +74,7 @@ async def test_the_python_subscriber_prints_estimates(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
-def test_a_subscriber_asks_for_topics_and_keys_that_there_are(name: str) -> None:
+def test_subscribers_use_existing_topics_and_keys(name: str) -> None:
     """MATLAB is on no machine of ours, so what its subscriber reads is held to the schema of the messages."""
     program = (ROOT / "docs/examples" / name).read_text()
     topics = set(re.findall(r'"((?:eit|load|skin|robot|gripper|loop)\.[a-z]*)"', program))
@@ -90,7 +89,7 @@ def test_a_subscriber_asks_for_topics_and_keys_that_there_are(name: str) -> None
 
 
 @pytest.mark.parametrize("name", ["subscriber.py", "subscriber.cpp", "subscriber.m"])
-def test_a_subscriber_is_about_a_dozen_lines(name: str) -> None:
+def test_subscribers_are_short(name: str) -> None:
     lines = (ROOT / "docs/examples" / name).read_text().splitlines()
     code = [line for line in lines if line.strip() and not line.lstrip().startswith(("//", "%", '"""', "#", "import"))]
     assert len(code) <= 15

@@ -36,7 +36,7 @@ def test_commands_and_options_exist(page: Path) -> None:
                 assert word.rstrip(",.").split("=")[0] in known, f"{page.name}: shearloop {text}"
 
 
-def test_what_the_readme_records_is_ignored_by_git() -> None:
+def test_the_readmes_recordings_are_ignored_by_git() -> None:
     folders = {Path(one).parts[0] for one in re.findall(r"--record (\S+)", (ROOT / "README.md").read_text())}
     assert folders
     assert {f"/{folder}/" for folder in folders} <= set((ROOT / ".gitignore").read_text().splitlines())

@@ -22,9 +22,9 @@ from shearloop.daemon.doctor.checks import (
     from_error,
 )
 from shearloop.daemon.doctor.devices import check_channels, check_rate, check_task
+from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.keys import make_key_pair
-from shearloop.daemon.messaging.subscriber import messages
-from shearloop.daemon.ports import PortThere
+from shearloop.daemon.serial_ports import SerialPortInfo
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
@@ -56,7 +56,7 @@ async def examined(path: Path, seconds: float) -> dict[str, Finding]:
 
 
 @pytest.mark.real_time
-async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, tiny_bank: Path) -> None:
+async def test_doctor_checks_a_rig_with_and_without_its_daemon(rig_config: Path, tiny_bank: Path) -> None:
     found = await examined(rig_config, 0.1)
     assert "There is no serial port" in found["port of right"].found
     assert "switched on" in found["robot"].next_step
@@ -85,7 +85,7 @@ async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, t
         assert "remote control, top right" in found["remote control"].next_step
         rig.stdin.write(b"normal\n")
         async with shearloop("run", str(rig_config)):
-            published = messages(f"ipc://{rig_config.parent}/publish", ["robot.state"], DEADLINE_S)
+            published = receive_messages(f"ipc://{rig_config.parent}/publish", ["robot.state"], DEADLINE_S)
             await asyncio.to_thread(next, published)
             published.close()
             found = await examined(rig_config, 2.0)
@@ -97,7 +97,7 @@ async def test_a_rig_is_examined_with_and_without_its_daemon(rig_config: Path, t
             assert found["rate of load.torque load_cell"].state == "note"
 
 
-def test_a_configuration_that_is_wrong_ends_the_examination(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_stops_at_an_invalid_configuration(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", str(tmp_path / "no.yaml")]) == 1
     said = capsys.readouterr().out
     assert "WRONG configuration" in said
@@ -130,7 +130,7 @@ def test_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ({"alive": True, "connected": True, "errors": {"nan": 2}}, "note", "2 × nan"),
     ],
 )
-def test_a_task_is_judged_by_what_it_counts(facts: dict[str, Any], state: str, part: str) -> None:
+def test_tasks_are_judged_by_their_counters(facts: dict[str, Any], state: str, part: str) -> None:
     finding = check_task("right", facts)
     assert finding.state == state
     assert part in finding.found
@@ -161,7 +161,7 @@ def test_a_secret_key_that_others_can_read_is_reported(tmp_path: Path) -> None:
     _, secret = make_key_pair(tmp_path, "server")
     (tmp_path / "clients").mkdir()
     curve = CurveConfig(server_key=secret, clients=tmp_path / "clients")
-    assert "nobody could connect" in check_keys(curve, {}).found
+    assert "no client could connect" in check_keys(curve, {}).found
     make_key_pair(tmp_path / "clients", "ada")
     assert check_keys(curve, {"publish": "tcp://0.0.0.0:1"}).found == "ada may connect to tcp://0.0.0.0:1"
     assert check_keys(curve, {}).state == "note"
@@ -186,11 +186,11 @@ def port(**changes: Any) -> Any:
     return SimpleNamespace(**{**fields, **changes})
 
 
-def test_ports_are_listed_with_what_a_configuration_names_them_by(
+def test_ports_are_listed_with_their_configuration_entry(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there: list[Any] = []
-    monkeypatch.setattr("shearloop.daemon.ports.sorted", lambda ports: ports, raising=False)
+    monkeypatch.setattr("shearloop.daemon.serial_ports.sorted", lambda ports: ports, raising=False)
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: there)
     assert main(["ports"]) == 0
     assert "there is no serial port" in capsys.readouterr().out
@@ -198,7 +198,7 @@ def test_ports_are_listed_with_what_a_configuration_names_them_by(
     assert main(["ports", "--json"]) == 0
     first, second = json.loads(capsys.readouterr().out)
     assert first["named_by"] == '{serial_number: "12345670"}'
-    assert (first["likely"], first["usb"], first["trouble"]) == ("EIT-kit (Teensy)", "16c0:0483", "")
+    assert (first["likely"], first["usb"], first["error"]) == ("EIT-kit (Teensy)", "16c0:0483", "")
     assert second["named_by"] == "{path: /dev/null}"
     there[:] = [port(device="/dev/gone")]
     assert main(["ports"]) == 0
@@ -206,14 +206,14 @@ def test_ports_are_listed_with_what_a_configuration_names_them_by(
 
 
 def test_each_denied_port_is_reported_with_its_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    def port(path: str, trouble: str) -> PortThere:
-        return PortThere(path, "1", "", "", "", "", trouble)
+    def port(path: str, trouble: str) -> SerialPortInfo:
+        return SerialPortInfo(path, "1", "", "", "", "", trouble)
 
     there = [
         port("/dev/ttyACM0", ""),
         port("/dev/ttyUSB0", "another program holds it"),
         port("/dev/ttyUSB1", "no right"),
     ]
-    monkeypatch.setattr("shearloop.daemon.doctor.checks.ports_there", lambda: there)
+    monkeypatch.setattr("shearloop.daemon.doctor.checks.list_serial_ports", lambda: there)
     found = check_ports()
     assert (found.state, found.means) == ("note", "/dev/ttyUSB0: another program holds it; /dev/ttyUSB1: no right")

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from shearloop.daemon.cli import EXIT_USAGE, main
-from shearloop.drivers.eit_format import ADC_STEP_V
-from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame
 
 # Guards against a test that hangs; none of them waits for so long.
 DEADLINE_S = 60
@@ -75,9 +74,9 @@ async def test_a_recording_at_a_hundred_times_its_pace_arrives_whole_and_in_orde
         frames = await take(kit, 832)
     assert [frame.seq for frame in frames] == list(range(832))
     np.testing.assert_array_equal([frame.raw for frame in frames], expected)
-    facts = kit.facts()
-    assert (facts["frames"], facts["errors"], facts["openings"]) == (832, {}, 1)
-    assert facts["first_partials"] == 0
+    facts = kit.diagnostics()
+    assert (facts["frames"], facts["errors"], facts["connections"]) == (832, {}, 1)
+    assert facts["partial_lines"] == 0
     # The pace is checked loosely: the machine may be busy, but the board does not hurry.
     spread_s = (frames[-1].t_arrival_ns - frames[0].t_arrival_ns) / 1e9
     assert spread_s > 0.9 * 831 * PERIOD_S / 100
@@ -119,9 +118,9 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
         assert await process.wait() == 0, "it ends when its standard input does"
         assert process.stderr is not None
         assert b"there is no fault 'what'" in await process.stderr.read()
-    facts = kit.facts()
+    facts = kit.diagnostics()
     assert facts["errors"] == {"wrong_count": 1, "nan": 1}
-    assert facts["openings"] == 2
+    assert facts["connections"] == 2
     sent = [line.tolist() for line in lines]
     places = [sent.index(frame.raw.tolist()) for frame in frames]
     assert places[:4] == [0, 2, 4, 5]
@@ -188,13 +187,13 @@ def test_a_mistake_is_one_sentence_and_status_two(
 
 
 def test_help_names_every_fault(capsys: pytest.CaptureFixture[str]) -> None:
-    from shearloop.drivers.emulators.eit_kit import FaultKind
+    from shearloop.drivers.emulators.boards import EitKitBoard
 
     with pytest.raises(SystemExit) as ended:
         main(["emulate", "eit-kit", "--help"])
     assert ended.value.code == 0
     told = capsys.readouterr().out
-    assert [kind.value for kind in FaultKind if kind.value not in told] == []
+    assert [kind.value for kind in EitKitBoard.faults if kind.value not in told] == []
 
 
 def test_the_command_runs_without_a_terminal(tmp_path: Path) -> None:

@@ -9,16 +9,12 @@ import numpy as np
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.cli.emulated.skin_push import PushedSkin
+from shearloop.daemon.cli.emulate.skin import PushedSkin
+from shearloop.daemon.synthetic_skin import SyntheticSkin
+from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
-from shearloop.drivers.serial_port import Link, SerialLink
-from shearloop.drivers.shear_skin.adc_board import AdcBoard
-from shearloop.drivers.shear_skin.daq import Daq
-from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
-from shearloop.drivers.shear_skin.scanner import ScpiScanner
-from shearloop.drivers.shear_skin.skin import ShearSkin
-from shearloop.drivers.shear_skin.source import Keithley6430
-from shearloop.drivers.tcp_port import TcpLink
+from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 SPEED = 20
@@ -123,8 +119,8 @@ def test_mistakes_on_the_command_line_are_sentences(
 
 
 def test_on_the_rig_the_robot_s_motion_shears_the_skin(tmp_path: Path) -> None:
-    pushed = PushedSkin()
-    skin = RigSkin(lambda nm, gripped: pushed.gripped(nm, gripped=gripped, lever_m=0.02), pushed.resistances_ohm)
+    pushed = PushedSkin(SyntheticSkin())
+    skin = RigSkin(lambda nm, gripped: pushed.follow_grip(nm, gripped=gripped, lever_m=0.02), pushed.resistances_ohm)
     rig = EmulatedRig(RigSettings(run_dir=tmp_path, skin=True), lambda *_: np.zeros(1024), skin=skin)
     robot, gripper = rig.controller.robot, rig.scene.gripper
 

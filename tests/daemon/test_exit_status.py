@@ -12,15 +12,14 @@ import zmq.asyncio
 
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
+from shearloop.daemon.control.configured_experiment import ConfiguredExperiment, CrashMarker
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from shearloop.daemon.crash_marker import CrashMarker
 from shearloop.daemon.errors import UserError
 from tests.daemon.conftest import Log, deadline, shearloop
 from tests.emulator_process import own_address
 
 Write = Callable[..., Path]
-LEFT_TO_OPERATOR = "it begins by `shearloop command start` alone"
+LEFT_TO_OPERATOR = "it starts by `shearloop command start` only"
 
 
 @pytest.fixture
@@ -28,7 +27,7 @@ def waiting_config(config: Write, tmp_path: Path) -> Path:
     """Write a configuration whose experiment waits for a robot that there is none of."""
     robot = yaml.safe_load(Path("config/ur.yaml").read_text())
     (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": own_address(6)}))
-    steps = {"name": "test", "drive": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}
+    steps = {"name": "test", "torque_source": "wrench", "steps": [{"do": "wait", "wait_s": 1}]}
     (tmp_path / "experiment.yaml").write_text(yaml.safe_dump(steps))
     return config(robot="ur.yaml", experiment="experiment.yaml", stop_when_done=True)
 
@@ -38,7 +37,7 @@ def waiting_config(config: Write, tmp_path: Path) -> Path:
     ("number", "status"),
     [(signal.SIGINT, 3), (signal.SIGTERM, 0), (signal.SIGHUP, 0)],
 )
-async def test_an_experiment_that_is_not_done_is_seen_in_the_exit_status(
+async def test_an_unfinished_experiment_sets_the_exit_status(
     number: signal.Signals, status: int, waiting_config: Path
 ) -> None:
     async with shearloop("run", str(waiting_config)) as daemon:
@@ -62,10 +61,10 @@ async def ended(path: Path, log: Log, *, once: str) -> Daemon:
 
 
 async def done_experiment() -> SimpleNamespace:
-    return SimpleNamespace(phase=ExperimentPhase.DONE, why="")
+    return SimpleNamespace(phase=ExperimentPhase.DONE, stop_reason="")
 
 
-async def test_after_a_crash_no_experiment_begins_by_itself(
+async def test_no_experiment_starts_automatically_after_a_crash(
     waiting_config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, log: Log
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
@@ -73,12 +72,12 @@ async def test_after_a_crash_no_experiment_begins_by_itself(
     assert not crashed.left_behind
     crashed.set()
     assert not (await ended(waiting_config, log, once=LEFT_TO_OPERATOR)).finished
-    assert any("died after it had begun an experiment" in one for one in log.said)
+    assert any("crashed after it had started an experiment" in one for one in log.said)
     assert not CrashMarker().left_behind, "this one ended in good order"
 
 
 @pytest.mark.parametrize(("own", "finished"), [(True, True), (False, False)])
-async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment_that_waited(
+async def test_a_manual_start_cancels_the_waiting_experiment(
     own: bool, finished: bool, waiting_config: Path, tmp_path: Path, log: Log
 ) -> None:
     """Neither by the same one again, nor by the configured one after another."""
@@ -112,7 +111,7 @@ async def test_what_an_operator_starts_by_hand_is_not_followed_by_the_experiment
 
 
 @pytest.mark.parametrize("crashed", [False, True], ids=["called off", "after a crash"])
-async def test_an_experiment_that_is_begun_by_hand_after_all_is_seen_to_its_end(
+async def test_a_manually_started_experiment_is_followed_to_its_end(
     crashed: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
@@ -121,29 +120,29 @@ async def test_an_experiment_that_is_begun_by_hand_after_all_is_seen_to_its_end(
     path = tmp_path / "experiment.yaml"
 
     async def not_yet(_path: Path) -> str | None:
-        experiment.give_up()
+        experiment.call_off()
         return "the gripper is not ready"
 
     experiment = ConfiguredExperiment(path, not_yet, done_experiment)  # type: ignore[arg-type]
     async with deadline("the experiment was not seen to its end"), asyncio.TaskGroup() as group:
         await experiment.run()
         assert experiment.left_to_operator
-        running = group.create_task(experiment.begun_and_ended())
-        experiment.has_begun(tmp_path / "another.yaml")
+        running = group.create_task(experiment.wait_for_end())
+        experiment.on_begun(tmp_path / "another.yaml")
         await asyncio.sleep(0)
         assert not running.done()
-        experiment.has_begun(path)
+        experiment.on_begun(path)
     assert experiment.done
 
 
 @pytest.mark.parametrize("by", ["stop", "another"])
-async def test_what_was_called_off_stays_so_when_its_task_dies(by: str, tmp_path: Path) -> None:
+async def test_a_cancelled_experiment_stays_cancelled_after_a_crash_of_its_task(by: str, tmp_path: Path) -> None:
     """An experiment file may be spoilt when it is to begin, and mended after somebody has said stop."""
     begun = []
 
     async def begin(path: Path) -> str | None:
         if begun:
-            experiment.has_begun(path)
+            experiment.on_begun(path)
             return None
         begun.append(path)
         raise UserError("the file is none")
@@ -152,15 +151,15 @@ async def test_what_was_called_off_stays_so_when_its_task_dies(by: str, tmp_path
     with pytest.raises(UserError):
         await experiment.run()
     if by == "stop":
-        assert experiment.give_up() == experiment.path
+        assert experiment.call_off() == experiment.path
     else:
-        experiment.has_begun(tmp_path / "another.yaml")
+        experiment.on_begun(tmp_path / "another.yaml")
     await experiment.run()
     assert experiment.left_to_operator
     assert not experiment.begun
 
 
-def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_crash_marker_without_a_service_manager(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
     mark = CrashMarker()
     mark.set()
@@ -168,6 +167,6 @@ def test_without_a_service_manager_nothing_is_marked(monkeypatch: pytest.MonkeyP
     assert not CrashMarker().left_behind
 
 
-def test_a_mark_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failing_crash_marker_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     CrashMarker({"RUNTIME_DIRECTORY": str(tmp_path / "nowhere")}).set()
-    assert "there is no mark of this one" in capsys.readouterr().out
+    assert "cannot write the crash marker" in capsys.readouterr().out

@@ -16,9 +16,15 @@ import zmq.asyncio
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.health import resident_memory_mb
-from shearloop.daemon.messaging.command_server import MOST_AT_ONCE
+from shearloop.daemon.messaging.command_server import (
+    CLIENT_BURST,
+    CLIENT_PER_S,
+    MAX_CONCURRENT,
+    TOTAL_BURST,
+    TOTAL_PER_S,
+    RateLimit,
+)
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.messaging.rate_limit import ALL_BURST, ALL_PER_S, PER_CLIENT_BURST, PER_CLIENT_PER_S, RateLimit
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import CommandReply
 
@@ -116,7 +122,7 @@ async def test_a_flood_of_malformed_frames_and_requests(
 
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(path), context)
-        daemon.publisher.listen(count)
+        daemon.publisher.add_listener(count)
         running = asyncio.create_task(daemon.run())
         try:
             async with asyncio.timeout(DEADLINE_S):
@@ -127,7 +133,7 @@ async def test_a_flood_of_malformed_frames_and_requests(
                     asyncio.to_thread(exchange, address, malformed_requests(REQUESTS)),
                     asyncio.to_thread(write_all, board, malformed_frames(FRAMES)),
                 )
-                while (refused := sum(daemon._fingertips["right"].facts()["errors"].values())) < FRAMES - 1:
+                while (refused := sum(daemon._fingertips["right"].diagnostics()["errors"].values())) < FRAMES - 1:
                     told.clear()
                     await told.wait()
             assert replies == {False: REQUESTS}, "each is answered, and none is carried out"
@@ -137,11 +143,11 @@ async def test_a_flood_of_malformed_frames_and_requests(
             assert published["eit.estimate"] == published["eit.frame"] == 0
             assert arm.told == [], "nothing was asked of the robot"
             assert daemon._rig is not None
-            assert daemon._rig.brain.experiment is None
+            assert daemon._rig.control_loop.experiment is None
             assert not daemon.supervisor.dead
             assert all(record.restarts == 0 for record in daemon.supervisor.records.values())
             assert resident_memory_mb() - before_mb < MOST_GROWTH_MB
-            assert len(asyncio.all_tasks()) <= tasks + MOST_AT_ONCE
+            assert len(asyncio.all_tasks()) <= tasks + MAX_CONCURRENT
             status = await asyncio.to_thread(exchange, address, iter([[encode({"command": "stop"})]]))
             assert status == {True: 1}, "stop is heard in the middle of it all"
             await daemon.stopped()
@@ -184,14 +190,14 @@ def write_all(board: int, lines: Iterator[bytes]) -> None:
 
 def test_the_limit_is_a_clients_own_and_lets_go_again() -> None:
     limit = RateLimit()
-    allowed = [limit.allows(b"loud", 0) for _ in range(1000)]
-    assert sum(allowed) == PER_CLIENT_BURST
-    assert limit.allows(b"quiet", 0)
-    assert sum(limit.allows(b"loud", 10**9) for _ in range(1000)) == PER_CLIENT_PER_S
+    allowed = [limit.allow(b"loud", 0) for _ in range(1000)]
+    assert sum(allowed) == CLIENT_BURST
+    assert limit.allow(b"quiet", 0)
+    assert sum(limit.allow(b"loud", 10**9) for _ in range(1000)) == CLIENT_PER_S
 
 
 def test_many_clients_have_no_more_than_one_limit_together() -> None:
     limit = RateLimit()
-    allowed = sum(limit.allows(b"%d" % number, number * 1000) for number in range(100_000))
-    assert allowed <= ALL_BURST + 0.1 * ALL_PER_S + 1
-    assert len(limit._each) <= 256
+    allowed = sum(limit.allow(b"%d" % number, number * 1000) for number in range(100_000))
+    assert allowed <= TOTAL_BURST + 0.1 * TOTAL_PER_S + 1
+    assert len(limit._clients) <= 256

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.bank.eit.gaussian import TWO_SIDED_95
+from shearloop.bank.eit.polynomial import TWO_SIDED_95
 from shearloop.daemon.control import gripper_task
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.gripper_task import GripperTask
@@ -78,7 +78,7 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
             assert not rig.model.gto
             assert felt[-1].uncertain
             assert not felt[-1].holding
-        assert rig.driver.facts()["openings"] == 1
+        assert rig.driver.diagnostics()["openings"] == 1
         read.cancel()
 
 

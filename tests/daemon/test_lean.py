@@ -9,30 +9,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.daemon.control.actions import along_tool
+from shearloop.daemon.control.device_commands import along_tool
 
 # Each costs tens of megabytes and tenths of a second, and none is needed to run.
 HEAVY = ("scipy.stats", "scipy.optimize", "scipy.spatial", "scipy.interpolate", "skfem", "numba", "matplotlib")
 
 
-def test_the_daemon_starts_without_what_only_other_commands_need() -> None:
+def test_the_daemon_imports_no_heavy_modules() -> None:
     says = f"import sys, shearloop.daemon.app; print([name for name in {HEAVY} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"
 
 
-def test_help_loads_neither_numpy_nor_pydantic() -> None:
-    says = (
-        "import sys\nfrom shearloop.daemon.cli import main\n"
-        "try:\n    main(['--help'])\nexcept SystemExit:\n    pass\n"
-        "print('loaded:', [name for name in ('numpy', 'pydantic', 'zmq') if name in sys.modules])"
-    )
-    found = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
-    assert found.stdout.endswith("loaded: []\n")
-
-
 @given(st.lists(st.floats(-7, 7), min_size=3, max_size=3), st.floats(-1, 1))
-def test_along_the_tool_is_along_the_third_axis_of_its_rotation(turned: list[float], distance_m: float) -> None:
+def test_along_tool_moves_along_the_third_axis(turned: list[float], distance_m: float) -> None:
     found = along_tool((0.1, -0.2, 0.3, *turned), distance_m)
     axis = Rotation.from_rotvec(turned).as_matrix()[:, 2]
     assert found[:3] == pytest.approx(np.array([0.1, -0.2, 0.3]) + distance_m * axis, abs=1e-12)

@@ -6,8 +6,8 @@ import pytest
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import LoadTorque
-from shearloop.daemon.sensing.load_cell_task import ZERO_DEADLINE_S, ZERO_SAMPLES, LoadCellTask
-from shearloop.drivers.hx711 import LoadSample
+from shearloop.daemon.sensing.load_cell_task import ZERO_SAMPLES, ZERO_TIMEOUT_S, LoadCellTask
+from shearloop.drivers.load_cell import LoadSample
 
 
 class Board:
@@ -27,7 +27,7 @@ class Board:
     def tare(self, raw_at_rest: float) -> None:
         self.tares.append(raw_at_rest)
 
-    def facts(self) -> dict[str, bool | str]:
+    def diagnostics(self) -> dict[str, bool | str]:
         return {"connected": True, "last_loss": ""}
 
     async def send(self, raw: float, count: int = ZERO_SAMPLES, *, saturated: bool = False) -> None:
@@ -87,7 +87,7 @@ async def test_whoever_waits_for_a_zero_is_told_though_another_asks_meanwhile() 
 
 async def test_a_zero_that_cannot_be_taken_is_given_up_with_the_reason() -> None:
     async with reading() as (task, board):
-        task._zero_within_s = 0.05
+        task._timeout_s = 0.05
         zero = await asked(task)
         await board.send(8388607.0, saturated=True)
         why = await zero
@@ -111,7 +111,7 @@ async def test_a_slow_board_has_the_time_that_its_readings_take() -> None:
             board.sent.put_nowait(LoadSample(3.0, 0.1, now_ns + number * 10**9, now_ns + number * 10**9, number))
         await board.sent.join()
         assert board.tares == [3.0]
-        assert task.facts()["trouble"] == ""
+        assert task.diagnostics()["error"] == ""
 
 
 async def test_readings_that_know_of_the_load_before_are_not_of_the_zero() -> None:
@@ -133,15 +133,15 @@ async def test_a_zero_that_the_operator_asked_for_is_not_taken_at_the_load_of_a_
     async with reading() as (task, board):
         task.tare()
         await board.send(8388607.0, saturated=True)
-        later_ns = Clock().now_ns() + round((ZERO_DEADLINE_S + 1.0) * 1e9)
+        later_ns = Clock().now_ns() + round((ZERO_TIMEOUT_S + 1.0) * 1e9)
         for seq in range(2 * ZERO_SAMPLES):
             board.sent.put_nowait(LoadSample(9.0, 0.1, later_ns + seq, later_ns + seq, seq))
         await board.sent.join()
         assert board.tares == []
-        assert "was not taken within 15 s" in str(task.facts()["trouble"])
+        assert "was not taken within 15 s" in str(task.diagnostics()["error"])
         task._clock = Later()
         task.tare()
-        assert task.facts()["trouble"] == ""
+        assert task.diagnostics()["error"] == ""
         later_ns = task._clock.now_ns() + 10**9
         for seq in range(ZERO_SAMPLES):
             board.sent.put_nowait(LoadSample(3.0, 0.1, later_ns + seq, later_ns + seq, seq))
@@ -160,5 +160,5 @@ async def test_a_reading_that_is_not_to_be_believed_says_so_to_whoever_listens(f
         await board.send(5.0, 1)
     spoilt, good = published.messages
     assert not spoilt.valid
-    assert why in spoilt.why
-    assert (good.valid, good.why) == (True, "")
+    assert why in spoilt.reason
+    assert (good.valid, good.reason) == (True, "")

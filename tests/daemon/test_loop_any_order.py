@@ -47,7 +47,7 @@ class Story:
             self.look()
 
     def look(self) -> None:
-        experiment, verdict = self.cell.brain.experiment, self.cell.brain.status.decision
+        experiment, verdict = self.cell.control_loop.experiment, self.cell.control_loop.status.decision
         runs = (
             experiment is not None and experiment.phase is ExperimentPhase.RUNNING and verdict.response is Response.NOTE
         )
@@ -65,23 +65,23 @@ class Story:
             await self.go(1)
 
     async def start(self, *steps: dict[str, Any]) -> None:
-        file = ExperimentFile.model_validate({"name": "any", "drive": WRENCH, "steps": list(steps)})
-        await self.within(self.cell.loop.start(file), 100)
+        file = ExperimentFile.model_validate({"name": "any", "torque_source": WRENCH, "steps": list(steps)})
+        await self.within(self.cell.runner.start(file), 100)
 
     async def mend(self) -> None:
         self.arm.be(age_ns=0, wrench=(0.0,) * 6, safety_mode=1)
         self.arm.stoppable, self.cell.died = True, {}
         await self.go(5)
-        await self.within(self.cell.loop.unlock(), 300)
+        await self.within(self.cell.runner.unlock(), 300)
 
     def tick_dies(self) -> None:
-        tick = self.cell.brain.tick
+        tick = self.cell.control_loop.tick
 
         def once(_t_ns: int) -> Any:
-            self.cell.brain.tick = tick  # type: ignore[method-assign]
+            self.cell.control_loop.tick = tick  # type: ignore[method-assign]
             raise ZeroDivisionError("a tick went wrong")
 
-        self.cell.brain.tick = once  # type: ignore[method-assign]
+        self.cell.control_loop.tick = once  # type: ignore[method-assign]
 
     def protective_stop(self) -> None:
         if self.arm.reading.safety_mode == 1:
@@ -95,12 +95,12 @@ class Story:
 
     def beyond(self) -> None:
         now_ns = self.cell.robot.flight.now_ns
-        self.cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        self.cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
 
     def process_dies(self) -> None:
         self.cell.robot.die(50)
         self.arm.be(moving_linearly=False)
-        self.cell.loop.decide_now()
+        self.cell.runner.decide_now()
 
     def unread(self) -> None:
         for _ in range(40):
@@ -114,9 +114,9 @@ HAPPENINGS: dict[str, Callable[[Story], Any]] = {
     "mend": lambda story: story.mend(),
     "wait": lambda story: story.go(40),
     "wait long": lambda story: story.go(90),
-    "pause": lambda story: story.cell.brain.pause(),
-    "resume": lambda story: story.cell.brain.resume(),
-    "stop": lambda story: story.cell.brain.stop("the operator said stop"),
+    "pause": lambda story: story.cell.control_loop.pause(),
+    "resume": lambda story: story.cell.control_loop.resume(),
+    "stop": lambda story: story.cell.control_loop.stop("the operator said stop"),
     "protective stop": lambda story: story.protective_stop(),
     "resumed at the pendant": lambda story: story.resumed(),
     "program ends": lambda story: story.arm.end_program(),

@@ -15,7 +15,7 @@ async def test_a_stop_in_the_middle_of_a_grip_stops_the_fingers_once() -> None:
         await cell.start(GRIP)
         await cell.cycles(10)
         assert cell.gripper.asked == ["grip"]
-        cell.brain.stop("the operator said stop")
+        cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "halt"]
 
@@ -31,9 +31,9 @@ async def test_a_grip_that_has_failed_stops_the_fingers_once(answer: str | Excep
         cell.gripper.answers = ""
         await cell.start(GRIP, {"do": "wait", "wait_s": 60})
         await cell.cycles(20)
-        cell.brain.stop("the operator said stop")
+        cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
-        await cell.loop.released()
+        await cell.runner.released()
         assert cell.gripper.asked == ["grip", "halt", "grip"]
 
 
@@ -41,7 +41,7 @@ async def test_a_stop_after_a_grip_leaves_the_fingers_alone() -> None:
     async with driven() as cell:
         await cell.start(GRIP, {"do": "wait", "wait_s": 60})
         await cell.cycles(50)
-        cell.brain.stop("the operator said stop")
+        cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip"]
 
@@ -52,7 +52,7 @@ async def test_a_stop_that_lets_the_tool_go_in_the_middle_of_a_grip_opens_the_fi
         await cell.start(GRIP)
         await cell.cycles(10)
         now_ns = cell.robot.flight.now_ns
-        cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.cycles(20)
         assert cell.gripper.asked == ["grip", "grip"], "the second one wide open"
 
@@ -63,7 +63,7 @@ async def test_a_loop_that_dies_in_the_middle_of_a_grip_stops_the_fingers(monkey
         await cell.start(GRIP)
         await cell.cycles(10)
 
-        monkeypatch.setattr(cell.brain, "tick", no_tick)
+        monkeypatch.setattr(cell.control_loop, "tick", no_tick)
         await cell.cycles(2)
         assert cell.task is not None
         with pytest.raises(ZeroDivisionError):
@@ -76,7 +76,7 @@ async def test_a_daemon_that_ends_in_the_middle_of_a_grip_stops_the_fingers_firs
         cell.gripper.there.clear()
         await cell.start(GRIP)
         await cell.cycles(10)
-        await cell.loop.released()
+        await cell.runner.released()
         assert cell.gripper.asked == ["grip", "halt"]
 
 
@@ -90,7 +90,7 @@ async def test_fingers_that_could_not_be_stopped_are_told_of(monkeypatch: pytest
         cell.gripper.there.clear()
         await cell.start(GRIP)
         await cell.cycles(10)
-        cell.brain.stop("the operator said stop")
+        cell.control_loop.stop("the operator said stop")
         await cell.cycles(20)
         reasons = [one.reasons for one in cell.published.messages if one.topic == "loop.state"]
-        assert any("the fingers were told to stop and did not: the gripper does not answer" in one for one in reasons)
+        assert any("the fingers did not stop: the gripper does not answer" in one for one in reasons)

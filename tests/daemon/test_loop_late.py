@@ -16,7 +16,7 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
     async with driven() as cell:
         await cell.start(TWIST)
         await cell.cycles(50)
-        decide = cell.brain.tick
+        decide = cell.control_loop.tick
 
         def at_length(t_ns: int) -> Any:
             monkeypatch.undo()
@@ -24,9 +24,9 @@ async def test_a_decision_that_takes_long_makes_the_loop_late(monkeypatch: pytes
             cell.robot.flight.now_ns += 200_000_000
             return orders
 
-        monkeypatch.setattr(cell.brain, "tick", at_length)
+        monkeypatch.setattr(cell.control_loop, "tick", at_length)
         await cell.cycles(2)
-        assert FaultCode.LOOP_LATE in [trouble.code for trouble in cell.brain.status.decision.faults]
+        assert FaultCode.LOOP_LATE in [trouble.code for trouble in cell.control_loop.status.decision.faults]
 
 
 @pytest.mark.parametrize(("missed", "read"), [(24, 1), (18, 2), (12, 1)])
@@ -62,21 +62,21 @@ async def test_a_loop_that_decides_before_the_last_state_is_stale_is_in_time() -
             for _ in range(11):
                 cell.robot.cycle(read=False)
             await cell.cycles(1)
-            assert cell.brain.status.decision.faults == ()
+            assert cell.control_loop.status.decision.faults == ()
 
 
 async def test_of_states_that_are_read_at_once_the_newest_is_decided_upon(monkeypatch: pytest.MonkeyPatch) -> None:
     async with driven() as cell:
         await cell.start({"do": "wait", "wait_s": 60})
         decided: list[int] = []
-        decide = cell.brain.tick
+        decide = cell.control_loop.tick
 
         def tick(t_ns: int) -> Any:
-            assert cell.brain.inputs.arm is not None
-            decided.append(cell.brain.inputs.arm.t_ns)
+            assert cell.control_loop.inputs.arm is not None
+            decided.append(cell.control_loop.inputs.arm.t_ns)
             return decide(t_ns)
 
-        monkeypatch.setattr(cell.brain, "tick", tick)
+        monkeypatch.setattr(cell.control_loop, "tick", tick)
         for _ in range(5):
             cell.robot.cycle(read=False)
         await cell.cycles(1)

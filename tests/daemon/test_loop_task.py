@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.daemon.control.actions import along_tool
+from shearloop.daemon.control.device_commands import along_tool
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.runner import WRENCH
@@ -43,7 +43,7 @@ async def test_an_action_that_dies_fails_its_step_and_is_told() -> None:
         cell.gripper.answers = RuntimeError("no such register")
         await cell.start(GRIP)
         await cell.until_ended(50)
-        assert "step 1 (grip) failed: it died of RuntimeError: no such register" in cell.why
+        assert "step 1 (grip) failed: it crashed with RuntimeError: no such register" in cell.why
 
 
 @pytest.mark.parametrize("answer", ["the gripper does not answer", OSError("the gripper does not answer")])
@@ -54,13 +54,13 @@ async def test_a_gripper_that_does_not_open_after_a_stop_is_told_until_the_opera
         await cell.start({"do": "wait", "wait_s": 60})
         cell.gripper.answers = answer
         now_ns = cell.robot.flight.now_ns
-        cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.until_ended(10)
         await cell.cycles(50)
         assert "the gripper did not open" in cell.published.reasons
         assert "the gripper does not answer" in cell.published.reasons
         assert "the torque is beyond its limit" in cell.published.reasons, "and why it was to open"
-        unlocking = asyncio.create_task(cell.loop.unlock())
+        unlocking = asyncio.create_task(cell.runner.unlock())
         await cell.cycles(30)
         assert await unlocking is None
         assert cell.published.reasons == ""
@@ -84,7 +84,7 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() ->
         await cell.start(MOVE)
         await cell.cycles(40)
         end_m = cell.robot.end_m
-        assert cell.brain.pause() is None
+        assert cell.control_loop.pause() is None
         await cell.cycles(5)
         paused_m = cell.robot.z_m
         assert abs(paused_m - end_m) > 0.05, "it is under way"
@@ -92,7 +92,7 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() ->
         assert cell.robot.z_m == paused_m, "it stands"
         assert cell.phase is ExperimentPhase.PAUSED
         assert sum(isinstance(command, Stop) for command in cell.robot.commands[-20:]) == 1
-        assert cell.brain.resume() is None
+        assert cell.control_loop.resume() is None
         await cell.until_ended()
         assert cell.phase is ExperimentPhase.DONE, cell.why
         assert cell.robot.z_m == pytest.approx(end_m), "where it was to go from the start"
@@ -101,14 +101,14 @@ async def test_a_straight_move_that_is_paused_brakes_and_goes_on_to_its_end() ->
 async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> None:
     async with driven() as cell:
         starting = asyncio.create_task(
-            cell.loop.start(ExperimentFile.model_validate({"name": "test", "drive": WRENCH, "steps": [MOVE]}))
+            cell.runner.start(ExperimentFile.model_validate({"name": "test", "torque_source": WRENCH, "steps": [MOVE]}))
         )
         while not starting.done():
             await cell.cycles(1)
-            cell.brain.pause()
+            cell.control_loop.pause()
         await cell.cycles(50)
         assert not any(isinstance(command, MoveLinear) for command in cell.robot.commands)
-        cell.brain.resume()
+        cell.control_loop.resume()
         await cell.until_ended()
         assert cell.phase is ExperimentPhase.DONE, cell.why
 
@@ -116,14 +116,14 @@ async def test_a_straight_move_is_not_begun_while_the_experiment_is_paused() -> 
 async def test_who_waits_for_an_experiments_end_is_told_of_that_one() -> None:
     async with driven() as cell:
         await cell.start({"do": "wait", "wait_s": 60})
-        first = cell.brain.experiment
-        waiting = asyncio.create_task(cell.loop.ended())
+        first = cell.control_loop.experiment
+        waiting = asyncio.create_task(cell.runner.experiment_ended())
         await cell.cycles(5)
-        cell.brain.stop("the operator said stop")
+        cell.control_loop.stop("the operator said stop")
         # The next one begins before whoever waits has had his turn.
-        cell.brain.tick(cell.robot.flight.now_ns)
-        again = {"name": "again", "drive": WRENCH, "steps": [{"do": "wait", "wait_s": 60}]}
-        assert cell.brain.start(ExperimentFile.model_validate(again), cell.robot.flight.now_ns) is None
+        cell.control_loop.tick(cell.robot.flight.now_ns)
+        again = {"name": "again", "torque_source": WRENCH, "steps": [{"do": "wait", "wait_s": 60}]}
+        assert cell.control_loop.start(ExperimentFile.model_validate(again), cell.robot.flight.now_ns) is None
         async with asyncio.timeout(20):
             while not waiting.done():
                 await cell.cycles(1)
@@ -138,7 +138,7 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         await cell.cycles(40)
         assert cell.state.motion == "linear"
 
-        monkeypatch.setattr(cell.brain, "tick", no_tick)
+        monkeypatch.setattr(cell.control_loop, "tick", no_tick)
         await cell.cycles(1)
         assert cell.task is not None
         with pytest.raises(ZeroDivisionError):
@@ -152,7 +152,7 @@ async def test_a_loop_that_dies_stops_the_arm_and_when_begun_again_the_experimen
         assert cell.phase is ExperimentPhase.STOPPED
         assert "loop: ZeroDivisionError: a tick went wrong" in cell.why
         assert cell.robot.z_m == stopped_m
-        assert FaultCode.TASK_DIED in {trouble.code for trouble in cell.brain.status.decision.faults}
+        assert FaultCode.TASK_DIED in {trouble.code for trouble in cell.control_loop.status.decision.faults}
 
 
 async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -168,16 +168,16 @@ async def test_a_loop_that_dies_while_the_gripper_opens_lets_it_open(monkeypatch
 
         monkeypatch.setattr(cell.gripper, "release", at_length)
         now_ns = cell.robot.flight.now_ns
-        cell.brain.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
+        cell.control_loop.on_torque(TorqueSample(WRENCH, 0.9, "", now_ns, now_ns))
         await cell.until_ended(10)
         await heard.wait()
-        tick = cell.brain.tick
+        tick = cell.control_loop.tick
 
         def dies_once(_t_ns: int) -> Any:
-            monkeypatch.setattr(cell.brain, "tick", tick)
+            monkeypatch.setattr(cell.control_loop, "tick", tick)
             raise ZeroDivisionError("a tick went wrong")
 
-        monkeypatch.setattr(cell.brain, "tick", dies_once)
+        monkeypatch.setattr(cell.control_loop, "tick", dies_once)
         await cell.cycles(20)
         assert cell.task is not None
         assert not cell.task.done(), "it waits for the gripper"
@@ -196,14 +196,14 @@ async def test_a_loop_that_dies_as_a_straight_move_is_to_begin_leaves_the_arm_at
     """The loop dies of the state that also wakes the move which waits for it."""
     for _ in range(2):
         async with driven() as cell:
-            tick, running = cell.brain.tick, iter(range(2))
+            tick, running = cell.control_loop.tick, iter(range(2))
 
             def dies_at_the_second(t_ns: int, tick: Any = tick, running: Any = running) -> Any:
-                if cell.brain.experiment is not None and next(running):
+                if cell.control_loop.experiment is not None and next(running):
                     raise ZeroDivisionError("a tick went wrong")
                 return tick(t_ns)
 
-            monkeypatch.setattr(cell.brain, "tick", dies_at_the_second)
+            monkeypatch.setattr(cell.control_loop, "tick", dies_at_the_second)
             await cell.start(MOVE)
             await cell.cycles(5)
             assert cell.task is not None
@@ -217,8 +217,8 @@ async def test_what_stopped_the_arm_is_not_enabled_again_by_a_start_that_is_refu
         await cell.start(TWIST)
         await cell.cycles(10)
         before = len(cell.robot.commands)
-        file = ExperimentFile.model_validate({"name": "other", "drive": WRENCH, "steps": [MOVE]})
-        assert "is still running" in (await cell.loop.start(file) or "")
+        file = ExperimentFile.model_validate({"name": "other", "torque_source": WRENCH, "steps": [MOVE]})
+        assert "is still running" in (await cell.runner.start(file) or "")
         assert all(isinstance(command, WristSpeed) for command in cell.robot.commands[before:])
 
 
@@ -230,8 +230,8 @@ async def test_each_state_is_decided_upon_and_every_fifth_published(
         if running:
             await cell.start({"do": "wait", "wait_s": 60})
         decided: list[int] = []
-        tick = cell.brain.tick
-        monkeypatch.setattr(cell.brain, "tick", lambda now_ns: decided.append(cell.state.cycle) or tick(now_ns))
+        tick = cell.control_loop.tick
+        monkeypatch.setattr(cell.control_loop, "tick", lambda now_ns: decided.append(cell.state.cycle) or tick(now_ns))
         cell.published.messages.clear()
         await cell.cycles(50)
         assert len(decided) == 50
@@ -253,9 +253,9 @@ async def test_a_straight_move_goes_on_though_the_pause_was_shorter_than_its_bra
         await cell.cycles(40)
         end_m = cell.robot.end_m
         cell.robot.brakes_for = 20
-        assert cell.brain.pause() is None
+        assert cell.control_loop.pause() is None
         await cell.cycles(cycles)
-        assert cell.brain.resume() is None
+        assert cell.control_loop.resume() is None
         await cell.until_ended()
         assert cell.phase is ExperimentPhase.DONE, cell.why
         assert cell.robot.z_m == pytest.approx(end_m)
@@ -269,11 +269,11 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
         # The pause is said while the state that tells of the force is on its way.
         arm.be(wrench=(0.0, 0.0, SETTINGS.limits.force_n.inner + 5.0, 0.0, 0.0, 0.0))
         flight.fly(1)
-        assert "force" in flight.state.ended
-        cell.loop._actions.hold_back()
+        assert "force" in flight.state.end_reason
+        cell.runner._actions.interrupt()
         arm.be(wrench=(0.0,) * 6)
         await cell.cycles(1)
-        cell.loop._actions.let_go()
+        cell.runner._actions.resume()
         await cell.until_ended()
         assert "the move ended early: force" in cell.why
         assert sum(isinstance(command, MoveLinear) for command in cell.robot.commands) == 1
@@ -282,8 +282,8 @@ async def test_a_straight_move_that_met_something_is_not_begun_again_after_a_pau
 async def test_a_paused_program_that_could_not_be_stopped_is_counted_in_health() -> None:
     async with driven() as cell:
         cell.robot.losses["hung"] = 2
-        assert cell.loop.facts()["errors"] == {"hung": 2}
+        assert cell.runner.diagnostics()["errors"] == {"hung": 2}
         cell.robot.flight.arm.stoppable = False
         cell.robot.flight.arm.protective_stop()
         await cell.cycles(200)
-        assert cell.loop.facts()["errors"] == {"hung": 2, "paused program not stopped": 2}
+        assert cell.runner.diagnostics()["errors"] == {"hung": 2, "paused program not stopped": 2}

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from shearloop.daemon.messaging.messages import EitHeatmap, RobotStateMessage, decode, encode, wire_map
-from shearloop.daemon.messaging.topics import TOPICS
+from shearloop.daemon.messaging.messages import TOPICS, EitHeatmap, RobotStateMessage, decode, encode, wire_map
 from tests.daemon.sample_messages import sample
 
 SCALARS = st.none() | st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | st.text()

@@ -6,13 +6,13 @@ import sys
 import threading
 from contextlib import closing
 
-from shearloop.daemon.nonblocking_writer import NonBlockingWriter
+from shearloop.daemon.logs import NonBlockingWriter
 
 PROGRAM = """
 import os, sys
 from contextlib import closing
 from shearloop.daemon.logs import logging_to_stderr
-from shearloop.daemon.nonblocking_writer import NonBlockingWriter as Outlet
+from shearloop.daemon.logs import NonBlockingWriter as Outlet
 import structlog
 read, write = os.pipe()
 os.close(read)
@@ -29,7 +29,7 @@ def test_what_is_written_comes_out_in_order_and_all_of_it_at_the_end() -> None:
         for number in range(1000):
             assert outlet.write(f"{number}\n") == len(f"{number}\n")
     assert stream.getvalue().splitlines() == [str(number) for number in range(1000)]
-    assert outlet.facts() == {"errors": {}, "trouble": ""}
+    assert outlet.diagnostics() == {"errors": {}, "error": ""}
 
 
 class Terminal(io.StringIO):
@@ -53,8 +53,8 @@ def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_t
     for number in range(1, 9):
         outlet.write(f"{number}\n")
     assert outlet.lost == 3
-    assert outlet.facts()["errors"] == {"unread": 3}
-    assert "Ctrl-Q" in str(outlet.facts()["trouble"])
+    assert outlet.diagnostics()["errors"] == {"unread": 3}
+    assert "Ctrl-Q" in str(outlet.diagnostics()["error"])
     outlet.close(timeout_s=0.0)
     assert outlet._thread.is_alive(), "the end waits no longer than it is told"
     terminal.goes_on.set()
@@ -63,7 +63,7 @@ def test_a_terminal_that_is_stopped_keeps_nobody_waiting_and_what_it_missed_is_t
     outlet.close(10)
     assert not outlet._thread.is_alive()
     assert terminal.getvalue().splitlines() == [
-        *"012345", "… 3 texts are missing here: nobody read for a while",
+        *"012345", "… 3 texts are missing here: the terminal did not read them",
     ]  # fmt: skip
 
 
@@ -98,14 +98,14 @@ def test_what_is_missing_is_told_before_what_came_later() -> None:
     terminal.may.release(2)
     outlet.close(10)
     told = terminal.getvalue().splitlines()
-    assert told[-2:] == [f"… {lost} texts are missing here: nobody read for a while", "20"]
+    assert told[-2:] == [f"… {lost} texts are missing here: the terminal did not read them", "20"]
     assert told[:-2] == [str(number) for number in range(kept + 1)]
 
 
 def test_what_nobody_reads_any_longer_kills_nobody() -> None:
     ended = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=False)
     assert ended.returncode == 0, ended.stderr
-    assert ended.stderr.count("nobody reads any more what is shown") == 1
+    assert ended.stderr.count("the output has no reader any more") == 1
     assert "Broken pipe" in ended.stderr
 
 

@@ -15,9 +15,8 @@ import pytest
 import zmq
 
 from shearloop.daemon.clock import Clock
-from shearloop.daemon.messaging.messages import Message
+from shearloop.daemon.messaging.messages import TOPICS, Message
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.messaging.topics import TOPICS
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.view.fake_daemon import MESSAGES, made
 
@@ -56,7 +55,7 @@ def frames(tmp_path: Path) -> dict[str, list[bytes]]:
         socket.setsockopt(zmq.RCVTIMEO, DEADLINE_S * 1000)
         socket.connect(address)
         socket.subscribe("")
-        while not publisher.wanted("health"):
+        while not publisher.has_subscriber("health"):
             socket.poll(1)
         for message in messages():
             publisher.publish(message)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from shearloop.daemon.recording.summary import summarise
+from shearloop.daemon.recording.repair import summarise
 from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, started
 
 __all__ = ["rig_config"]
@@ -63,8 +63,8 @@ async def test_a_full_disk_refuses_the_next_experiment_and_the_running_one_goes_
         await started(command, path)
         await watcher.until("robot.state", lambda state: state["wrist_speed_rad_per_s"] > 0.005)
         filler = fill(small_disk)
-        told = await watcher.until("health", lambda health: bool(health["tasks"]["recording"]["trouble"]))
-        assert "No space left on device" in told["tasks"]["recording"]["trouble"]
+        told = await watcher.until("health", lambda health: bool(health["tasks"]["recording"]["error"]))
+        assert "No space left on device" in told["tasks"]["recording"]["error"]
         # What runs goes on. (A busy computer may hold the wrist for a moment meanwhile, as it must.)
         await watcher.until(
             "loop.state",
@@ -77,10 +77,10 @@ async def test_a_full_disk_refuses_the_next_experiment_and_the_running_one_goes_
         assert (await command("stop"))["stopped"] == "test"
         refused = await command("start", experiment=path)
         assert not refused["ok"]
-        assert "the recording cannot be written" in refused["why"]
-        assert "No space left on device" in refused["why"]
+        assert "the recording cannot be written" in refused["reason"]
+        assert "No space left on device" in refused["reason"]
         filler.unlink()
-        while "the recording cannot be written" in (reply := await command("start", experiment=path)).get("why", ""):
+        while "the recording cannot be written" in (reply := await command("start", experiment=path)).get("reason", ""):
             # It is tried again three times a second.
             heard = len(watcher.seen["health"])
             await watcher.until("health", lambda health, heard=heard: health["seq"] >= heard)

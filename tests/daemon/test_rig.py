@@ -25,7 +25,7 @@ async def a_rig() -> AsyncIterator[Rig]:
         return ""
 
     rig = Rig(config, Published(), Clock(), SOURCES, no_tare, dict)  # type: ignore[arg-type]
-    driving = asyncio.create_task(rig.loop.drive())
+    driving = asyncio.create_task(rig.runner.run())
     await asyncio.sleep(0)
     try:
         yield rig
@@ -36,14 +36,14 @@ async def a_rig() -> AsyncIterator[Rig]:
 
 async def test_a_robot_that_is_lost_is_told_at_once_and_not_when_its_state_is_missed() -> None:
     async with a_rig() as rig:
-        assert rig.brain.status.decision.faults == ()
-        rig._robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
-        assert "the robot's process died" in " ".join(rig.brain.status.decision.reasons)
+        assert rig.control_loop.status.decision.faults == ()
+        rig._on_robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
+        assert "the robot's process died" in " ".join(rig.control_loop.status.decision.reasons)
 
 
 async def test_a_device_that_is_lost_before_the_loop_runs_and_after_its_end_is_noted() -> None:
     async with a_rig() as rig:
         pass
-    rig._robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
-    assert rig.brain.inputs.lost == {"robot": "the robot's process died"}
-    assert rig.brain.status.decision.faults == ()
+    rig._on_robot_link(UrLinkEvent(time.monotonic_ns(), "down", "the robot's process died", "crashed", 1))
+    assert rig.control_loop.inputs.lost == {"robot": "the robot's process died"}
+    assert rig.control_loop.status.decision.faults == ()

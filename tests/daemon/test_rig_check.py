@@ -9,7 +9,7 @@ import yaml
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.rig_check import checked_experiment
+from shearloop.daemon.rig import check_experiment
 
 SERIAL = {"device": {"path": "port"}}
 STEPS = [{"do": "tare"}, {"do": "wait", "wait_s": 1}]
@@ -35,26 +35,28 @@ SOURCES = {
 
 def refusal(folder: Path, experiment: dict[str, Any], **more: Any) -> str:
     with pytest.raises(UserError) as error:
-        checked_experiment(config(folder, experiment, **more), SOURCES)
+        check_experiment(config(folder, experiment, **more), SOURCES)
     return str(error.value)
 
 
 def test_a_torque_that_is_measured_may_drive(tmp_path: Path) -> None:
     for drive in ("right", "load_cell", "wrench"):
-        file = checked_experiment(config(tmp_path, {"drive": drive}, load_cell={"device": {"path": "load"}}), SOURCES)
+        file = check_experiment(
+            config(tmp_path, {"torque_source": drive}, load_cell={"device": {"path": "load"}}), SOURCES
+        )
         assert file is not None
-        assert file.drive == drive
+        assert file.torque_source == drive
 
 
 def test_a_torque_that_is_not_measured_may_not_drive(tmp_path: Path) -> None:
-    assert refusal(tmp_path, {"drive": "load_cell"}).endswith(
-        "experiment.yaml: `drive: load_cell` is not a measured torque: choose another, or configure its "
+    assert refusal(tmp_path, {"torque_source": "load_cell"}).endswith(
+        "experiment.yaml: `torque_source: load_cell` is not a measured torque: choose another, or configure its "
         "device; there are right, wrench"
     )
-    assert "`drive: left` is a fingertip without a calibration" in refusal(tmp_path, {"drive": "left"})
+    assert "`torque_source: left` is a fingertip without a calibration" in refusal(tmp_path, {"torque_source": "left"})
     tips = {name: {"device": {"path": name}, "calibration": f"{name}.cal"} for name in SOURCES}
-    told = refusal(tmp_path, {"drive": "left"}, fingertips=tips)
-    assert "`drive: left` has a calibration of diameters alone" in told
+    told = refusal(tmp_path, {"torque_source": "left"}, fingertips=tips)
+    assert "`torque_source: left` has a calibration without torques" in told
     assert told.endswith("there are right, wrench")
 
 
@@ -92,7 +94,7 @@ LIMITS = {"torque_nm": 0.2, "angle_rad": 1.0}
 def test_a_step_that_asks_for_more_than_its_limit_is_refused_with_both_numbers(
     tmp_path: Path, step: dict[str, Any], told: str
 ) -> None:
-    said = refusal(tmp_path, {"drive": "wrench", "limits": LIMITS, "steps": [*STEPS, step]})
+    said = refusal(tmp_path, {"torque_source": "wrench", "limits": LIMITS, "steps": [*STEPS, step]})
     assert f"`steps[2]` ({step['do']}) {told}" in said
 
 
@@ -102,13 +104,13 @@ def test_a_tool_of_which_nothing_is_known_is_not_held(tmp_path: Path, between: l
     gripper = {"socket": {"host": "127.0.0.1"}}
     first = [identify] if between else []
     told = refusal(tmp_path, {"steps": [*first, *between, hold, identify, hold]}, gripper=gripper)
-    assert f"step {1 + len(first) + len(between)} is `hold_torque`, and the tool is not known then; put an" in told
+    assert f"step {1 + len(first) + len(between)} is `hold_torque`, and the tool is not identified then; put an" in told
     steps = [*between, identify, {"do": "wait", "wait_s": 1}, hold, hold]
-    assert checked_experiment(config(tmp_path, {"steps": steps}, gripper=gripper), SOURCES) is not None
+    assert check_experiment(config(tmp_path, {"steps": steps}, gripper=gripper), SOURCES) is not None
 
 
 def test_a_file_that_is_none_is_told_with_its_name(tmp_path: Path) -> None:
     daemon = config(tmp_path, {})
     (tmp_path / "experiment.yaml").unlink()
     with pytest.raises(UserError, match=r"experiment\.yaml: the configuration cannot be read: No such file"):
-        checked_experiment(daemon, SOURCES)
+        check_experiment(daemon, SOURCES)

@@ -19,9 +19,9 @@ from scipy.io import savemat
 from shearloop.bank.eit.channels import LINE_SLOTS, line_of_channels
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
-from shearloop.daemon.messaging.request import request
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.emulator_process import own_address
 
@@ -45,7 +45,7 @@ def recording(folder: Path, n_frames: int) -> Path:
     return path
 
 
-async def test_every_frame_of_a_recording_at_a_hundred_times_its_pace_becomes_an_estimate_in_order(
+async def test_every_frame_at_100_times_speed_becomes_an_estimate_in_order(
     shared: Path, config: Write, tmp_path: Path, subscriber: Connect
 ) -> None:
     play = shared / "recordings" / "streams" / "2024-12-03_16-09" / "device1.mat"
@@ -114,11 +114,11 @@ def collector(daemon: Daemon, topic: str) -> "asyncio.Queue[dict[str, Any]]":
         if name == topic:
             queue.put_nowait(content)
 
-    daemon.publisher.listen(listen)
+    daemon.publisher.add_listener(listen)
     return queue
 
 
-async def test_commands_tare_tell_the_status_and_stop(config: Write, tmp_path: Path) -> None:
+async def test_tare_status_and_stop_commands(config: Write, tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/commands"
     play = recording(tmp_path, 60)
     link = str(tmp_path / "eit-right")
@@ -130,22 +130,20 @@ async def test_commands_tare_tell_the_status_and_stop(config: Write, tmp_path: P
         ):
             while not (await estimates.get())["valid"]:
                 continue
-            reply = await asyncio.to_thread(request, address, {"command": "tare"}, DEADLINE_S)
+            reply = await asyncio.to_thread(send_command, address, {"command": "tare"}, DEADLINE_S)
             assert reply == {"ok": True, "tared": ["right"]}
-            while "taking the homogeneous frame, 1 of 10" not in (await estimates.get())["why"]:
+            while "taking the homogeneous frame, 1 of 10" not in (await estimates.get())["reason"]:
                 continue
-            reply = await asyncio.to_thread(request, address, {"command": "tare", "source": "left"}, DEADLINE_S)
-            assert reply == {"ok": False, "why": "there is no sensor 'left' to tare; there are right"}
-            status = await asyncio.to_thread(request, address, {"command": "status"}, DEADLINE_S)
+            reply = await asyncio.to_thread(send_command, address, {"command": "tare", "source": "left"}, DEADLINE_S)
+            assert reply == {"ok": False, "reason": "there is no sensor 'left' to tare; there are right"}
+            status = await asyncio.to_thread(send_command, address, {"command": "status"}, DEADLINE_S)
             assert status["tasks"]["right"]["connected"]
             assert status["tasks"]["commands"]["errors"] == {"tare refused": 1}
-        assert (await asyncio.to_thread(request, address, {"command": "stop"}, DEADLINE_S))["ok"]
+        assert (await asyncio.to_thread(send_command, address, {"command": "stop"}, DEADLINE_S))["ok"]
         await daemon.stopped()
 
 
-async def test_a_heatmap_is_computed_only_while_somebody_subscribes(
-    config: Write, tmp_path: Path, subscriber: Connect
-) -> None:
+async def test_a_heatmap_is_computed_only_with_a_subscriber(config: Write, tmp_path: Path, subscriber: Connect) -> None:
     play, link = recording(tmp_path, 60), str(tmp_path / "eit-right")
     async with running(config()) as daemon:
         estimates, heatmaps = collector(daemon, "eit.estimate"), collector(daemon, "eit.heatmap")
@@ -180,25 +178,21 @@ def robotless(config: Write, tmp_path: Path) -> Path:
     return config(**rig, experiment=str(Path("config/experiments/loosen.yaml").resolve()))
 
 
-async def test_a_stop_calls_off_an_experiment_that_waits_for_its_devices_and_spares_the_daemon(
-    robotless: Path, tmp_path: Path
-) -> None:
+async def test_stop_cancels_a_waiting_experiment_and_keeps_the_daemon(robotless: Path, tmp_path: Path) -> None:
     async with running(robotless) as daemon:
         health = collector(daemon, "health")
         while not (await health.get())["tasks"]["experiment"]["alive"]:
             continue
         stop = {"command": "stop", "spare_daemon": True}
-        reply = await asyncio.to_thread(request, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
+        reply = await asyncio.to_thread(send_command, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
         assert reply == {"ok": True, "stopped": "the start of loosen.yaml"}
         while not (await health.get())["tasks"]["experiment"]["done"]:
             continue
-        reply = await asyncio.to_thread(request, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
+        reply = await asyncio.to_thread(send_command, f"ipc://{tmp_path}/commands", stop, DEADLINE_S)
         assert reply == {"ok": True, "stopped": ""}
 
 
-async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_health(
-    config: Write, tmp_path: Path
-) -> None:
+async def test_a_lost_board_reconnects_and_health_counts_refused_lines(config: Write, tmp_path: Path) -> None:
     link = str(tmp_path / "eit-right")
     faults = ["--fault", "wrong-count@5", "--fault", "garbage@7", "--fault", "unplug:0.3@12"]
     async with running(config()) as daemon:
@@ -211,14 +205,14 @@ async def test_a_board_that_vanishes_is_awaited_and_refused_lines_are_named_in_h
             for _ in range(25):
                 await frames.get()
             facts = (await health.get())["tasks"]["right"]
-            while facts["openings"] < 2 or facts["frames"] < 25:
+            while facts["connections"] < 2 or facts["frames"] < 25:
                 facts = (await health.get())["tasks"]["right"]
             assert facts["alive"]
             assert facts["errors"]["wrong_count"] >= 1
             assert sum(facts["errors"].values()) >= 2
 
 
-async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
+async def test_a_crashed_estimator_restarts_and_is_reported(
     config: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from shearloop.daemon.sensing.estimators import Estimator
@@ -245,7 +239,7 @@ async def test_an_estimator_that_dies_is_started_again_and_the_death_is_told(
     assert (record.restarts, record.last_error) == (1, "RuntimeError: a bug")
 
 
-async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, tmp_path: Path) -> None:
+async def test_the_daemon_survives_a_closed_log(config: Write, tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/commands"
     reader, writer = os.pipe()
     process = await asyncio.create_subprocess_exec(
@@ -257,7 +251,7 @@ async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, t
             assert await asyncio.to_thread(os.read, reader, 1), "it runs, and says so"
             os.close(reader)
             for command in ("status", "tare", "stop"):
-                assert (await asyncio.to_thread(request, address, {"command": command}, DEADLINE_S))["ok"]
+                assert (await asyncio.to_thread(send_command, address, {"command": command}, DEADLINE_S))["ok"]
             assert await process.wait() == 0
     finally:
         if process.returncode is None:
@@ -265,9 +259,7 @@ async def test_a_daemon_whose_log_nobody_reads_any_more_goes_on(config: Write, t
             await process.wait()
 
 
-async def test_a_terminal_that_was_stopped_keeps_no_estimate_waiting(
-    config: Write, tmp_path: Path, subscriber: Connect
-) -> None:
+async def test_a_stopped_terminal_delays_no_estimate(config: Write, tmp_path: Path, subscriber: Connect) -> None:
     terminal, its_end = pty.openpty()
     process = await asyncio.create_subprocess_exec(
         sys.executable, "-m", "shearloop", "run", str(config()), "--show", stdout=its_end, stderr=its_end
@@ -283,7 +275,7 @@ async def test_a_terminal_that_was_stopped_keeps_no_estimate_waiting(
             # A line for each would be 30 kB, of which the terminal takes 4 unread.
             received = await asyncio.to_thread(lambda: [next_message(frames) for _ in range(300)])
         assert [message["frame"] for message in received] == list(range(300))
-        assert (await asyncio.to_thread(next_message, health))["tasks"]["shown"]["trouble"] == ""
+        assert (await asyncio.to_thread(next_message, health))["tasks"]["shown"]["error"] == ""
         await stop_and_time(process, signal.SIGTERM)
     finally:
         if process.returncode is None:
@@ -293,7 +285,7 @@ async def test_a_terminal_that_was_stopped_keeps_no_estimate_waiting(
         os.close(its_end)
 
 
-async def test_a_load_cell_is_read_without_a_robot_too(config: Write, tmp_path: Path) -> None:
+async def test_a_load_cell_works_without_a_robot(config: Write, tmp_path: Path) -> None:
     link = str(tmp_path / "load-cell")
     # Lines of torques, of which no calibration is needed.
     async with running(config(load_cell={"device": {"path": "load-cell"}})) as daemon:
@@ -304,9 +296,11 @@ async def test_a_load_cell_is_read_without_a_robot_too(config: Write, tmp_path: 
         ):
             assert (await torques.get())["torque_nm"] == pytest.approx(0.08, abs=0.005)
             address = f"ipc://{tmp_path}/commands"
-            reply = await asyncio.to_thread(request, address, {"command": "tare", "source": "load_cell"}, DEADLINE_S)
+            reply = await asyncio.to_thread(
+                send_command, address, {"command": "tare", "source": "load_cell"}, DEADLINE_S
+            )
             assert reply == {"ok": True, "tared": ["load_cell"]}
             while abs((await torques.get())["torque_nm"]) > 0.005:
                 continue
-            status = await asyncio.to_thread(request, address, {"command": "status"}, DEADLINE_S)
+            status = await asyncio.to_thread(send_command, address, {"command": "status"}, DEADLINE_S)
             assert status["tasks"]["load_cell"]["alive"]

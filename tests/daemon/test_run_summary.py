@@ -14,13 +14,13 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
         "source": "loop",
         "phase": "running",
         "experiment": "hold",
-        "driving": "right",
+        "torque_source": "right",
         "tool_mm": None,
         "step": 2,
         "steps": 3,
         "step_name": "hold_torque",
         "hold": 0,
-        "doing": "",
+        "activity": "",
         "set_point_nm": 0.1,
         "stiffness_nm_per_rad": 0.75,
         "delay_s": 0.8,
@@ -89,7 +89,9 @@ def test_a_last_moment_in_the_band_is_no_way_back() -> None:
     assert "not back by the end" in told(truth_that_falls_at(26.0, 17.5), [(26 * S, "kick")])
 
 
-@pytest.mark.parametrize(("others", "judge"), [(("left", "load_cell"), "load_cell"), (("left", "both"), "both")])
+@pytest.mark.parametrize(
+    ("others", "judge"), [(("left", "load_cell"), "load_cell"), (("left", "combined"), "combined")]
+)
 def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[str, ...], judge: str) -> None:
     lines: list[str] = []
     summary = RunSummary(lines.extend)
@@ -122,7 +124,7 @@ def test_an_experiment_that_was_stopped_says_why() -> None:
     lines: list[str] = []
     summary = RunSummary(lines.extend)
     summary("loop.state", loop_state(0))
-    summary("loop.state", loop_state(5, phase="stopped", doing="the operator said stop"))
+    summary("loop.state", loop_state(5, phase="stopped", activity="the operator said stop"))
     assert lines[:2] == ["What happened: 'hold' was STOPPED before its end, after 5 s.", "  the operator said stop"]
 
 
@@ -137,7 +139,7 @@ def test_where_a_screw_ended_and_what_it_took_is_told() -> None:
     lines: list[str] = []
     truth = Known(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
     summary = RunSummary(lines.extend, lambda: truth)
-    turning = {"step_name": "tighten", "driving": "load_cell", "set_point_nm": None}
+    turning = {"step_name": "tighten", "torque_source": "load_cell", "set_point_nm": None}
     summary("loop.state", loop_state(10, **turning))
     for t_s, wrist_rad, torque_nm in ((10.0, 0.4, -0.05), (11.0, 0.2, -0.176), (12.0, -0.1, -0.121)):
         summary("robot.state", {"source": "robot", "wrist_rad": wrist_rad})

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon import gc_control as collector
+from shearloop.daemon import gc_control
 from shearloop.daemon.cli import main, run
 from shearloop.daemon.signals import ending_signals
 from tests.daemon.conftest import DEADLINE_S
@@ -26,7 +26,7 @@ def as_it_was() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("as_it_was")
-def test_a_closed_terminal_ends_what_was_not_told_to_outlive_it() -> None:
+def test_sighup_ends_a_process_unless_it_is_ignored() -> None:
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     assert ending_signals() == (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     # As `nohup` leaves it.
@@ -45,7 +45,7 @@ def heard_anew() -> Iterator[None]:
 
 @pytest.mark.usefixtures("heard_anew")
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_what_ends_a_daemon_does_nothing_more_when_it_comes_again(
+def test_a_second_signal_does_not_kill_the_daemon(
     number: signal.Signals, config: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It killed the process, as soon as the event loop was closed, before all was written that there was to show."""
@@ -60,18 +60,18 @@ def test_what_ends_a_daemon_does_nothing_more_when_it_comes_again(
 
     monkeypatch.setattr(run, "_run_emulators", emulators)
     monkeypatch.setattr(
-        collector, "kept_from_lasting_objects", lambda: nullcontext(partial(os.kill, os.getpid(), number))
+        gc_control, "without_long_collections", lambda: nullcontext(partial(os.kill, os.getpid(), number))
     )
     assert main(["run", str(config())]) == 0
     assert came == ["again"]
     assert signal.getsignal(number) is signal.SIG_DFL, "as before the command"
 
 
-def test_a_command_runs_in_any_thread_and_hears_no_signals_there(
+def test_commands_run_in_any_thread_without_signal_handlers(
     config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     ready = threading.Event()
-    monkeypatch.setattr(collector, "kept_from_lasting_objects", lambda: nullcontext(ready.set))
+    monkeypatch.setattr(gc_control, "without_long_collections", lambda: nullcontext(ready.set))
     with ThreadPoolExecutor() as pool:
         assert pool.submit(ending_signals).result() == ()
         daemon = pool.submit(main, ["run", str(config())])

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, ZERO_SLOTS, channels_of_line
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.synthetic import INJECTIONS, Synthesiser, TwistProgramme, twist_frames
-from shearloop.drivers.eit_line import FrameParser
-from shearloop.drivers.emulators.eit_kit import format_line
+from shearloop.drivers.eit_kit import FrameParser
+from shearloop.drivers.emulators.boards import format_line
 
 ADC_STEP_V = 2.2 / 1024
 
@@ -146,7 +146,7 @@ def test_a_grip_changes_the_frame_by_as_much_as_the_recorded_torques_do(shared) 
     from shearloop.bank.eit.forward import ForwardModel
     from shearloop.bank.eit.mesh import load_mesh
     from shearloop.bank.eit.models import conductivity
-    from shearloop.daemon.recording.matlab_streams import read_torque_slices
+    from shearloop.daemon.recording.matlab import read_torque_slices
 
     mesh = load_mesh(shared / "reference" / "fingertip_mesh.npz")
     forward = ForwardModel(mesh)

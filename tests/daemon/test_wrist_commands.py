@@ -28,15 +28,15 @@ async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none()
         # What is clipped is told in each cycle, so that one is unanswered whenever the process dies.
         cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
         await cell.cycles(20)
-        cell.brain.inputs.lost["robot"] = "The robot's process died of SIGKILL."
+        cell.control_loop.inputs.lost["robot"] = "The robot's process died of SIGKILL."
         cell.robot.die(50)
-        cell.loop.decide_now()
+        cell.runner.decide_now()
         assert cell.phase is ExperimentPhase.STOPPED
         assert "a command was refused" not in cell.why
         assert "ended before it answered" in cell.why
         assert cell.why.endswith("once the robot is connected again, `shearloop command unlock`.")
         # Neither was the stop that comes next, of which there is nobody to hear.
-        cell.loop.decide_now()
-        told = " ".join(cell.brain.status.decision.reasons)
+        cell.runner.decide_now()
+        told = " ".join(cell.control_loop.status.decision.reasons)
         assert "not connected" in told
         assert "a command was refused" not in told

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from shearloop.drivers import eit_kit
-from shearloop.drivers.eit_format import ADC_STEP_V, FrameErrorKind
-from shearloop.drivers.eit_kit import EitKit, Frame
-from shearloop.drivers.emulators.eit_kit import EitKitBoard, Fault, FaultKind, format_line
-from shearloop.drivers.serial_port import LinkEvent
+from shearloop.drivers.connection import LinkEvent
+from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame, FrameErrorKind
+from shearloop.drivers.emulators.boards import BoardFault, BoardFaultKind, EitKitBoard, format_line
 
 PERIOD_S = 0.003
 # Guards against a test that hangs; none of them waits for so long.
@@ -48,11 +47,11 @@ async def take(kit: EitKit, n_frames: int) -> list[Frame]:
 
 
 async def play(
-    lines: Iterable[NDArray[np.float64]], n_frames: int, tmp_path: Path, faults: dict[int, Fault] | None = None
+    lines: Iterable[NDArray[np.float64]], n_frames: int, tmp_path: Path, faults: dict[int, BoardFault] | None = None
 ) -> tuple[EitKit, list[Frame], list[LinkEvent]]:
     link = tmp_path / "eit"
     events: list[LinkEvent] = []
-    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, faults=faults)):
+    async with running(EitKitBoard(lines, period_s=PERIOD_S, link=link, fault_at=faults)):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=link, frame_period_s=PERIOD_S, on_event=events.append)
         frames = await take(kit, n_frames)
     return kit, frames, events
@@ -69,19 +68,19 @@ async def test_every_frame_arrives_once_and_in_order(tmp_path: Path) -> None:
     assert [frame.line + b"\n" for frame in frames] == [format_line(line) for line in lines]
     assert [frame.seq for frame in frames] == list(range(60))
     assert [event.up for event in events] == [True]
-    facts = kit.facts()
+    facts = kit.diagnostics()
     assert (facts["frames"], facts["errors"], facts["connected"]) == (60, {}, False)
 
 
 async def test_the_rate_is_told_once_it_is_measured(tmp_path: Path) -> None:
     async with running(EitKitBoard(cycle(some_lines(4)), period_s=PERIOD_S, link=tmp_path / "eit")):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
-        assert kit.facts()["measured_hz"] is None
+        assert kit.diagnostics()["measured_hz"] is None
         async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
             async for _ in arriving:
-                if kit.facts()["measured_hz"] is not None:
+                if kit.diagnostics()["measured_hz"] is not None:
                     break
-    assert kit.facts()["measured_hz"] == pytest.approx(1 / kit.period_s)
+    assert kit.diagnostics()["measured_hz"] == pytest.approx(1 / kit.period_s)
 
 
 async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> None:
@@ -102,61 +101,61 @@ async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("fault", "kind", "lost"),
     [
-        (FaultKind.CUT_LINE, FrameErrorKind.WRONG_COUNT, True),
-        (FaultKind.WRONG_COUNT, FrameErrorKind.WRONG_COUNT, True),
-        (FaultKind.NOT_A_NUMBER, FrameErrorKind.NOT_A_NUMBER, True),
-        (FaultKind.NAN, FrameErrorKind.NAN, True),
-        (FaultKind.NEGATIVE, FrameErrorKind.NEGATIVE, True),
-        (FaultKind.ZERO, FrameErrorKind.ZERO_CHANNEL, True),
-        (FaultKind.GARBAGE, FrameErrorKind.WRONG_COUNT, False),
-        (FaultKind.FLOOD, FrameErrorKind.TOO_LONG, False),
+        (BoardFaultKind.CUT_LINE, FrameErrorKind.WRONG_COUNT, True),
+        (BoardFaultKind.WRONG_COUNT, FrameErrorKind.WRONG_COUNT, True),
+        (BoardFaultKind.NOT_A_NUMBER, FrameErrorKind.NOT_A_NUMBER, True),
+        (BoardFaultKind.NAN, FrameErrorKind.NAN, True),
+        (BoardFaultKind.NEGATIVE, FrameErrorKind.NEGATIVE, True),
+        (BoardFaultKind.ZERO, FrameErrorKind.ZERO_CHANNEL, True),
+        (BoardFaultKind.GARBAGE, FrameErrorKind.WRONG_COUNT, False),
+        (BoardFaultKind.FLOOD, FrameErrorKind.TOO_LONG, False),
     ],
 )
 async def test_a_fault_costs_its_own_frame_at_most_and_is_counted(
-    fault: FaultKind, kind: FrameErrorKind, lost: bool, tmp_path: Path
+    fault: BoardFaultKind, kind: FrameErrorKind, lost: bool, tmp_path: Path
 ) -> None:
     lines = some_lines(6)
-    kit, frames, _ = await play(lines, 6 - lost, tmp_path, {3: Fault(fault)})
+    kit, frames, _ = await play(lines, 6 - lost, tmp_path, {3: BoardFault(fault)})
     assert_same(frames, lines[:3] + lines[3 + lost :])
-    facts = kit.facts()
+    facts = kit.diagnostics()
     assert facts["errors"] == {kind.name.lower(): 1}
-    assert kind.value in str(facts["last_refusal"])
+    assert kind.value in str(facts["last_frame_error"])
 
 
 async def test_a_repeated_line_is_handed_over_as_such(tmp_path: Path) -> None:
-    _, frames, _ = await play(some_lines(4), 5, tmp_path, {1: Fault(FaultKind.REPEAT)})
+    _, frames, _ = await play(some_lines(4), 5, tmp_path, {1: BoardFault(BoardFaultKind.REPEAT)})
     assert [frame.repeated for frame in frames] == [False, False, True, False, False]
 
 
 async def test_a_board_that_fell_silent_is_started_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(eit_kit, "SHORTEST_SILENCE_S", 0.05)
+    monkeypatch.setattr(eit_kit, "MIN_SILENCE_S", 0.05)
     lines = some_lines(8)
-    kit, frames, events = await play(lines, 8, tmp_path, {4: Fault(FaultKind.SILENCE)})
+    kit, frames, events = await play(lines, 8, tmp_path, {4: BoardFault(BoardFaultKind.SILENCE)})
     assert_same(frames, lines)
-    assert cast("int", kit.facts()["silences"]) >= 1  # more when the machine is slow
-    assert kit.facts()["openings"] == 1
+    assert cast("int", kit.diagnostics()["silences"]) >= 1  # more when the machine is slow
+    assert kit.diagnostics()["connections"] == 1
     assert len(events) == 1
 
 
 async def test_a_board_that_stays_silent_is_opened_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(eit_kit, "SHORTEST_SILENCE_S", 0.02)
+    monkeypatch.setattr(eit_kit, "MIN_SILENCE_S", 0.02)
     monkeypatch.setattr(eit_kit, "STARTS_BEFORE_REOPENING", 2)
     lines = some_lines(5)
-    kit, frames, events = await play(cycle(lines), 10, tmp_path, {2: Fault(FaultKind.SILENCE, 0.5)})
+    kit, frames, events = await play(cycle(lines), 10, tmp_path, {2: BoardFault(BoardFaultKind.SILENCE, 0.5)})
     # What the board sends while nobody has its port open is lost, as with a real one.
     places = [[line.tolist() for line in lines].index(frame.raw.tolist()) for frame in frames]
     assert places[:2] == [0, 1]
     assert places[2:] == [(places[2] + n) % 5 for n in range(8)]
-    assert cast("int", kit.facts()["openings"]) >= 2
+    assert cast("int", kit.diagnostics()["connections"]) >= 2
     assert any("open but silent" in event.sentence for event in events)
 
 
 async def test_a_board_that_is_unplugged_is_found_again_and_started(tmp_path: Path) -> None:
     lines = some_lines(12)
-    kit, frames, events = await play(lines, 11, tmp_path, {6: Fault(FaultKind.UNPLUG, 0.05)})
+    kit, frames, events = await play(lines, 11, tmp_path, {6: BoardFault(BoardFaultKind.UNPLUG, 0.05)})
     assert_same(frames, [*lines[:6], *lines[7:]])
-    facts = kit.facts()
-    assert facts["openings"] == 2
+    facts = kit.diagnostics()
+    assert facts["connections"] == 2
     assert facts["errors"] == {}
     assert facts["unfinished"] == 1, "the half of a line that was under way"
     assert [event.up for event in events if not event.repeated] == [True, False, True]
@@ -174,7 +173,7 @@ async def test_a_driver_that_begins_while_the_board_sends_takes_up_with_the_next
     places = [sent.index(frame.raw.tolist()) for frame in second]
     assert places == list(range(places[0], places[0] + 10))
     assert places[0] >= 10
-    assert kit.facts()["errors"] == {}
+    assert kit.diagnostics()["errors"] == {}
 
 
 async def test_a_board_that_is_not_there_is_awaited_and_told_of_once(tmp_path: Path) -> None:

@@ -7,17 +7,20 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
-from shearloop.drivers.eit_format import (
+from shearloop.drivers.eit_kit import (
     ADC_STEP_V,
     FULL_SCALE_SINE_RMS_V,
     LINE_BYTES,
-    LONGEST_LINE_BYTES,
+    MAX_LINE_BYTES,
+    NOMINAL_PERIOD_NS,
+    TRANSFER_NS,
+    Frame,
     FrameError,
     FrameErrorKind,
+    FrameParser,
     read_line,
 )
-from shearloop.drivers.eit_line import NOMINAL_PERIOD_NS, TRANSFER_NS, Frame, FrameParser
-from shearloop.drivers.emulators.eit_kit import format_line
+from shearloop.drivers.emulators.boards import format_line
 
 PERIOD_NS = NOMINAL_PERIOD_NS
 
@@ -126,8 +129,8 @@ def test_any_slicing_gives_the_same_frames(cuts: list[int]) -> None:
     parser = FrameParser(ZERO_SLOTS)
     frames = feed_all(parser, slices(b"".join(LINES), cuts))
     assert [frame.line + b"\n" for frame in frames] == LINES
-    assert not parser.refused
-    assert parser.first_partials == 0
+    assert not parser.errors
+    assert parser.partial_lines == 0
 
 
 def test_one_byte_at_a_time_gives_the_same_frames() -> None:
@@ -151,10 +154,10 @@ def test_each_kind_of_broken_line_is_refused_and_named_and_the_next_is_unaffecte
     for kind, broken in BROKEN:
         parser = FrameParser(ZERO_SLOTS)
         frames = parser.feed(GOOD + broken + LINES[1], 0)
-        assert dict(parser.refused) == {kind: 1}, broken[:20]
+        assert dict(parser.errors) == {kind: 1}, broken[:20]
         assert [frame.line + b"\n" for frame in frames] == [GOOD, LINES[1]]
-        assert kind.value in str(parser.last_refusal)
-        assert len(str(parser.last_refusal)) < 600
+        assert kind.value in str(parser.last_error)
+        assert len(str(parser.last_error)) < 600
 
 
 def test_a_refusal_says_which_value_it_was() -> None:
@@ -173,9 +176,9 @@ def test_a_line_with_any_one_byte_changed_is_refused_or_reads_as_another_number(
     frames = parser.feed(LINES[1] + changed + LINES[2], 0)
     read_line(changed.rstrip(b"\n"), ZERO_SLOTS)
     is_digit = chr(byte).isdigit() and byte < 128 and chr(GOOD[position]).isdigit()
-    assert len(frames) + parser.refused.total() == 3
+    assert len(frames) + parser.errors.total() == 3
     assert [frames[0].line + b"\n", frames[-1].line + b"\n"] == LINES[1:3]
-    assert is_digit or parser.refused.total() == 1
+    assert is_digit or parser.errors.total() == 1
 
 
 @given(st.lists(st.one_of(st.sampled_from(LINES), st.sampled_from([b for _, b in BROKEN])), max_size=12), st.data())
@@ -187,7 +190,7 @@ def test_every_good_line_among_broken_ones_arrives_and_every_broken_one_is_count
     parser = FrameParser(ZERO_SLOTS)
     frames = feed_all(parser, slices(stream, cuts))
     assert [frame.line + b"\n" for frame in frames] == [GOOD, *[line for line in lines if line in LINES]]
-    assert parser.refused.total() == len(lines) + 1 - len(frames)
+    assert parser.errors.total() == len(lines) + 1 - len(frames)
 
 
 @given(st.binary(max_size=3000), st.integers(1, 300))
@@ -195,7 +198,7 @@ def test_garbage_never_yields_a_frame_nor_grows_the_parser(garbage: bytes, times
     parser = FrameParser(ZERO_SLOTS)
     for _ in range(times):
         assert parser.feed(garbage, 0) == []
-        assert len(parser._begun) <= LONGEST_LINE_BYTES
+        assert len(parser._lines.partial) <= MAX_LINE_BYTES
     parser.feed(b"\n", 0)
     assert [frame.line + b"\n" for frame in parser.feed(GOOD, 0)] == [GOOD]
 
@@ -204,24 +207,24 @@ def test_a_flood_without_newline_is_told_when_it_happens_and_only_once() -> None
     parser = FrameParser(ZERO_SLOTS)
     for _ in range(100):
         parser.feed(b"7" * 10_000, 0)
-    assert dict(parser.refused) == {FrameErrorKind.TOO_LONG: 1}
+    assert dict(parser.errors) == {FrameErrorKind.TOO_LONG: 1}
     assert len(parser.feed(b"777\n" + GOOD, 0)) == 1
-    assert parser.refused.total() == 1
+    assert parser.errors.total() == 1
 
 
 @given(st.integers(1, LINE_BYTES))
 def test_the_rest_of_a_line_that_was_under_way_is_no_error(start: int) -> None:
     parser = FrameParser(ZERO_SLOTS)
     assert len(parser.feed(GOOD[start:] + LINES[1], 0)) == 1
-    assert not parser.refused
-    assert parser.first_partials == 1
+    assert not parser.errors
+    assert parser.partial_lines == 1
 
 
 def test_a_whole_line_that_is_broken_is_refused_even_as_the_first() -> None:
     parser = FrameParser(ZERO_SLOTS)
     parser.feed(with_value(CHANNEL, b"nan"), 0)
-    assert dict(parser.refused) == {FrameErrorKind.NAN: 1}
-    assert parser.first_partials == 0
+    assert dict(parser.errors) == {FrameErrorKind.NAN: 1}
+    assert parser.partial_lines == 0
 
 
 def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> None:
@@ -231,7 +234,7 @@ def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> N
     frames = parser.feed(LINES[2], 0)
     assert [(frame.line + b"\n", frame.seq) for frame in frames] == [(LINES[2], 1)]
     assert parser.unfinished == 1
-    assert not parser.refused
+    assert not parser.errors
 
 
 @given(st.integers(0, LINE_BYTES), st.booleans())
@@ -242,7 +245,7 @@ def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun: int, anew:
     frames = parser.feed((LINES[2] if anew else LINES[1][begun:]) + LINES[3], 0)
     assert [frame.line + b"\n" for frame in frames] == [LINES[2] if anew else LINES[1], LINES[3]]
     assert parser.unfinished == (anew and begun > 0)
-    assert not parser.refused
+    assert not parser.errors
 
 
 def test_frames_that_waited_together_are_stamped_a_period_apart() -> None:

@@ -7,21 +7,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.calibration_file import CalibrationError, load_calibration, save_calibration
-from shearloop.drivers.hx711 import (
+from shearloop.drivers.errors import DeviceCalibrationError
+from shearloop.drivers.load_cell import (
     COUNTS_MAX,
     COUNTS_MIN,
     MAX_LINE_BYTES,
     PERIOD_NS,
     RATE_HZ,
+    SLEW_NM_PER_S,
     STUCK_AFTER,
-    Despiker,
     LoadCalibration,
-    LoadLimits,
     LoadParser,
     LoadSample,
-    refusals,
+    SpikeFilter,
+    describe_errors,
 )
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.drivers.yaml_files import load_calibration, save_calibration
 
 TORQUE_LINES = LoadCalibration.of_torque_lines()
 STREAMS = {
@@ -52,7 +54,7 @@ def test_the_two_real_corrupted_values_are_flagged_and_nothing_else(shared: Path
     rows = recorded(shared, name)
     samples = [sample for t_ns, value in rows for sample in parser.feed(f"{value:.12f}\r\n".encode(), t_ns)]
     assert len(samples) == len(rows)
-    assert not parser.refused
+    assert not parser.errors
     spikes = [sample.raw for sample in samples if sample.spike]
     assert spikes == ([996.0, 38399996.0] if name.startswith("glitch") else [])
     assert [sample.seq for sample in samples if not sample.trusted] == sorted({0, *(s.seq for s in samples if s.spike)})
@@ -83,10 +85,10 @@ def test_the_slices_in_which_bytes_come_change_nothing(pieces: list[bytes], widt
     assert [(s.raw, s.seq, s.saturated, s.partial) for s in got] == [
         (s.raw, s.seq, s.saturated, s.partial) for s in expected
     ]
-    assert sliced.refused == whole.refused
+    assert sliced.errors == whole.errors
     # Every line is either a sample or a counted refusal; only an unfinished one is neither.
     unfinished_but_refused = len(data) - data.rfind(b"\n") - 1 > MAX_LINE_BYTES
-    assert len(expected) + whole.refused.total() == data.count(b"\n") + unfinished_but_refused
+    assert len(expected) + whole.errors.total() == data.count(b"\n") + unfinished_but_refused
 
 
 NOT_DECIMAL = ("nan", "inf", "ovf", "1e5", "0x10", "1 2", "1.", ".5", "--1", "٣", "9" * 20)
@@ -98,9 +100,8 @@ NOT_DECIMAL = ("nan", "inf", "ovf", "1e5", "0x10", "1 2", "1.", ".5", "--1", "٣
 def test_a_line_that_is_no_decimal_is_refused_by_kind_with_a_sentence(line: str, kind: str) -> None:
     parser = LoadParser(TORQUE_LINES)
     assert feed_lines(parser, [line]) == []
-    assert dict(parser.refused) == {kind: 1}
-    (sentence,) = refusals(parser)
-    assert "(1 times)" in sentence
+    assert dict(parser.errors) == {kind: 1}
+    assert describe_errors(parser.errors).count("(1 times)") == 1
 
 
 def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
@@ -108,14 +109,14 @@ def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
     parser.feed(b"0.010\r\n0.0", 0)
     parser.restart()
     assert [sample.raw for sample in parser.feed(b"20\r\n0.030\r\n", 1)] == [20.0, 0.03]
-    assert dict(parser.refused) == {"unfinished": 1}
+    assert dict(parser.errors) == {"unfinished": 1}
 
 
 def test_line_that_never_seems_to_end_is_counted_once() -> None:
     parser = LoadParser(TORQUE_LINES)
     for _ in range(10):
         assert parser.feed(b"7" * 1000, 0) == []
-    assert dict(parser.refused) == {"too_long": 1}
+    assert dict(parser.errors) == {"too_long": 1}
     samples = parser.feed(b"7\n0.5\n", 0)
     assert [(s.raw, s.partial) for s in samples] == [(0.5, False)]
 
@@ -158,9 +159,9 @@ torques = st.floats(-1.7, 1.7)
 
 @given(torques, torques, st.integers(3, 10))
 def test_a_real_step_is_believed_after_three_agreeing_values(before: float, after: float, n: int) -> None:
-    despiker = Despiker(LoadLimits())
-    assert not any(despiker.is_spike(before, k * PERIOD_NS) for k in range(5))
-    flags = [despiker.is_spike(after, (5 + k) * PERIOD_NS) for k in range(n)]
+    spikes = SpikeFilter()
+    assert not any(spikes.is_spike(before, k * PERIOD_NS) for k in range(5))
+    flags = [spikes.is_spike(after, (5 + k) * PERIOD_NS) for k in range(n)]
     assert flags[0] == (abs(after - before) > 2.0 * PERIOD_NS * 1e-9)
     assert not any(flags[2:])
 
@@ -173,19 +174,19 @@ def test_one_corrupted_value_in_a_moving_signal_is_flagged_alone(steps: list[flo
         values.append(level)
     where = data.draw(st.integers(1, len(values) - 1))
     values[where] = values[where - 1] + data.draw(st.sampled_from([-1, 1])) * data.draw(st.floats(0.2, 1e9))
-    despiker = Despiker(LoadLimits())
-    assert [k for k, v in enumerate(values) if despiker.is_spike(v, k * PERIOD_NS)] == [where]
+    spikes = SpikeFilter()
+    assert [k for k, v in enumerate(values) if spikes.is_spike(v, k * PERIOD_NS)] == [where]
 
 
 def test_after_a_gap_the_rig_may_have_moved_further() -> None:
-    despiker = Despiker(LoadLimits())
-    assert not despiker.is_spike(0.0, 0)
-    assert not despiker.is_spike(1.5, 10**9)
+    spikes = SpikeFilter()
+    assert not spikes.is_spike(0.0, 0)
+    assert not spikes.is_spike(1.5, 10**9)
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 10.9, 80.0])
 def test_a_spike_is_what_the_rig_cannot_do_within_the_boards_own_period(rate_hz: float) -> None:
-    within_nm = LoadLimits().slew_nm_per_s / rate_hz
+    within_nm = SLEW_NM_PER_S / rate_hz
     for share, spike in ((0.9, False), (1.1, True)):
         parser, torque_nm = LoadParser(TORQUE_LINES, rate_hz), min(share * within_nm, 1.74)
         lines = [f"{value:.4f}\n".encode() for value in (0.0, 0.0, torque_nm)]
@@ -196,7 +197,7 @@ def test_a_spike_is_what_the_rig_cannot_do_within_the_boards_own_period(rate_hz:
 def test_a_tare_forgets_the_level_that_spikes_are_judged_by() -> None:
     parser = LoadParser(LoadCalibration(tare_counts=0, scale_n_per_count=1e-4))
     assert not feed_lines(parser, ["200000", "200000"])[-1].spike
-    parser.calibration = parser.calibration.tared(200000)
+    parser.handle(RawEvent(InputKind.TARE, 0, b"200000"))
     assert (sample := feed_lines(parser, ["200000"])[0]).trusted
     assert sample.torque_nm == 0
 
@@ -222,13 +223,13 @@ def test_a_calibration_survives_its_file(tmp_path: Path) -> None:
 def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / "load.yaml"
     path.write_text(text)
-    with pytest.raises(CalibrationError, match=said) as refused:
+    with pytest.raises(DeviceCalibrationError, match=said) as refused:
         load_calibration(path, LoadCalibration)
     assert str(path) in str(refused.value)
 
 
 def test_a_missing_calibration_file_says_how_to_make_one(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match="shearloop calibrate"):
+    with pytest.raises(DeviceCalibrationError, match="shearloop calibrate"):
         load_calibration(tmp_path / "none.yaml", LoadCalibration)
-    with pytest.raises(CalibrationError, match="cannot be written"):
+    with pytest.raises(DeviceCalibrationError, match="cannot be written"):
         save_calibration(tmp_path / "no/such/folder.yaml", TORQUE_LINES)

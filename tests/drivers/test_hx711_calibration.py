@@ -7,18 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.calibration_file import CalibrationError
-from shearloop.drivers.hx711 import COUNTS_MAX, LoadCalibration, LoadParser, LoadSample
-from shearloop.drivers.hx711_calibration import (
+from shearloop.drivers.errors import DeviceCalibrationError
+from shearloop.drivers.load_calibration import (
+    SAMPLES_PER_STEP,
+    SKIP_SAMPLES,
     STANDARD_GRAVITY,
     UNCALIBRATED,
-    CalibrationBounds,
     LoadCalibrator,
-    tare,
 )
+from shearloop.drivers.load_cell import COUNTS_MAX, LoadCalibration, LoadParser, LoadSample
 
-BOUNDS = CalibrationBounds()
-STEP = BOUNDS.skip_samples + BOUNDS.samples_per_step
+STEP = SKIP_SAMPLES + SAMPLES_PER_STEP
 
 
 def samples(raws: Iterable[float]) -> list[LoadSample]:
@@ -33,7 +32,7 @@ def noisy(level: float, std: float = 200.0, seed: int = 0) -> list[LoadSample]:
 
 def calibrate(calibrator: LoadCalibrator, signal: Callable[[float], list[LoadSample]]) -> None:
     for mass_g in (0.0, *calibrator.masses_g):
-        calibrator.ready()
+        calibrator.start_step()
         assert [calibrator.feed(sample) for sample in signal(mass_g)].index(True) == STEP - 1
 
 
@@ -72,15 +71,15 @@ def test_a_board_that_sends_newton_metres_is_calibrated_the_same_way() -> None:
 
 
 def refused(calibrator: LoadCalibrator, signal: list[LoadSample]) -> str:
-    calibrator.ready()
-    with pytest.raises(CalibrationError) as error:
+    calibrator.start_step()
+    with pytest.raises(DeviceCalibrationError) as error:
         any(calibrator.feed(sample) for sample in signal)
     return str(error.value)
 
 
 def after_empty(masses_g: list[float]) -> LoadCalibrator:
     calibrator = LoadCalibrator(masses_g)
-    calibrator.ready()
+    calibrator.start_step()
     assert any(calibrator.feed(sample) for sample in noisy(8000.0))
     return calibrator
 
@@ -90,7 +89,7 @@ def test_a_saturated_signal_is_refused_and_the_step_asked_for_again() -> None:
     asked = calibrator.prompt
     assert "end of its range" in refused(calibrator, [*noisy(8000.0)[:-1], *samples([COUNTS_MAX])])
     assert calibrator.prompt == asked
-    calibrator.ready()
+    calibrator.start_step()
     assert any(calibrator.feed(sample) for sample in noisy(50_000.0))
     assert calibrator.finished
 
@@ -111,12 +110,12 @@ def test_noise_is_refused_beyond_the_bound_and_beyond_a_share_of_the_change() ->
 def test_masses_off_the_line_or_in_the_wrong_order_are_refused() -> None:
     bent = LoadCalibrator([100.0, 200.0])
     calibrate(bent, lambda mass_g: noisy(420 * mass_g * (0.8 if mass_g == 200 else 1.0)))
-    with pytest.raises(CalibrationError, match="straight line"):
+    with pytest.raises(DeviceCalibrationError, match="straight line"):
         bent.result()
     swapped = LoadCalibrator([100.0, 200.0])
-    swapped.ready()
+    swapped.start_step()
     assert any(swapped.feed(sample) for sample in noisy(0.0))
-    swapped.ready()
+    swapped.start_step()
     assert any(swapped.feed(sample) for sample in noisy(84_000.0))
     assert "order given" in refused(swapped, noisy(42_000.0))
 
@@ -127,9 +126,9 @@ def test_too_many_corrupted_values_are_refused_and_few_are_left_out() -> None:
     raws[20] = 9e12
     few = parser.feed(b"0\n" + b"".join(b"%.0f\n" % raw for raw in raws), 0)[1:]
     calibrator = LoadCalibrator([100.0])
-    calibrator.ready()
+    calibrator.start_step()
     assert any(calibrator.feed(sample) for sample in few)
-    assert calibrator.levels[0].n == BOUNDS.samples_per_step - 1
+    assert calibrator.levels[0].n == SAMPLES_PER_STEP - 1
     raws[20:25] = 9e12
     parser.restart()
     many = parser.feed(b"0\n" + b"".join(b"%.0f\n" % raw for raw in raws), 0)[1:]
@@ -140,20 +139,11 @@ def test_samples_between_the_steps_count_for_nothing() -> None:
     calibrator = after_empty([100.0])
     assert not any(calibrator.feed(sample) for sample in noisy(1e6))
     assert len(calibrator.levels) == 1
-    with pytest.raises(CalibrationError, match="1 steps"):
+    with pytest.raises(DeviceCalibrationError, match="1 steps"):
         calibrator.result()
 
 
 @pytest.mark.parametrize("masses_g", [[], [0.0], [-5.0], [float("nan")], [float("inf")], [100.0, 100.0]])
 def test_masses_that_no_line_goes_through_are_refused(masses_g: list[float]) -> None:
-    with pytest.raises(CalibrationError, match="mass"):
+    with pytest.raises(DeviceCalibrationError, match="mass"):
         LoadCalibrator(masses_g)
-
-
-def test_a_tare_moves_the_zero_and_keeps_the_scale() -> None:
-    before = LoadCalibration(tare_counts=0, scale_n_per_count=2e-5, sign=-1)
-    after = tare(before, noisy(8000.0), BOUNDS)
-    assert after.nm_per_count == before.nm_per_count
-    assert after.torque_nm(8000.0) == pytest.approx(0, abs=200 * 2e-5 * 0.035)
-    with pytest.raises(CalibrationError, match="Only 4"):
-        tare(before, noisy(8000.0)[:4], BOUNDS)

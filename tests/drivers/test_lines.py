@@ -5,7 +5,7 @@ import tracemalloc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.line_splitter import LineSplitter
+from shearloop.drivers.serial_sensor import LineSplitter
 
 LONGEST = 8
 
@@ -17,20 +17,20 @@ def test_slices_change_nothing_and_every_line_is_given_or_counted(slices: list[b
     expected = whole.feed(data)
     assert [line for part in slices for line in sliced.feed(part)] == expected
     *ended, rest = data.split(b"\n")
-    assert expected == [line if len(line) <= LONGEST else None for line in ended]
+    assert expected == [line if len(line) <= LONGEST else None for line in ended] + [None] * (len(rest) > LONGEST)
     assert whole.too_long == sliced.too_long == sum(len(line) > LONGEST for line in [*ended, rest])
-    assert sliced.begun == whole.begun == (bool(rest.strip()) or len(rest) > LONGEST)
+    assert sliced.in_line == whole.in_line == (bool(rest.strip()) or len(rest) > LONGEST)
 
 
 def test_memory_stays_bounded_where_no_line_ever_ends() -> None:
     lines, slice_ = LineSplitter(LONGEST), b"7" * 1000
     tracemalloc.start()
     for _ in range(1000):
-        assert lines.feed(slice_) == []
+        lines.feed(slice_)
     _, peak_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak_bytes < 10 * len(slice_)
-    assert (lines.too_long, lines.begun) == (1, True)
+    assert (lines.too_long, lines.in_line) == (1, True)
 
 
 def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten() -> None:
@@ -38,7 +38,7 @@ def test_what_had_begun_when_the_port_was_opened_again_is_counted_and_forgotten(
     lines.feed(b"1\n2")
     lines.restart()
     lines.restart()
-    assert (lines.unfinished, lines.begun) == (1, False)
+    assert (lines.unfinished, lines.in_line) == (1, False)
     assert lines.feed(b"3\n") == [b"3"]
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.hx711 import COUNTS_MAX, COUNTS_MIN, LoadCalibration, LoadParser
+from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN, LoadCalibration, LoadParser
 
 SKETCH = Path(__file__).resolve().parents[2] / "firmware/hx711_torque/hx711_torque.ino"
 
@@ -74,4 +74,4 @@ def test_the_sketch_reads_the_converter_and_speaks_the_drivers_language(tmp_path
     samples = parser.feed(done.stdout.encode(), 0)
     assert [sample.raw for sample in samples] == counts
     assert [sample.saturated for sample in samples] == [count in (COUNTS_MAX, COUNTS_MIN) for count in counts]
-    assert not parser.refused
+    assert not parser.errors

@@ -22,10 +22,10 @@ from shearloop.bank.estimation import (
 )
 from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.fingertip_validator import channel_noise
+from shearloop.daemon.analysis.bank_design import residual_noise
 from shearloop.daemon.analysis.charts.sources import Split
-from shearloop.daemon.scene import residual_noise
 from shearloop.daemon.workers import Executor, in_order
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 
 Mask = NDArray[np.bool_]
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.batch_forward import BatchForwardModel
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
-from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel, ForwardModel
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import Conductivities, conductivity
+from shearloop.bank.eit.models import ConductivityModel, conductivity
 from shearloop.daemon.analysis.charts.sources import own_fingertip
 
 MODEL = "gaussian_derivative"
@@ -119,8 +118,8 @@ def pyeit(mesh: Mesh) -> Callable[[], object] | None:
     solve = pyeit_solver(mesh)
     if solve is None:
         return None
-    of = Conductivities(mesh)
-    cells = [of.of(MODEL, k, s) for k, s in CELLS]
+    of = ConductivityModel(mesh)
+    cells = [of.conductivity(MODEL, k, s) for k, s in CELLS]
     return lambda: [solve(cell) for cell in cells]
 
 
@@ -150,10 +149,10 @@ def pyeit_solver(mesh: Mesh) -> Callable[[FloatArray], object] | None:
 
 def batch(mesh: Mesh) -> Callable[[], FloatArray]:
     """Return a function that solves the same signals in one batch, as `bank build` does."""
-    model, of = BatchForwardModel(mesh), Conductivities(mesh)
+    model, of = BatchForwardModel(mesh), ConductivityModel(mesh)
     (homogeneous,) = model.voltages(np.ones((1, len(mesh.triangles))))
     # The elimination takes several cells at once; six alone would leave lanes empty.
-    cells = np.array([of.of(MODEL, k, s) for k, s in CELLS])
+    cells = np.array([of.conductivity(MODEL, k, s) for k, s in CELLS])
     many = np.resize(np.arange(len(CELLS)), BATCHES * len(CELLS))
     return lambda: (model.voltages(cells[many]) - homogeneous)[: len(CELLS)]
 

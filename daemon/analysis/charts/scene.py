@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from shearloop.bank.eit.design import ALLOWED, Choice, Design, Scene, designed
+from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank
 from shearloop.bank.eit.fingertip import Fingertip
+from shearloop.daemon.analysis.bank_design import choices_of, doubts, scene_of
 from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save
 from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
-from shearloop.daemon.scene import choices_of, doubts, scene_of
 from shearloop.daemon.workers import Executor, in_order
 
 _MESH_SIZE_CM = 0.07
@@ -35,9 +35,9 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
     return written
 
 
-def designed_on(fingertip: Fingertip, scene: Scene) -> Design:
+def designed_on(fingertip: Fingertip, scene: MeasuredFrames) -> Design:
     """Return `designed` with its arguments as a task has them."""
-    return designed(scene, fingertip)
+    return design_bank(scene, fingertip)
 
 
 def write(title: str, design: Design, out: Path) -> list[Path]:
@@ -61,7 +61,7 @@ def write(title: str, design: Design, out: Path) -> list[Path]:
     return save(made, content, out, f"scene-{slug}")
 
 
-def _draw_choice(axes: Axes, choice: Choice) -> None:
+def _draw_choice(axes: Axes, choice: DesignChoice) -> None:
     settings, added = ([getattr(step, name) for step in choice.steps] for name in ("setting", "added"))
     # What is exact adds nothing, which a logarithmic axis cannot show.
     shown = np.maximum(added, _LEAST_SHOWN)
@@ -112,7 +112,7 @@ def _draw_models(axes: Axes, design: Design) -> None:
     )  # fmt: skip
 
 
-def _draw_table(axes: Axes, choices: Sequence[Choice]) -> None:
+def _draw_table(axes: Axes, choices: Sequence[DesignChoice]) -> None:
     rows = []
     for one in choices:
         step, after = one.chosen, one.next_step

@@ -28,7 +28,7 @@ from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
 from shearloop.daemon.workers import Executor, in_order
-from shearloop.drivers.shear_skin.judge import SkinSample
+from shearloop.drivers.shear_skin.skin import SkinSample
 
 TICK_S, SAMPLE_TICKS = 0.008, 12.5
 # From the middle of a conversion to the controller; and from a speed command to the wrist.
@@ -86,7 +86,12 @@ class SkinLoop:
         # The chart looks for the boundary, so every margin is allowed.
         config = LoopConfig.model_validate(
             {
-                **{"kp": case.kp, "deadband_nm": case.deadband_nm, "jump_nm": 0.006, "slip_nm": 0.006},
+                **{
+                    "kp": case.kp,
+                    "deadband_nm": case.deadband_nm,
+                    "max_innovation_nm": 0.006,
+                    "max_offset_drift_nm": 0.006,
+                },
                 **{"gain_margin": 1.0, "phase_margin_deg": 0.0},
             }
         )
@@ -174,7 +179,9 @@ def _experiment(hold_s: float) -> ExperimentFile:
         for n in SET_POINTS_N
     ]
     steps = [{"do": "tare"}, {"do": "identify", "amplitude_rad": 0.1}, *holds]
-    return ExperimentFile.model_validate({"name": "bench", "drive": "skin", "steps": steps, "limits": {"angle_rad": 1}})
+    return ExperimentFile.model_validate(
+        {"name": "bench", "torque_source": "skin", "steps": steps, "limits": {"angle_rad": 1}}
+    )
 
 
 def holds_of(loop: SkinLoop, settled_s: float) -> list[FloatArray]:

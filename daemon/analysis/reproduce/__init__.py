@@ -1,1 +1,1 @@
-"""Computing the numbers and figures of Trehan et al. 2025 anew, from slices of recordings."""
+"""The numbers and figures of Trehan et al. 2025, from recorded slices."""

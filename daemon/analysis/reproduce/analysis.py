@@ -1,17 +1,15 @@
-"""The analysis of Trehan et al. 2025 on recorded slices: what torque and diameter follow from the best matches.
-
-Sensors 2025, 25, 5159. Every number that the paper reports is computed anew; what the recordings do not determine
-stays None, with a sentence that says so.
-"""
+"""The analysis of Trehan et al. 2025 (Sensors 25, 5159): torque and diameter from best matches of recorded slices."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import smoothed_along_channels
+from shearloop.bank.eit.channels import channels_of_line, smoothed_along_channels
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.grouping import group_means, kmeans_groups, place_in_series
 from shearloop.bank.eit.matching import Match, ReferenceMatcher, best_match
@@ -27,22 +25,82 @@ from shearloop.bank.eit.models import MODELS
 from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError, MatchingError
 from shearloop.bank.estimation.calibration import DIAMETER_DEGREE, TORQUE_DEGREE
-from shearloop.daemon.recording.matlab_streams import DiameterSlices, TorqueSlices
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.matlab import (
+    DiameterSlices,
+    TorqueSlices,
+    read_diameter_slices,
+    read_line,
+    read_torque_slices,
+)
 
-# Called with how many slices have been matched since the last call.
+TORQUE_FOLDER, DIAMETER_FOLDER = "torque_slices", "diameter_slices"
+RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Inputs:
+    """The slices of a folder; `raw_difference` (896,) is of one raw frame, `notes` name missing files."""
+
+    torque: TorqueSlices | None
+    diameter: DiameterSlices | None
+    raw_difference: NDArray[np.float64] | None
+    notes: tuple[str, ...]
+
+
+def read_inputs(recordings: Path) -> Inputs:
+    """Read torque_slices and diameter_slices of a folder.
+
+    Raises UserError when both are absent, a file cannot be used, or there are fewer than three torque slices.
+    """
+    torque_folder, diameter_folder = recordings / TORQUE_FOLDER, recordings / DIAMETER_FOLDER
+    if not torque_folder.is_dir() and not diameter_folder.is_dir():
+        if not recordings.is_dir():
+            raise UserError(
+                f"{recordings} is not a folder; name the folder that contains {TORQUE_FOLDER} or {DIAMETER_FOLDER}"
+            )
+        raise UserError(f"{recordings} has neither a folder {TORQUE_FOLDER} nor a folder {DIAMETER_FOLDER}")
+    notes: list[str] = []
+    torque = diameter = raw = None
+    if torque_folder.is_dir():
+        torque = read_torque_slices(torque_folder)
+        if len(torque.torque_nm) < FEWEST_SLICES:
+            raise UserError(
+                f"{torque_folder} has {len(torque.torque_nm)} slices; a correlation needs at least {FEWEST_SLICES}"
+            )
+        raw = _raw_difference(torque_folder, notes)
+    else:
+        notes.append(f"{torque_folder} does not exist: nothing about torque, and no scores of the models.")
+    if diameter_folder.is_dir():
+        diameter = read_diameter_slices(diameter_folder)
+    else:
+        notes.append(f"{diameter_folder} does not exist: nothing about diameter.")
+    return Inputs(torque, diameter, raw, tuple(notes))
+
+
+def _raw_difference(folder: Path, notes: list[str]) -> NDArray[np.float64] | None:
+    frame, homogeneous = folder / RAW_FRAME, folder / RAW_HOMOGENEOUS
+    absent = [path.name for path in (frame, homogeneous) if not path.exists()]
+    if absent:
+        notes.append(f"{' and '.join(absent)} not found in {folder}: models are scored by the matching alone.")
+        return None
+    return np.abs(channels_of_line(read_line(frame)) - channels_of_line(read_line(homogeneous)))
+
+
+# Called with the number of slices matched since the last call.
 Progress = Callable[[int], object]
 
 FEWEST_SLICES = 3
 # The paper sorts its torques into ten groups.
 _GROUPS = 10
-# Where the slices are no repeats, the held-out parts are so many stretches of time.
+# Without repeats, the held-out parts are stretches of time.
 _STRETCHES = 5
 _BATCH = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Matches:
-    """The best matches of n slices on one bank: heatmaps (n, K, S), k (n,), sigma (n,) in cm, scores (n,)."""
+    """The best matches of n slices in a bank: heatmaps (n, K, S), k (n,) and sigma (n,) in cm, scores (n,)."""
 
     heatmaps: FloatArray
     k: FloatArray
@@ -53,11 +111,11 @@ class Matches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TorqueResult:
-    """What the torque slices say. Correlations are Pearson's, between torque and the best match's sigma.
+    """The torque slices' results. Correlations are Pearson's, between torque and the best match's sigma.
 
-    groups (n,) are levels of torque, found as `grouping` says; r_clustered is between the groups' means; fit is the
-    parabola through these means; rmse_nm is that of single slices, each predicted by a parabola fitted without its
-    part of the recording, parts being as `held_out` says.
+    `groups` (n,) are levels of torque, `r_clustered` is between their means, and `fit` is the parabola through these.
+    `rmse_nm` is of single slices, each predicted by a parabola fitted without its part of the recording. `grouping` and
+    `held_out` describe the groups and the parts.
     """
 
     slices: TorqueSlices
@@ -86,10 +144,10 @@ class TorqueResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiameterResult:
-    """What the diameter slices say: Pearson's correlation between diameter and the best match's k.
+    """The diameter slices' results: Pearson's correlation between diameter and the best match's k.
 
-    single is slice by slice; accumulated has one match for each of diameters_mm (d,), of the mean of its heatmaps
-    (d, K, S); fit is the line through accumulated_k (d,).
+    `single` is slice by slice. `accumulated` has one match per diameter (d,), of its mean heatmap (d, K, S); `fit` is
+    the line through `accumulated_k` (d,).
     """
 
     slices: DiameterSlices
@@ -106,10 +164,9 @@ class DiameterResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModelScores:
-    """The score of each basis model by name, in two measures (see shearloop.bank.eit.model_scores), None where none
-    is possible.
+    """The score of each basis model in two measures (see bank.eit.model_scores), None where it is undefined.
 
-    envelope needs the raw frame; matching is over the torque slices.
+    `envelope` needs the raw frame; `matching` is over the torque slices.
     """
 
     envelope: dict[str, float | None] | None
@@ -117,7 +174,7 @@ class ModelScores:
 
     @property
     def chosen(self) -> dict[str, float | None]:
-        """The paper's measure where the raw frame is there, else that of the matching."""
+        """The paper's measure where the raw frame exists, else the matching's."""
         return self.matching if self.envelope is None else self.envelope
 
 
@@ -140,7 +197,7 @@ def match_slices(differences: FloatArray, bank: Bank, progress: Progress) -> Mat
 
 
 def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) -> TorqueResult:
-    """Relate the sigma of torque slices, at least three of them, to torque, by their matches on both banks."""
+    """Relate sigma to torque, from the matches of at least three slices in both banks."""
     torque = slices.torque_nm
     sigma = on_focused.sigma
     groups, grouping = _levels(torque)
@@ -169,7 +226,7 @@ def analyse_torque(slices: TorqueSlices, on_focused: Matches, on_wide: Matches) 
 
 
 def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> DiameterResult:
-    """Match diameter slices, smoothed along the channels, on the wide bank and relate k to diameter."""
+    """Match diameter slices, smoothed along the channels, in the wide bank and relate k to diameter."""
     single = match_slices(smoothed_along_channels(slices.differences), wide, progress)
     diameters = np.unique(slices.diameter_mm)
     heatmaps = np.array([single.heatmaps[slices.diameter_mm == each].mean(axis=0) for each in diameters])
@@ -194,7 +251,7 @@ def analyse_diameter(slices: DiameterSlices, wide: Bank, progress: Progress) -> 
 
 
 def score_models(slices: TorqueSlices, raw_difference: FloatArray | None, mesh: Mesh) -> ModelScores:
-    """Score the five basis models on a mesh against the slices and, where it is there, a raw (896,) difference."""
+    """Score the five basis models on a mesh against the slices and, if given, a raw (896,) difference."""
     forward = ForwardModel(mesh)
     middle = float(mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2
     envelope: dict[str, float | None] = {}
@@ -209,7 +266,7 @@ def score_models(slices: TorqueSlices, raw_difference: FloatArray | None, mesh: 
 
 
 def correlation(x: FloatArray, y: FloatArray) -> float | None:
-    """Return Pearson's r of (n,) x and y, None for fewer than three points or where one of them does not vary."""
+    """Return Pearson's r of (n,) x and y, None for fewer than three points or constant values."""
     if len(x) < FEWEST_SLICES or np.ptp(x) == 0 or np.ptp(y) == 0:
         return None
     return float(np.corrcoef(x, y)[0, 1])
@@ -224,7 +281,7 @@ def _levels(torque: FloatArray) -> tuple[IntArray, str]:
 
 
 def _held_out_parts(torque: FloatArray) -> tuple[IntArray, str]:
-    """Return the part of time that each slice belongs to: neighbours in time are not independent of each other."""
+    """Return each slice's part of the recording: neighbours in time are not independent."""
     series = place_in_series(torque)
     if series is not None:
         return series.repeat, "one repeat of the series left out at a time"
@@ -260,5 +317,5 @@ def _envelope_score_or_none(raw_difference: FloatArray, signals: FloatArray) -> 
 
 
 def all_notes(results: Iterable[TorqueResult | DiameterResult | None]) -> list[str]:
-    """Return the notes of the results that there are."""
+    """Return the notes of the existing results."""
     return [note for result in results if result is not None for note in result.notes]

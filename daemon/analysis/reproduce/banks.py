@@ -1,4 +1,4 @@
-"""The mesh and the two banks that a reproduction uses: chosen, built, and kept for the next time."""
+"""The mesh and the two banks of a reproduction: chosen, built, and kept for the next run."""
 
 import sys
 from collections.abc import Callable
@@ -17,9 +17,9 @@ from shearloop.daemon.bank_config import load_bank_plan, load_geometry
 from shearloop.daemon.errors import UserError
 
 MODEL = "gaussian_derivative"
-# Beside a folder of recordings, where the paper's own mesh is looked for.
+# The paper's own mesh, next to a folder of recordings.
 PAPER_MESH = Path("reference") / "fingertip_mesh.npz"
-# Beside the packages: the fingertip by its measures.
+
 OWN_FINGERTIP = Path(str(resources.files("shearloop"))) / "config" / "fingertips" / "paper.yaml"
 
 RowProgress = Callable[[str, int, int], None]
@@ -33,23 +33,23 @@ class Grid:
     sigma: NDArray[np.float64]
 
 
-# Over all of the fingertip, as the paper's figure 6, and finer over the part where screwdrivers are found.
+# The whole fingertip as in the paper's figure 6, and finer where screwdrivers match.
 GRIDS = {
     "focused": Grid(np.linspace(3.1, 3.4, 100), np.linspace(1.2, 1.9, 100)),
     "wide": Grid(np.linspace(0.01, 4.4, 100), np.linspace(0.01, 4.4, 100)),
 }
 
 
-# The paper's focused grid is where nearly all of its own slices match best; a tool of another thickness is elsewhere.
+# The paper's focused grid stays where this share of the best matches is inside; other tools match elsewhere.
 FEWEST_INSIDE = 0.9
-# Of the best matches: outliers set no border. Around them so many of the wide bank's steps are added.
+# Quantiles of the best matches that a moved grid covers, and the number of the wide bank's steps around them.
 _ENDS, _STEPS_AROUND = (0.02, 0.98), 2
 
 
 def focused_grid(k: NDArray[np.float64], sigma: NDArray[np.float64]) -> Grid:
-    """Return the cells to look at more closely, from the best matches k (n,), sigma (n,) on the wide bank, in cm.
+    """Return the focused grid for the best matches k (n,) and sigma (n,) in the wide bank, in cm.
 
-    The paper's own, where they hold the matches; else as many around the matches, and over no less.
+    It is the paper's where that covers the matches; else an equally large or larger one around the matches.
     """
     paper, wide = GRIDS["focused"], GRIDS["wide"]
     inside = _within(k, paper.k) & _within(sigma, paper.sigma)
@@ -72,16 +72,16 @@ def _around(found: NDArray[np.float64], paper: NDArray[np.float64], wide: NDArra
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenMesh:
-    """A mesh, and where it is from, for the report."""
+    """A mesh and its origin, for the report."""
 
     mesh: Mesh
     origin: str
 
 
 def choose_mesh(recordings: Path, mesh: Path | None, bank_config: Path | None) -> ChosenMesh:
-    """Return the mesh of a file or a bank's configuration; without either the paper's beside the recordings, or ours.
+    """Return the mesh of a file or of a bank's configuration, else the paper's next to the recordings, else our own.
 
-    Raises UserError and GeometryError for files that cannot be used.
+    Raises UserError and GeometryError for unusable files.
     """
     if mesh is not None:
         return ChosenMesh(load_geometry(mesh), str(mesh))
@@ -96,9 +96,9 @@ def choose_mesh(recordings: Path, mesh: Path | None, bank_config: Path | None) -
 
 
 def cached_bank(name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int, on_row: RowProgress) -> Bank:
-    """Return the bank of this grid and mesh from a folder, building it there if it is not there in good order.
+    """Return the bank of this grid and mesh from a folder; build it where it is missing or damaged.
 
-    `on_row(name, done, total)` is called while it is built. Raises BankFileError where it cannot be written.
+    `on_row(name, done, total)` is called during the build. Raises BankFileError where it cannot be written.
     """
     identity = BankDefinition(mesh.digest, MODEL, grid.k, grid.sigma).identity
     path = folder / f"{name}-{identity[:12]}.bank"
@@ -108,7 +108,7 @@ def cached_bank(name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int, on_r
             if bank.identity == identity:
                 return bank
         except BankFileError as error:
-            print(f"{error} (building it anew)", file=sys.stderr)
+            print(f"{error} (building it again)", file=sys.stderr)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,20 +1,29 @@
-"""What a reproduction found: as JSON, and as a table beside the paper's numbers."""
+"""The numbers and figures of a reproduction, next to those of the paper."""
 
 import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import QuadMesh
+from matplotlib.figure import Figure
+from matplotlib.gridspec import SubplotSpec
+
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.models import MODELS
+from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, ModelScores, TorqueResult, all_notes
 from shearloop.daemon.analysis.reproduce.banks import Grid
 
 PAPER = "Trehan, Hardman and Iida 2025, Sensors 25, 5159"
-# As published, and without the signs: sigma falls as torque rises, and k as diameter does.
+# As published, without signs: sigma falls with rising torque, and k with rising diameter.
 PAPER_TORQUE_R, PAPER_TORQUE_CLUSTERED_R, PAPER_DIAMETER_R = 0.6552, 0.9588, 0.9746
 # The bars of figure 5.
 PAPER_MODEL_SCORES = {
@@ -28,7 +37,7 @@ PAPER_MODEL_SCORES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reproduction:
-    """All that was found, and on which mesh; None where the recordings were not there."""
+    """The results on a mesh; None where the recordings are missing."""
 
     mesh_origin: str
     bank_valid_cells: int
@@ -39,15 +48,15 @@ class Reproduction:
 
 
 def moved_focus(grid: Grid) -> str:
-    """Return the sentence for a focused bank that is not where the paper's is."""
+    """Return the note about a focused bank elsewhere than the paper's."""
     return (
-        "Most slices match best beyond the paper's focused bank: this one lies around them, "
+        "Most slices match best outside of the paper's focused bank: this one lies around them, "
         f"k {grid.k[0]:.2f} to {grid.k[-1]:.2f} cm, sigma {grid.sigma[0]:.2f} to {grid.sigma[-1]:.2f} cm."
     )
 
 
 def as_json(found: Reproduction) -> dict[str, Any]:
-    """Return the numbers by name; None where the recordings do not determine one."""
+    """Return the numbers by name; None where the recordings do not determine them."""
     torque, diameter, models = found.torque, found.diameter, found.models
     return {
         "torque_sigma_r_focused": torque.r_focused if torque else None,
@@ -62,12 +71,12 @@ def as_json(found: Reproduction) -> dict[str, Any]:
 
 
 def json_text(found: Reproduction) -> str:
-    """Return the JSON as it is printed and written."""
+    """Return the numbers as JSON text."""
     return json.dumps(as_json(found), indent=2, allow_nan=False)
 
 
 def table(found: Reproduction) -> str:
-    """Return the comparison with the paper, and below it what there is to know about the numbers."""
+    """Return the comparison with the paper, and the explanations."""
     rows = [("", "paper", "here")]
     if found.torque:
         torque = found.torque
@@ -102,23 +111,23 @@ def table(found: Reproduction) -> str:
 
 
 def explanations(found: Reproduction) -> list[str]:
-    """Return sentences on how the numbers came about, and on what is missing."""
-    said = [f"Paper: {PAPER}; it gives magnitudes, and torque from 99 slices.", f"Mesh: {found.mesh_origin}."]
+    """Return sentences about the origin of the numbers, and about missing ones."""
+    sentences = [f"Paper: {PAPER}; it gives magnitudes, and torque from 99 slices.", f"Mesh: {found.mesh_origin}."]
     if found.torque:
-        said += [
+        sentences += [
             f"Torque: {len(found.torque.slices.torque_nm)} slices, grouped {found.torque.grouping}.",
-            f"RMSE: a parabola for single slices, {found.torque.held_out}; slices of no other recording are tried.",
+            f"RMSE: a parabola for single slices, {found.torque.held_out}; no other recording is tried.",
         ]
     if found.diameter:
         n_slices, n_diameters = len(found.diameter.slices.diameter_mm), len(found.diameter.diameters_mm)
-        said.append(f"Diameter: {n_slices} slices of {n_diameters} diameters, smoothed along the channels.")
+        sentences.append(f"Diameter: {n_slices} slices of {n_diameters} diameters, smoothed along the channels.")
     if found.models:
-        said += model_explanations(found.models)
-    return said + list(found.notes) + all_notes([found.torque, found.diameter])
+        sentences += model_explanations(found.models)
+    return sentences + list(found.notes) + all_notes([found.torque, found.diameter])
 
 
 def model_explanations(models: ModelScores) -> list[str]:
-    """Return what the model scores are, how near they come to the paper's, and which model is first."""
+    """Return sentences about the model scores: their definition, their distance from the paper's, and the first."""
     matching = (
         "Matching score: the largest normalised cross-correlation over lags and settings, averaged over the slices; "
         f"first is {_first(models.matching)}."
@@ -129,7 +138,7 @@ def model_explanations(models: ModelScores) -> list[str]:
     return [
         "Envelope score: the paper's measure, Spearman's correlation of the envelopes of one raw difference and the "
         "simulated signal at the best circular shift, averaged over settings of a centred model; first is "
-        f"{_first(models.envelope)}, and the farthest from the paper's is {max(gaps, default=0.0):.3f} away.",
+        f"{_first(models.envelope)}, and the largest difference from the paper's is {max(gaps, default=0.0):.3f}.",
         matching,
     ]
 
@@ -144,8 +153,7 @@ def write_json(found: Reproduction, folder: Path) -> Path:
 def save_calibrations(found: Reproduction, banks: dict[str, Bank], recordings: Path, folder: Path) -> list[Path]:
     """Write a calibration file for every fit that the slices determine, and return the paths.
 
-    Torque is fitted to single slices, whose scatter a single frame has; diameters likewise. Raises CalibrationError
-    where a file cannot be written.
+    Fits are to single slices, which scatter as frames do. Raises CalibrationError where a file cannot be written.
     """
     fits: dict[str, tuple[str, dict[str, tuple[FloatArray, FloatArray]]]] = {}
     if found.torque:
@@ -158,7 +166,7 @@ def save_calibrations(found: Reproduction, banks: dict[str, Bank], recordings: P
         source = f"{name.split('_')[0]} slices of {recordings.name}, on the {bank} bank"
         try:
             calibration = Calibration.from_matches(banks[bank].identity, source, **points)
-        except CalibrationError:  # told in the notes already
+        except CalibrationError:  # already in the notes
             continue
         written.append(folder / f"calibration_{name}.cal")
         calibration.save(written[-1])
@@ -176,3 +184,223 @@ def _bare(value: float) -> str:
 
 def _number(value: float | None) -> str:
     return "none" if value is None else f"{value:.5f}"
+
+
+_GREY, _BLACK, _PINK, _BLUE, _TEAL, _ORANGE = "#8c8c8c", "#222222", "#d6338a", "#1f5f99", "#2a9d8f", "#d9822b"
+_HEAT = "viridis"
+_HEATMAPS_SHOWN = 4
+
+
+def draw_all(found: Reproduction, banks: dict[str, Bank], folder: Path) -> list[Path]:
+    """Draw the figures of all existing results as PNG and SVG, and return the paths; raises OSError."""
+    figures: dict[str, Figure] = {}
+    if found.models:
+        figures["figure_5_models"] = model_figure(found.models)
+    if found.torque:
+        figures["figure_7_heatmap"] = heatmap_figure(found.torque, banks["wide"])
+        figures["figure_8_torque"] = torque_figure(found.torque, banks["focused"])
+    if found.diameter:
+        figures["figure_9_diameter"] = diameter_figure(found.diameter, banks["wide"])
+    written = []
+    for name, figure in figures.items():
+        # The layout takes longer than drawing: compute it once for both files.
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+        for path in (folder / f"{name}.png", folder / f"{name}.svg"):
+            # Without a date, the same numbers make the same file.
+            figure.savefig(path, dpi=150, metadata={"Date": None} if path.suffix == ".svg" else None)
+            written.append(path)
+    return written
+
+
+def model_figure(models: ModelScores) -> Figure:
+    """Draw the five models' scores next to the paper's, the paper's best first."""
+    names = sorted(PAPER_MODEL_SCORES, key=lambda name: -PAPER_MODEL_SCORES[name])
+    bars: list[tuple[str, str, dict[str, float | None]]] = [("paper", _GREY, dict(PAPER_MODEL_SCORES))]
+    if models.envelope is not None:
+        bars.append(("envelope score, one raw frame (the paper's measure)", _BLUE, models.envelope))
+    bars.append(("matching score, mean over the torque slices", _TEAL, models.matching))
+    figure = _figure(9, 4.6)
+    axes = figure.subplots()
+    width = 0.8 / len(bars)
+    for place, (label, colour, scores) in enumerate(bars):
+        heights = [np.nan if scores[name] is None else float(scores[name] or 0.0) for name in names]
+        at = np.arange(len(names)) + (place - (len(bars) - 1) / 2) * width
+        drawn = axes.bar(at, heights, 0.92 * width, color=colour, label=label)
+        axes.bar_label(drawn, fmt="%.3f", fontsize=7, padding=2)
+    axes.set_xticks(np.arange(len(names)), [MODELS[name].title for name in names])
+    axes.set(ylim=(0, 1.12), ylabel="score")
+    axes.set_yticks(np.arange(0, 1.01, 0.2))
+    axes.legend(frameon=False, ncols=len(bars), fontsize=8, loc="upper center")
+    axes.set_title("Likeness of the five basis models to measured differences (figure 5)", loc="left", fontsize=11)
+    _plain(axes)
+    return figure
+
+
+def heatmap_figure(torque: TorqueResult, bank: Bank) -> Figure:
+    """Draw one slice's match: its difference, the bank's best signal, and the heatmap over the wide bank."""
+    index = int(np.argmax(torque.wide.scores))
+    match, number = torque.wide.best[index], int(torque.slices.numbers[index])
+    figure = _figure(12, 5)
+    halves = figure.add_gridspec(1, 2, width_ratios=[1.25, 1])
+    measured, simulated = halves[0].subgridspec(2, 1).subplots(sharex=True, squeeze=False)[:, 0]
+    measured.plot(torque.slices.differences[index] * 1e3, color=_BLACK, linewidth=0.6)
+    measured.set(ylabel="|difference| (mV)", xlim=(0, N_CHANNELS))
+    measured.set_title(f"Measured: slice {number} at {torque.slices.torque_nm[index]:.3f} N·m", loc="left", fontsize=10)
+    simulated.plot(np.abs(bank.signals[match.cell]), color=_BLUE, linewidth=0.6)
+    simulated.set(ylabel="|signal| (model's voltage)", xlabel="channel")
+    simulated.set_title(
+        f"Best of the bank: k = {match.k:.2f} cm, σ = {match.sigma:.2f} cm, score {match.score:.3f}",
+        loc="left",
+        fontsize=10,
+    )
+    for axes in (measured, simulated):
+        _plain(axes)
+    axes = figure.add_subplot(halves[1])
+    image = _heatmap(axes, torque.wide.heatmaps[index], bank, match)
+    axes.set_title("Heatmap: largest cross-correlation over all lags", loc="left", fontsize=10)
+    figure.colorbar(image, ax=axes, label="score", shrink=0.9)
+    figure.suptitle("From a measured difference to k and σ (figure 7); hatched cells are not valid", fontsize=11)
+    return figure
+
+
+def torque_figure(torque: TorqueResult, bank: Bank) -> Figure:
+    """Draw sigma against torque with four heatmaps, and the torque predicted from sigma."""
+    measured, sigma = torque.slices.torque_nm, torque.focused.sigma
+    shown = _spread_over(measured)
+    figure = _figure(13, 8.2)
+    halves = figure.add_gridspec(2, 1, height_ratios=[1.25, 1])
+    scatter, predicted = halves[0].subgridspec(1, 2).subplots(squeeze=False)[0]
+    scatter.plot(measured, sigma, "o", color=_GREY, alpha=0.6, markeredgewidth=0, label="slices")
+    scatter.plot(measured[shown], sigma[shown], "o", color=_PINK, label="heatmaps below")
+    scatter.plot(torque.group_torque_nm, torque.group_sigma, "x", color=_BLACK, markersize=9, label="group means")
+    scatter.set(xlabel="torque (N·m)", ylabel="σ of the best match (cm)")
+    scatter.set_title(
+        f"a  r = {_r(torque.r_focused)} for slices, {_r(torque.r_clustered)} for groups", loc="left", fontsize=10
+    )
+    _predictions(predicted, torque.fit, (sigma, measured), (torque.group_sigma, torque.group_torque_nm))
+    predicted.set(xlabel="measured torque (N·m)", ylabel="predicted torque (N·m)")
+    predicted.set_title("b  second-order polynomial of σ, fitted to the group means", loc="left", fontsize=10)
+    for axes in (scatter, predicted):
+        axes.legend(frameon=False, fontsize=8)
+        _plain(axes)
+    _heatmap_row(
+        figure,
+        halves[1],
+        [torque.focused.heatmaps[index] for index in shown],
+        [torque.focused.best[index] for index in shown],
+        [f"{measured[index]:.3f} N·m, σ = {sigma[index]:.2f} cm" for index in shown],
+        bank,
+    )
+    figure.suptitle(f"Torque from σ (figure 8): {len(measured)} slices, {torque.grouping}, focused bank", fontsize=11)
+    return figure
+
+
+def diameter_figure(diameter: DiameterResult, bank: Bank) -> Figure:
+    """Draw k against diameter with the accumulated heatmaps, and the diameter predicted from k."""
+    measured, k = diameter.slices.diameter_mm, diameter.single.k
+    figure = _figure(13, 8.2)
+    halves = figure.add_gridspec(2, 1, height_ratios=[1.25, 1])
+    scatter, predicted = halves[0].subgridspec(1, 2).subplots(squeeze=False)[0]
+    scatter.plot(k, measured, "o", color=_GREY, alpha=0.6, markeredgewidth=0, label="slices")
+    scatter.plot(
+        diameter.accumulated_k, diameter.diameters_mm, "x", color=_BLACK, markersize=9, label="heatmaps accumulated"
+    )
+    scatter.set(xlabel="k of the best match (cm)", ylabel="diameter (mm)")
+    scatter.set_title(
+        f"a  r = {_r(diameter.r_single)} for slices, {_r(diameter.r_accumulated)} accumulated", loc="left", fontsize=10
+    )
+    _predictions(predicted, diameter.fit, (k, measured), (diameter.accumulated_k, diameter.diameters_mm))
+    predicted.set(xlabel="measured diameter (mm)", ylabel="predicted diameter (mm)")
+    predicted.set_title("b  first-order polynomial of k, fitted to the accumulated matches", loc="left", fontsize=10)
+    for axes in (scatter, predicted):
+        axes.legend(frameon=False, fontsize=8)
+        _plain(axes)
+    few = _spread_over(diameter.diameters_mm)
+    _heatmap_row(
+        figure,
+        halves[1],
+        [diameter.heatmaps[index] for index in few],
+        [diameter.accumulated[index] for index in few],
+        [f"{diameter.diameters_mm[index]:g} mm, k = {diameter.accumulated_k[index]:.2f} cm" for index in few],
+        bank,
+    )
+    figure.suptitle(
+        f"Diameter from k (figure 9): {len(measured)} slices of {len(diameter.diameters_mm)} diameters, wide bank",
+        fontsize=11,
+    )
+    return figure
+
+
+def _predictions(
+    axes: Axes, fit: Polynomial | None, slices: tuple[FloatArray, FloatArray], means: tuple[FloatArray, FloatArray]
+) -> None:
+    """Draw predicted against measured; each pair is (places of the matches, measured values)."""
+    everything = np.concatenate([slices[1], means[1]])
+    ends = np.array([everything.min(), everything.max()])
+    axes.plot(ends, ends, color=_ORANGE, linewidth=1, label="predicted = measured")
+    if fit is None:
+        return
+    x, y = slices
+    predicted = np.array([fit(value) for value in x])
+    inside = (x >= fit.x_low) & (x <= fit.x_high)
+    axes.plot(y[inside], predicted[inside], "o", color=_GREY, alpha=0.6, markeredgewidth=0, label="slices")
+    if not inside.all():
+        axes.plot(
+            y[~inside], predicted[~inside], "o", color=_GREY, markerfacecolor="none", label="slices beyond the fit"
+        )
+    axes.plot(means[1], [fit(value) for value in means[0]], "x", color=_BLACK, markersize=9, label="fitted points")
+
+
+def _heatmap_row(
+    figure: Figure,
+    place: SubplotSpec,
+    heatmaps: list[FloatArray],
+    matches: list[Match],
+    titles: list[str],
+    bank: Bank,
+) -> None:
+    """Draw heatmaps side by side, each relative to its own maximum."""
+    row = place.subgridspec(1, len(heatmaps)).subplots(sharey=True, squeeze=False)[0]
+    below = [heatmap - match.score for heatmap, match in zip(heatmaps, matches, strict=True)]
+    # Skip the worst half of the cells, which would take most of the colours.
+    lowest = float(np.median([np.nanmedian(heatmap) for heatmap in below]))
+    for axes, heatmap, match, title in zip(row, below, matches, titles, strict=True):
+        image = _heatmap(axes, heatmap, bank, match, (min(lowest, -1e-6), 0.0))
+        axes.set_title(f"{title}, score {match.score:.3f}", fontsize=9)
+        axes.label_outer()
+    figure.colorbar(image, ax=list(row), label="score − the map's maximum", extend="min")
+
+
+def _heatmap(
+    axes: Axes, heatmap: FloatArray, bank: Bank, match: Match, limits: tuple[float, float] | None = None
+) -> QuadMesh:
+    """Draw scores over σ and k with the maximum marked; invalid cells stay hatched."""
+    axes.patch.set(hatch="////", edgecolor="#c8c8c8", facecolor="white")
+    low, high = limits or (None, None)
+    image = axes.pcolormesh(
+        bank.sigma_grid, bank.k_grid, heatmap, cmap=_HEAT, vmin=low, vmax=high, shading="nearest", rasterized=True
+    )
+    axes.plot(match.sigma, match.k, "o", markersize=8, markerfacecolor="none", markeredgecolor=_PINK, markeredgewidth=2)
+    axes.set(xlabel="σ (cm)", ylabel="k (cm)")
+    return image
+
+
+def _spread_over(values: FloatArray) -> list[int]:
+    """Return the indices of up to four values, evenly spread from the smallest to the largest."""
+    order = np.argsort(values, kind="stable")
+    places = np.rint(np.linspace(0, len(values) - 1, min(_HEATMAPS_SHOWN, len(values)))).astype(int)
+    return [int(order[place]) for place in places]
+
+
+def _r(value: float | None) -> str:
+    return "none" if value is None else f"{value:.3f}"
+
+
+def _plain(axes: Axes) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _figure(width: float, height: float) -> Figure:
+    """Return an empty figure in inches, without a window or global state."""
+    return Figure(figsize=(width, height), layout="constrained")

@@ -1,33 +1,32 @@
-"""`shearloop bank build`: solve every cell of a grid and write the bank, or a folder of them over more parameters."""
+"""`shearloop bank build`: solve every cell of a grid and write the bank, or a folder of banks over more parameters."""
 
 import argparse
 import json
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, Self
+from typing import TYPE_CHECKING, Any
 
-from shearloop.daemon.cli.options import add_cluster
+from shearloop.daemon.cli.options import add_cluster, add_json, check_overwrite
+from shearloop.daemon.cli.output import progress_bar
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.signals import report_interrupt
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from tqdm import tqdm
-
     from shearloop.bank.eit.bank_file import BankDefinition
-    from shearloop.bank.eit.journal import BankRow
+    from shearloop.bank.eit.build import BankRow
     from shearloop.bank.eit.mesh import Mesh
     from shearloop.daemon.bank_config import BankPlan, GridConfig
 
-# In words, for `--help` loads nothing that computes.
+# As text: `--help` imports no large library.
 MODELS = "step, linear, cut_linear, gaussian_derivative or modulated_gaussian"
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="what the bank is of (YAML)")
+    parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="the bank's configuration (YAML)")
     parser.add_argument(
         "--out", type=Path, required=True, metavar="PATH", help="the bank file to write; with `over`, the folder"
     )
@@ -39,11 +38,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="threads that solve, or workers of a cluster of this machine (default: one per core)",
     )
     add_cluster(parser)
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    add_json(parser)
 
 
 def add_overrides(parser: argparse.ArgumentParser) -> None:
-    """Add the options that take the place of what the configuration says."""
+    """Add the options that replace values of the configuration."""
     parser.add_argument("--model", metavar="M", help=f"basis model ({MODELS}), in place of the configured one")
     parser.add_argument(
         "--k",
@@ -54,7 +53,7 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Build the bank, telling how far it is on stderr."""
+    """Build the bank, with progress on stderr."""
     before = _version(args.out)
     try:
         return _build(args)
@@ -63,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _version(path: Path) -> tuple[int, int] | None:
-    """Return what differs after a file was replaced, None where there is none."""
+    """Return numbers that change when a file is replaced, None where there is no file."""
     try:
         found = path.stat()
     except OSError:
@@ -72,15 +71,15 @@ def _version(path: Path) -> tuple[int, int] | None:
 
 
 def _left(out: Path, before: tuple[int, int] | None) -> str:
-    """Return what an interrupted build leaves, by what is on the disk: its bank may be there when it is interrupted."""
-    kept = out.with_name(f"{out.name}.part")
+    """Return what an interrupted build leaves on the disk; its bank may already be complete."""
+    journal = out.with_name(f"{out.name}.part")
     if out.is_dir():
-        return f"what is finished of its banks and rows is in {out}, and the same command goes on from there"
+        return f"its finished banks and rows are in {out}, and the same command resumes from there"
     if _version(out) != before:
-        rest = f"; {kept} is not needed any more" if kept.exists() else ""
+        rest = f"; {journal} is not needed any more" if journal.exists() else ""
         return f"{out} is written, and complete{rest}"
-    if kept.exists():
-        return f"{out} was not written; its finished rows are in {kept}, and the same command goes on from there"
+    if journal.exists():
+        return f"{out} was not written; its finished rows are in {journal}, and the same command resumes from there"
     return f"{out} was not written; nothing is left"
 
 
@@ -89,7 +88,6 @@ def _build(args: argparse.Namespace) -> int:
     from shearloop.bank.eit.build import build_bank, solve_row
     from shearloop.bank.errors import EmptyBankError
     from shearloop.daemon.bank_config import load_bank_plans
-    from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.workers import open_executor
 
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
@@ -98,7 +96,7 @@ def _build(args: argparse.Namespace) -> int:
     model, k, sigma = overrides(args)
     plans = load_bank_plans(args.config, model=model, k=k, sigma=sigma)
     paths = _paths(args.out, list(plans))
-    # In a folder the names are the banks' own, and what cannot be used of an earlier build is built anew.
+    # In a folder the names are the banks' own, and an unusable bank is built again.
     if paths == [args.out]:
         check_overwrite(args.out, "a bank", BANK_MAGIC)
     built = []
@@ -115,7 +113,7 @@ def _build(args: argparse.Namespace) -> int:
                 built.append(path)
                 continue
             try:
-                with _Progress(path.name) as progress:
+                with progress_bar(path.name, len(plan.k_grid), "row") as show:
                     build_bank(
                         plan.mesh,
                         plan.model,
@@ -125,12 +123,12 @@ def _build(args: argparse.Namespace) -> int:
                         variation=plan.variation,
                         jobs=jobs,
                         elsewhere=on_cluster if args.cluster is not None else None,
-                        on_row=progress.show,
+                        on_row=lambda done, _: show(done),
                         on_notice=lambda sentence: print(sentence, file=sys.stderr),
                     )
                 built.append(path)
             except EmptyBankError as error:
-                # Others of a folder can be matched with; where all are empty, the last one says so and fails.
+                # The other banks of a folder are usable; where all are empty, the last one fails.
                 if path == paths[-1] and not built:
                     raise
                 print(f"{error}. It is left out", file=sys.stderr)
@@ -144,7 +142,7 @@ def _build(args: argparse.Namespace) -> int:
 
 
 def _paths(out: Path, names: list[str]) -> list[Path]:
-    """Return where the banks go: to `out` the only one without a name, into it those with one."""
+    """Return the banks' paths: `out` for a single one without a name, else files in the folder `out`."""
     if names == [""]:
         return [out]
     try:
@@ -155,7 +153,7 @@ def _paths(out: Path, names: list[str]) -> list[Path]:
 
 
 def _is_built(path: Path, plan: "BankPlan") -> bool:
-    """Return whether an earlier build of a folder has finished this bank of it."""
+    """Return whether an earlier build of a folder has finished this bank."""
     from shearloop.bank.eit.bank_file import Bank, BankDefinition
     from shearloop.bank.errors import BankFileError
 
@@ -165,7 +163,7 @@ def _is_built(path: Path, plan: "BankPlan") -> bool:
     try:
         return Bank.open(path, verify=True).identity == definition.identity
     except BankFileError:
-        print(f"{path}: it cannot be used, and is built anew", file=sys.stderr)
+        print(f"{path}: it cannot be used, and is built again", file=sys.stderr)
         return False
 
 
@@ -185,7 +183,7 @@ def _result(path: Path) -> dict[str, Any]:
 
 
 def overrides(args: argparse.Namespace) -> "tuple[str | None, GridConfig | None, GridConfig | None]":
-    """Return the model and the grids given on the command line, None where the configuration's hold."""
+    """Return the model and the grids of the command line, None where the configuration's hold."""
     from shearloop.bank.eit.models import model_named
 
     if args.model is not None:
@@ -208,31 +206,3 @@ def _grid(option: str, text: str | None) -> "GridConfig | None":
         raise UserError(f"{option} {text}: {mistakes(error, GridConfig)}") from error
     except ValueError as error:
         raise UserError(f"{option} must be LO:HI:N such as 0.01:4.4:100, not {text!r}") from error
-
-
-class _Progress:
-    """The rows done, on stderr where that is a terminal."""
-
-    def __init__(self, name: str) -> None:
-        """Say what is in progress."""
-        self._name = name
-        self._bar: tqdm[NoReturn] | None = None
-
-    def __enter__(self) -> Self:
-        """Show nothing yet."""
-        return self
-
-    def show(self, done: int, total: int) -> None:
-        """Show that `done` of `total` rows are on the disk."""
-        from tqdm import tqdm
-
-        if self._bar is None:
-            # Rows taken over from an interrupted build say nothing about how fast this one is.
-            self._bar = tqdm(total=total, initial=done, unit="row", desc=self._name, disable=None)
-        else:
-            self._bar.update(done - self._bar.n)
-
-    def __exit__(self, *_: object) -> None:
-        """Leave the last state on the screen."""
-        if self._bar is not None:
-            self._bar.close()

@@ -1,4 +1,4 @@
-"""The pictures of a bank: its signals over the grid, and what the five basis models do to conductivity and signals."""
+"""Figures of a bank: its signals over the grid, and conductivity and signals of the five basis models."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -7,36 +7,56 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from shearloop.bank.eit.bank_file import Bank, BankDefinition
+from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import MODELS, conductivity
+from shearloop.daemon.bank_config import BankPlan
 
 _PANELS = 10
 _BLUE, _GREY = "#1f5f99", "#8a8a8a"
 
 
 class SignalGrid(NamedTuple):
-    """Signals to draw: of K values of k and S of σ, (K, S, 896), drawn where valid (K, S)."""
+    """Signals (K, S, 896) to draw over (K,) k and (S,) σ, where valid (K, S)."""
 
     model: str
-    k: NDArray[np.float64]
-    sigma: NDArray[np.float64]
-    signals: NDArray[np.float32]
-    valid: NDArray[np.bool_]
+    k: FloatArray
+    sigma: FloatArray
+    signals: Float32Array
+    valid: BoolArray
 
 
-def spread(count: int) -> NDArray[np.int64]:
+def grid_of_bank(bank: Bank) -> SignalGrid:
+    """Return up to ten rows and columns, evenly spread over a bank."""
+    rows, columns = _spread(len(bank.k_grid)), _spread(len(bank.sigma_grid))
+    cells = rows[:, None], columns
+    return SignalGrid(bank.model, bank.k_grid[rows], bank.sigma_grid[columns], bank.signals[cells], bank.valid[cells])
+
+
+def grid_of_plan(plan: BankPlan) -> SignalGrid:
+    """Solve up to ten rows and columns, evenly spread over a planned bank."""
+    k, sigma = plan.k_grid[_spread(len(plan.k_grid))], plan.sigma_grid[_spread(len(plan.sigma_grid))]
+    solver = RowSolver(plan.mesh, BankDefinition(plan.mesh.digest, plan.model, k, sigma))
+    rows = [solver.solve(row) for row in range(len(k))]
+    return SignalGrid(
+        plan.model, k, sigma, np.stack([cells.signals for cells in rows]), np.stack([cells.valid for cells in rows])
+    )
+
+
+def _spread(count: int) -> IntArray:
     """Return up to ten places, evenly spread over `count`, first and last included."""
     return np.unique(np.rint(np.linspace(0, count - 1, min(_PANELS, count))).astype(np.int64))
 
 
 def signal_figure(grid: SignalGrid) -> Figure:
-    """Draw every signal of a small grid in a panel of its own, as figure 6 of Trehan et al. 2025 does.
+    """Draw every signal of a small grid in its own panel, as figure 6 of Trehan et al. 2025 does.
 
-    Every panel has a scale of its own (signals differ by a hundred times in size); the peak is written into it.
+    Signals differ a hundredfold in size, so every panel is scaled to its peak and shows it.
     """
     model = MODELS[grid.model]
     rows, columns = len(grid.sigma), len(grid.k)
@@ -77,12 +97,12 @@ class _Example(NamedTuple):
 
 
 def _examples(height: float) -> list[_Example]:
-    """Return parameters that show each model's shape with a conductivity positive everywhere, for any height."""
+    """Return parameters that show each model with a positive conductivity, for any height."""
     return [
         _Example("step", height / 2, height),
         _Example("linear", height / 2, 1.1 * height),
         _Example("cut_linear", 0.65 * height, 0.7 * height),
-        # Its largest fall is e^(-1/2)/σ, with σ in cm: that sets the least σ, not the height.
+        # Its steepest fall, e^(-1/2)/σ with σ in cm, limits σ.
         _Example("gaussian_derivative", height / 2, max(0.9, 0.2 * height)),
         _Example("modulated_gaussian", 3.0, 0.25 * height),
     ]
@@ -136,20 +156,8 @@ def save_figure(figure: Figure, directory: Path, name: str) -> list[Path]:
     return paths
 
 
-def solved_grid(mesh: Mesh, model: str, k: NDArray[np.float64], sigma: NDArray[np.float64]) -> SignalGrid:
-    """Solve the cells of a small grid of (K,) k and (S,) σ for drawing."""
-    from shearloop.bank.eit.bank_file import BankDefinition
-    from shearloop.bank.eit.build import RowSolver
-
-    solver = RowSolver(mesh, BankDefinition(mesh.digest, model, k, sigma))
-    rows = [solver.solve(row) for row in range(len(k))]
-    return SignalGrid(
-        model, k, sigma, np.stack([cells.signals for cells in rows]), np.stack([cells.valid for cells in rows])
-    )
-
-
 def _figure(width: float, height: float) -> Figure:
-    """Return an empty figure in inches, drawn without any window or global state."""
+    """Return an empty figure, sizes in inches, without a window."""
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure

@@ -26,7 +26,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation import Calibration
     from shearloop.daemon.analysis.evaluate import estimate_series, grips_of
     from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, read_series
-    from shearloop.daemon.cli.recorded import check_kind
+    from shearloop.daemon.cli.options import check_kind
     from shearloop.daemon.control.creep import fit_creep
 
     check_paths_differ(args.recordings)

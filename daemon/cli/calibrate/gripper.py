@@ -1,4 +1,4 @@
-"""`shearloop calibrate gripper`: the fingers close on objects of known diameter, and the counts become millimetres."""
+"""`shearloop calibrate gripper`: grips objects of known diameter, to convert counts to millimetres."""
 
 import argparse
 import asyncio
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `calibrate gripper`."""
     parser.epilog = (
-        "The fingers open and close: keep clear of them. It asks for one object after the other, to be held between "
-        "the fingertips, and closes on each once you press Enter. No daemon may be using the gripper meanwhile. Name "
-        "the file as `gripper.calibration` in the configuration."
+        "The fingers open and close: keep clear of them. Asks for one object after the other, to be held between the "
+        "fingertips, and closes on each after you press Enter. Stop the daemon first: it uses the gripper. Name the "
+        "file as `gripper.calibration` in the configuration."
     )
     way = parser.add_mutually_exclusive_group(required=True)
     way.add_argument("--host", metavar="ADDRESS", help="the robot's controller, for the URCap's socket")
@@ -42,15 +42,15 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Grip each object, and write the calibration."""
+    """Grip each object and write the calibration."""
     from shearloop.daemon.cli.options import check_overwrite
     from shearloop.daemon.errors import UserError
-    from shearloop.drivers.calibration_file import save_calibration
     from shearloop.drivers.robotiq.gripper import RobotiqGripper
     from shearloop.drivers.robotiq.messages import GripperClient
     from shearloop.drivers.robotiq.modbus_client import ModbusClient
     from shearloop.drivers.robotiq.socket_client import SocketClient
     from shearloop.drivers.robotiq.width import STROKE_MM, WidthCalibration
+    from shearloop.drivers.yaml_files import save_calibration
 
     if any(not 0 < diameter < STROKE_MM for diameter in args.diameter_mm) or len(set(args.diameter_mm)) < 2:
         raise UserError(f"give at least two different --diameter-mm between 0 and {STROKE_MM:g}")
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     gauges = asyncio.run(_grip(gripper, args.diameter_mm, args.force_n, operator))
     calibration = WidthCalibration.of_gauges(gauges)
     save_calibration(args.out, calibration)
-    told = {
+    report = {
         "path": str(args.out),
         "calibration": calibration.model_dump(mode="json"),
         "mm_per_count": calibration.mm_per_count,
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
         f"One count is {-calibration.mm_per_count:.3f} mm; a diameter is good to {calibration.width_std_mm:.2f} mm.",
         f"Written to {args.out}.",
     ]
-    print_result(told, sentences, as_json=args.json)
+    print_result(report, sentences, as_json=args.json)
     return 0
 
 
@@ -108,11 +108,11 @@ async def _grip(
 
 
 async def _contact(gripper: "RobotiqGripper", force_n: float) -> int | None:
-    """Close, open again, and return the position at which the fingers stopped on something."""
+    """Close and open; return the position of the contact, or None without one."""
     from shearloop.drivers.robotiq.messages import SPEED_MIN_MM_S, GripperCommand, ObjectStatus
     from shearloop.drivers.robotiq.width import STROKE_MM
 
-    # Past the fingers' own stop, so that reaching the target is never mistaken for a contact.
+    # Beyond the fingers' stop: reaching the target is never a contact.
     closed = await gripper.finish(await gripper.move(GripperCommand(-STROKE_MM, SPEED_MIN_MM_S, force_n)))
     await gripper.finish(await gripper.move(GripperCommand(STROKE_MM)))
     return closed.position_counts if closed.object is ObjectStatus.CONTACT_CLOSING else None

@@ -57,13 +57,13 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.bank.estimation import Physics
     from shearloop.bank.estimation.calibration import ARCHIVE_MAGIC
     from shearloop.daemon.analysis.calibrate import CalibrationOptions, calibrate
-    from shearloop.daemon.cli.recorded import parsed_sides, parsed_time_range
+    from shearloop.daemon.cli.options import parse_sides, parse_time_range
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.recording.schema import LARGEST_DIAMETER_MM
 
     options = CalibrationOptions(
-        sides=parsed_sides(args.sides),
-        time_range=parsed_time_range(args.time_range),
+        sides=parse_sides(args.sides),
+        time_range=parse_time_range(args.time_range),
         load_cell_delay_s=args.load_cell_delay_s,
         assume_full_range=args.assume_full_range,
         tool_mm=args.tool_mm,

@@ -1,4 +1,4 @@
-// The page: takes messages in as they come, and draws thirty times a second what is known.
+// The page: receives messages and redraws thirty times a second.
 
 import { TimeChart } from "./chart.js";
 import { Controls } from "./controls.js";
@@ -8,10 +8,10 @@ import { Series } from "./series.js";
 import { age, byId, number, put } from "./text.js";
 
 const REDRAWS_PER_S = 30;
-// Estimates are drawn in shapes that differ, and in blues and browns of different lightness.
+// Estimates differ in shape, and in lightness of blue and brown.
 const TIPS = [{ stroke: "#0b4f8a", fill: "#0b4f8a33" }, { stroke: "#8a4b00", fill: "#8a4b0033", hollow: true }, { stroke: "#4a4a4a", fill: "#4a4a4a33", dash: [2, 4] }];
 
-// Stop works before anything else is known.
+// Stop works before any message arrives.
 new Controls();
 const settings = await (await fetch("settings.json")).json();
 
@@ -48,7 +48,7 @@ const takers = {
 const link = new Link(settings, (message) => takers[message.topic]?.(message.content));
 
 function chartLines() {
-  // The estimate that drives the loop has its interval drawn; others are points alone.
+  // Only the estimate that drives the loop is drawn with its interval.
   const sources = estimatesFirst(link).filter((source) => torques.columns.get(source)?.some((value) => value != null));
   const lines = sources.slice(0, TIPS.length).map((source, i) => ({
     ...TIPS[i],
@@ -84,7 +84,7 @@ function linkLine() {
   const state = link.state();
   byId("link").dataset.state = state;
   const heard = Number.isFinite(link.sinceDaemon());
-  const [name, why] = {
+  const [name, reason] = {
     live: ["● live", ""],
     connecting: ["connecting", "to the viewer on the rig's computer"],
     lost: ["✗ VIEWER LOST", `no word from the viewer for ${age(link.sinceBatch())}; what is shown is old, and it is tried again`],
@@ -93,7 +93,7 @@ function linkLine() {
       : ["✗ NO DAEMON", `nothing is heard at ${settings.publish}; start one with \`shearloop run CONFIG\``],
   }[state];
   put(byId("link-state"), name);
-  put(byId("link-why"), why);
+  put(byId("link-reason"), reason);
 }
 
 function draw() {
@@ -115,7 +115,7 @@ function draw() {
   put(byId("bridge"), refused ? `the viewer refused: ${refused}` : "");
 }
 
-// How many redraws there were in the last second, and what one takes.
+// Shows the redraws in the last second, and the time that one takes.
 const rate = { count: 0, spent: 0, since: performance.now() };
 
 function tellRate(now) {
@@ -129,7 +129,7 @@ let due = performance.now();
 function onFrame() {
   requestAnimationFrame(onFrame);
   const now = performance.now();
-  // Half a screen's frame early is in time.
+  // Half a screen refresh early is on time.
   if (now < due - 8) return;
   due = Math.max(due + 1000 / REDRAWS_PER_S, now);
   draw();

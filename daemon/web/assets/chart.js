@@ -1,12 +1,12 @@
-// A minute of torques or forces, scrolling. Lines are told apart by shape first: points, solid, dashed.
+// A scrolling minute of torques or forces. Lines differ in shape: points, solid, dashed.
 
 const SPAN_S = 60;
 const INK = "#10212e";
 
 const clock = (t) => new Date(t * 1000).toLocaleTimeString([], { hour12: false });
 
-// A line of the chart: label, stroke, and how it is drawn (dash, width, points, hollow); `low` and `high` name the
-// columns of its interval.
+// A line of the chart: label, stroke and style (dash, width, points, hollow). `low` and `high` are the columns of its
+// interval.
 export class TimeChart {
   constructor(element, legend, unit, least) {
     this.element = element;
@@ -78,7 +78,7 @@ export class TimeChart {
     this.chart.setData(series.data(this.names), true);
   }
 
-  // The legend shows each line as it is drawn.
+  // The legend shows each line's style.
   sample(line) {
     const label = document.createElement("span");
     const canvas = document.createElement("canvas");

@@ -1,9 +1,9 @@
-// The buttons: stop for everyone, what moves something with the token alone.
+// The buttons: stop needs no token, every motion needs it.
 
 import { byId, put } from "./text.js";
 
 const KEY = "shearloop-token";
-// A daemon that lives answers in some milliseconds; `unlock` takes its time.
+// A daemon answers within milliseconds; `unlock` takes longer.
 const LATE_MS = 65000;
 const STOP_LATE_MS = 4000;
 
@@ -25,7 +25,7 @@ export class Controls {
 
   buttons() { return document.querySelectorAll("#controls [data-command]"); }
 
-  // The token comes behind the #, which browsers send to nobody; it does not stay in the address bar.
+  // Browsers do not send the part after the #; the token is removed from the address bar.
   takeTokenFromAddress() {
     const given = new URLSearchParams(location.hash.slice(1)).get("token");
     if (!given) return;
@@ -52,15 +52,15 @@ export class Controls {
     this.tell("stopping …");
     const reply = await this.ask("stop", {}, STOP_LATE_MS);
     if (reply.ok) this.tell(reply.stopped ? `stopped: ${reply.stopped}` : "stop: nothing was moving");
-    else this.tell(`STOP NOT CONFIRMED: ${reply.why}. Use the emergency stop of the robot.`, "bad");
+    else this.tell(`STOP NOT CONFIRMED: ${reply.reason}. Use the emergency stop of the robot.`, "bad");
   }
 
   async command(name) {
     this.tell(`${name} …`);
     const reply = await this.ask(`commands/${name}`, { Authorization: `Bearer ${sessionStorage.getItem(KEY)}` }, LATE_MS);
     if (reply.ok) this.tell(`${name}: done`);
-    else this.tell(`${name} was refused: ${reply.why}`, "bad");
-    // A token that is not the right one is asked for anew.
+    else this.tell(`${name} was refused: ${reply.reason}`, "bad");
+    // Ask again after a wrong token.
     if (reply.status === 403) this.keep("");
   }
 
@@ -69,7 +69,7 @@ export class Controls {
       const response = await fetch(path, { method: "POST", headers, keepalive: true, signal: AbortSignal.timeout(lateMs) });
       return { status: response.status, ...(await response.json()) };
     } catch {
-      return { ok: false, why: "the viewer on the rig's computer does not answer" };
+      return { ok: false, reason: "the viewer on the rig's computer does not answer" };
     }
   }
 

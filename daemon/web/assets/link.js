@@ -1,15 +1,15 @@
-// The page's end of the wire: what was heard last, when, and whether anybody is still there.
+// The connection to the viewer: the latest messages, their ages, and whether daemon and viewer respond.
 
 const RETRY_MS = 500;
-// The viewer says something every quarter of a second; after this silence the connection is taken for lost.
+// The viewer sends a batch every quarter of a second; after this silence the connection counts as lost.
 const LOST_AFTER_S = 1.0;
-// What is said of a time further from now is said by a replay; until it speaks of times that much earlier, it goes on.
+// Messages that are further from now come from a replay; a step back by more than this starts it again.
 const REPLAYED_S = 5.0;
 
 const seconds = () => performance.now() / 1000;
 
 export class Link {
-  // onMessage(message) is called for each message, and for what was before this page.
+  // Calls onMessage(message) for each message, and for the history.
   constructor(settings, onMessage) {
     this.settings = settings;
     this.latest = new Map();
@@ -32,7 +32,7 @@ export class Link {
   take(batch) {
     const now = seconds();
     if (batch.first) {
-      // Another viewer, perhaps another daemon: nothing from before may stand beside what comes now.
+      // Another viewer or daemon: drop all earlier data.
       this.latest.clear();
       this.daemonAt = null;
       this.said = null;
@@ -50,12 +50,12 @@ export class Link {
     if (batch.messages.length) this.hear(Math.max(...batch.messages.map((message) => message.content.timestamp - message.at)));
   }
 
-  // The latest time that is spoken of, less this page's: a frame speaks of a while ago, what follows it of now.
+  // The latest message time minus this page's time; a frame is older than the messages that follow it.
   hear(said) {
     if (this.said === null || said > this.said || this.said - said > REPLAYED_S) this.said = said;
   }
 
-  // Unix time by the viewer's clock (the tablet's own may be wrong); of a replay, the recording's.
+  // Unix time of the viewer's clock (a tablet's may be wrong); in a replay, the recording's time.
   unixNow() {
     const replayed = this.said !== null && Math.abs(this.said - this.offset) > REPLAYED_S;
     return seconds() + (replayed ? this.said : this.offset);
@@ -65,10 +65,10 @@ export class Link {
 
   sinceDaemon() { return this.daemonAt === null ? Infinity : seconds() - this.daemonAt; }
 
-  // live; dead: no daemon is heard; lost: the viewer itself is not.
+  // live; dead: no message from the daemon; lost: no message from the viewer.
   state() {
     if (this.sinceBatch() > LOST_AFTER_S) {
-      // A socket that is open and silent, as after the computer slept, is given up.
+      // Close a socket that is open but silent, as after the computer slept.
       if (this.batchAt !== null && this.sinceBatch() > 3 && this.socket.readyState === WebSocket.OPEN) this.socket.close();
       return this.batchAt === null ? "connecting" : "lost";
     }
@@ -77,19 +77,19 @@ export class Link {
 
   ageOf(message) { return seconds() - message.at; }
 
-  // Whether a message says nothing of the present any more.
+  // Whether a message is stale.
   isOld(message) {
     return this.state() !== "live" || this.ageOf(message) > this.staleAfter(message);
   }
 
-  // A device that is slower than its topic's usual one is given the time that its task expects of it.
+  // A device that is slower than usual has the period that its task expects.
   staleAfter({ topic, content }) {
     const usual = this.settings.stale_after_s[topic] ?? 3;
     const expectedHz = this.get("health")?.content.tasks?.[content.source]?.expected_hz;
     return expectedHz > 0 ? Math.max(usual, this.settings.stale_after_periods / expectedHz) : usual;
   }
 
-  // The latest message of a topic: of one source, or of the first that was heard.
+  // The latest message of a topic: of one source, or of the first source.
   get(topic, source) {
     if (source !== undefined) return this.latest.get(`${topic}/${source}`);
     for (const message of this.latest.values()) if (message.topic === topic) return message;

@@ -1,4 +1,4 @@
-// What each message says, in its panel. A panel whose message is old says so, and strikes its numbers.
+// Fills the panels. A panel with a stale message is marked and its numbers are struck out.
 
 import { drawGel, drawMap } from "./pictures.js";
 import { age, array, byId, interval, number, put, show, warn } from "./text.js";
@@ -8,7 +8,7 @@ const ROBOT_MODES = { "-1": "no controller", 0: "disconnected", 1: "confirm safe
 const SAFETY_MODES = { 1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "system emergency stop", 7: "robot emergency stop", 8: "violation", 9: "fault", 10: "validate joint", 11: "undefined" };
 const MARK_OLD_AFTER_S = 1;
 
-// Phases in which something is wanted; an experiment that has ended wants nothing, whatever it last said.
+// Phases with a set point.
 const ACTIVE = new Set(["running", "paused", "held"]);
 
 export const wantedNow = (loop) => (ACTIVE.has(loop.phase) ? loop.ramp_nm : null);
@@ -19,27 +19,27 @@ export function markAge(panel, link, message) {
   const old = message === undefined || link.isOld(message);
   panel.classList.toggle("old", message !== undefined && old);
   const badge = panel.querySelector(".age");
-  if (message === undefined) put(badge, "nothing heard");
+  if (message === undefined) put(badge, "no message");
   else if (old) put(badge, `OLD, ${age(link.ageOf(message))} ago`);
   else put(badge, link.ageOf(message) > MARK_OLD_AFTER_S ? `${age(link.ageOf(message))} ago` : "");
 }
 
-// The sources of estimates, the one that drives the loop first, then the one of both fingertips.
+// The sources of estimates: first the one that drives the loop, then the combined one.
 export function estimatesFirst(link) {
-  const driving = link.get("loop.state")?.content.driving;
+  const driving = link.get("loop.state")?.content.torque_source;
   const rank = (source) => (source === driving ? 0 : source === "combined" ? 1 : 2);
   return link.sources("eit.estimate").sort((one, other) => rank(one) - rank(other));
 }
 
-// Whether an estimate is of one fingertip with a gel to draw, and not of two together.
+// Whether an estimate is of one fingertip, with a gel to draw.
 export function isFingertip(link, source) {
   return source !== "combined" || link.get("eit.heatmap", source) !== undefined;
 }
 
-// Torque, what is wanted, load cell and diameter. The estimate that drives the loop comes first.
+// Torque, set point, load cell and diameter, with the estimate that drives the loop.
 export function torquePanel(link) {
   const loop = link.get("loop.state");
-  const driving = loop?.content.driving;
+  const driving = loop?.content.torque_source;
   const estimate = link.get("eit.estimate", estimatesFirst(link)[0]);
   const skin = link.get("skin.shear");
   const shown = estimate ?? skin;
@@ -50,8 +50,8 @@ export function torquePanel(link) {
   put(byId("torque-now"), valid ? number(said.torque_nm, 4, "N·m", { signed: true }) : "–");
   put(byId("torque-interval"), valid && said.torque_low_nm !== undefined ? interval(said.torque_low_nm, said.torque_high_nm, 4) : "");
   const load = link.get("load.torque");
-  const silent = load && !load.content.valid && !link.isOld(load) ? `load cell: ${load.content.why}` : "";
-  warn(byId("torque-why"), [said && !valid ? `no estimate: ${said.why}` : "", silent].filter(Boolean).join("; "));
+  const silent = load && !load.content.valid && !link.isOld(load) ? `load cell: ${load.content.reason}` : "";
+  warn(byId("torque-reason"), [said && !valid ? `no estimate: ${said.reason}` : "", silent].filter(Boolean).join("; "));
   const wanted = loop && !link.isOld(loop) && ACTIVE.has(loop.content.phase) ? loop.content : {};
   put(byId("wanted"), number(wanted.ramp_nm, 4, "N·m", { signed: true }));
   put(byId("set-point"), wanted.set_point_nm == null ? "" : `set point ${number(wanted.set_point_nm, 3, "", { signed: true })}`);
@@ -103,7 +103,7 @@ export class FingertipPanel {
     put(this.part("sigma"), number(said.sigma, 3, "cm"));
     put(this.part("frame"), said.frame === undefined ? "–" : String(said.frame));
     put(this.part("latency"), said.latency_s === undefined ? "–" : number(1000 * said.latency_s, 0, "ms"));
-    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.why}` : "");
+    warn(this.part("invalid"), estimate && !said.valid ? `not valid: ${said.reason}` : "");
     if (this.drawn.gel !== estimate || !estimate) this.drawGel(estimate);
     if (this.drawn.map !== heatmap) this.drawMap(heatmap);
     if (heatmap) this.mapText(heatmap, said);
@@ -151,7 +151,7 @@ export function shearPanel(link) {
   put(byId("shear-response"), number(said.response, 5, "", { signed: true }));
   put(byId("shear-gauges"), `${number(said.r1_ohm, 3)} · ${number(said.r2_ohm, 3)} Ω`);
   put(byId("shear-state"), said.deadband ? "within the deadband" : said.direction);
-  warn(byId("shear-why"), said.valid ? "" : `no force: ${said.why}`);
+  warn(byId("shear-reason"), said.valid ? "" : `no force: ${said.reason}`);
 }
 
 export function robotPanel(link) {
@@ -174,8 +174,8 @@ export function robotPanel(link) {
   const loop = link.get("loop.state");
   const sent = loop && !link.isOld(loop) ? loop.content : {};
   put(byId("speed-sent"), number(sent.speed_sent_rad_per_s, 3, "rad/s", { signed: true }));
-  const clipped = sent.speed_wanted_rad_per_s !== undefined && Math.abs(sent.speed_wanted_rad_per_s - sent.speed_sent_rad_per_s) > 0.0005;
-  put(byId("speed-wanted"), clipped ? `wanted ${number(sent.speed_wanted_rad_per_s, 3, "", { signed: true })}` : "");
+  const clipped = sent.speed_command_rad_per_s !== undefined && Math.abs(sent.speed_command_rad_per_s - sent.speed_sent_rad_per_s) > 0.0005;
+  put(byId("speed-command"), clipped ? `wanted ${number(sent.speed_command_rad_per_s, 3, "", { signed: true })}` : "");
 }
 
 export function gripperPanel(link) {
@@ -223,20 +223,20 @@ function fillRow(row, name, facts) {
   row.className = dead ? "dead" : "";
   const rate = facts.rate_hz == null ? "" : `${number(facts.rate_hz, 2)}${facts.expected_hz == null ? "" : ` of ${number(facts.expected_hz, 2)}`} Hz`;
   const errors = Object.entries(facts.errors ?? {}).map(([kind, count]) => `${count} ${kind}`).join(", ");
-  const trouble = facts.trouble || facts.last_error || "";
-  const texts = [name, alive, rate, errors || "0", String(facts.restarts ?? ""), trouble];
+  const error = facts.error || facts.last_error || "";
+  const texts = [name, alive, rate, errors || "0", String(facts.restarts ?? ""), error];
   texts.forEach((text, i) => put(row.cells[i], text));
 }
 
-// Where the loop stands, and every reason for holding, above everything else.
+// The loop's phase, and every reason for a hold.
 export function loopPanel(link) {
   const message = link.get("loop.state");
   const current = message && !link.isOld(message) ? message.content : undefined;
   const step = current?.steps ? `, step ${current.step} of ${current.steps}` : "";
   put(byId("phase-name"), current ? `${current.phase}${current.experiment ? `: ${current.experiment}` : ""}${step}` : "–");
   const reasons = current?.reasons ?? "";
-  // What stopped it stands below, with its cure.
-  put(byId("phase-doing"), current?.phase === "stopped" && reasons ? "" : current?.doing ?? "");
+  // The reason for the stop is listed below, with its cure.
+  put(byId("phase-activity"), current?.phase === "stopped" && reasons ? "" : current?.activity ?? "");
   const underWay = Boolean(current?.steps) && (ACTIVE.has(current.phase) || current.phase === "done");
   const share = underWay ? current.progress : 0;
   if (byId("progress").value !== share) byId("progress").value = share;
@@ -257,5 +257,5 @@ export function loopPanel(link) {
   }));
 }
 
-// A reason begins with a small letter and its cure with a capital: a new one begins after a full stop.
+// A reason begins with a small letter and its cure with a capital; split after each full stop before a small letter.
 const sentences = (reasons) => reasons.split(/(?<=\.) (?=[a-z])/);

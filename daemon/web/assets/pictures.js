@@ -1,6 +1,6 @@
-// The fingertip with its conductivity, and the heatmap. Shades rise from dark to light, so that they read in grey.
+// Draws the fingertip with its conductivity, and the heatmap. Shades go from dark to light and work in grey.
 
-// Anchors of a scale whose lightness rises evenly (after cividis).
+// Anchors of a colour scale with even lightness (after cividis).
 const ANCHORS = [[0, 32, 76], [40, 66, 108], [92, 97, 112], [124, 123, 120], [166, 157, 117], [209, 193, 99], [253, 233, 69]];
 const INK = "#10212e";
 const FONT = "system-ui, DejaVu Sans, sans-serif";
@@ -13,7 +13,7 @@ export function shade(share) {
 
 const css = (rgb) => `rgb(${rgb.join(" ")})`;
 
-// A pen in CSS pixels on a canvas as sharp as the screen.
+// A drawing context in CSS pixels at the screen's resolution.
 function fitted(canvas) {
   const scale = window.devicePixelRatio || 1;
   const width = canvas.clientWidth || 240;
@@ -52,7 +52,7 @@ function scaleBar(pen, x, y, height, low, high, digits) {
 const GEL_LOW = 0.4;
 const GEL_HIGH = 1.6;
 
-// Draw the gel: shade and level lines of its conductivity over the height, electrodes, and the curve beside it.
+// Draw the gel: shades and level lines of its conductivity over the height, electrodes, and the curve.
 export function drawGel(canvas, tip, conductivity, k, sigma) {
   const { pen, width, height } = fitted(canvas);
   const room = { left: 8, right: 42, top: 14, bottom: 30 };
@@ -126,7 +126,7 @@ function electrodes(pen, tip, x0, y0, scale, yOf) {
   }
 }
 
-// Draw scores of (k, σ) cells with maximum and runner-up; k rises upwards, σ to the right.
+// Draw scores of (k, σ) cells with maximum and runner-up; k upwards, σ to the right.
 export function drawMap(canvas, map, peaks) {
   const { pen, width, height } = fitted(canvas);
   const [x0, y0, w, h] = [44, 8, width - 44 - 52, height - 8 - 38];

@@ -1,9 +1,9 @@
-// Samples of several sources on one time axis, for a minute. A row has `undefined` for those that did not speak then,
-// and `null` where one said that it knows nothing: lines run through the first and break at the second.
+// A minute of samples from several sources on one time axis. `undefined` means no sample at that time, `null` an invalid
+// one: lines pass over the first and break at the second.
 
 const KEPT_S = 65;
 const MOST_ROWS = 6000;
-// Times that fall by more are another clock's: nothing from before can stand beside them.
+// A larger step back means another clock: drop all earlier samples.
 const LATEST_S = 10;
 
 export class Series {
@@ -24,7 +24,7 @@ export class Series {
     return this.columns.get(name);
   }
 
-  // Add values by column name at a time; after a pause longer than gapS the lines begin anew.
+  // Add values by column name at a time; lines break after a pause longer than gapS.
   add(t, values, gapS) {
     const names = Object.keys(values);
     const before = this.last.get(names[0]);
@@ -40,7 +40,7 @@ export class Series {
 
   insert(t, values) {
     this.version += 1;
-    // Frames speak of the middle of their acquisition and come a little out of order.
+    // Frames are stamped in the middle of their acquisition and arrive slightly out of order.
     let at = this.times.length;
     while (at > 0 && this.times[at - 1] > t) at -= 1;
     for (const name of Object.keys(values)) this.column(name);
@@ -51,7 +51,7 @@ export class Series {
   trim(before) {
     let drop = Math.max(0, this.times.length - MOST_ROWS);
     while (drop < this.times.length && this.times[drop] < before) drop += 1;
-    // Not one by one: arrays are cut a second at a time.
+    // Drop old samples a second at a time.
     if (drop < 40) return;
     this.version += 1;
     this.times.splice(0, drop);

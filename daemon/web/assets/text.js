@@ -1,4 +1,4 @@
-// Numbers and sentences into the page; an element is touched only where its text changes.
+// Writes numbers and sentences into the page; changes an element only if its text changes.
 
 const MINUS = "\u2212";
 
@@ -17,7 +17,7 @@ export function warn(element, sentence) {
   show(element, sentence !== "");
 }
 
-// A number with its unit; a dash where there is none.
+// A number with its unit; a dash if there is no number.
 export function number(value, digits, unit = "", { signed = false } = {}) {
   if (value === null || value === undefined) return "–";
   const text = Math.abs(value).toFixed(digits);
@@ -33,7 +33,7 @@ export function interval(low, high, digits) {
 
 export const age = (seconds) => (seconds < 10 ? `${seconds.toFixed(1)} s` : `${Math.round(seconds)} s`);
 
-// A message's array: its shape and its numbers.
+// A message's array: shape and numbers.
 export function array(packed) {
   const bytes = Uint8Array.from(atob(packed.float32), (letter) => letter.charCodeAt(0));
   return { shape: packed.shape, values: new Float32Array(bytes.buffer) };

@@ -8,7 +8,7 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-from shearloop.drivers.emulators.pty_server import PtyServer
+from shearloop.drivers.emulators.ports import PtyServer
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
 
 DEVICE_ID = 9
@@ -147,11 +147,11 @@ class ModbusServer(PtyServer):
     def __init__(
         self, gripper: Gripper, link: Path | None = None, on_port: Callable[[str], None] = lambda _: None
     ) -> None:
-        super().__init__(link, on_port)
+        super().__init__(self._reply_to, link, on_port)
         self._face = ModbusFace(gripper)
         self.damage_next = False
 
-    def _answer(self, data: bytes) -> bytes:
+    def _reply_to(self, data: bytes) -> bytes:
         reply = self._face.feed(data, asyncio.get_running_loop().time())
         if reply and self.damage_next and not self.silent:
             self.damage_next = False

@@ -3,7 +3,7 @@
 import asyncio
 from typing import Protocol
 
-from shearloop.drivers.emulators.outage import Outage
+from shearloop.drivers.emulators.ports import Outage
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
 
 STEP_S = 0.008
@@ -22,10 +22,10 @@ class Server(Protocol):
     async def run(self) -> None:
         """Serve until cancelled."""
 
-    async def lose(self) -> None:
+    async def disconnect(self) -> None:
         """Break the connection."""
 
-    async def bring_back(self) -> None:
+    async def restore(self) -> None:
         """Let it be made again."""
 
 
@@ -94,9 +94,9 @@ class GripperPlayer:
     async def _break(self) -> None:
         while True:
             seconds = await self._outages.get()
-            await self._server.lose()
-            await self._outage.last(seconds)
-            await self._server.bring_back()
+            await self._server.disconnect()
+            await self._outage.wait(seconds)
+            await self._server.restore()
 
 
 def _seconds(words: list[str]) -> float:

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from shearloop.drivers.emulators.ports import SocketServer
 from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper
-from shearloop.drivers.emulators.socket_server import SocketServer
 
 PORT = 63352
 LONGEST_LINE = 256
@@ -91,11 +91,11 @@ class UrcapServer(SocketServer):
         port: int = PORT,
         on_port: Callable[[str], None] = lambda _: None,
     ) -> None:
-        super().__init__(host, port, on_port)
+        super().__init__(self._new_face, host, port, on_port)
         self._gripper = gripper
         self.no_data = False
 
-    def _answerer(self) -> Callable[[bytes], bytes]:
+    def _new_face(self) -> Callable[[bytes], bytes]:
         face = UrcapFace(self._gripper)
 
         def answer(data: bytes) -> bytes:

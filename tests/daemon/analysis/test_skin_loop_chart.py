@@ -87,7 +87,7 @@ def test_the_demo_holds_the_force_that_it_says() -> None:
     assert config.skin.tool_radius_mm is not None
     file = load_yaml_model(config.experiment, ExperimentFile)
     (hold,) = [step for step in file.steps if isinstance(step, HoldTorqueStep)]
-    assert file.drive == "skin"
+    assert file.torque_source == "skin"
     assert hold.torque_nm / config.skin.tool_radius_mm * 1e3 == pytest.approx(1.0)
     assert [step.do for step in file.steps] == ["tare", "identify", "hold_torque"]
     assert all(step.timeout_s for step in file.steps), "none may last for ever"

@@ -38,7 +38,7 @@ def every_parser() -> Iterator[tuple[str, argparse.ArgumentParser]]:
         yield from parsers(name, parser)
 
 
-def test_every_command_has_json_or_a_reason_to_have_none() -> None:
+def test_every_command_has_a_json_option_or_a_reason_for_none() -> None:
     having = {name: "--json" in parser._option_string_actions for name, parser in every_parser()}
     lacking = {name for name, has_it in having.items() if not has_it}
     assert {next((known for known in WITHOUT if name.startswith(known)), name) for name in lacking} == set(WITHOUT)

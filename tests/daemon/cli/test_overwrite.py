@@ -36,7 +36,7 @@ def matlab() -> bytes:
         ("recording export no.mcap --format mat --out", "a MATLAB file"),
     ],
 )
-def test_no_command_writes_over_another_s_file(
+def test_no_command_overwrites_a_file_of_another_kind(
     command: str, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there = tmp_path / "precious"
@@ -49,13 +49,13 @@ def test_no_command_writes_over_another_s_file(
 
 
 @pytest.mark.parametrize("content", [MCAP, b"PK\x03\x04\x14\0", matlab(), b"\x8eSHLBANK", "σ".encode()[:1] + b"x"])
-def test_text_is_written_over_text_alone(content: bytes, tmp_path: Path) -> None:
+def test_text_overwrites_only_text(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "file").write_bytes(content)
     with pytest.raises(UserError, match="is not a configuration"):
         check_overwrite(tmp_path / "file", "a configuration")
 
 
-def test_what_is_of_the_kind_or_empty_or_no_file_may_be_written_over(tmp_path: Path) -> None:
+def test_same_kind_empty_and_special_files_may_be_overwritten(tmp_path: Path) -> None:
     file = tmp_path / "file"
     check_overwrite(file, "a bank", b"BANK")
     file.touch()

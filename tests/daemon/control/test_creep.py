@@ -3,7 +3,7 @@ import pytest
 
 from shearloop.daemon.control.creep import Creep, Stretch, fit_creep
 from shearloop.daemon.errors import UserError
-from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Twin, TwinSettings
 
 PERIOD_S = 0.5412
 

@@ -14,13 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import CHANNELS, ZERO_SLOTS
+from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.eit_kit import EitKit, Frame
-from shearloop.drivers.hx711 import LoadCalibration, LoadSample
+from shearloop.drivers.load_cell import LoadCalibration, LoadSample
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.serial_port import LinkEvent
 from shearloop.drivers.ur.client import UrLinkEvent as RobotLink
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState, Stop, WristSpeed
@@ -106,7 +106,7 @@ async def twist(arm: UrRobot, by_rad: float) -> None:
         while abs(missing_rad := target_rad - (await arm.next_state()).wrist_rad) > 0.002:
             speed = float(np.clip(4.0 * missing_rad, -0.2, 0.2))
             reply = await arm.send(WristSpeed(speed, 2.0))
-            assert reply.accepted, reply.refused
+            assert reply.accepted, reply.refusal
     assert (await arm.send(Stop(4.0))).accepted
     await until(arm, lambda state: state.motion == "idle")
 

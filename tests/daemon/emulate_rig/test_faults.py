@@ -6,11 +6,11 @@ from contextlib import AsyncExitStack
 
 import pytest
 
+from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.errors import DeviceLostError, DriverError
 from shearloop.drivers.load_cell import LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import ObjectStatus
-from shearloop.drivers.serial_port import LinkEvent
 from shearloop.drivers.ur.client import UrLinkEvent as RobotLink
 from shearloop.drivers.ur.messages import Unlock
 from tests.daemon.emulate_rig.rig import (
@@ -112,7 +112,7 @@ async def test_boards_fall_silent_vanish_and_come_back(rig: RigProcess) -> None:
             assert not (await told.get()).up
             assert "has sent nothing" in (await losses.get()).sentence
             # A silent board is started again by its driver, without being lost.
-            while not other.facts()["silences"]:
+            while not other.diagnostics()["silences"]:
                 await left.take(1)
             await rig.fault("replug right")
             await rig.fault("normal")
@@ -123,6 +123,6 @@ async def test_boards_fall_silent_vanish_and_come_back(rig: RigProcess) -> None:
             for each in (right, left, load):
                 await each.take(2)
             await rig.fault("right cut-line")
-            while "wrong_count" not in kit.facts()["errors"]:
+            while "wrong_count" not in kit.diagnostics()["errors"]:
                 await right.take(1)
-            assert other.facts()["errors"] == {}
+            assert other.diagnostics()["errors"] == {}

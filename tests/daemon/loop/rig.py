@@ -11,7 +11,7 @@ from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
-from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Twin, TwinSettings
 
 TICK_S = 0.008
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
@@ -20,7 +20,7 @@ GRIP = {"do": "grip", "width_mm": 10.0, "force_n": 60.0}
 CONFIG = LoopConfig()
 
 
-def brain() -> ControlLoop:
+def new_loop() -> ControlLoop:
     return ControlLoop(CONFIG, {"right": EIT, "load_cell": LOAD}, ("gripper", "right"))
 
 
@@ -28,7 +28,7 @@ class Rig:
     """The twin with sensors and devices around it, stepped in the loop's own ticks: no I/O, no waiting."""
 
     def __init__(self, subject: ControlLoop, seed: int = 0, noise_nm: float = 0.012) -> None:
-        self.brain = subject
+        self.control_loop = subject
         self.twin = Twin(TwinSettings(gel_stiffness_nm_per_rad=0.3))
         self.random = np.random.default_rng(seed)
         self.noise_nm = noise_nm
@@ -63,9 +63,9 @@ class Rig:
             if self.tick >= due:
                 self.pending.remove((due, action))
                 self._finish(action)
-        orders = self.orders = self.brain.tick(self.t_ns)
+        orders = self.orders = self.control_loop.tick(self.t_ns)
         self.speed = 0.0 if orders.stop else orders.wrist_rad_per_s
-        self.brain.on_speed_sent(self.speed)
+        self.control_loop.on_speed_sent(self.speed)
         if orders.release:
             self.force_n = 0.0
         if orders.action is not None:
@@ -75,16 +75,20 @@ class Rig:
     def _sense(self, torque_nm: float) -> None:
         now = self.t_ns
         if "arm" not in self.silent:
-            self.brain.inputs.arm = replace(self.arm, wrist_rad=self.wrist_rad, t_ns=now)
+            self.control_loop.inputs.arm = replace(self.arm, wrist_rad=self.wrist_rad, t_ns=now)
         if "hand" not in self.silent:
-            self.brain.inputs.gripper = replace(self.hand, t_ns=now, holding=self.force_n > 0, width_mm=self.width_mm)
+            self.control_loop.inputs.gripper = replace(
+                self.hand, t_ns=now, holding=self.force_n > 0, width_mm=self.width_mm
+            )
         if self.tick % 68 == 0 and "right" not in self.silent:
             middle = now - round(EIT.window_s * 0.5e9)
             value = float(np.mean(self.window) + self.random.normal(0.0, self.noise_nm))
-            self.brain.on_torque(TorqueSample("right", value, "", middle, now))
+            self.control_loop.on_torque(TorqueSample("right", value, "", middle, now))
         if self.tick % 11 == 0 and "load_cell" not in self.silent:
             value = torque_nm + self.offset_nm + float(self.random.normal(0.0, 0.0005))
-            self.brain.on_torque(TorqueSample("load_cell", None if self.void else value, "", now - 1_000_000, now))
+            self.control_loop.on_torque(
+                TorqueSample("load_cell", None if self.void else value, "", now - 1_000_000, now)
+            )
 
     def _finish(self, action: Action) -> None:
         if isinstance(action, GripTo):
@@ -92,13 +96,13 @@ class Rig:
             self.force_n = action.force_n if holds else 0.0
             self.width_mm = 30.0 if holds else action.width_mm
             # As the gripper's task does, before it says that the fingers have closed.
-            self.brain.inputs.gripper = replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm)
-        self.brain.on_action_ended()
+            self.control_loop.inputs.gripper = replace(self.hand, t_ns=self.t_ns, holding=holds, width_mm=self.width_mm)
+        self.control_loop.on_action_ended()
 
     def run(self, most_s: float) -> None:
         for _ in range(round(most_s / TICK_S)):
             self.step()
-            if self.brain.experiment is not None and not self.brain.experiment.running:
+            if self.control_loop.experiment is not None and not self.control_loop.experiment.running:
                 return
 
 
@@ -106,10 +110,10 @@ def started(rig: Rig, *steps: dict[str, Any], **keys: Any) -> Rig:
     for _ in range(70):
         rig.step()
     file = ExperimentFile.model_validate({"name": "test", "steps": list(steps), **keys})
-    assert rig.brain.start(file, rig.t_ns) is None
+    assert rig.control_loop.start(file, rig.t_ns) is None
     return rig
 
 
 def phase(rig: Rig) -> ExperimentPhase:
-    assert rig.brain.experiment is not None
-    return rig.brain.experiment.phase
+    assert rig.control_loop.experiment is not None
+    return rig.control_loop.experiment.phase

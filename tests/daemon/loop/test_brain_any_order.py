@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from tests.daemon.loop.rig import GRIP, TICK_S, Rig, brain, phase, started
+from tests.daemon.loop.rig import GRIP, TICK_S, Rig, new_loop, phase, started
 
 FAULTS = st.sampled_from(["right", "load_cell", "arm", "hand", "protective", "pause", "resume", "stop", "kick", "ack"])
 
@@ -17,24 +17,26 @@ FAULTS = st.sampled_from(["right", "load_cell", "arm", "hand", "protective", "pa
 def test_no_fault_at_any_time_makes_the_wrist_faster_than_its_limit_or_move_after_a_stop(
     story: list[tuple[int, str]], seed: int
 ) -> None:
-    rig = started(Rig(brain(), seed), GRIP, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.08, "hold_s": 5})
+    rig = started(
+        Rig(new_loop(), seed), GRIP, {"do": "identify"}, {"do": "hold_torque", "torque_nm": 0.08, "hold_s": 5}
+    )
     for ticks, fault in [*story, (100, "right")]:
         for _ in range(ticks):
             rig.step()
             assert abs(rig.speed) <= 0.5
-            if rig.brain.status.decision.response >= Response.HOLD or phase(rig) is not ExperimentPhase.RUNNING:
+            if rig.control_loop.status.decision.response >= Response.HOLD or phase(rig) is not ExperimentPhase.RUNNING:
                 assert rig.speed == 0.0
         match fault:
             case "protective":
                 rig.arm = replace(rig.arm, protective_stop=not rig.arm.protective_stop)
             case "pause":
-                rig.brain.pause()
+                rig.control_loop.pause()
             case "resume":
-                rig.brain.resume()
+                rig.control_loop.resume()
             case "stop":
-                rig.brain.stop("the operator said so")
+                rig.control_loop.stop("the operator said so")
             case "ack":
-                rig.brain.acknowledge()
+                rig.control_loop.acknowledge()
             case "kick":
                 rig.twin.kick_nm = 0.1 - rig.twin.kick_nm
             case name:
@@ -52,7 +54,10 @@ def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
 ) -> None:
     """Held counts whole, free counts half against it: never more than 5 s, and nothing moves while it is held."""
     rig = started(
-        Rig(brain(), seed), GRIP, {"do": "twist", "angles_rad": [0.3, -0.3], "speed_rad_per_s": 0.05}, drive="load_cell"
+        Rig(new_loop(), seed),
+        GRIP,
+        {"do": "twist", "angles_rad": [0.3, -0.3], "speed_rad_per_s": 0.05},
+        torque_source="load_cell",
     )
     rig.run(2)
     held_s = 0.0
@@ -60,13 +65,13 @@ def test_whatever_holds_the_wrist_however_it_takes_turns_it_is_stopped_in_time(
         rig.silent = {*wrong} & {"right", "load_cell", "arm", "hand"}
         rig.offset_nm = 0.2 if "apart" in wrong else 0.0
         rig.void = "void" in wrong
-        rig.brain.inputs.late_s = 0.15 if "late" in wrong else 0.0
+        rig.control_loop.inputs.late_s = 0.15 if "late" in wrong else 0.0
         for _ in range(ticks):
             rig.step()
             if phase(rig) is not ExperimentPhase.RUNNING:
                 assert rig.speed == 0.0
                 continue
-            held = rig.brain.status.decision.response is Response.HOLD
+            held = rig.control_loop.status.decision.response is Response.HOLD
             assert not (held and rig.speed)
             assert not held or held_s <= 5.0 + 2 * TICK_S
             held_s = held_s + TICK_S if held else max(0.0, held_s - 0.5 * TICK_S)

@@ -1,4 +1,4 @@
-"""Random experiments, faults and timings through brain and pilot: not one command to the arm is outside its limits."""
+"""Random experiments, faults and timings through loop and handler: no command to the arm exceeds its limits."""
 
 import dataclasses
 import math
@@ -7,15 +7,15 @@ from typing import Any
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from shearloop.daemon.control.actions import along_tool
+from shearloop.daemon.control.device_commands import along_tool
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, TorqueSample
 from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo, MoveTo
-from shearloop.drivers.emulators.twin import Twin, TwinSettings
+from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
-from tests.daemon.loop.rig import EIT, brain
+from tests.daemon.loop.rig import EIT, new_loop
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm
 from tests.drivers.ur.test_limits import LIMITS
 
@@ -90,12 +90,12 @@ class CheckedArm(FakeArm):
 
 
 class WholeRig:
-    """Brain and pilot with the twin between them, a control cycle at a time; what LoopTask does, without its ports."""
+    """Control loop and command handler with the twin between them, one cycle at a time."""
 
     def __init__(self) -> None:
-        self.brain, self.arm, self.twin = brain(), CheckedArm(), Twin(TwinSettings())
+        self.control_loop, self.arm, self.twin = new_loop(), CheckedArm(), Twin(TwinSettings())
         self.now_ns, self.number, self.force_n = 10**12, 0, 0.0
-        self.pilot = CommandHandler(SETTINGS, self.arm, self.now_ns)
+        self.handler = CommandHandler(SETTINGS, self.arm, self.now_ns)
         self.silent, self.absurd, self.fault = False, False, ""
         self.sent, self.stopped, self.late = 0.0, True, 0
         self.action: tuple[int, Action] | None = None
@@ -106,15 +106,15 @@ class WholeRig:
         self.number += 1
         torque_nm = self.twin.step(CYCLE_NS / 1e9, self.arm.reading.wrist_rad, self.force_n).torque_nm
         self.arm.be(wrench=(0.0, 0.0, 0.0, 0.0, 0.0, torque_nm))
-        self.pilot.heard(self.now_ns)
-        self.pilot.tick(self.arm.reading, self.now_ns)
+        self.handler.note_daemon_alive(self.now_ns)
+        self.handler.tick(self.arm.reading, self.now_ns)
         if self.late:
             self.late -= 1
             return
         self._sense(torque_nm)
         if self.action is not None and self.number >= self.action[0]:
             self._finish(self.action[1])
-        orders = self.brain.tick(self.now_ns)
+        orders = self.control_loop.tick(self.now_ns)
         if orders.stop:
             if not self.stopped:
                 self._ask(Stop(4.0))
@@ -125,12 +125,12 @@ class WholeRig:
         if orders.action is not None:
             self._begin(orders.action)
         assert math.isfinite(orders.wrist_rad_per_s)
-        if self.brain.status.decision.response >= Response.HOLD:
+        if self.control_loop.status.decision.response >= Response.HOLD:
             assert orders.wrist_rad_per_s == 0.0, "held, and yet it turns"
         if orders.wrist_rad_per_s or self.sent:
             reply = self._ask(WristSpeed(orders.wrist_rad_per_s, 4.0))
             self.sent = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self.brain.on_speed_sent(self.sent)
+            self.control_loop.on_speed_sent(self.sent)
 
     def befall(self, fault: str) -> None:
         match fault:
@@ -149,33 +149,37 @@ class WholeRig:
             case "late":
                 self.late = 40
             case "pause":
-                self.brain.pause()
+                self.control_loop.pause()
             case "resume":
-                self.brain.resume()
+                self.control_loop.resume()
             case "stop":
-                self.brain.stop("the operator said so")
+                self.control_loop.stop("the operator said so")
             case "unlock":
                 self.arm.be(safety_mode=1)
                 self._ask(Unlock())
-                self.brain.acknowledge()
+                self.control_loop.acknowledge()
 
     def _ask(self, command: Any) -> Any:
-        reply = self.pilot.request(self.number, command, self.arm.reading, self.now_ns)
+        reply = self.handler.request(self.number, command, self.arm.reading, self.now_ns)
         return reply if reply is not None else dataclasses.make_dataclass("Later", [("sent", object, None)])()
 
     def _sense(self, torque_nm: float) -> None:
-        state = self.pilot.state(self.arm.reading, self.number)
-        self.brain.inputs.arm = ArmStatus(
+        state = self.handler.state(self.arm.reading, self.number)
+        self.control_loop.inputs.arm = ArmStatus(
             state.wrist_rad, self.now_ns, state.protective_stop, state.emergency_stop, state.blocked
         )
         holding = self.force_n > 0
-        self.brain.inputs.gripper = GripperStatus(self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault)
+        self.control_loop.inputs.gripper = GripperStatus(
+            self.now_ns, 20.0, holding=holding, moving=False, fault=self.fault
+        )
         said = 1e30 if self.absurd else torque_nm
         if not self.silent and self.number % 11 == 0:
-            self.brain.on_torque(TorqueSample("load_cell", said, "", self.now_ns - CYCLE_NS, self.now_ns))
+            self.control_loop.on_torque(TorqueSample("load_cell", said, "", self.now_ns - CYCLE_NS, self.now_ns))
         if not self.silent and self.number % 68 == 0:
             middle = self.now_ns - round(EIT.window_s * 0.5e9)
-            self.brain.on_torque(TorqueSample("right", math.nan if self.absurd else torque_nm, "", middle, self.now_ns))
+            self.control_loop.on_torque(
+                TorqueSample("right", math.nan if self.absurd else torque_nm, "", middle, self.now_ns)
+            )
 
     def _begin(self, action: Action) -> None:
         self.action = (self.number + 30, action)
@@ -188,9 +192,11 @@ class WholeRig:
         self.arm.be(moving_linearly=False)
         if isinstance(action, GripTo):
             self.force_n = action.force_n if action.expect_object else 0.0
-            if self.brain.inputs.gripper is not None:
-                self.brain.inputs.gripper = dataclasses.replace(self.brain.inputs.gripper, holding=action.expect_object)
-        self.brain.on_action_ended()
+            if self.control_loop.inputs.gripper is not None:
+                self.control_loop.inputs.gripper = dataclasses.replace(
+                    self.control_loop.inputs.gripper, holding=action.expect_object
+                )
+        self.control_loop.on_action_ended()
 
 
 @settings(max_examples=40, deadline=None)
@@ -211,8 +217,8 @@ def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits
     for _ in range(70):
         rig.cycle()
     begin = [{"do": "grip", "width_mm": 5, "force_n": 60}]
-    content = {"name": "any", "drive": drive, "steps": begin + steps, "limits": {"torque_nm": torque_limit_nm}}
-    assert rig.brain.start(ExperimentFile.model_validate(content), rig.now_ns) is None
+    content = {"name": "any", "torque_source": drive, "steps": begin + steps, "limits": {"torque_nm": torque_limit_nm}}
+    assert rig.control_loop.start(ExperimentFile.model_validate(content), rig.now_ns) is None
     for cycles, fault in [*story, (150, "resume")]:
         for _ in range(cycles):
             rig.cycle()
@@ -220,7 +226,7 @@ def test_whatever_is_asked_and_whatever_happens_no_command_is_outside_the_limits
             assert LIMITS.joints.lower_rad[5] <= wrist <= LIMITS.joints.upper_rad[5]
             assert abs(speed) <= LIMITS.wrist_speed_rad_per_s.hard
         rig.befall(fault)
-    experiment = rig.brain.experiment
+    experiment = rig.control_loop.experiment
     assert experiment is not None
     if experiment.phase is ExperimentPhase.STOPPED:
         for _ in range(60):

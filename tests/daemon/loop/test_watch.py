@@ -13,7 +13,7 @@ from shearloop.daemon.control.loop_inputs import ArmStatus, GripperStatus, LoopI
 from shearloop.daemon.control.runner import PUBLISH_EVERY, wrench_source
 from shearloop.daemon.control.safety import TABLE, FaultCode, Response
 from shearloop.daemon.control.settings import LoopConfig
-from shearloop.drivers.ur.sample_age import SampleAge
+from shearloop.drivers.ur.controller import SampleAge
 
 EIT = TorqueSource(name="right", period_s=0.5412, window_s=0.5412)
 LOAD = TorqueSource(name="load_cell", period_s=1 / 10.9)
@@ -99,7 +99,7 @@ def test_a_frame_that_is_missed_and_a_mean_of_several_are_borne(source: TorqueSo
 
 
 def test_a_torque_that_counts_as_new_is_held_against_its_limit() -> None:
-    """Beyond 2.5 of its short periods, and younger than `freshness_s`."""
+    """Beyond 2.5 of its short periods, and younger than `stale_after_s`."""
     quick = replace(LOAD, period_s=0.005)
     beyond = torque(quick, 0.9, came_s=0.05)
     assert found(beyond, driving=quick, supervising=()).keys() == {FaultCode.TORQUE_LIMIT}

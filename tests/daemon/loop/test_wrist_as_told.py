@@ -7,10 +7,10 @@ from typing import cast
 import pytest
 
 from shearloop.daemon.control.control_loop import ControlLoop
+from shearloop.daemon.control.device_commands import VelocityCommandSender
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.control.step_runner import MoveToAngle
-from shearloop.daemon.control.velocity_sender import VelocityCommandSender
 from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply
@@ -28,13 +28,13 @@ def errors_rad(angle_rad: float, bandwidth_per_s: float, cycles: int = 500) -> l
     wrist = WristController(TorqueSource(name="load_cell", period_s=0.1), config)
     replies: list[Callable[[], None]] = []
 
-    def tell(command: Command, answered: Callable[[CommandReply], None]) -> None:
+    def send_nowait(command: Command, answered: Callable[[CommandReply], None]) -> None:
         reply = flight.ask(command)
         assert reply.accepted
         # It comes with the next state that is told.
         replies.append(lambda: answered(reply))
 
-    robot = SimpleNamespace(settings=SETTINGS, state=None, tell=tell)
+    robot = SimpleNamespace(settings=SETTINGS, state=None, send_nowait=send_nowait)
     brain = SimpleNamespace(on_speed_sent=wrist.on_speed_sent, on_command_refused=pytest.fail)
     commands = VelocityCommandSender(cast(UrRobot, robot), cast(ControlLoop, brain), 4.0, pytest.fail)
     origin_rad, errors = flight.state.wrist_rad, []

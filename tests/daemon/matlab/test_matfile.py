@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.io import loadmat, savemat
 
-from shearloop.daemon.recording.matlab_file import MatFileError, NotAMatrix, read_variables
+from shearloop.daemon.recording.matlab import MatFileError, NotAMatrix, read_variables
 
 NAMES = st.from_regex(r"[A-Za-z][A-Za-z0-9_]{0,30}", fullmatch=True)
 KINDS = ["f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"]
@@ -83,10 +83,10 @@ def test_other_kinds_are_named(value: object, what: str) -> None:
         (written_by_hand("<", 3, bytes(8)) + b"abc", "ends inside an element's tag"),
         (written_by_hand("<", 3, bytes(6)), "x has 3 numbers for a matrix of 2 × 2"),
         (written_by_hand("<", 3, bytes(7)), "7 bytes for numbers of 2 bytes each"),
-        (written_by_hand("<", 8, bytes(8)), "element of type 8 where numbers should be"),
+        (written_by_hand("<", 8, bytes(8)), "element of type 8 where numbers are expected"),
         (written_by_hand("<", 3, bytes(8), (-2, -2)), "without a proper class, shape and name"),
         (written_by_hand("<", 3, bytes(8)) + written_by_hand("<", 3, bytes(8))[128:], "the variable 'x' twice"),
-        (saved({})[:128] + element(9, bytes(8), "<"), "element of type 9 where a variable should be"),
+        (saved({})[:128] + element(9, bytes(8), "<"), "element of type 9 where a variable is expected"),
         (saved({})[:128] + element(15, b"not packed", "<"), "does not unpack"),
         (saved({})[:128] + element(15, zlib.compress(bytes(100))[:-6], "<"), "is not complete"),
     ],

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.matlab_streams import (
+from shearloop.daemon.recording.matlab import (
     read_diameter_slices,
     read_line,
     read_load_stream,
@@ -55,7 +55,7 @@ def test_of_both_fingertips_in_one_file_one_must_be_chosen(tmp_path: Path) -> No
     savemat(tmp_path / "both.mat", {"Left_Data": left, "Right_Data": right})
     assert len(read_stream(tmp_path / "both.mat", side="left").lines) == 2
     assert len(read_stream(tmp_path / "both.mat", side="right").lines) == 3
-    with pytest.raises(UserError, match=r"both\.mat holds Right_Data and Left_Data; say which"):
+    with pytest.raises(UserError, match=r"both\.mat holds Right_Data and Left_Data; choose one"):
         read_stream(tmp_path / "both.mat")
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.daemon.errors import UserError
+from shearloop.daemon.recording.matlab import read_diameter_slices, read_line, read_torque_slices
 from shearloop.daemon.recording.matlab_slices import SliceRecorder
-from shearloop.daemon.recording.matlab_streams import read_diameter_slices, read_line, read_torque_slices
 
 S = 1_000_000_000
 PERIOD_S = 0.5
@@ -23,7 +23,7 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
         "step_name": "twist",
         "hold": 0,
         "slices": "torque",
-        "driving": "load_cell",
+        "torque_source": "load_cell",
         **changes,
     }
 
@@ -254,10 +254,10 @@ def test_a_folder_that_cannot_be_written_kills_nobody_and_is_told(unwritable: Pa
     sweep.hold(2, 0.1)
     sweep.done()
     assert f"no slice was kept; 2 missed: {unwritable} cannot be written (" in sweep.recorder.summary
-    facts = sweep.recorder.facts()
+    facts = sweep.recorder.diagnostics()
     assert facts["slices"] == 0
     assert facts["errors"] == sweep.recorder.missed
-    assert "cannot be written" in str(facts["trouble"])
+    assert "cannot be written" in str(facts["error"])
     assert not list(unwritable.glob("torque_slices/*")), "nothing half written is left"
 
 

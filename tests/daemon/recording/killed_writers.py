@@ -45,7 +45,7 @@ async def write(folder: Path) -> None:
             dead=0,
             repeated=False,
         )
-        recorder.record(frame.topic, wire_map(frame, clock.unix_s(now_ns), seq))
+        recorder.record_message(frame.topic, wire_map(frame, clock.unix_s(now_ns), seq))
         times[8:] = struct.pack("<q", now_ns)
         seq += 1
         await asyncio.sleep(PERIOD_S)

@@ -19,8 +19,8 @@ def recording(tmp_path: Path) -> Path:
     path = tmp_path / "twist.mcap"
     with RecordingWriter(path, "a bench") as writer:
         for i, line in enumerate(LINES):
-            writer.frame("right", 10**18 + i * 541_000_000, 10**18 + i * 541_000_000 + 300_000_000, line)
-            writer.torque(10**18 + i, 0.01 * i)
+            writer.add_frame("right", 10**18 + i * 541_000_000, 10**18 + i * 541_000_000 + 300_000_000, line)
+            writer.add_torque(10**18 + i, 0.01 * i)
     return path
 
 
@@ -48,13 +48,13 @@ def test_a_torn_recording_is_refused_with_its_cure_and_repaired(
     assert main(["recording", "info", str(torn)]) == 0
     assert "It was not closed" in capsys.readouterr().out
     assert main(["recording", "repair", str(torn)]) == 0
-    assert "torn.mcap: 8 messages are safe" in capsys.readouterr().out
+    assert "torn.mcap: 8 messages are saved" in capsys.readouterr().out
     assert torn.exists(), "the original stays"
     found = read_recording(tmp_path / "torn.mcap")
     np.testing.assert_array_equal(found.sides["right"].lines, LINES)
     assert found.source == "a bench"
     assert main(["recording", "repair", str(torn)]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
 
 
 def test_a_damaged_chunk_is_left_out_and_told(
@@ -64,7 +64,7 @@ def test_a_damaged_chunk_is_left_out_and_told(
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, "a bench") as writer:
         for i in range(100):
-            writer.torque(10**18 + i, 0.01 * i)
+            writer.add_torque(10**18 + i, 0.01 * i)
     content = bytearray(path.read_bytes())
     at = content.index(b'{"torque_nm":0.5}') if b'{"torque_nm":0.5}' in content else len(content) // 4
     content[at : at + 4] = bytes(255 - byte for byte in content[at : at + 4])

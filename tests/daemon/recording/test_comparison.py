@@ -7,10 +7,8 @@ import pytest
 
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import EitEstimate, wire_map
-from shearloop.daemon.recording.content import message_json
-from shearloop.daemon.recording.recorded_run import RecordedEvent
-from shearloop.daemon.recording.replay import Comparison
-from shearloop.daemon.recording.schema import completed
+from shearloop.daemon.recording.replay import RecordedEvent, ReplayComparison
+from shearloop.daemon.recording.schema import message_json, with_missing_keys
 from tests.daemon.sample_messages import sample
 
 TOPIC = EitEstimate.topic
@@ -24,7 +22,7 @@ def estimate(**changes: Any) -> dict[str, Any]:
 def recorded(content: dict[str, Any]) -> RecordedEvent:
     """Return a message as it comes back from a recording, which leaves out what has no value."""
     plain = json.loads(message_json(TOPIC, content, 0))
-    return RecordedEvent(TOPIC, content["t_mono_ns"], completed(TOPIC, plain), content["source"])
+    return RecordedEvent(TOPIC, content["t_mono_ns"], with_missing_keys(TOPIC, plain), content["source"])
 
 
 @pytest.mark.parametrize(
@@ -35,15 +33,15 @@ def recorded(content: dict[str, Any]) -> RecordedEvent:
         ({"torque_nm": 0.1}, {"torque_nm": 0.1 + 1e-16}, "torque_nm was 0.1, is 0.100000000000000"),
         ({"k": None}, {"k": 1.5}, "k was None, is 1.5"),
         ({"k": 1.5}, {"k": None}, "k was 1.5, is None"),
-        ({"why": ""}, {"why": "no grip"}, "why was"),
+        ({"reason": ""}, {"reason": "no grip"}, "reason was"),
     ],
 )
 def test_a_message_is_the_recorded_one_bit_for_bit_or_told_with_what_differs(
     then: dict[str, Any], now: dict[str, Any], told: str
 ) -> None:
-    comparison = Comparison(("eit.estimate.right",))
-    comparison.made(TOPIC, estimate(**now))
-    comparison.recorded(recorded(estimate(**then)))
+    comparison = ReplayComparison(("eit.estimate.right",))
+    comparison.add_computed(TOPIC, estimate(**now))
+    comparison.compare(recorded(estimate(**then)))
     assert comparison.compared[TOPIC] == 1
     assert comparison.different[TOPIC] == bool(told)
     assert told in "".join(comparison.examples)
@@ -51,18 +49,18 @@ def test_a_message_is_the_recorded_one_bit_for_bit_or_told_with_what_differs(
 
 
 def test_what_was_recorded_and_not_made_again_differs() -> None:
-    comparison = Comparison(("eit.estimate.right", "eit.estimate.left"))
-    comparison.made(TOPIC, estimate(source="left"))
-    comparison.recorded(recorded(estimate()))
+    comparison = ReplayComparison(("eit.estimate.right", "eit.estimate.left"))
+    comparison.add_computed(TOPIC, estimate(source="left"))
+    comparison.compare(recorded(estimate()))
     assert comparison.different[TOPIC] == 1
-    assert "it was not made again" in comparison.examples[0]
+    assert "the replay did not compute it" in comparison.examples[0]
     assert comparison.unrecorded == 1, "the left one has no message beside it"
 
 
 def test_what_is_in_no_topic_of_the_recording_is_counted_and_not_kept() -> None:
-    comparison = Comparison(("eit.estimate.right",))
+    comparison = ReplayComparison(("eit.estimate.right",))
     for _ in range(3):
-        comparison.made(TOPIC, estimate(source="left"))
-        comparison.made("health", {"source": "daemon"})
+        comparison.add_computed(TOPIC, estimate(source="left"))
+        comparison.add_computed("health", {"source": "daemon"})
     assert comparison.unrecorded == 3
-    assert comparison._made == {}
+    assert comparison._computed == {}

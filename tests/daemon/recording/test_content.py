@@ -9,8 +9,8 @@ from typing import Any, NoReturn
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from shearloop.daemon.recording.content import as_json, input_json, input_of
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.daemon.recording.schema import as_json, input_event, input_json
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 texts = st.text()
 scalars = st.none() | st.booleans() | st.integers(-(2**63), 2**63) | st.floats() | texts
@@ -48,4 +48,4 @@ def test_mapping_that_is_no_dict_is_written_as_one() -> None:
 
 def test_raw_input_reads_the_same_byte_for_byte() -> None:
     told = RawEvent(InputKind.DATA, 123456789012345678, bytes(range(256)))
-    assert input_of(json.loads(input_json(told))) == told
+    assert input_event(json.loads(input_json(told))) == told

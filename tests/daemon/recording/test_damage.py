@@ -15,15 +15,14 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.export import export, topics_of
-from shearloop.daemon.recording.identity import Attached, Identity, basic_identity
+from shearloop.daemon.recording.export import count_messages, export
+from shearloop.daemon.recording.identity import AttachedFile, Identity, basic_identity
 from shearloop.daemon.recording.importing import import_mat
 from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.recording.recorded_run import RecordedRun
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import repair
-from shearloop.daemon.recording.summary import summarise
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.daemon.recording.repair import repair, summarise
+from shearloop.daemon.recording.replay import RecordedRun
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.recording.test_recorder import frame, torque
 from tests.daemon.recording.test_replay import replayed
 
@@ -34,13 +33,13 @@ CONFIGURATION = {"fingertips": {"right": {"device": {"path": "eit-right"}}}}
 def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Return a recording as the daemon's own recorder makes it, of two chunks, with inputs and a configuration."""
     folder, clock = tmp_path_factory.mktemp("whole"), Clock()
-    attached = Attached("configuration.json", "application/json", json.dumps(CONFIGURATION).encode())
+    attached = AttachedFile("configuration.json", "application/json", json.dumps(CONFIGURATION).encode())
     recorder = Recorder(folder, Identity(basic_identity("a test"), (attached,)), clock)
-    tap = recorder.tap("right")
+    tap = recorder.input_recorder("right")
     for number in range(4):
         tap(RawEvent(InputKind.DATA, clock.now_ns(), b"0.1, 0.2\r\n"))
-        recorder.record("eit.frame", frame(clock, number))
-        recorder.record("load.torque", torque(clock, number))
+        recorder.record_message("eit.frame", frame(clock, number))
+        recorder.record_message("load.torque", torque(clock, number))
         if number == 1:
             recorder.write()
     recorder.close()
@@ -52,25 +51,25 @@ def happened(path: Path) -> list[Any]:
     run = RecordedRun(path)
     with run.configuration() as config:
         assert list(config.fingertips) == ["right"]
-    run.asides()
-    return list(run.happenings())
+    run.replay_events()
+    return list(run.events())
 
 
 def exported(path: Path) -> list[bytes]:
-    return [one.read_bytes() for one in export(path, "csv", path.parent / "csv", sorted(topics_of(path)))]
+    return [one.read_bytes() for one in export(path, "csv", path.parent / "csv", sorted(count_messages(path)))]
 
 
 def told(path: Path) -> list[tuple[str, int]]:
     found = summarise(path)
     # What is torn or damaged is said so here, and is no mistake.
-    if found.closed and not found.damaged_chunks:
+    if found.condition.closed and not found.condition.damaged_chunks:
         return sorted((name, topic.messages) for name, topic in found.topics.items())
     return []
 
 
 def repaired(path: Path) -> int:
     done = repair(path, path.with_name("repaired.mcap"))
-    assert sum(topics_of(done.path).values()) == done.messages
+    assert sum(count_messages(done.path).values()) == done.messages
     return 0
 
 
@@ -178,4 +177,4 @@ def test_nothing_is_kept_of_what_is_not_compared(
     published, comparison = asyncio.run(replayed(imported, math.inf, f"ipc://{tmp_path}/replay", configured))
     assert sum(topic == "eit.estimate" for topic, _ in published) > 30
     assert comparison.unrecorded == 0
-    assert comparison._made == {}
+    assert comparison._computed == {}

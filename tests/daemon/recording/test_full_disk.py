@@ -15,10 +15,9 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import recorder as recorder_module
-from shearloop.daemon.recording.mcap_file import McapFile
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import repair
-from shearloop.daemon.recording.summary import summarise
+from shearloop.daemon.recording.repair import repair, summarise
+from shearloop.daemon.recording.writer import McapFile
 from tests.daemon.conftest import deadline
 from tests.daemon.recording.test_recorder import IDENTITY, frame, topics, torque
 
@@ -46,10 +45,10 @@ def test_wherever_the_disk_is_full_all_that_was_flushed_is_kept(tmp_path: Path) 
             disks.append(SmallDisk(path.with_name(path.name + ".partial"), room))
             return McapFile(path, disks[0])
 
-        recorder = Recorder(tmp_path / str(n), IDENTITY, clock, opener=opener)
+        recorder = Recorder(tmp_path / str(n), IDENTITY, clock, open_file=opener)
         safe = -1
         for number in range(12):
-            recorder.record("eit.frame", frame(clock, number))
+            recorder.record_message("eit.frame", frame(clock, number))
             recorder.write()
             if not recorder.failure:
                 safe = number
@@ -73,15 +72,15 @@ def test_when_there_is_room_again_nothing_is_missing(tmp_path: Path) -> None:
         return McapFile(path, disks[-1])
 
     told: list[str] = []
-    recorder = Recorder(tmp_path, IDENTITY, clock, opener=opener, on_failure=told.append)
+    recorder = Recorder(tmp_path, IDENTITY, clock, open_file=opener, on_failure=told.append)
     for number in range(20):
-        recorder.record("eit.frame", frame(clock, number))
+        recorder.record_message("eit.frame", frame(clock, number))
         recorder.write()
     assert "No space left on device" in recorder.failure
-    facts = recorder.facts()
-    assert facts["trouble"] == recorder.failure
+    facts = recorder.diagnostics()
+    assert facts["error"] == recorder.failure
     assert facts["waiting_bytes"] > 0
-    recorder.experiment("another")
+    recorder.record_experiment("another")
     recorder.write()
     assert len(disks) == 1, "no other file is begun on a full disk"
     disks[0].room = 10_000_000
@@ -101,18 +100,18 @@ def test_a_file_that_cannot_be_begun_leaves_nothing(tmp_path: Path, monkeypatch:
         disk.room = rooms.pop(0)
         return McapFile(path, disk)
 
-    with pytest.raises(UserError, match="nothing can be recorded there: No space left on device"):
-        Recorder(tmp_path, IDENTITY, clock, opener=opener)
+    with pytest.raises(UserError, match="cannot record there: No space left on device"):
+        Recorder(tmp_path, IDENTITY, clock, open_file=opener)
     assert list(tmp_path.iterdir()) == []
-    recorder = Recorder(tmp_path, IDENTITY, clock, opener=opener)
+    recorder = Recorder(tmp_path, IDENTITY, clock, open_file=opener)
     # Each item asks for another file, as all do after an hour; the disk has room for one at last.
     monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
     for number in range(3):
-        recorder.record("load.torque", torque(clock, number))
+        recorder.record_message("load.torque", torque(clock, number))
     recorder.write()
     assert "No space left on device" in recorder.failure
     assert list(tmp_path.iterdir()) == [recorder.path]
-    recorder.record("load.torque", torque(clock, 3))
+    recorder.record_message("load.torque", torque(clock, 3))
     recorder.write()
     assert recorder.failure == ""
     recorder.close()
@@ -121,10 +120,10 @@ def test_a_file_that_cannot_be_begun_leaves_nothing(tmp_path: Path, monkeypatch:
 
 def test_what_waits_has_a_bound_and_what_is_dropped_is_counted(tmp_path: Path) -> None:
     clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock, most_waiting_bytes=100_000)
+    recorder = Recorder(tmp_path, IDENTITY, clock, max_waiting_bytes=100_000)
     for number in range(20):
-        recorder.record("eit.frame", frame(clock, number))
-    dropped = recorder.facts()["errors"]["dropped"]
+        recorder.record_message("eit.frame", frame(clock, number))
+    dropped = recorder.diagnostics()["errors"]["dropped"]
     assert 0 < dropped < 20
     recorder.close()
     (path,) = recorder.finished
@@ -134,20 +133,20 @@ def test_what_waits_has_a_bound_and_what_is_dropped_is_counted(tmp_path: Path) -
 
 def test_what_was_dropped_is_told_by_the_file_that_lacks_it_and_no_later_one(tmp_path: Path) -> None:
     clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock, most_waiting_bytes=100_000)
+    recorder = Recorder(tmp_path, IDENTITY, clock, max_waiting_bytes=100_000)
     for number in range(20):
-        recorder.record("eit.frame", frame(clock, number))
-    dropped = recorder.facts()["errors"]["dropped"]
+        recorder.record_message("eit.frame", frame(clock, number))
+    dropped = recorder.diagnostics()["errors"]["dropped"]
     recorder.write()
-    recorder.experiment("one")
-    recorder.record("load.torque", torque(clock, 0))
+    recorder.record_experiment("one")
+    recorder.record_message("load.torque", torque(clock, 0))
     recorder.write()
-    recorder.experiment("two")
+    recorder.record_experiment("two")
     for number in range(20):
-        recorder.record("eit.frame", frame(clock, number))
-    later = recorder.facts()["errors"]["dropped"] - dropped
+        recorder.record_message("eit.frame", frame(clock, number))
+    later = recorder.diagnostics()["errors"]["dropped"] - dropped
     recorder.write()
-    recorder.experiment("three")
+    recorder.record_experiment("three")
     recorder.close()
     assert dropped > 0 < later
     assert [summarise(path).dropped for path in recorder.finished] == [dropped, later, 0]
@@ -185,7 +184,7 @@ async def test_on_a_real_full_disk_the_failure_is_told_and_what_was_written_is_s
         while not why:
             assert number < 1000, "a disk of 64 kB took a thousand frames, and is not full"
             for _ in range(5):
-                recorder.record("eit.frame", frame(clock, number))
+                recorder.record_message("eit.frame", frame(clock, number))
                 number += 1
             flushed.clear()
             await flushed.wait()
@@ -201,5 +200,5 @@ async def test_on_a_real_full_disk_the_failure_is_told_and_what_was_written_is_s
 
 def test_a_folder_where_nothing_can_be_written_is_a_mistake(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match="nothing can be recorded there"):
+    with pytest.raises(UserError, match="cannot record there"):
         Recorder(tmp_path / "file", IDENTITY, Clock())

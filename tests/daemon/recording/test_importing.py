@@ -87,6 +87,6 @@ def test_what_cannot_be_imported_is_named(mat_folder, tmp_path):
 def test_a_line_is_written_as_each_of_its_numbers_is_rounded(tmp_path, decimals):
     line = np.round(np.random.default_rng(decimals).uniform(-1, 1, N_LINE_VALUES), decimals)
     with RecordingWriter(tmp_path / "a.mcap", "a test") as writer:
-        writer.frame("right", 1, 2, line)
+        writer.add_frame("right", 1, 2, line)
     found = read_recording(tmp_path / "a.mcap").sides["right"].lines[0]
     assert found.tolist() == [round(value, 6) for value in line.tolist()]

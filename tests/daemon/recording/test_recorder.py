@@ -20,15 +20,14 @@ from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, LoadTorque, wire_map
 from shearloop.daemon.recording import recorder as recorder_module
-from shearloop.daemon.recording.identity import Attached, Identity, basic_identity
+from shearloop.daemon.recording.identity import AttachedFile, Identity, basic_identity
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.repair import repair
-from shearloop.daemon.recording.summary import summarise
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.daemon.recording.repair import repair, summarise
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.conftest import deadline
 
-IDENTITY = Identity(basic_identity("a test"), (Attached("configuration.json", "application/json", b"{}"),))
+IDENTITY = Identity(basic_identity("a test"), (AttachedFile("configuration.json", "application/json", b"{}"),))
 
 
 def frame(clock: Clock, number: int) -> dict:
@@ -57,7 +56,7 @@ def torque(clock: Clock, number: int, torque_nm: float = 0.1) -> dict:
         saturated=False,
         spike=False,
         valid=True,
-        why="",
+        reason="",
     )
     return wire_map(message, clock.unix_s(message.t_mono_ns), number)
 
@@ -75,11 +74,11 @@ def topics(path: Path) -> dict[str, list[dict]]:
 def test_everything_is_recorded_with_its_schema_and_its_time(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path / "new" / "folder", IDENTITY, clock)
-    recorder.tap("right")(RawEvent(InputKind.OPENED, 5))
-    recorder.tap("right")(RawEvent(InputKind.DATA, 7, bytes(range(256))))
+    recorder.input_recorder("right")(RawEvent(InputKind.OPENED, 5))
+    recorder.input_recorder("right")(RawEvent(InputKind.DATA, 7, bytes(range(256))))
     one = frame(clock, 0)
-    recorder.record("eit.frame", one)
-    recorder.record("load.torque", torque(clock, 0, float("nan")))
+    recorder.record_message("eit.frame", one)
+    recorder.record_message("load.torque", torque(clock, 0, float("nan")))
     recorder.close()
     assert recorder.failure == ""
     (path,) = recorder.finished
@@ -96,7 +95,7 @@ def test_everything_is_recorded_with_its_schema_and_its_time(tmp_path: Path) -> 
         reader = make_reader(file)
         assert [one.name for one in reader.iter_attachments()] == ["configuration.json"]
     told = summarise(path)
-    assert (told.closed, told.dropped, told.same_code) == (True, 0, True)
+    assert (told.condition.closed, told.dropped, told.same_code) == (True, 0, True)
     assert told.topics["input.right"].messages == 2
     assert told.metadata["source"] == "a test"
 
@@ -106,12 +105,9 @@ def test_a_live_recording_is_read_as_an_imported_one(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, IDENTITY, clock)
     frames = [frame(clock, n) for n in range(3)]
     for n, one in enumerate(frames):
-        recorder.record("eit.frame", one)
-        recorder.record("load.torque", torque(clock, n))
-    recorder.record("load.torque", {**torque(clock, 3, 9.0), "valid": False})
-    recorded_before = torque(clock, 4, 9.0) | {"spike": True}
-    del recorded_before["valid"], recorded_before["why"]
-    recorder.record("load.torque", recorded_before)
+        recorder.record_message("eit.frame", one)
+        recorder.record_message("load.torque", torque(clock, n))
+    recorder.record_message("load.torque", {**torque(clock, 3, 9.0), "valid": False})
     recorder.close()
     found = read_recording(recorder.finished[0])
     wanted = np.round(np.array([np.frombuffer(one["line"], "<f4") for one in frames], dtype=np.float64), 4)
@@ -125,7 +121,7 @@ def test_a_frame_that_the_board_sent_again_is_read_once(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, IDENTITY, clock)
     frames = [frame(clock, n) for n in range(2)]
     for one in (frames[0], frames[1], {**frames[1], "t_mono_ns": frames[1]["t_mono_ns"] + 10, "repeated": True}):
-        recorder.record("eit.frame", one)
+        recorder.record_message("eit.frame", one)
     recorder.close()
     found = read_recording(recorder.finished[0]).sides["right"]
     assert found.t_mid_ns.tolist() == [one["t_mono_ns"] + clock.offset_ns for one in frames]
@@ -134,12 +130,12 @@ def test_a_frame_that_the_board_sent_again_is_read_once(tmp_path: Path) -> None:
 def test_each_experiment_has_a_file_which_bears_its_name(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
-    recorder.record("load.torque", torque(clock, 0))
-    recorder.experiment("Hold 0.10 N·m", (Attached("hold.yaml", "application/yaml", b"name: hold"),))
-    recorder.record("load.torque", torque(clock, 1))
+    recorder.record_message("load.torque", torque(clock, 0))
+    recorder.record_experiment("Hold 0.10 N·m", (AttachedFile("hold.yaml", "application/yaml", b"name: hold"),))
+    recorder.record_message("load.torque", torque(clock, 1))
     recorder.write()
-    recorder.experiment("again")
-    recorder.record("load.torque", torque(clock, 2))
+    recorder.record_experiment("again")
+    recorder.record_message("load.torque", torque(clock, 2))
     recorder.close()
     first, second = recorder.finished
     assert first.name.endswith("_hold-0.10-n-m.mcap")
@@ -156,12 +152,12 @@ def test_without_an_experiment_a_file_is_no_longer_than_an_hour(
 ) -> None:
     clock = Clock()
     busy = True
-    recorder = Recorder(tmp_path, IDENTITY, clock, busy=lambda: busy)
+    recorder = Recorder(tmp_path, IDENTITY, clock, is_busy=lambda: busy)
     monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
-    recorder.record("load.torque", torque(clock, 0))
+    recorder.record_message("load.torque", torque(clock, 0))
     recorder.write()
     busy = False
-    recorder.record("load.torque", torque(clock, 1))
+    recorder.record_message("load.torque", torque(clock, 1))
     recorder.close()
     assert [topics(path)["load.torque"][0]["seq"] for path in recorder.finished] == [0, 1]
 
@@ -226,20 +222,20 @@ def test_a_message_without_a_json_form_is_left_out_and_counted_and_the_recorder_
 ) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
-    recorder.experiment("first")
-    recorder.record("load.torque", torque(clock, 0))
-    recorder.record("load.torque", {**torque(clock, 1), "raw": raw})
-    recorder.record("load.torque", torque(clock, 2))
+    recorder.record_experiment("first")
+    recorder.record_message("load.torque", torque(clock, 0))
+    recorder.record_message("load.torque", {**torque(clock, 1), "raw": raw})
+    recorder.record_message("load.torque", torque(clock, 2))
     # In a thread, as it is live: its stack is what nesting takes up.
     asyncio.run(asyncio.to_thread(recorder.write))
-    facts = recorder.facts()
+    facts = recorder.diagnostics()
     assert facts["errors"] == {"unwritable": 1}
-    assert facts["trouble"].startswith("a message of load.torque is left out, for it has no JSON form: ")
-    assert why in facts["trouble"]
+    assert facts["error"].startswith("a message of load.torque has no JSON form and is left out: ")
+    assert why in facts["error"]
     assert facts["waiting_bytes"] == 0
     assert recorder.failure == "", "nothing is wrong with the disk"
-    recorder.experiment("second")
-    recorder.record("load.torque", torque(clock, 3))
+    recorder.record_experiment("second")
+    recorder.record_message("load.torque", torque(clock, 3))
     recorder.close()
     first, second = recorder.finished
     assert [one["seq"] for one in topics(first)["load.torque"]] == [0, 2]
@@ -249,7 +245,7 @@ def test_a_message_without_a_json_form_is_left_out_and_counted_and_the_recorder_
 def test_what_is_nested_a_hundred_times_is_recorded(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
-    recorder.record("load.torque", {**torque(clock, 0), "raw": nested(100)})
+    recorder.record_message("load.torque", {**torque(clock, 0), "raw": nested(100)})
     recorder.close()
     assert topics(recorder.finished[0])["load.torque"][0]["raw"] == nested(100)
 

@@ -19,8 +19,8 @@ def written(path, n=4):
     frames = line_of_channels(np.round(rng.uniform(0, 1, (n, 896)), 4))
     with RecordingWriter(path, "a bench", {"tool": "driver"}) as writer:
         for i, line in enumerate(frames):
-            writer.frame("right", 1_700_000_000_000_000_000 + i * 540_000_000, 1_700_000_000_300_000_000 + i, line)
-            writer.torque(1_700_000_000_100_000_000 + i, 0.01 * i)
+            writer.add_frame("right", 1_700_000_000_000_000_000 + i * 540_000_000, 1_700_000_000_300_000_000 + i, line)
+            writer.add_torque(1_700_000_000_100_000_000 + i, 0.01 * i)
     return frames
 
 
@@ -39,14 +39,14 @@ def test_what_was_written_is_read(tmp_path):
 def test_messages_out_of_order_are_sorted(tmp_path):
     with RecordingWriter(tmp_path / "a.mcap", "x") as writer:
         for t in (3, 1, 2):
-            writer.torque(t, float(t))
+            writer.add_torque(t, float(t))
     np.testing.assert_array_equal(read_recording(tmp_path / "a.mcap").torque_nm, [1, 2, 3])
 
 
 def test_what_was_not_closed_is_kept_under_another_name(tmp_path):
     def interrupted():
         with RecordingWriter(tmp_path / "a.mcap", "x") as writer:
-            writer.torque(1, 1.0)
+            writer.add_torque(1, 1.0)
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -73,7 +73,7 @@ def test_foreign_and_stale_files_are_refused(tmp_path, monkeypatch):
         read_recording(tmp_path / "stale.mcap")
     monkeypatch.setattr(identity, "FORMAT_VERSION", "99")
     written(tmp_path / "new.mcap")
-    with pytest.raises(UserError, match="format version 99, expected 1"):
+    with pytest.raises(UserError, match="format version 99, expected 2"):
         read_recording(tmp_path / "new.mcap")
     with pytest.raises(UserError, match="choose another --out"):
         RecordingWriter(tmp_path / "no" / "where.mcap", "x")
@@ -89,5 +89,7 @@ def test_a_side_that_no_file_has_is_not_to_be_imported(tmp_path):
 
 def test_a_folder_whose_name_is_no_text_is_refused_in_a_sentence(config):
     recorded = RecordingConfig(folder=Path(os.fsdecode(b"caf\xe9")))
-    with pytest.raises(UserError, match=r"no text in UTF-8 \(it records into 'caf\\udce9'\); choose another name"):
-        identity.identity_of(load_daemon_config(config()).model_copy(update={"recording": recorded}))
+    with pytest.raises(
+        UserError, match=r"not UTF-8 \(the folder of the recordings is 'caf\\udce9'\); choose another name"
+    ):
+        identity.daemon_identity(load_daemon_config(config()).model_copy(update={"recording": recorded}))

@@ -16,12 +16,10 @@ import zmq.asyncio
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import DaemonConfig, load_daemon_config
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.messaging.request import request
 from shearloop.daemon.recording.importing import import_mat
-from shearloop.daemon.recording.recorded_run import RecordedRun
-from shearloop.daemon.recording.replay import Comparison, Replay, ReplayClock
-from shearloop.daemon.recording.replay_pipeline import ReplayPipeline
+from shearloop.daemon.recording.replay import RecordedRun, Replay, ReplayClock, ReplayComparison, ReplayPipeline
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.test_run import recording
 
@@ -33,15 +31,15 @@ RELATIVE = 1e-9
 
 async def replayed(
     path: Path, speed: float, address: str, config: DaemonConfig | None = None
-) -> tuple[list[tuple[str, dict[str, Any]]], Comparison]:
+) -> tuple[list[tuple[str, dict[str, Any]]], ReplayComparison]:
     """Return all that a replay publishes, and how it compares."""
     run, clock, seen = RecordedRun(path), ReplayClock(), []
     with contextlib.ExitStack() as opened:
         config = config or opened.enter_context(run.configuration())
         publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), address, clock)
         opened.callback(publisher.close)
-        publisher.listen(lambda topic, content: seen.append((topic, content)))
-        replay = Replay(run, ReplayPipeline(config, run.asides(), publisher), publisher, clock)
+        publisher.add_listener(lambda topic, content: seen.append((topic, content)))
+        replay = Replay(run, ReplayPipeline(config, run.replay_events(), publisher), publisher, clock)
         await replay.play(speed)
     return seen, replay.comparison
 
@@ -72,14 +70,14 @@ def recorded(config: Write, tmp_path: Path) -> Callable[..., Path]:
                     news.clear()
                     await news.wait()
 
-            daemon.publisher.listen(listen)
+            daemon.publisher.add_listener(listen)
             async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
                 group.create_task(daemon.run())
                 play = ("--recording", str(recording(tmp_path, 60)), "--once", "--speed", "20", "--link", link)
                 async with shearloop("emulate", "eit-kit", *play, *faults, stdin=asyncio.subprocess.PIPE):
                     await until(25)
                     reply = await asyncio.to_thread(
-                        request, f"ipc://{tmp_path}/commands", {"command": "tare"}, DEADLINE_S
+                        send_command, f"ipc://{tmp_path}/commands", {"command": "tare"}, DEADLINE_S
                     )
                     assert reply["ok"]
                     await until(50)
@@ -127,7 +125,7 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pyte
         then = measured([one for one in live if one[0] == topic])
         again = measured([one for one in fast if one[0] == topic])
         assert again[: len(then)] == then
-    zeros = [c for t, c in fast if t == "eit.estimate" and c["why"].startswith("taking the homogeneous frame, 1 of")]
+    zeros = [c for t, c in fast if t == "eit.estimate" and c["reason"].startswith("taking the homogeneous frame, 1 of")]
     assert len(zeros) == 2, "the operator's tare is replayed"
     assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
     told = capsys.readouterr().err
@@ -150,7 +148,7 @@ def test_a_real_recording_gives_the_estimates_that_it_gave(shared: Path, config:
     seen = {
         "valid": sum(content["valid"] for content in estimates),
         "estimates": [
-            {key: content[key] for key in ("frame", "t_mono_ns", "k", "sigma", "score", "torque_nm", "why")}
+            {key: content[key] for key in ("frame", "t_mono_ns", "k", "sigma", "score", "torque_nm", "reason")}
             for content in estimates[::52]
         ],
     }
@@ -160,7 +158,7 @@ def test_a_real_recording_gives_the_estimates_that_it_gave(shared: Path, config:
     assert seen["valid"] == reference["valid"]
     for now, then in zip(seen["estimates"], reference["estimates"], strict=True):
         assert now["frame"] == then["frame"]
-        assert now["why"] == then["why"]
+        assert now["reason"] == then["reason"]
         # To a microsecond, and to what another processor's arithmetic may do.
         assert now["t_mono_ns"] == pytest.approx(then["t_mono_ns"], abs=1000)
         for key in ("k", "sigma", "score", "torque_nm"):
@@ -171,8 +169,8 @@ def test_a_real_recording_gives_the_estimates_that_it_gave(shared: Path, config:
     ("arguments", "message"),
     [
         (["nowhere.mcap"], "nowhere.mcap: the recording cannot be read: No such file"),
-        (["{imported}"], "has no configuration; give one with --config"),
-        (["{imported}", "{imported}", "a.mcap"], "one recording is replayed at a time, and 3 were named; name one"),
+        (["{imported}"], "has no configuration because"),
+        (["{imported}", "{imported}", "a.mcap"], "one recording can be replayed at a time, not 3; name one"),
         (["{imported}", "--speed", "0"], "--speed must be a number above 0, or max, not '0'"),
         (["{imported}", "--speed", "fast"], "--speed must be a number above 0, or max, not 'fast'"),
     ],
@@ -186,9 +184,9 @@ def test_mistakes_end_in_one_sentence(
 
 
 def test_what_is_not_a_number_goes_on_the_wire_as_it_went() -> None:
-    from shearloop.daemon.recording.replay import wire_map_of
+    from shearloop.daemon.recording.replay import restored_wire_map
 
-    on_wire = wire_map_of({"seq": 3, "joints_rad": [1.5, None, 2.5], "why": ""})
+    on_wire = restored_wire_map({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})
     assert on_wire["joints_rad_shape"] == [3]
     np.testing.assert_array_equal(np.frombuffer(on_wire["joints_rad"], "<f4"), np.float32([1.5, np.nan, 2.5]))
     assert on_wire["seq"] == 3

@@ -19,7 +19,7 @@ from shearloop.bank.estimation import FrameSeries, Measured, fit
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.sensing.fingertip_task import MAX_BACKLOG, CombinedFingertipTask, Taken
-from shearloop.drivers.eit_format import ADC_STEP_V
+from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import measured, replayed
 
@@ -103,7 +103,7 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
         published.append((topic, content))
         frames.update([content["source"]] * (topic == "eit.estimate"))
         # On a busy computer one board falls behind the other, and what is left over has no partner.
-        if all(frames[side] >= N_FRAMES - 10 for side in SIDES) and frames["both"] > N_FRAMES // 3:
+        if all(frames[side] >= N_FRAMES - 10 for side in SIDES) and frames["combined"] > N_FRAMES // 3:
             enough.set()
 
     async with asyncio.timeout(DEADLINE_S), AsyncExitStack() as played:
@@ -118,7 +118,7 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
             await board.stdout.readline()
         with zmq.asyncio.Context() as context:
             daemon = Daemon(load_daemon_config(config), context)
-            daemon.publisher.listen(listen)
+            daemon.publisher.add_listener(listen)
             right = daemon._estimations["right"]
             right.held_tool = lambda _: Measured(OTHER_MM, 0.5) if right.count in OTHER_TOOL else None
             running = asyncio.create_task(daemon.run())
@@ -141,7 +141,7 @@ def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
     fingertips["right"] |= {"calibration": str(twists.calibrations["right"]), "estimator": "fused"}
     path = config(
         fingertips=fingertips,
-        both={"calibration": str(twists.calibrations["both"])},
+        combined={"calibration": str(twists.calibrations["both"])},
         recording={"folder": "recordings"},
     )
     live = asyncio.run(record(path, twists.boards))
@@ -154,16 +154,16 @@ def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
         assert comparison.compared["eit.estimate"] >= 2 * (N_FRAMES - 12) + N_FRAMES // 3
         replays[speed] = measured([one for one in again if one[0] == "eit.estimate"])
     assert replays[1.0] == replays[7.0] == replays[math.inf]
-    for source in ("right", "left", "both"):
+    for source in ("right", "left", "combined"):
         then = measured([one for one in live if one[0] == "eit.estimate" and one[1]["source"] == source])
         assert [one for one in replays[math.inf] if one[1]["source"] == source][: len(then)] == then
     torques = [one["torque_nm"] for _, one in replays[math.inf] if one["source"] == "right" and one["valid"]]
     assert len(torques) > 30
     assert np.ptp(torques) > 0.05
-    says = [(one["source"], "the tool is of 14 mm" in one["why"]) for _, one in replays[math.inf]]
+    says = [(one["source"], "the tool is of 14 mm" in one["reason"]) for _, one in replays[math.inf]]
     assert not any(refused for source, refused in says if source != "right")
     right = [one for _, one in replays[math.inf] if one["source"] == "right"]
-    refused = [number for number, one in enumerate(right) if "the tool is of 14 mm" in one["why"]]
+    refused = [number for number, one in enumerate(right) if "the tool is of 14 mm" in one["reason"]]
     # On a busy computer frames come so unevenly that a few are refused as coming after lost ones.
     assert refused
     assert set(refused) <= set(OTHER_TOOL)

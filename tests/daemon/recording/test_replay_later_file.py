@@ -12,7 +12,7 @@ import zmq.asyncio
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.recording.recorded_run import RecordedRun
+from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.sensing.estimators import Estimator
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import replayed
@@ -43,14 +43,14 @@ async def record(config: Path, stream: Path) -> list[dict[str, Any]]:
         recorder, right = daemon._recorder, daemon._estimations["right"]
         assert recorder is not None
         right.held_tool = lambda _: OTHER_TOOL if right.count >= HELD else None
-        daemon.publisher.listen(listen)
+        daemon.publisher.add_listener(listen)
         async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
             group.create_task(daemon.run())
             play = ("--recording", str(stream), "--once", "--speed", "20", "--link", str(config.parent / "eit-right"))
             async with shearloop("emulate", "eit-kit", *play, stdin=asyncio.subprocess.PIPE):
-                recorder.experiment("first")
+                recorder.record_experiment("first")
                 await until(BEGUN)
-                recorder.experiment("second")
+                recorder.record_experiment("second")
                 await until(ZEROED)
                 right.tare()
                 await until(ENOUGH)
@@ -63,7 +63,7 @@ def test_numbers_zeros_and_tools_of_a_later_file_are_replayed_as_they_were(
 ) -> None:
     live = asyncio.run(record(config(recording={"folder": "recordings"}), recording(tmp_path, 60)))
     (later,) = (path for path in (tmp_path / "recordings").iterdir() if "second" in path.name)
-    ((zeroed,),) = RecordedRun(later).asides().tares.values()
+    ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
     assert zeroed >= ZEROED
     held: list[object] = []
     monkeypatch.setattr(Estimator, "hold", lambda _self, tool: held.append(tool))
@@ -71,10 +71,10 @@ def test_numbers_zeros_and_tools_of_a_later_file_are_replayed_as_they_were(
     assert held == [OTHER_TOOL], "which was told before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
     assert min(estimates) >= BEGUN
-    said = ("why", "valid", "k", "sigma", "score", "torque_nm")
+    said = ("reason", "valid", "k", "sigma", "score", "torque_nm")
     after = [one for one in live if one["frame"] >= zeroed]
     assert len(after) > ENOUGH - ZEROED - 10
     assert [[estimates[one["frame"]][key] for key in said] for one in after] == [
         [one[key] for key in said] for one in after
     ]
-    assert estimates[zeroed]["why"].startswith("taking the homogeneous frame, 1 of")
+    assert estimates[zeroed]["reason"].startswith("taking the homogeneous frame, 1 of")

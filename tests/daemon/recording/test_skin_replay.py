@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.recording.export import topics_of
+from shearloop.daemon.recording.export import count_messages
 from tests.daemon.recording.test_replay import measured, replayed
 from tests.daemon.skin.test_skin_run import played
 
@@ -18,7 +18,7 @@ async def recorded(folder: Path, *, socket: bool) -> list[tuple[str, dict[str, A
     """Return what a daemon published while a skin was loaded, tared and ill-treated, all of it recorded."""
     published: list[tuple[str, dict[str, Any]]] = []
     async with played(folder, socket=socket, daemon={"recording": {"folder": "recordings"}}) as bench:
-        bench.daemon.publisher.listen(lambda topic, content: published.append((topic, content)))
+        bench.daemon.publisher.add_listener(lambda topic, content: published.append((topic, content)))
         await bench.valid()
         for number in range(20):
             bench.skin.push(0.8 * number / 19)
@@ -47,7 +47,7 @@ def test_the_skin_s_raw_inputs_give_the_same_forces_again(
 ) -> None:
     live = asyncio.run(recorded(tmp_path, socket=socket))
     (path,) = (tmp_path / "recordings").iterdir()
-    assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(topics_of(path))
+    assert {"skin.shear", "input.skin", "input.skin.source", "input.skin.daq"} <= set(count_messages(path))
     address = f"ipc://{tmp_path}/replay"
     again, comparison = asyncio.run(replayed(path, math.inf, address))
     assert comparison.different == Counter(), comparison.examples
@@ -55,9 +55,9 @@ def test_the_skin_s_raw_inputs_give_the_same_forces_again(
     then, now = (measured([one for one in run if one[0] == "skin.shear"]) for run in (live, again))
     begin = next(i for i, (_, content) in enumerate(now) if content["sample"] == then[0][1]["sample"])
     assert now[begin : begin + len(then)] == then
-    reasons = {content["why"].split(",")[0] for _, content in now}
+    reasons = {content["reason"].split(",")[0] for _, content in now}
     assert {"", "taking the zero"} <= reasons
     assert any("gauge 1 is open" in why for why in reasons)
     assert main(["replay", str(path), "--speed", "max", "--publish", address, "--check"]) == 0
     count = comparison.compared["skin.shear"]
-    assert f"skin.shear: {count} of {count} are the same as recorded" in capsys.readouterr().err
+    assert f"skin.shear: {count} of {count} equal the recorded ones" in capsys.readouterr().err

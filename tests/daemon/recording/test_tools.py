@@ -12,12 +12,12 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.control.experiment_schema import ExperimentFile, WaitStep
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitFrame, wire_map
-from shearloop.daemon.recording.identity import Identity, basic_identity, notes_of
+from shearloop.daemon.recording.identity import Identity, basic_identity, experiment_notes
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import Recorder
-from shearloop.daemon.recording.summary import summarise
+from shearloop.daemon.recording.repair import summarise
 from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 PERIOD_NS = 540_000_000
 TEN, TWENTY = Measured(10.2, 1.2), Measured(20.1, 1.2)
@@ -37,12 +37,12 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
     clock, told = Held(), dict(held)
     file = ExperimentFile(name="twist", tool_mm=named_mm, steps=(WaitStep(do="wait", wait_s=1.0),))
     recorder = Recorder(folder, Identity(basic_identity("a test")), clock)
-    recorder.experiment(file.name, notes=notes_of(file))
+    recorder.record_experiment(file.name, notes=experiment_notes(file))
     for number in range(40):
         clock.t_ns += PERIOD_NS
-        recorder.tap("right")(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
+        recorder.input_recorder("right")(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
         if number in told:
-            recorder.tap("right")(
+            recorder.input_recorder("right")(
                 RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool_as_bytes(number, told[number]))
             )
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
@@ -57,7 +57,7 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
             dead=0,
             repeated=False,
         )
-        recorder.record("eit.frame", wire_map(message, 0.0, number))
+        recorder.record_message("eit.frame", wire_map(message, 0.0, number))
     recorder.close()
     return recorder.finished[0]
 
@@ -70,7 +70,7 @@ def test_the_experiment_names_its_tool(tmp_path: Path, capsys: pytest.CaptureFix
     assert read_series(path, tool_mm=30.0)[0].tool_mm == Measured(20.0, 0.0), "a recording that names it knows better"
     assert summarise(path).tool_mm == "20"
     assert main(["recording", "info", str(path)]) == 0
-    assert "  tool     of 20 mm\n" in capsys.readouterr().out
+    assert "  tool     20 mm\n" in capsys.readouterr().out
 
 
 def test_the_gripper_says_which_tool_it_held(tmp_path: Path) -> None:

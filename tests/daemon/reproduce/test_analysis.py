@@ -19,7 +19,7 @@ from shearloop.daemon.analysis.reproduce.analysis import (
     score_models,
 )
 from shearloop.daemon.analysis.reproduce.banks import GRIDS, Grid, cached_bank, focused_grid
-from shearloop.daemon.recording.matlab_streams import DiameterSlices, TorqueSlices, read_torque_slices
+from shearloop.daemon.recording.matlab import DiameterSlices, TorqueSlices, read_torque_slices
 
 
 @pytest.fixture(scope="module")

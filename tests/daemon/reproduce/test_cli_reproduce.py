@@ -62,7 +62,7 @@ def test_numbers_figures_and_calibrations_are_made(
     (wide,) = (out / "banks").glob("wide-*.bank")
     wide.write_bytes(wide.read_bytes()[:-100])
     monkeypatch.setattr(
-        "shearloop.daemon.analysis.reproduce.figures.draw_all", lambda *_: []
+        "shearloop.daemon.analysis.reproduce.report.draw_all", lambda *_: []
     )  # they take most of the time
     assert main(command) == 0
     said = capsys.readouterr()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.cli import main
-from shearloop.daemon.service.installation import (
+from shearloop.daemon.service import (
     EXAMPLE,
     PLACES,
     REAL_TIME,
@@ -34,7 +34,7 @@ def without_the_users_tables(names: set[str]) -> set[str]:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="making a user and folders of his needs root")
-def test_all_is_put_in_place_and_taken_away_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_install_and_uninstall(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert place(tmp_path, "install") == 0
     said = capsys.readouterr().out
     assert without_the_users_tables(files(tmp_path)) == {*PLACES.values(), EXAMPLE}
@@ -58,7 +58,7 @@ def test_all_is_put_in_place_and_taken_away_again(tmp_path: Path, capsys: pytest
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="making a user and folders of his needs root")
-def test_what_was_edited_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_edited_files_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert place(tmp_path, "install", "--real-time") == 0
     assert (tmp_path / REAL_TIME).read_text() == service_file("realtime.conf")
     edited = tmp_path / EXAMPLE
@@ -74,7 +74,7 @@ def test_what_was_edited_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize("command", ["install", "uninstall"])
-def test_a_dry_run_says_everything_and_does_nothing(
+def test_dry_run_prints_the_steps_and_changes_nothing(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     kept = tmp_path / PLACES["shearloop.service"]
@@ -88,7 +88,7 @@ def test_a_dry_run_says_everything_and_does_nothing(
     assert kept.read_text() == "something else"
 
 
-def test_for_a_script_the_steps_are_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_steps_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert place(tmp_path, "install", "--dry-run", "--json") == 0
     told = json.loads(capsys.readouterr().out)
     assert told["dry_run"] is True
@@ -108,7 +108,7 @@ def mistake(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return capsys.readouterr().err
 
 
-def test_mistakes_are_sentences(
+def test_mistakes_are_one_sentence(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert "is not a file" in mistake(capsys, "install", "--root", str(tmp_path), "--program", "no/such/shearloop")
@@ -119,15 +119,15 @@ def test_mistakes_are_sentences(
     assert "run it with sudo" in mistake(capsys, "uninstall")
 
 
-def test_a_program_that_the_service_cannot_see_is_refused(
+def test_a_program_hidden_from_the_service_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.executable", str(tmp_path / "bin/python3"))
     assert "there is no program" in mistake(capsys, "install", "--dry-run")
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin/shearloop").touch()
-    monkeypatch.setattr("shearloop.daemon.service.installation._HIDDEN", (str(tmp_path),))
+    monkeypatch.setattr("shearloop.daemon.service._HIDDEN", (str(tmp_path),))
     said = mistake(capsys, "install", "--dry-run")
     assert f"lies in {tmp_path}, which the service is not allowed to see" in said
-    monkeypatch.setattr("shearloop.daemon.service.installation._HIDDEN", ("/nowhere",))
+    monkeypatch.setattr("shearloop.daemon.service._HIDDEN", ("/nowhere",))
     assert find_program() == tmp_path / "bin/shearloop"

@@ -3,10 +3,10 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.daemon.service import realtime
+from shearloop.daemon import realtime
 
 
-def test_the_session_gets_its_place_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sessions_niceness_is_restored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[int] = []
     group = tmp_path / "autogroup"
     group.write_text("/autogroup-3 nice 2")
@@ -19,7 +19,7 @@ def test_the_session_gets_its_place_back(tmp_path: Path, monkeypatch: pytest.Mon
     assert asked == [-10]
 
 
-def test_where_it_is_not_allowed_nothing_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_changes_without_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_kind: int, _who: int, _niceness: int) -> None:
         raise PermissionError
 

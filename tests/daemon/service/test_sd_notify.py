@@ -13,8 +13,8 @@ from shearloop.daemon import health
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sd_notify import notify
-from shearloop.daemon.service.realtime import lock_memory
+from shearloop.daemon.realtime import lock_memory
+from shearloop.daemon.service import notify
 from shearloop.daemon.supervisor import Supervisor, TaskRecord
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
@@ -29,14 +29,14 @@ def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.
         yield listening
 
 
-def test_nobody_is_told_where_nobody_listens(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_no_notification_without_a_service_manager(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     assert not notify("READY=1")
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
     assert not notify("READY=1")
 
 
-def test_states_arrive_at_a_path_and_at_an_abstract_address(
+def test_states_arrive_at_a_path_and_an_abstract_address(
     manager: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert notify("READY=1", "STATUS=well")
@@ -50,13 +50,13 @@ def test_states_arrive_at_a_path_and_at_an_abstract_address(
         assert abstract.recv(4096) == b"WATCHDOG=1"
 
 
-def test_a_manager_that_does_not_read_keeps_nobody_waiting(manager: socket.socket) -> None:
+def test_a_blocked_manager_does_not_block_the_daemon(manager: socket.socket) -> None:
     # The kernel queues a few datagrams; the daemon must not wait for room.
     assert not all(notify("WATCHDOG=1") for _ in range(2000))
     assert manager.recv(4096) == b"WATCHDOG=1"
 
 
-async def test_the_daemon_says_when_it_is_ready_that_it_lives_and_that_it_ends(
+async def test_the_daemon_notifies_ready_alive_and_stopping(
     manager: socket.socket, config: Callable[..., Path]
 ) -> None:
     async with shearloop("run", str(config())) as daemon:
@@ -69,7 +69,7 @@ async def test_the_daemon_says_when_it_is_ready_that_it_lives_and_that_it_ends(
         said = manager.recv(4096)
 
 
-async def test_the_watchdog_is_fed_only_while_every_task_is_alive(
+async def test_the_watchdog_is_fed_only_while_all_tasks_are_alive(
     manager: socket.socket, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(health, "HEALTH_PERIOD_S", 0.0)
@@ -85,14 +85,14 @@ async def test_the_watchdog_is_fed_only_while_every_task_is_alive(
         supervisor.records["right"].alive = False
         while said.startswith(b"WATCHDOG=1"):
             said = await asyncio.to_thread(manager.recv, 4096)
-        assert said == b"STATUS=dead, to be started again: right"
+        assert said == b"STATUS=dead, restarting: right"
         assert await asyncio.to_thread(manager.recv, 4096) == said, "and it stays hungry"
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
         publisher.close()
 
 
-async def test_a_task_that_ends_by_itself_is_not_dead() -> None:
+async def test_a_finished_task_is_not_dead() -> None:
     supervisor = Supervisor()
 
     async def ends() -> None:
@@ -104,7 +104,7 @@ async def test_a_task_that_ends_by_itself_is_not_dead() -> None:
     assert supervisor.dead == ("other",)
 
 
-def test_memory_that_may_not_be_locked_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failing_to_lock_memory_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 1000)
     monkeypatch.setattr(resource, "getrlimit", lambda _: (8 << 20, 8 << 20))
     with pytest.raises(UserError, match="needs an unlimited RLIMIT_MEMLOCK, and it is 8192 kB: run `sudo shearloop"):

@@ -53,7 +53,9 @@ def booted(folder: Path, bank: Path, *options: str) -> dict[str, list[str]]:
     return seen
 
 
-def test_it_starts_is_restarted_when_killed_or_hung_and_not_after_a_mistake(tmp_path: Path, tiny_bank: Path) -> None:
+def test_the_service_starts_and_restarts_after_kill_and_hang_but_not_after_a_mistake(
+    tmp_path: Path, tiny_bank: Path
+) -> None:
     seen = booted(tmp_path, tiny_bank)
     assert seen["started"] == ["0"], "READY=1 came, and ZeroMQ could make its threads and sockets"
     assert seen["alive"] == ["4 tasks are alive"]
@@ -65,7 +67,7 @@ def test_it_starts_is_restarted_when_killed_or_hung_and_not_after_a_mistake(tmp_
     assert seen["mistake"] == ["status 2, 0 restarts"]
 
 
-def test_with_the_real_time_options_it_starts_too(tmp_path: Path, tiny_bank: Path) -> None:
+def test_the_service_starts_with_the_real_time_options(tmp_path: Path, tiny_bank: Path) -> None:
     (tmp_path / "start_only").touch()
     seen = booted(tmp_path, tiny_bank, "--real-time")
     assert (seen["started"], seen["alive"]) == (["0"], ["4 tasks are alive"])

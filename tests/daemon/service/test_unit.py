@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.service.installation import PLACES, UNIT, hidden_folder, service_file, unit_for
+from shearloop.daemon.service import PLACES, UNIT, hidden_folder, service_file, unit_for
 
 ROOT = Path(__file__).resolve().parents[3]
 # Any program will do for systemd to look at; that the service may see ours is find_program's business.
@@ -39,12 +39,12 @@ def test_the_unit_runs_the_program_given(unit: Path) -> None:
     assert f"ExecStart={PROGRAM} run /etc/shearloop/shearloop.yaml\n" in unit.read_text()
 
 
-def test_systemd_has_nothing_to_say_of_the_unit(unit: Path) -> None:
+def test_systemd_accepts_the_unit(unit: Path) -> None:
     done = analyze("verify", str(unit))
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
-def test_systemd_says_of_a_wrong_unit_what_is_wrong(tmp_path: Path) -> None:
+def test_systemd_reports_a_wrong_unit(tmp_path: Path) -> None:
     path = tmp_path / UNIT
     path.write_text(unit_for(PROGRAM).replace("WatchdogSec=15", "WatchdogSec=often"))
     assert "Failed to parse sec value" in analyze("verify", str(path)).stderr
@@ -140,7 +140,7 @@ TEENSY = {
 
 
 @pytest.mark.parametrize("vendor", ["16c0", "2341", "2a03", "1a86", "0403"])
-def test_a_board_is_named_by_its_serial_number_and_given_to_the_service(vendor: str) -> None:
+def test_boards_are_linked_by_serial_number_and_owned_by_the_service(vendor: str) -> None:
     given = applied(service_file("60-shearloop.rules"), {**TEENSY, "ENV{ID_VENDOR_ID}": vendor})
     assert given == {
         "GROUP": "shearloop",
@@ -160,5 +160,5 @@ def test_a_board_is_named_by_its_serial_number_and_given_to_the_service(vendor: 
         {"ENV{ID_SERIAL_SHORT}": ""},
     ],
 )
-def test_what_is_no_board_is_left_alone(other: dict[str, str]) -> None:
+def test_other_devices_are_ignored(other: dict[str, str]) -> None:
     assert applied(service_file("60-shearloop.rules"), {**TEENSY, **other}) == {}

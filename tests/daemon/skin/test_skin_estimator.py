@@ -11,7 +11,7 @@ from shearloop.bank.skin.calibration import SkinCalibration, fit_calibration, lo
 from shearloop.bank.skin.membrane import Direction
 from shearloop.daemon.sensing.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
 from shearloop.daemon.synthetic_skin import REST_OHM, SyntheticSkin, SyntheticSkinSettings, calibration_table
-from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
+from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 
 NOISE = 1e-4
 PERIOD_NS = 100_000_000
@@ -81,7 +81,7 @@ def test_the_demo_s_calibration_is_that_of_the_emulated_skin(calibration: SkinCa
 def test_the_zero_comes_first_and_then_every_sample_is_a_force(calibration: SkinCalibration) -> None:
     bench = Bench(calibration)
     said = [bench.at(0.0, 0.0) for _ in range(20)]
-    assert said[0].why == ("taking the zero, 1 of 20",)
+    assert said[0].reasons == ("taking the zero, 1 of 20",)
     assert not any(reading.valid for reading in said[:19])
     assert said[19].valid
     readings = list(bench.to(1.0))
@@ -111,7 +111,7 @@ def test_what_the_driver_refuses_is_no_force_and_the_next_good_sample_is_one(
     bench = Bench(calibration).zeroed()
     bench.push(0.8)
     refused = bench.estimator.update(bench.sample(r1_ohm=None, r2_ohm=None, faults=(fault,)))
-    assert refused.why == (str(fault),)
+    assert refused.reasons == (str(fault),)
     assert refused.shear_n is None
     assert refused.interval is None
     again = bench.at(0.8)
@@ -134,7 +134,7 @@ def test_a_zero_under_load_is_refused_until_the_load_is_off(calibration: SkinCal
     bench.push(0.8)
     bench.estimator.tare()
     readings = [bench.at(0.8) for _ in range(25)]
-    assert "would look like that" in readings[-1].why[0]
+    assert "would look like that" in readings[-1].reasons[0]
     assert bench.estimator.zero is None
     assert bench.estimator.refused
     bench.push(0.0)
@@ -148,12 +148,12 @@ def test_a_sample_that_was_under_way_when_a_zero_was_asked_for_is_not_of_it(cali
     bench = Bench(calibration).zeroed()
     asked_ns = round(bench.time_s * 1e9) + 3 * PERIOD_NS // 4
     bench.estimator.tare(asked_ns)
-    whys = []
+    reasons = []
     for _ in range(3):
         sample = bench.sample()
         known_ns = sample.t_mid_ns + PERIOD_NS // 2
-        whys += bench.estimator.update(replace(sample, t_arrival_ns=known_ns)).why
-    assert whys == ["measured before the zero was asked for", "taking the zero, 1 of 20", "taking the zero, 2 of 20"]
+        reasons += bench.estimator.update(replace(sample, t_arrival_ns=known_ns)).reasons
+    assert reasons == ["measured before the zero was asked for", "taking the zero, 1 of 20", "taking the zero, 2 of 20"]
 
 
 @pytest.mark.parametrize("shear_n", [0.1, -0.15])
@@ -178,9 +178,9 @@ def test_a_zero_under_load_that_nothing_gave_away_is_told_when_the_load_goes(cal
     for _ in range(20):
         bench.at(0.84)
     assert bench.estimator.zero is not None
-    why = bench.push(0.0).why
-    assert "the zero was taken under load" in why[0]
-    assert "gauge 1 reads" in why[0]
+    reasons = bench.push(0.0).reasons
+    assert "the zero was taken under load" in reasons[0]
+    assert "gauge 1 reads" in reasons[0]
 
 
 def test_swapped_gauges_are_refused_at_the_zero(calibration: SkinCalibration) -> None:
@@ -188,7 +188,7 @@ def test_swapped_gauges_are_refused_at_the_zero(calibration: SkinCalibration) ->
     bench.spoil = lambda r1, r2, _: (r2, r1)
     for _ in range(25):
         reading = bench.at(0.0, 0.0)
-    assert "the wires of the gauges are swapped" in reading.why[0]
+    assert "the wires of the gauges are swapped" in reading.reasons[0]
 
 
 def test_gauges_that_are_swapped_after_the_zero_are_not_believed(calibration: SkinCalibration) -> None:
@@ -218,7 +218,7 @@ def test_a_gauge_that_drifts_where_it_shows_widens_the_interval_and_is_then_name
     widths = [reading.interval.high_n - reading.interval.low_n for reading in valid if reading.interval is not None]
     assert widths[-1] > widths[20] + 0.2
     assert not readings[-1].valid
-    assert "drifts" in readings[-1].why[0]
+    assert "drifts" in readings[-1].reasons[0]
 
 
 def test_a_drift_that_no_response_shows_is_learnt_at_the_next_zero(calibration: SkinCalibration) -> None:
@@ -251,7 +251,7 @@ def test_the_paper_s_own_drift_stays_within_the_interval_for_an_hour(calibration
 def test_a_force_beyond_the_curve_is_not_a_force(calibration: SkinCalibration) -> None:
     bench = Bench(calibration).zeroed()
     assert bench.push(4.5).valid
-    assert "beyond the calibrated curve" in bench.push(6.0).why[0]
+    assert "beyond the calibrated curve" in bench.push(6.0).reasons[0]
 
 
 def test_turning_the_tool_stretches_contact_and_skin_in_series() -> None:

@@ -14,9 +14,9 @@ import zmq.asyncio
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.messaging.request import request
+from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.synthetic_skin import SyntheticSkin
-from shearloop.drivers.emulators.skin.instruments import SkinInstruments
+from shearloop.drivers.emulators.skin import SkinInstruments
 from tests.daemon.conftest import DEADLINE_S
 from tests.daemon.test_run import collector, running
 
@@ -35,7 +35,7 @@ class Played:
     def refused_lines(self) -> int:
         skin = self.daemon._skin
         assert skin is not None
-        errors = skin.facts()["errors"]
+        errors = skin.diagnostics()["errors"]
         assert isinstance(errors, Mapping)
         return int(errors.get("not two decimals", 0))
 
@@ -49,7 +49,7 @@ class Played:
         said: set[str] = set()
         try:
             async with asyncio.timeout(20):
-                return await self.until(lambda content: said.add(content["why"]) or why in content["why"])
+                return await self.until(lambda content: said.add(content["reason"]) or why in content["reason"])
         except TimeoutError:
             pytest.fail(f"nothing says {why!r}; said was {said}")
 
@@ -57,7 +57,7 @@ class Played:
         return await self.until(lambda content: content["valid"])
 
     async def command(self, name: str, **arguments: Any) -> dict[str, Any]:
-        return await asyncio.to_thread(request, self.address, {"command": name, **arguments}, DEADLINE_S)
+        return await asyncio.to_thread(send_command, self.address, {"command": name, **arguments}, DEADLINE_S)
 
     def fresh(self) -> None:
         while not self.shear.empty():
@@ -121,7 +121,7 @@ async def played(
 @pytest.mark.parametrize("socket", [False, True])
 async def test_a_shear_force_is_streamed_from_either_daq(tmp_path: Path, socket: bool) -> None:
     async with played(tmp_path, socket=socket) as bench:
-        content = await bench.until(lambda content: "taking the zero" in content["why"])
+        content = await bench.until(lambda content: "taking the zero" in content["reason"])
         assert content["shear_n"] is None
         await bench.valid()
         for number in range(80):
@@ -186,11 +186,11 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path)
         await bench.valid()
         assert await bench.daemon._tare_to_the_end() == ""
         refused = await bench.command("tare", source="left")
-        assert refused == {"ok": False, "why": "there is no sensor 'left' to tare; there are skin"}
+        assert refused == {"ok": False, "reason": "there is no sensor 'left' to tare; there are skin"}
 
 
 async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shearloop.daemon.sensing.skin_task.ZERO_DEADLINE_S", 0.3)
+    monkeypatch.setattr("shearloop.daemon.sensing.skin_task.ZERO_TIMEOUT_S", 0.3)
     async with played(tmp_path) as bench:
         await bench.valid()
         bench.instruments.command("open 2")
@@ -252,7 +252,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section({"adc": {"device": {"path": "./skin-source"}}})},
-            "`skin.source.serial` and `skin.daq.adc.device` are both the port skin-source; each device has its own",
+            "`skin.source.serial` and `skin.daq.adc.device` are both the port skin-source; each device needs its own",
         ),
         (
             {"skin": section(SCANNER, source=SOCKET)},
@@ -264,7 +264,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section(ADC, tool_radius_mm=None), "robot": ROBOT, "experiment": HOLDS},
-            "`drive: skin` has no torque without a radius: add `skin.tool_radius_mm`, or take another",
+            "`torque_source: skin` has no torque without a radius: add `skin.tool_radius_mm`, or choose another",
         ),
         ({"skin": section(ADC, calibration="none.yaml")}, "none.yaml: the calibration cannot be read: No such file"),
         ({"skin": section(ADC, calibration=ROBOT)}, "is not a calibration as `shearloop skin calibrate` writes it: it"),

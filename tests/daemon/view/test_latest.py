@@ -38,7 +38,7 @@ def test_a_page_gets_the_latest_of_each_topic_and_source_with_its_age() -> None:
     assert [each["topic"] for each in batch(latest, after=latest.number - 1)["messages"]] == ["health"]
 
 
-def test_a_new_page_gets_the_minute_that_was_before_it() -> None:
+def test_a_new_page_gets_the_last_minute() -> None:
     latest = LatestMessages(3.6)
     for second in range(100):
         latest.add("load.torque", message("load_cell", torque_nm=0.01 * second, raw=1.0, valid=True), float(second))
@@ -51,11 +51,11 @@ def test_a_new_page_gets_the_minute_that_was_before_it() -> None:
     assert latest.history(1e6) == []
 
 
-def test_where_nothing_was_heard_the_silence_has_no_length() -> None:
+def test_quiet_time_is_unknown_without_messages() -> None:
     assert batch(LatestMessages(3.6))["quiet_s"] is None
 
 
-def test_what_is_no_message_of_ours_is_counted_by_kind_and_is_no_sign_of_life() -> None:
+def test_invalid_messages_are_counted_by_kind_and_do_not_end_the_silence() -> None:
     latest = LatestMessages(3.6)
     latest.add("weather", message(), 1.0)
     latest.add("health", {"source": "daemon"}, 1.0)
@@ -85,14 +85,14 @@ VALUES: st.SearchStrategy[Any] = st.recursive(
 
 
 @given(st.dictionaries(st.text(), VALUES, max_size=4))
-def test_whatever_the_daemon_sends_the_page_gets_json(content: dict[str, Any]) -> None:
+def test_any_message_becomes_json_or_is_counted(content: dict[str, Any]) -> None:
     latest = LatestMessages(3.6)
     latest.add("eit.estimate", message(**content) | {"source": "right"}, 1.0)
     told = batch(latest)
     assert len(told["messages"]) + sum(told["refused"].values()) == 1
 
 
-def test_arrays_come_as_float32_and_numbers_that_are_none_as_nothing() -> None:
+def test_arrays_become_float32_and_nan_becomes_null() -> None:
     scores = np.array([[0.25, np.nan], [0.5, 1.0]])
     told = json_value(
         decode(encode({"scores": scores.astype("<f4").tobytes(), "scores_shape": [2, 2], "k": float("inf")}))
@@ -114,7 +114,7 @@ def test_a_heatmap_comes_with_its_maximum_and_runner_up() -> None:
         assert batch(latest)["messages"][0]["peaks"] is None
 
 
-def test_an_estimate_comes_with_the_conductivity_that_its_model_gives_k_and_sigma() -> None:
+def test_an_estimate_comes_with_its_conductivity_profile() -> None:
     latest = LatestMessages(3.6)
     latest.add("eit.estimate", message(k=1.8, sigma=0.9), 1.0)
     assert batch(latest)["messages"][0]["conductivity"] is None, "the model is not known yet"
@@ -124,7 +124,7 @@ def test_an_estimate_comes_with_the_conductivity_that_its_model_gives_k_and_sigm
     assert told == pytest.approx(conductivity_profile("gaussian_derivative", 1.8, 0.9, 3.6))
 
 
-def test_the_profile_is_the_conductivity_that_the_bank_is_built_with() -> None:
+def test_the_profile_equals_the_banks_conductivity() -> None:
     mesh = small_fingertip()
     height_cm = float(mesh.nodes[:, 1].max())
     told = conductivity_profile("gaussian_derivative", 0.6 * height_cm, 0.8 * height_cm, height_cm)

@@ -46,7 +46,7 @@ def signed(value: float, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "\u2212")
 
 
-def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> None:
+def test_the_page_shows_the_messages_numbers(browsed: Browsed) -> None:
     browsed.open()
     browsed.until(".fingertip .map-text", "100 k × 100 σ")
     said = {name: dict(given) for name, given in MESSAGES.items()}
@@ -75,7 +75,7 @@ def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> 
         "#wrist": f"{signed(robot['wrist_rad'], 3)} rad",
         "#wrist-speed": f"{signed(robot['wrist_speed_rad_per_s'], 3)} rad/s",
         "#speed-sent": f"{signed(said['loop']['speed_sent_rad_per_s'], 3)} rad/s",
-        "#speed-wanted": f"wanted {signed(said['loop']['speed_wanted_rad_per_s'], 3)}",
+        "#speed-command": f"wanted {signed(said['loop']['speed_command_rad_per_s'], 3)}",
         "#wrist-torque": f"{signed(robot['wrist_torque_nm'], 3)} N·m",
         "#robot-mode": "running (7)",
         "#safety-mode": "normal (1)",
@@ -86,7 +86,7 @@ def test_the_numbers_on_the_page_are_those_of_the_messages(browsed: Browsed) -> 
         "#gripper-diameter": "19.7 ± 3.0 mm",
         "#gripper-current": "270 mA",
         "#phase-name": "running: hold 0.10 N·m, step 6 of 7",
-        "#phase-doing": "holding",
+        "#phase-activity": "holding",
         "#progress-text": "62 %, about 38 s left",
         "#process": "142 MB, 6.0 % of a core, event loop 1.3 ms late",
     }
@@ -122,7 +122,7 @@ def test_the_heatmap_has_k_upwards_and_sigma_to_the_right_and_shades_rise_evenly
     assert grey[-1] - grey[0] > 180
 
 
-def test_lines_break_where_nothing_is_known_and_go_on_past_what_others_say(browsed: Browsed) -> None:
+def test_lines_break_at_invalid_values_and_continue_past_other_sources(browsed: Browsed) -> None:
     rows = browsed.open().evaluate(
         """async () => {
           const { Series } = await import('/assets/series.js');
@@ -144,13 +144,13 @@ def test_lines_break_where_nothing_is_known_and_go_on_past_what_others_say(brows
     assert b == ["", 1, "", 2, "", 3, None, None, 4], "a pause breaks the line as well"
 
 
-def test_an_invalid_estimate_is_no_number(browsed: Browsed) -> None:
+def test_an_invalid_estimate_shows_no_number(browsed: Browsed) -> None:
     nothing = {"torque_nm": None, "torque_low_nm": None, "torque_high_nm": None, "diameter_mm": None}
-    browsed.daemon.say(estimate={**nothing, "valid": False, "why": "no signal above the noise"})
+    browsed.daemon.say(estimate={**nothing, "valid": False, "reason": "no signal above the noise"})
     browsed.open()
     browsed.until_shown(
         {
-            "#torque-why": "no estimate: no signal above the noise",
+            "#torque-reason": "no estimate: no signal above the noise",
             ".fingertip .invalid": "not valid: no signal above the noise",
             "#torque-now": "–",
             "#torque-interval": "",
@@ -159,14 +159,14 @@ def test_an_invalid_estimate_is_no_number(browsed: Browsed) -> None:
     )
 
 
-def test_a_replay_is_drawn_at_the_times_that_it_speaks_of(browsed: Browsed) -> None:
+def test_a_replay_is_drawn_at_its_own_times(browsed: Browsed) -> None:
     browsed.daemon.say(**{name: {"ago_s": 3600.0} for name in MESSAGES})
     browsed.open()
     for chart in ("#torque-chart", "#shear-chart"):
         browsed.page.wait_for_function(COLOURED, arg=chart)
 
 
-def test_every_reason_for_holding_is_told(browsed: Browsed) -> None:
+def test_every_reason_for_a_hold_is_shown(browsed: Browsed) -> None:
     browsed.daemon.say(loop={"phase": "held", "response": "hold", "reasons": REASONS})
     browsed.open()
     browsed.until("#holding-title", "Holding, because")
@@ -177,11 +177,11 @@ def test_every_reason_for_holding_is_told(browsed: Browsed) -> None:
     browsed.page.wait_for_selector("#holding", state="hidden")
 
 
-def test_a_fault_of_robot_and_gripper_stands_in_its_panel(browsed: Browsed) -> None:
+def test_faults_of_robot_and_gripper_are_shown_in_their_panels(browsed: Browsed) -> None:
     browsed.daemon.say(
         robot={"protective_stop": True, "safety_mode": 3, "blocked": "The robot is in a protective stop."},
         gripper={"fault": 11, "fault_text": "overheated"},
-        loop={"phase": "stopped", "response": "stop and keep grip", "reasons": REASONS, "doing": "a long sentence"},
+        loop={"phase": "stopped", "response": "stop and keep grip", "reasons": REASONS, "activity": "a long sentence"},
     )
     browsed.open()
     browsed.until_shown(
@@ -190,22 +190,22 @@ def test_a_fault_of_robot_and_gripper_stands_in_its_panel(browsed: Browsed) -> N
             "#safety-mode": "protective stop (3)",
             "#gripper-fault": "fault 11: overheated",
             "#holding-title": "Stopped: stop and keep grip",
-            "#phase-doing": "",
+            "#phase-activity": "",
             "#wanted": "–",
             "#progress-text": "",
         }
     )
 
 
-def test_a_reading_of_the_load_cell_that_is_not_to_be_believed_is_no_figure(browsed: Browsed) -> None:
+def test_an_invalid_load_cell_reading_shows_no_number(browsed: Browsed) -> None:
     browsed.open()
-    browsed.daemon.say(load={"valid": False, "why": "the reading is the same for two seconds"})
+    browsed.daemon.say(load={"valid": False, "reason": "the reading is the same for two seconds"})
     why = "load cell: the reading is the same for two seconds"
-    browsed.until_shown({"#load-torque": "–", "#load-note": "not valid", "#torque-why": why})
+    browsed.until_shown({"#load-torque": "–", "#load-note": "not valid", "#torque-reason": why})
     assert browsed.layout()["spilt"] == []
 
 
-def test_what_has_gone_silent_is_old_while_the_rest_is_live(browsed: Browsed) -> None:
+def test_silent_sources_are_marked_old(browsed: Browsed) -> None:
     browsed.open()
     browsed.daemon.say(robot=None, load=None)
     browsed.until("#robot .age", "OLD")
@@ -214,7 +214,7 @@ def test_what_has_gone_silent_is_old_while_the_rest_is_live(browsed: Browsed) ->
     browsed.until_old(1)
 
 
-def test_a_load_cell_that_is_slower_than_usual_is_not_old_between_its_readings(browsed: Browsed) -> None:
+def test_a_slow_load_cell_is_not_marked_old(browsed: Browsed) -> None:
     browsed.open()
     slow = {"load_cell": {"alive": True, "restarts": 0, "expected_hz": 0.05}}
     browsed.daemon.say(health={"tasks": slow})
@@ -232,12 +232,12 @@ def test_the_page_is_redrawn_thirty_times_a_second(browsed: Browsed) -> None:
     assert each_ms < 33
 
 
-def test_two_fingertips_and_the_estimate_of_both(browsed: Browsed) -> None:
+def test_two_fingertips_and_their_combined_estimate(browsed: Browsed) -> None:
     page = browsed.open()
     browsed.daemon.say(
-        loop={"driving": "both"},
-        left={"source": "left", "torque_nm": None, "valid": False, "why": "no calibration is configured"},
-        both={"source": "both", "torque_nm": 0.0876, "k": None, "sigma": None, "score": None, "runner_up": None},
+        loop={"torque_source": "combined"},
+        left={"source": "left", "torque_nm": None, "valid": False, "reason": "no calibration is configured"},
+        both={"source": "combined", "torque_nm": 0.0876, "k": None, "sigma": None, "score": None, "runner_up": None},
     )
     browsed.until("#torque-source", "estimate of both, drives the loop")
     browsed.until("#torque-now", "+0.0876 N·m")

@@ -12,7 +12,7 @@ COMMANDS = ("tare", "start", "pause", "resume", "unlock")
 SIZES = {"tablet": (1024, 768), "upright tablet": (768, 1024), "screen": (1920, 1080), "phone": (390, 844)}
 
 
-def test_stop_needs_no_token_and_whatever_moves_something_does(browsed: Browsed) -> None:
+def test_stop_needs_no_token_and_motion_does(browsed: Browsed) -> None:
     page = browsed.open()
     assert page.locator("#controls [data-command]:disabled").count() == len(COMMANDS)
     page.click("#stop")
@@ -28,7 +28,7 @@ def test_stop_needs_no_token_and_whatever_moves_something_does(browsed: Browsed)
     assert browsed.daemon.asked == ["stop", "stop"]
 
 
-def test_with_the_token_the_commands_reach_the_daemon_and_a_refusal_is_told(browsed: Browsed) -> None:
+def test_commands_reach_the_daemon_with_the_token(browsed: Browsed) -> None:
     page = browsed.open(token=True)
     assert "token" not in page.url, "it does not stay in the address bar"
     for name in COMMANDS:
@@ -40,7 +40,7 @@ def test_with_the_token_the_commands_reach_the_daemon_and_a_refusal_is_told(brow
     browsed.until("#answer", "pause was refused: no experiment is running")
 
 
-def test_everything_is_reached_with_the_keyboard_and_stop_first(browsed: Browsed) -> None:
+def test_the_keyboard_reaches_everything_and_stop_first(browsed: Browsed) -> None:
     page = browsed.open(token=True)
     reached: list[dict[str, Any]] = []
     for _ in range(8):
@@ -66,7 +66,7 @@ def test_everything_is_reached_with_the_keyboard_and_stop_first(browsed: Browsed
 
 
 @pytest.mark.parametrize("size", SIZES.values(), ids=SIZES)
-def test_the_page_fits_and_stop_is_always_in_reach(size: tuple[int, int], browsed: Browsed) -> None:
+def test_the_page_fits_and_stop_stays_visible(size: tuple[int, int], browsed: Browsed) -> None:
     page = browsed.open(token=True)
     page.set_viewport_size({"width": size[0], "height": size[1]})
     browsed.daemon.say(loop={"phase": "held", "response": "hold", "reasons": REASONS})
@@ -87,7 +87,7 @@ def test_the_page_fits_and_stop_is_always_in_reach(size: tuple[int, int], browse
             assert apart or one["bottom"] <= other["top"] or other["bottom"] <= one["top"]
 
 
-def test_a_daemon_that_dies_is_shown_as_dead_within_two_seconds_and_lives_again(browsed: Browsed) -> None:
+def test_a_dead_daemon_is_shown_within_two_seconds(browsed: Browsed) -> None:
     page = browsed.open()
     told_after_s = []
     # The bound is the page's; a browser that the machine does not let run for half a second is given another try.
@@ -96,7 +96,8 @@ def test_a_daemon_that_dies_is_shown_as_dead_within_two_seconds_and_lives_again(
             """() => {
               window.toldDead = null;
               new MutationObserver((_, observer) => {
-                const said = document.querySelector('#link-why').textContent.match(/nothing from it for ([0-9.]+) s/);
+                const shown = document.querySelector("#link-reason").textContent;
+                const said = shown.match(/nothing from it for ([0-9.]+) s/);
                 if (!said) return;
                 window.toldDead = Number(said[1]);
                 observer.disconnect();
@@ -117,7 +118,7 @@ def test_a_daemon_that_dies_is_shown_as_dead_within_two_seconds_and_lives_again(
     assert min(told_after_s) < 2.0
 
 
-def test_a_viewer_that_is_lost_is_told_and_what_comes_back_is_new(browsed: Browsed) -> None:
+def test_a_lost_viewer_is_shown_and_reconnects(browsed: Browsed) -> None:
     page = browsed.open(token=True)
     browsed.viewer.kill()
     browsed.until("#link-state", "✗ VIEWER LOST")
@@ -139,14 +140,14 @@ def test_a_viewer_that_is_lost_is_told_and_what_comes_back_is_new(browsed: Brows
     assert (found["spilt"], len(found["panels"])) == ([], 5)
 
 
-def test_no_daemon_is_told_with_what_to_do(browsed: Browsed) -> None:
+def test_a_missing_daemon_is_shown_with_the_cure(browsed: Browsed) -> None:
     browsed.daemon.kill()
     browsed.viewer.kill()
     browsed.viewer.start()
     browsed.page.goto(browsed.viewer.url)
     browsed.until("#link-state", "✗ NO DAEMON")
-    assert "start one with `shearloop run CONFIG`" in browsed.text("#link-why")
-    assert "nothing heard" in browsed.text("#torque .age")
+    assert "start one with `shearloop run CONFIG`" in browsed.text("#link-reason")
+    assert "no message" in browsed.text("#torque .age")
     browsed.page.click("#stop")
     browsed.until("#answer", "STOP NOT CONFIRMED: no daemon answered")
     browsed.daemon.start()

@@ -95,7 +95,7 @@ async def post(page: Served, path: str, **headers: str) -> tuple[int, dict[str, 
         return response.status, await response.json()
 
 
-async def test_what_moves_something_needs_the_token_and_stop_does_not(tmp_path: Path) -> None:
+async def test_motion_needs_the_token_and_stop_does_not(tmp_path: Path) -> None:
     async with served(tmp_path) as page:
         for name in NEEDS_TOKEN:
             assert (await post(page, f"/commands/{name}"))[0] == 403
@@ -103,7 +103,10 @@ async def test_what_moves_something_needs_the_token_and_stop_does_not(tmp_path: 
         assert page.asked == []
         assert await post(page, "/stop") == (200, {"ok": True, "stopped": "test"})
         assert await post(page, "/commands/start", **BEARER) == (200, {"ok": True})
-        assert await post(page, "/commands/pause", **BEARER) == (409, {"ok": False, "why": "no experiment is running"})
+        assert await post(page, "/commands/pause", **BEARER) == (
+            409,
+            {"ok": False, "reason": "no experiment is running"},
+        )
         # Other commands of the daemon are not the page's.
         for name in ("stop", "set", "status"):
             assert (await post(page, f"/commands/{name}", **BEARER))[0] == 404
@@ -119,7 +122,7 @@ async def test_what_moves_something_needs_the_token_and_stop_does_not(tmp_path: 
         {"Host": "evil.example", "Origin": "http://evil.example"},
     ],
 )
-async def test_pages_of_strangers_in_the_same_browser_get_nothing(headers: dict[str, str], tmp_path: Path) -> None:
+async def test_pages_of_other_sites_get_nothing(headers: dict[str, str], tmp_path: Path) -> None:
     async with served(tmp_path) as page:
         for path in ("/", "/assets/app.js", "/settings.json"):
             async with page.http.get(page.base + path, headers=headers) as response:
@@ -132,7 +135,7 @@ async def test_pages_of_strangers_in_the_same_browser_get_nothing(headers: dict[
         assert page.asked == []
 
 
-async def test_every_answer_tells_the_browser_to_load_nothing_from_elsewhere(tmp_path: Path) -> None:
+async def test_every_response_has_the_security_headers(tmp_path: Path) -> None:
     async with served(tmp_path) as page:
         for path in ("/", "/assets/view.css", "/settings.json", "/assets/..%2Fserver.py", "/none", "/stop"):
             async with page.http.get(page.base + path) as response:
@@ -146,7 +149,7 @@ async def test_every_answer_tells_the_browser_to_load_nothing_from_elsewhere(tmp
             assert response.status == 404
 
 
-def test_the_page_names_nothing_outside_of_itself() -> None:
+def test_the_page_uses_no_external_resources() -> None:
     assets = resources.files("shearloop.daemon.web") / "assets"
     for item in assets.iterdir():
         if item.name.endswith((".html", ".css", ".js")):
@@ -163,15 +166,15 @@ def test_the_page_names_nothing_outside_of_itself() -> None:
     assert "onclick" not in html
 
 
-async def test_messages_reach_an_open_page_and_heatmaps_are_asked_for_while_one_is_open(tmp_path: Path) -> None:
+async def test_messages_reach_open_pages_and_heatmaps_need_one(tmp_path: Path) -> None:
     async with served(tmp_path) as page:
-        await until(lambda: page.publisher.wanted("load.torque"))
-        assert not page.publisher.wanted(EitHeatmap.topic)
+        await until(lambda: page.publisher.has_subscriber("load.torque"))
+        assert not page.publisher.has_subscriber(EitHeatmap.topic)
         async with page.http.ws_connect(f"{page.base}/stream") as stream:
             first = await stream.receive_json()
             assert first["first"]
             assert (first["messages"], first["quiet_s"]) == ([], None)
-            await until(lambda: page.publisher.wanted(EitHeatmap.topic))
+            await until(lambda: page.publisher.has_subscriber(EitHeatmap.topic))
             page.publisher.publish(
                 LoadTorque(
                     source="load_cell",
@@ -181,7 +184,7 @@ async def test_messages_reach_an_open_page_and_heatmaps_are_asked_for_while_one_
                     saturated=False,
                     spike=False,
                     valid=True,
-                    why="",
+                    reason="",
                 )
             )
             while not (batch := await stream.receive_json())["messages"]:
@@ -192,10 +195,10 @@ async def test_messages_reach_an_open_page_and_heatmaps_are_asked_for_while_one_
             first = await again.receive_json()
             assert first["messages"][0]["content"]["torque_nm"] == 0.1, "a page that comes later gets what is known"
             assert first["history"][0]["content"]["torque_nm"] == 0.1
-        await until(lambda: not page.publisher.wanted(EitHeatmap.topic))
+        await until(lambda: not page.publisher.has_subscriber(EitHeatmap.topic))
 
 
-async def test_a_flood_of_stops_is_one_request_and_passes_commands_that_hang(
+async def test_many_stops_share_one_request_and_overtake_hanging_commands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 30.0)
@@ -231,20 +234,16 @@ async def test_a_flood_of_stops_is_one_request_and_passes_commands_that_hang(
         assert sorted(status for status, _ in await asyncio.gather(*hanging)) == [200] * 4 + [429] * 2
 
 
-async def test_without_a_daemon_a_stop_says_that_it_was_not_heard(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_stop_without_a_daemon_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bridge_module, "COMMAND_TIMEOUT_S", 0.05)
     async with served(tmp_path) as page:
         page.bridge._address = DaemonAddress("", f"ipc://{tmp_path}/nobody")
         status, reply = await post(page, "/stop")
         assert (status, reply["ok"]) == (503, False)
-        assert "no daemon answered" in reply["why"]
+        assert "no daemon answered" in reply["reason"]
 
 
-async def test_no_more_pages_than_can_be_served_and_none_that_talks_at_length(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_pages_and_their_messages_are_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server_module, "MAX_PAGES", 1)
     async with served(tmp_path) as page:
         async with page.http.ws_connect(f"{page.base}/stream") as stream:
@@ -258,7 +257,7 @@ async def test_no_more_pages_than_can_be_served_and_none_that_talks_at_length(
             assert response.status in (200, 413)
 
 
-async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tmp_path: Path) -> None:
+async def test_a_used_port_and_an_invalid_address_are_one_sentence(tmp_path: Path) -> None:
     def ready(_: int) -> None:
         raise AssertionError
 
@@ -269,7 +268,7 @@ async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tm
         port = taken.getsockname()[1]
         with pytest.raises(UserError, match=f"cannot be served on 127.0.0.1:{port}"):
             await serve(DaemonAddress(PUBLISH_ADDRESS, f"ipc://{tmp_path}/c"), port, TOKEN, tip, ready)
-    for wrong, said in (("nonsense", "'nonsense' is not an address"), ("tcp://127.0.0.1:70000", "ends in no port")):
+    for wrong, said in (("nonsense", "'nonsense' is not an address"), ("tcp://127.0.0.1:70000", "has no valid port")):
         for publish, commands in ((wrong, PUBLISH_ADDRESS), (PUBLISH_ADDRESS, wrong)):
             with pytest.raises(UserError, match=said):
                 await serve(DaemonAddress(publish, commands), 0, TOKEN, tip, ready)
@@ -277,9 +276,7 @@ async def test_a_port_that_is_taken_and_an_address_that_is_none_are_sentences(tm
 
 @pytest.mark.usefixtures("hears_of_terminal")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-async def test_the_command_prints_its_address_with_the_token_once_and_ends_on_a_signal(
-    number: signal.Signals, tmp_path: Path
-) -> None:
+async def test_view_prints_its_address_and_ends_on_a_signal(number: signal.Signals, tmp_path: Path) -> None:
     token = tmp_path / "token"
     addresses = ("--connect", f"ipc://{tmp_path}/p", "--commands", f"ipc://{tmp_path}/c")
     async with shearloop("view", "--port", "0", "--json", "--token-file", str(token), *addresses) as view:

@@ -74,7 +74,7 @@ async def page_of(places: dict[str, str], folder: Path, who: str | None) -> Asyn
         yield Page(http, told["url"], told["url_with_token"].partition("#token=")[2])
 
 
-async def test_motion_needs_key_and_token_and_a_stop_neither(
+async def test_over_the_network_motion_needs_key_and_token_and_stop_neither(
     config: Callable[..., Path], places: dict[str, str], tmp_path: Path
 ) -> None:
     curve = {"server_key": str(tmp_path / "keys/server.key_secret"), "clients": str(tmp_path / "keys/clients")}
@@ -91,7 +91,7 @@ async def test_motion_needs_key_and_token_and_a_stop_neither(
                     # It came to the daemon, which has nothing to start.
                     status, reply = await page.post("commands/start", token=True)
                     assert status == 409
-                    assert reply["why"].startswith("which experiment?")
+                    assert reply["reason"].startswith("no experiment is given")
                     assert await page.post("stop") == (200, {"ok": True, "stopped": ""})
                 for who in ("eve", None):
                     async with page_of(places, tmp_path, who) as page:

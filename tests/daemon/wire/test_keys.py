@@ -14,7 +14,7 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.messaging.addresses import has_a_port, needs_keys, open_stop_address, stays_on_this_machine
+from shearloop.daemon.messaging.addresses import has_valid_port, is_local, local_stop_address, needs_keys
 from shearloop.daemon.messaging.keys import ClientKeys, KeyPair, load_key_pair, load_public_key, load_server_keys
 from shearloop.daemon.messaging.messages import decode, encode
 from shearloop.daemon.messaging.publisher import bind
@@ -46,20 +46,20 @@ def ada(folder: Path) -> ClientKeys:
 
 def test_what_can_be_reached_from_the_network() -> None:
     for address in ("tcp://127.0.0.1:1", "tcp://[::1]:1", "ipc:///run/x", "ipc://@x"):
-        assert stays_on_this_machine(address), address
+        assert is_local(address), address
     for address in ("tcp://0.0.0.0:1", "tcp://*:1", "tcp://10.0.0.1:1", "tcp://pc:1", "tcp://127.0.0.1:1;0.0.0.0:2"):
-        assert not stays_on_this_machine(address), address
+        assert not is_local(address), address
     assert not needs_keys("tcp://localhost:1")
     assert needs_keys("tcp://pc:1")
 
 
 def test_which_addresses_end_in_a_port_that_there_is() -> None:
     for address in ("tcp://127.0.0.1:1", "tcp://[::1]:65535", "tcp://0.0.0.0:*", "ipc:///run/x", "ipc://@x:70000"):
-        assert has_a_port(address), address
+        assert has_valid_port(address), address
     for port in ("65536", "70000", "0000070000", "7761a", "-1", "", "²", "1" * 5000):
-        assert not has_a_port(f"tcp://127.0.0.1:{port}"), port
-    assert not has_a_port("tcp://127.0.0.1")
-    with zmq.Context() as context, pytest.raises(UserError, match="ends in no port, which is a whole number"):
+        assert not has_valid_port(f"tcp://127.0.0.1:{port}"), port
+    assert not has_valid_port("tcp://127.0.0.1")
+    with zmq.Context() as context, pytest.raises(UserError, match=r"has no valid port \(a whole number"):
         bind(context.socket(zmq.PUB), "tcp://127.0.0.1:70000", "publish")
 
 
@@ -78,7 +78,7 @@ def test_nor_one_whose_keys_are_not_there(config: Write, keys: Path, capsys: pyt
         assert "make it with `shearloop keys`" in capsys.readouterr().err
     assert main(["keys", "revoke", "ada", "--dir", str(keys / "keys")]) == 0
     assert main(["run", str(config(commands=NETWORK, curve=curve(keys)))]) == 2
-    assert "holds no key, so that nobody could connect" in capsys.readouterr().err
+    assert "holds no key, so no client could connect" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -91,7 +91,7 @@ def connect() -> Iterator[Callable[..., "zmq.asyncio.Socket"]]:
             sockets.append(socket)
             socket.setsockopt(zmq.LINGER, 0)
             if client is not None:
-                client.use(socket)
+                client.apply(socket)
             if kind == zmq.SUB:
                 socket.setsockopt(zmq.SUBSCRIBE, b"")
             socket.connect(address)
@@ -144,7 +144,7 @@ async def _stop_without_a_key(daemon: Daemon, connect: Callable[..., Any]) -> No
     anyone = connect(zmq.DEALER, address_of(daemon._open_stop._socket), None)
     for name in ("start", "resume", "unlock", "tare", "pause"):
         await anyone.send(encode({"command": name}))
-        assert "this needs a key" in decode(await anyone.recv())["why"]
+        assert "this command needs a key" in decode(await anyone.recv())["reason"]
     await anyone.send(encode({"command": "stop"}))
     assert decode(await anyone.recv())["ok"]
     await daemon.stopped()
@@ -152,8 +152,8 @@ async def _stop_without_a_key(daemon: Daemon, connect: Callable[..., Any]) -> No
 
 def test_the_open_stop_is_named_by_the_port() -> None:
     assert (
-        open_stop_address("tcp://0.0.0.0:7762")
-        == open_stop_address("tcp://127.0.0.1:7762")
+        local_stop_address("tcp://0.0.0.0:7762")
+        == local_stop_address("tcp://127.0.0.1:7762")
         == "ipc://@shearloop-stop-7762"
     )
 
@@ -175,7 +175,7 @@ def test_keys_are_made_once_shown_and_taken_back(keys: Path, capsys: pytest.Capt
     assert (folder / "server.key_secret").stat().st_mode & 0o777 == 0o600
     assert (folder / "clients/ada.key").stat().st_mode & 0o777 == 0o644
     assert main(["keys", "server", "--dir", str(folder)]) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert main(["keys", "list", "--dir", str(folder), "--json"]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["clients"] == {"ada": load_public_key(keys / "ada/client.key").decode()}
@@ -184,10 +184,10 @@ def test_keys_are_made_once_shown_and_taken_back(keys: Path, capsys: pytest.Capt
     assert main(["keys", "allow", str(folder / "server.key"), "--name", "../eve", "--dir", str(folder)]) == 2
     assert "is not a client's name" in capsys.readouterr().err
     assert main(["keys", "revoke", "eve", "--dir", str(folder)]) == 2
-    assert "there is no client 'eve'; allowed is ada" in capsys.readouterr().err
+    assert "there is no client 'eve'; the allowed clients are ada" in capsys.readouterr().err
     assert main(["keys", "revoke", "ada", "--dir", str(folder)]) == 0
     assert main(["keys", "list", "--dir", str(folder)]) == 0
-    assert "nobody may connect yet" in capsys.readouterr().out
+    assert "no client may connect yet" in capsys.readouterr().out
 
 
 def test_a_damaged_key_is_a_sentence(keys: Path) -> None:
@@ -197,7 +197,7 @@ def test_a_damaged_key_is_a_sentence(keys: Path) -> None:
         ("", "is no key file"),
         ('public-key = "short"\n', "damaged key"),
         (f'public-key = "{other.public.decode()}"\n', "holds no secret key"),
-        (secret.read_text().replace(load_public_key(secret).decode(), other.public.decode()), "are no pair"),
+        (secret.read_text().replace(load_public_key(secret).decode(), other.public.decode()), "do not match"),
     ):
         secret.write_text(text)
         with pytest.raises(UserError, match=part):

@@ -7,9 +7,9 @@ import pytest
 import zmq
 
 from shearloop.daemon.clock import Clock
+from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.messages import LoadTorque, decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.messaging.subscriber import messages
 from tests.daemon.conftest import DEADLINE_S
 
 
@@ -21,22 +21,22 @@ def until(is_so: Callable[[], bool]) -> None:
         time.sleep(0.001)
 
 
-def test_the_publisher_knows_which_topics_are_subscribed_to(tmp_path: Path) -> None:
+def test_the_publisher_knows_which_topics_are_prefixes_to(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/publish"
     with zmq.Context() as context:
         publisher = Publisher(context, address, Clock())
-        assert not publisher.wanted("eit.heatmap")
+        assert not publisher.has_subscriber("eit.heatmap")
         with context.socket(zmq.SUB) as one, context.socket(zmq.SUB) as two:
             one.connect(address)
             two.connect(address)
             one.subscribe("eit.")
             two.subscribe("eit.heatmap")
-            until(lambda: publisher.wanted("eit.heatmap") and publisher.wanted("eit.frame"))
-            assert not publisher.wanted("health")
+            until(lambda: publisher.has_subscriber("eit.heatmap") and publisher.has_subscriber("eit.frame"))
+            assert not publisher.has_subscriber("health")
             one.unsubscribe("eit.")
-            until(lambda: not publisher.wanted("eit.frame"))
-            assert publisher.wanted("eit.heatmap")
-        until(lambda: not publisher.wanted("eit.heatmap"))
+            until(lambda: not publisher.has_subscriber("eit.frame"))
+            assert publisher.has_subscriber("eit.heatmap")
+        until(lambda: not publisher.has_subscriber("eit.heatmap"))
         publisher.close()
 
 
@@ -50,7 +50,7 @@ def test_what_cannot_be_sent_spoils_no_other_message(tmp_path: Path) -> None:
         subscriber.setsockopt(zmq.RCVTIMEO, 10_000)
         subscriber.subscribe("health")
         subscriber.connect(address)
-        until(lambda: publisher.wanted("health"))
+        until(lambda: publisher.has_subscriber("health"))
         with pytest.raises(TypeError):
             publisher.forward("health", {"what": object()})
         publisher.forward("health", {"number": 1})
@@ -68,14 +68,21 @@ def test_subscriptions_to_what_there_is_not_are_not_kept(tmp_path: Path) -> None
                 stranger.send(b"\x01eit.%d" % number)
             stranger.send(b"no subscription")
             stranger.send(b"\x01health")
-            until(lambda: publisher.wanted("health"))
-            assert publisher._subscribed == {b"health"}
+            until(lambda: publisher.has_subscriber("health"))
+            assert publisher._prefixes == {b"health"}
         publisher.close()
 
 
 def reading(number: int) -> LoadTorque:
     return LoadTorque(
-        source="load_cell", t_mono_ns=number, torque_nm=0.1, raw=1.0, saturated=False, spike=False, valid=True, why=""
+        source="load_cell",
+        t_mono_ns=number,
+        torque_nm=0.1,
+        raw=1.0,
+        saturated=False,
+        spike=False,
+        valid=True,
+        reason="",
     )
 
 
@@ -88,8 +95,8 @@ def test_subscribers_come_and_go_while_messages_are_sent(tmp_path: Path) -> None
             one.setsockopt(zmq.RCVTIMEO, round(DEADLINE_S * 1000))
             one.connect(address)
             one.subscribe("load.")
-            until(lambda: publisher.wanted("load.torque"))
-            assert not publisher.wanted("health")
+            until(lambda: publisher.has_subscriber("load.torque"))
+            assert not publisher.has_subscriber("health")
             publisher.publish(reading(100))
             topic, payload = one.recv_multipart()
             assert topic == b"load.torque"
@@ -98,15 +105,15 @@ def test_subscribers_come_and_go_while_messages_are_sent(tmp_path: Path) -> None
                 two.connect(address)
                 two.subscribe("health")
                 publisher.publish(reading(101))
-                until(lambda: publisher.wanted("health"))
-            until(lambda: not publisher.wanted("health"))
-        until(lambda: not publisher.subscribed)
+                until(lambda: publisher.has_subscriber("health"))
+            until(lambda: not publisher.has_subscriber("health"))
+        until(lambda: not publisher.has_subscribers())
 
 
 def test_who_listens_where_nobody_speaks_is_told_so_once_and_hears_who_comes_later(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("shearloop.daemon.messaging.subscriber.QUIET_S", 0.02)
+    monkeypatch.setattr("shearloop.daemon.messaging.client.QUIET_S", 0.02)
     address, told = f"ipc://{tmp_path}/publish", []
     content = {"timestamp": 1.0, "t_mono_ns": 2, "source": "daemon"}
     with zmq.Context() as context, context.socket(zmq.XPUB) as late:
@@ -119,6 +126,6 @@ def test_who_listens_where_nobody_speaks_is_told_so_once_and_hears_who_comes_lat
             for seq in range(2):
                 late.send_multipart([b"health", encode({**content, "seq": seq})])
 
-        with closing(messages(address, ["health"], on_quiet=comes)) as heard:
+        with closing(receive_messages(address, ["health"], on_quiet=comes)) as heard:
             assert [next(heard)[1]["seq"] for _ in range(2)] == [0, 1]
     assert told == ["quiet"]

@@ -44,7 +44,7 @@ def dies_once(folder: str, item: int) -> int:
     return item * item
 
 
-def test_the_numbers_are_the_same_wherever_they_are_computed(scheduler: str) -> None:
+def test_all_executors_give_the_same_numbers(scheduler: str) -> None:
     items, shared = list(range(12)), {"factor": 0.37}
     alone = dict(SerialExecutor().map(square, shared, items))
     assert dict(ProcessExecutor(2).map(square, shared, items)) == alone
@@ -74,12 +74,12 @@ def test_without_an_address_tasks_run_in_processes_of_this_computer(
             assert executor._count == count
 
 
-def test_what_a_task_raises_is_raised_here(scheduler: str) -> None:
+def test_a_tasks_error_is_raised(scheduler: str) -> None:
     with open_executor(scheduler) as cluster, pytest.raises(UserError, match="item 2 is wrong"):
         list(cluster.map(fails, None, range(4)))
 
 
-def test_a_worker_killed_in_the_middle_costs_only_its_tasks(scheduler: str, tmp_path: Path) -> None:
+def test_a_killed_worker_costs_only_its_own_tasks(scheduler: str, tmp_path: Path) -> None:
     with open_executor(scheduler) as cluster:
         results = dict(cluster.map(dies_once, str(tmp_path), range(12)))
     assert results == {item: item * item for item in range(12)}
@@ -90,7 +90,7 @@ def test_a_worker_killed_in_the_middle_costs_only_its_tasks(scheduler: str, tmp_
     assert len(runs) < 2 * 12 - 3
 
 
-def test_results_that_nobody_goes_on_with_are_let_go_after_the_end_of_the_cluster(scheduler: str) -> None:
+def test_unfinished_results_are_dropped_quietly(scheduler: str) -> None:
     """So ends what is interrupted where a result is used; a traceback told of it after the sentence."""
     with open_executor(scheduler) as cluster:
         found = cluster.map(square, {"factor": 0.37}, range(3))
@@ -110,7 +110,7 @@ def test_a_large_recording_is_sent_to_a_cluster_without_a_warning(scheduler: str
         assert list(cluster.map(size, None, [np.zeros(1_500_000)])) == [(0, 1_500_000)]
 
 
-def test_no_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "tip.yaml").write_text(FINGERTIP)
     (tmp_path / "bank.yaml").write_text(BANK)
     command = ["bank", "build", "--config", str(tmp_path / "bank.yaml"), "--out", str(tmp_path / "a.bank")]
@@ -118,7 +118,7 @@ def test_no_scheduler_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "no Dask scheduler answers at tcp://127.0.0.1:9" in capsys.readouterr().err
 
 
-def test_what_listens_and_is_no_scheduler_is_not_waited_for_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_is_no_scheduler_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("shearloop.daemon.workers.CONNECT_S", 0.5)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         address = f"tcp://127.0.0.1:{deaf.getsockname()[1]}"
@@ -149,7 +149,7 @@ def lonely(tmp_path: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
         process.wait(STARTED_S)
 
 
-def test_a_scheduler_without_workers_and_one_that_ends_are_one_sentence_each(
+def test_a_scheduler_without_workers_or_a_lost_one_is_one_sentence(
     lonely: tuple[subprocess.Popen[bytes], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import distributed
@@ -172,7 +172,7 @@ def test_a_scheduler_without_workers_and_one_that_ends_are_one_sentence_each(
         list(cluster.map(square, {"factor": 1.0}, range(3)))
 
 
-def test_without_the_extra_an_address_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_address_needs_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UserError, match=r"pip install 'shearloop\[cluster\]'"), open_executor("tcp://127.0.0.1:9"):
         pass

@@ -76,7 +76,7 @@ def killed(scheduler: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int
         client.wait_for_workers(2, timeout=STARTED_S)
 
 
-def test_recordings_are_evaluated_to_the_same_figures_on_a_cluster_that_a_worker_is_killed_of(
+def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(
     scheduler: str, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], killed: list[int]
 ) -> None:
     slices, cylinders = (str(shared / "recordings" / name) for name in ("torque_slices", "diameter_slices"))
@@ -92,7 +92,7 @@ def test_recordings_are_evaluated_to_the_same_figures_on_a_cluster_that_a_worker
     assert figures[0] == figures[1]
 
 
-def test_a_bank_that_a_worker_is_killed_under_has_the_same_bytes(
+def test_a_bank_has_the_same_bytes_after_a_killed_worker(
     banks: tuple[Path, Path], scheduler: str, killed: list[int]
 ) -> None:
     again = banks[0].with_name("killed.bank")
@@ -103,9 +103,7 @@ def test_a_bank_that_a_worker_is_killed_under_has_the_same_bytes(
 
 
 @pytest.mark.usefixtures("few_mixtures")
-def test_a_chart_has_the_same_numbers_from_a_cluster_that_a_worker_is_killed_of(
-    scheduler: str, killed: list[int], tmp_path: Path
-) -> None:
+def test_a_chart_has_the_same_numbers_after_a_killed_worker(scheduler: str, killed: list[int], tmp_path: Path) -> None:
     from shearloop.bank.estimation import Name, Physics
     from shearloop.daemon.analysis.charts.fault_sweeps import FAULTS, sweeps
     from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, synthetic_slices

@@ -58,7 +58,7 @@ def interrupted_once_it_works(tmp_path: Path) -> Iterator[Interrupted]:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("more", ["", "x" * (1 << 20)], ids=["small", "large"])
-def test_processes_end_when_this_one_is_interrupted(
+def test_worker_processes_end_on_an_interrupt(
     number: signal.Signals, more: str, interrupted_once_it_works: Interrupted, tmp_path: Path
 ) -> None:
     """They were waited for until their tasks were done; of SIGTERM they did not hear, and stayed.

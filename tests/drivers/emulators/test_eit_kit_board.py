@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.bank.eit.channels import ZERO_SLOTS
-from shearloop.drivers.eit_format import FrameError, read_line
-from shearloop.drivers.emulators.eit_kit import EitKitBoard, Fault, FaultKind, format_line, read_fault
-from shearloop.drivers.serial_port import SerialPort
+from shearloop.drivers.connection import SerialPort
+from shearloop.drivers.eit_kit import FrameError, read_line
+from shearloop.drivers.emulators.boards import BoardFault, BoardFaultKind, EitKitBoard, format_line, parse_fault
 
 
 async def two_lines(port: SerialPort) -> bytes:
@@ -38,9 +38,9 @@ def test_what_it_sends_is_what_the_driver_reads(seed: int) -> None:
 
 
 def test_faults_are_read_from_their_names() -> None:
-    assert read_fault("cut-line") == Fault(FaultKind.CUT_LINE)
-    assert read_fault(" silence 3\n") == Fault(FaultKind.SILENCE, 3.0)
-    assert read_fault("unplug:0.5") == Fault(FaultKind.UNPLUG, 0.5)
+    assert parse_fault("cut-line", EitKitBoard.faults) == BoardFault(BoardFaultKind.CUT_LINE)
+    assert parse_fault(" silence 3\n", EitKitBoard.faults) == BoardFault(BoardFaultKind.SILENCE, 3.0)
+    assert parse_fault("unplug:0.5", EitKitBoard.faults) == BoardFault(BoardFaultKind.UNPLUG, 0.5)
 
 
 @pytest.mark.parametrize(
@@ -55,7 +55,7 @@ def test_faults_are_read_from_their_names() -> None:
 )
 def test_what_is_no_fault_is_said_to_be_none(text: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        read_fault(text)
+        parse_fault(text, EitKitBoard.faults)
 
 
 async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last_frame() -> None:
@@ -82,7 +82,7 @@ async def test_it_says_nothing_before_it_is_started_and_is_silent_after_its_last
 async def test_faults_can_be_switched_on_while_it_runs() -> None:
     line = np.where(ZERO_SLOTS, 0, 0.25)
     board = EitKitBoard([line, line], period_s=0.001)
-    board.inject(Fault(FaultKind.NAN))
+    board.inject(BoardFault(BoardFaultKind.NAN))
     running = asyncio.create_task(board.run())
     await asyncio.sleep(0)
     with SerialPort(board.path) as port:

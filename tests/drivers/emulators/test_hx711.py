@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.emulators.hx711 import PAPER_SKETCH, Fault, FaultKind, Hx711Board, Sketch, read_fault
-from shearloop.drivers.hx711 import LoadCalibration, LoadSample
-from shearloop.drivers.load_cell import LoadCell
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy
+from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
+from shearloop.drivers.emulators.boards import PAPER_SKETCH, BoardFault, BoardFaultKind, Hx711Board, Sketch, parse_fault
+from shearloop.drivers.load_cell import LoadCalibration, LoadCell, LoadSample
 
 SKETCH = Sketch()
 CALIBRATION = LoadCalibration(tare_counts=SKETCH.tare_counts, scale_n_per_count=1 / (0.035 * SKETCH.counts_per_nm))
@@ -88,33 +87,34 @@ async def test_torque_comes_through_from_either_sketch(
             assert sample.trusted
             assert min(abs(sample.torque_nm - torque_nm) for torque_nm in sent) < 6 * noise_nm
         assert rig.samples[-1].torque_nm == pytest.approx(0.059, abs=6 * noise_nm)
-        assert rig.cell.facts()["errors"] == {}
-        assert rig.cell.facts()["flagged"] == 1  # the first line, whose beginning may be missing
+        assert rig.cell.diagnostics()["errors"] == {}
+        assert rig.cell.diagnostics()["flagged"] == 1  # the first line, whose beginning may be missing
 
 
 async def test_corrupted_lines_are_flagged_or_counted_and_the_rest_goes_on(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 5)
-        rig.board.inject(Fault(FaultKind.SPIKE))
-        rig.board.inject(Fault(FaultKind.GARBAGE))
-        await rig.until(lambda: rig.cell.facts()["errors"])
+        rig.board.inject(BoardFault(BoardFaultKind.SPIKE))
+        rig.board.inject(BoardFault(BoardFaultKind.GARBAGE))
+        await rig.until(lambda: rig.cell.diagnostics()["errors"])
         await rig.until(lambda: [sample for sample in rig.samples if sample.spike])
         n = len(rig.samples)
         await rig.until(lambda: len(rig.samples) > n + 5)
         assert [sample.raw for sample in rig.samples if sample.spike] == [38399996]
-        assert rig.cell.facts()["errors"] == {"not_decimal": 1}
-        assert "no decimal number" in str(rig.cell.facts()["refusals"])
+        assert rig.cell.diagnostics()["errors"] == {"not_decimal": 1}
+        assert "not a decimal" in str(rig.cell.diagnostics()["error_details"])
         assert all(sample.trusted for sample in rig.samples[n:])
 
 
 async def test_saturation_and_a_frozen_converter_are_flagged_while_they_last(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
-        rig.board.inject(Fault(FaultKind.SATURATION, 0.01))
+        await rig.until(lambda: rig.samples)
+        rig.board.inject(BoardFault(BoardFaultKind.SATURATION, 0.01))
         await rig.until(lambda: [sample for sample in rig.samples if sample.saturated])
         await rig.until(lambda: rig.samples[-1].trusted)
-        rig.board.inject(Fault(FaultKind.STUCK))
+        rig.board.inject(BoardFault(BoardFaultKind.STUCK))
         await rig.until(lambda: [sample for sample in rig.samples if sample.stuck])
-        rig.board.inject(Fault(FaultKind.STUCK, 0.0))
+        rig.board.inject(BoardFault(BoardFaultKind.STUCK, 0.0))
         await rig.until(lambda: rig.samples[-1].trusted)
 
 
@@ -122,7 +122,7 @@ async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path: Path) -> 
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
         before = len(rig.samples)
-        rig.board.inject(Fault(FaultKind.JUMP, 1.6))
+        rig.board.inject(BoardFault(BoardFaultKind.JUMP, 1.6))
         await rig.until(lambda: rig.samples[-1].trusted and rig.samples[-1].torque_nm > 1.5)
         jumped = [sample for sample in rig.samples[before:] if sample.torque_nm > 1.5]
         # Several lines may have come in one piece.
@@ -133,20 +133,20 @@ async def test_a_jump_in_torque_is_flagged_and_then_believed(tmp_path: Path) -> 
 async def test_an_unplugged_board_is_lost_and_found_again(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
-        rig.board.inject(Fault(FaultKind.UNPLUG, 0.05))
+        rig.board.inject(BoardFault(BoardFaultKind.UNPLUG, 0.05))
         await rig.until(lambda: [event for event in rig.events if not event.up])
         n = len(rig.samples)
         await rig.until(lambda: len(rig.samples) > n + 3)
         assert rig.samples[n].partial
         assert rig.samples[n].seq == rig.samples[n - 1].seq + 1
-        assert rig.cell.facts()["openings"] == 2
+        assert rig.cell.diagnostics()["connections"] == 2
         assert "gone" in next(event.sentence for event in rig.events if not event.up)
 
 
 async def test_silence_is_reported_as_a_loss(tmp_path: Path) -> None:
     async with a_rig(tmp_path) as rig:
         await rig.until(lambda: len(rig.samples) > 3)
-        rig.board.inject(Fault(FaultKind.SILENCE))
+        rig.board.inject(BoardFault(BoardFaultKind.SILENCE))
         await rig.until(lambda: [event for event in rig.events if not event.up])
         assert "sent nothing for 0.7 s" in next(event.sentence for event in rig.events if not event.up)
 
@@ -164,10 +164,14 @@ async def test_a_tare_takes_effect_with_the_next_sample(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["spark", "spike:3", "jump", "jump:high", "silence:-1", "unplug:nan", "stuck:inf"])
 def test_a_fault_that_does_not_exist_is_explained(text: str) -> None:
     with pytest.raises(ValueError, match=r"write|there are"):
-        read_fault(text)
+        parse_fault(text, Hx711Board.faults)
 
 
 def test_faults_are_read_as_they_are_typed() -> None:
-    assert read_fault("silence:3") == read_fault(" silence 3 ") == Fault(FaultKind.SILENCE, 3.0)
-    assert read_fault("jump:-0.05") == Fault(FaultKind.JUMP, -0.05)
-    assert read_fault("spike") == Fault(FaultKind.SPIKE)
+    assert (
+        parse_fault("silence:3", Hx711Board.faults)
+        == parse_fault(" silence 3 ", Hx711Board.faults)
+        == BoardFault(BoardFaultKind.SILENCE, 3.0)
+    )
+    assert parse_fault("jump:-0.05", Hx711Board.faults) == BoardFault(BoardFaultKind.JUMP, -0.05)
+    assert parse_fault("spike", Hx711Board.faults) == BoardFault(BoardFaultKind.SPIKE)

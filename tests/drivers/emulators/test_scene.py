@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
-from shearloop.drivers.emulators.scene import Scene, Truth
-from shearloop.drivers.emulators.twin import Joint, TwinSettings
+from shearloop.drivers.emulators.scene import Joint, Scene, Truth, TwinSettings
 
 DT_S = 0.002
 # A gel that does not creep, so that every torque can be said in advance.

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.emulators.twin import Joint, Twin, TwinSettings, TwinState
+from shearloop.drivers.emulators.scene import Joint, Twin, TwinSettings, TwinState
 
 DT_S = 0.008
 FIRM_N = 40.0

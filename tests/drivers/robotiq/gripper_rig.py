@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
 from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
 from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
 from shearloop.drivers.emulators.robotiq.urcap_face import UrcapServer
@@ -20,7 +21,6 @@ from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from shearloop.drivers.robotiq.width import WidthCalibration
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy
 
 STEP_S = 0.01
 # Between two looks of the driver at its clock.
@@ -62,12 +62,12 @@ async def a_rig(way: str, tmp_path: Path) -> AsyncIterator[Rig]:
     client: GripperClient
     if way == "socket":
         server = UrcapServer(model, port=0)
-        await server.bring_back()
+        await server.restore()
         client = SocketClient("127.0.0.1", server.port, reply_deadline_s=0.2)
     else:
         link = tmp_path / "gripper"
         server = ModbusServer(model, link)
-        await server.bring_back()
+        await server.restore()
         client = ModbusClient(path=str(link), reply_deadline_s=0.2)
     rig = Rig(model, server)
     driver = rig.driver = RobotiqGripper(

@@ -5,9 +5,14 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.robotiq.faults import GripperFaultError, GripperRefusedError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
-from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand, ObjectStatus
+from shearloop.drivers.robotiq.messages import (
+    ActivationStatus,
+    GripperCommand,
+    GripperFaultError,
+    GripperRefusedError,
+    ObjectStatus,
+)
 from shearloop.drivers.robotiq.socket_client import SocketClient
 from tests.drivers.robotiq.gripper_rig import CALIBRATION, WAYS, a_rig
 

@@ -67,18 +67,18 @@ async def test_it_comes_back_by_itself_and_says_so(way: str, tmp_path: Path) -> 
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         first = await anext(states)
         assert rig.driver.latest == first
-        await rig.server.lose()
+        await rig.server.disconnect()
         # The next states are awaited, not made up.
         coming = asyncio.create_task(anext(states))
         await rig.lost.wait()
         assert rig.driver.latest is None
         assert not coming.done()
         lost_ns = round(rig.t_s * 1e9)
-        await rig.server.bring_back()
+        await rig.server.restore()
         second = await coming
         assert second.t_ns >= lost_ns
         assert second.seq > first.seq
-        openings = rig.driver.facts()["openings"]
+        openings = rig.driver.diagnostics()["openings"]
         assert openings == 2
         ups = [event.up for event in rig.events]
         assert ups[0]
@@ -103,7 +103,7 @@ async def test_a_loss_that_a_command_meets_is_told_as_well(way: str, tmp_path: P
             (False, True),
             (True, False),
         ]
-        assert rig.driver.facts()["last_loss"] == str(met.value)
+        assert rig.driver.diagnostics()["last_loss"] == str(met.value)
 
 
 @WAYS
@@ -138,7 +138,7 @@ async def test_a_call_that_is_cancelled_does_not_leave_its_answer_to_the_next(wa
 @WAYS
 async def test_nobody_there_is_said_in_a_sentence(way: str, tmp_path: Path) -> None:
     async with a_rig(way, tmp_path) as rig:
-        await rig.server.lose()
+        await rig.server.disconnect()
         with pytest.raises(DeviceNotFoundError, match="There is no"):
             await rig.driver.connect()
 

@@ -6,9 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.robotiq.faults import GripperFaultError
-from shearloop.drivers.robotiq.messages import Activate, ActivationStatus, GripperMove, ObjectStatus, Readout, Reset
-from shearloop.drivers.robotiq.sequences import (
+from shearloop.drivers.robotiq.gripper import (
     ACTIVATION_DEADLINE_NS,
     MOTION_DEADLINE_NS,
     PAUSE_NS,
@@ -16,6 +14,15 @@ from shearloop.drivers.robotiq.sequences import (
     ActivationSequence,
     MotionWatch,
     object_status,
+)
+from shearloop.drivers.robotiq.messages import (
+    Activate,
+    ActivationStatus,
+    GripperFaultError,
+    GripperMove,
+    ObjectStatus,
+    Readout,
+    Reset,
 )
 
 S = 10**9
@@ -88,11 +95,11 @@ def test_a_gripper_that_is_not_active_holds_nothing(sta: ActivationStatus) -> No
 
 def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before() -> None:
     watch = MotionWatch(GO, 0)
-    assert not watch.finished(ACTIVE, S)
-    assert not watch.finished(replace(ACTIVE, pre=100, obj=ObjectStatus.MOVING), S)
-    assert watch.finished(replace(ACTIVE, pre=100, obj=ObjectStatus.CONTACT_CLOSING), S)
+    assert not watch.has_finished(ACTIVE, S)
+    assert not watch.has_finished(replace(ACTIVE, pre=100, obj=ObjectStatus.MOVING), S)
+    assert watch.has_finished(replace(ACTIVE, pre=100, obj=ObjectStatus.CONTACT_CLOSING), S)
     with pytest.raises(GripperFaultError, match="does not finish"):
-        watch.finished(ACTIVE, MOTION_DEADLINE_NS + 1)
+        watch.has_finished(ACTIVE, MOTION_DEADLINE_NS + 1)
 
 
 @pytest.mark.parametrize(
@@ -106,4 +113,4 @@ def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before() -> None:
 )
 def test_a_motion_that_will_never_end_is_reported(readout: Readout, said: str) -> None:
     with pytest.raises(GripperFaultError, match=said):
-        MotionWatch(GO, 0).finished(readout, S)
+        MotionWatch(GO, 0).has_finished(readout, S)

@@ -9,10 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.shear_skin.adc_board import BAUD_RATE, PairParser
-from shearloop.drivers.shear_skin.scanner import read_scan
-from shearloop.drivers.shear_skin.scpi import LONGEST_REPLY, Reply, ReplyLines, numbers
-from shearloop.drivers.shear_skin.source import read_elements
+from shearloop.drivers.shear_skin.instruments import ADC_BAUD, PairParser, read_elements, read_scan
+from shearloop.drivers.shear_skin.scpi import MAX_REPLY_BYTES, Reply, ReplyLines, parse_numbers
 
 PERIOD_NS = 100_000_000
 VOLTS = st.floats(-0.6, 0.6).map(lambda volts: round(volts, 6))
@@ -33,8 +31,8 @@ def test_every_line_of_the_board_comes_through_in_any_slices(pairs: list[tuple[f
     found = [voltages for part in slices(data, cuts) for voltages in parser.feed(part, 10**9)]
     assert [(one.v1_v, one.v2_v) for one in found] == pairs
     assert [(one.over_1, one.over_2) for one in found] == [(abs(a) >= 0.51174, abs(b) >= 0.51174) for a, b in pairs]
-    assert parser.first_partials == 1
-    assert not parser.refused
+    assert parser.partial_lines == 1
+    assert not parser.errors
 
 
 @given(st.binary(max_size=600), CUTS)
@@ -52,7 +50,7 @@ def test_no_bytes_break_the_board_s_parser_and_a_sound_line_comes_through_after_
 def test_refused_lines_are_counted_by_kind() -> None:
     parser = PairParser()
     parser.feed(b"cut\n0.1,0.2,0.3\n0.1\n0,1\nnan,0.1\n\r\n" + b"1" * 50 + b"\n0.100000,0.200000\n", 0)
-    assert parser.refused == {"not two decimals": 4, "empty": 1, "too long": 1}
+    assert parser.errors == {"not two decimals": 4, "empty": 1, "too long": 1}
 
 
 def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
@@ -63,14 +61,14 @@ def test_a_line_that_breaks_off_is_counted_and_no_part_of_it_is_read() -> None:
     assert parser.feed(b"0.125000,0.126000\n", 1) == [], "after the opening a line may be under way"
     (found,) = parser.feed(b"0.127000,0.128000\n", 2)
     assert (found.v1_v, found.v2_v) == (0.127, 0.128)
-    assert parser.refused == {"unfinished": 1}
+    assert parser.errors == {"unfinished": 1}
 
 
 def test_lines_that_arrive_together_are_a_period_apart() -> None:
     parser = PairParser()
     parser.feed(b"\n", 0)
     first, second = parser.feed(b"0.125000,0.126000\r\n" * 2, 10**9)
-    assert second.t_mid_ns == 10**9 - 19 * (10 * 10**9 // BAUD_RATE) - PERIOD_NS // 2
+    assert second.t_mid_ns == 10**9 - 19 * (10 * 10**9 // ADC_BAUD) - PERIOD_NS // 2
     assert second.t_mid_ns - first.t_mid_ns == PERIOD_NS
     assert first.t_arrival_ns == second.t_arrival_ns == 10**9
 
@@ -81,10 +79,10 @@ def test_replies_come_through_whatever_ends_their_lines(replies: list[str], cuts
         lines = ReplyLines()
         data = b"".join(reply.encode() + end for reply in replies)
         assert [text for part in slices(data, cuts) for text in lines.feed(part)] == [r.strip() for r in replies]
-        assert not lines.refused
+        assert not lines.errors
 
 
-@given(st.binary(max_size=2 * LONGEST_REPLY), CUTS)
+@given(st.binary(max_size=2 * MAX_REPLY_BYTES), CUTS)
 def test_no_bytes_break_the_reply_lines(noise: bytes, cuts: list[int]) -> None:
     lines = ReplyLines()
     for part in slices(noise, cuts):
@@ -98,12 +96,12 @@ def test_a_flood_without_an_end_is_counted_once_and_forgotten() -> None:
     for _ in range(10):
         assert lines.feed(b"7" * 300) == []
     assert lines.feed(b"\n\xff\n0\n") == ["0"]
-    assert lines.refused == {"too long": 1, "not ASCII": 1}
+    assert lines.errors == {"too long": 1, "not ASCII": 1}
 
 
 @given(st.text(max_size=80))
 def test_what_is_no_reading_is_refused_by_name(text: str) -> None:
-    for read in (lambda: read_elements(text, 0), lambda: read_scan(Reply(text, 0, 2))):
+    for read in (lambda: read_elements(Reply(text, 0, 0)), lambda: read_scan(Reply(text, 0, 2))):
         if re.fullmatch(r"[0-9Ee.,+ -]+", text):
             with suppress(ProtocolError):
                 read()
@@ -114,7 +112,7 @@ def test_what_is_no_reading_is_refused_by_name(text: str) -> None:
 
 def test_the_manual_s_own_example_is_read() -> None:
     # Figure 17-1 of the 6430's manual, without the resistance and the time; 10 kΩ at 100 µA.
-    reading = read_elements("+1.000206E+00, +1.000000E-04, +4.813200E+04", 5)
+    reading = read_elements(Reply("+1.000206E+00, +1.000000E-04, +4.813200E+04", 0, 5))
     assert (reading.voltage_v, reading.current_a, reading.t_ns) == (1.000206, 1e-4, 5)
     assert reading.output_on
     assert not reading.compliance
@@ -122,16 +120,16 @@ def test_the_manual_s_own_example_is_read() -> None:
 
 @pytest.mark.parametrize("bit", [0, 3, 4, 16])
 def test_every_way_of_not_keeping_its_current_is_compliance(bit: int) -> None:
-    assert read_elements(f"+1.0E+00,+1.0E-09,{38916 | 1 << bit:+.6E}", 0).compliance
+    assert read_elements(Reply(f"+1.0E+00,+1.0E-09,{38916 | 1 << bit:+.6E}", 0, 0)).compliance
 
 
 @pytest.mark.parametrize("text", ["+9.91E37,+5.0E-03,+3.8E+04", "1,2", "1,2,-1", "1,2,3E+08", "inf,nan,1", "1_0,2,3"])
 def test_a_reading_that_was_not_made_is_refused(text: str) -> None:
     with pytest.raises(ProtocolError):
-        read_elements(text, 0)
+        read_elements(Reply(text, 0, 0))
 
 
 def test_an_overload_of_the_scanner_is_told_by_channel() -> None:
     voltages = read_scan(Reply("+9.90000000E+37,-1.25000000E-01", 100, 300))
     assert (voltages.over_1, voltages.over_2, voltages.t_mid_ns) == (True, False, 200)
-    assert numbers("-1,2.5E3", 2, "It") == [-1.0, 2500.0]
+    assert parse_numbers("-1,2.5E3", 2, "It") == [-1.0, 2500.0]

@@ -10,18 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.emulators.skin import daq as played_daq
-from shearloop.drivers.emulators.skin.circuit import Circuit, befall
-from shearloop.drivers.emulators.skin.keithley import EmulatedKeithley6430 as PlayedSource
-from shearloop.drivers.emulators.skin.servers import Outages, ScpiSerial, ScpiSocket
-from shearloop.drivers.serial_port import LinkEvent, ReconnectPolicy, SerialLink
-from shearloop.drivers.shear_skin.adc_board import AdcBoard
-from shearloop.drivers.shear_skin.daq import Daq
-from shearloop.drivers.shear_skin.judge import SkinFault, SkinSample
-from shearloop.drivers.shear_skin.scanner import ScpiScanner
-from shearloop.drivers.shear_skin.skin import ShearSkin
-from shearloop.drivers.shear_skin.source import BAUD_RATE, OUTPUT, READ, Keithley6430
-from shearloop.drivers.tcp_port import TcpLink
+from shearloop.drivers.connection import LinkEvent, ReconnectPolicy, SerialLink, TcpLink
+from shearloop.drivers.emulators.boards import EmulatedAdcBoard
+from shearloop.drivers.emulators.ports import PtyServer, SocketServer
+from shearloop.drivers.emulators.scpi import FaultyServer
+from shearloop.drivers.emulators.skin import NOISE_V, Circuit, EmulatedKeithley6430, EmulatedScanner
+from shearloop.drivers.shear_skin.instruments import OUTPUT, READ, SOURCE_BAUD, AdcBoard, Daq, Keithley6430, ScpiScanner
+from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
 
 R1, R2 = 24.6, 25.3
 RATE_HZ = 500.0
@@ -32,8 +27,8 @@ DEADLINE_S = 30
 @dataclass
 class Bench:
     circuit: Circuit
-    played: PlayedSource
-    source: Outages
+    played: EmulatedKeithley6430
+    source: FaultyServer
     reader: Callable[[str], None]
     skin: ShearSkin
     samples: list[SkinSample] = field(default_factory=list)
@@ -46,7 +41,7 @@ class Bench:
 
     @property
     def source_errors(self) -> Mapping[str, int]:
-        errors = self.skin.source_facts()["errors"]
+        errors = self.skin.source_diagnostics()["errors"]
         assert isinstance(errors, Mapping)
         return errors
 
@@ -75,20 +70,18 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         events.append(event)
         changed.set()
 
-    played = PlayedSource(circuit, time.monotonic)
-    way_in: ScpiSerial | ScpiSocket
+    played = EmulatedKeithley6430(circuit)
+    way_in: PtyServer | SocketServer
     if serial_source:
-        way_in = ScpiSerial(played.feed, folder / "source", lambda _: ready.release(), answer_s=0.0)
+        way_in = PtyServer(played.feed, folder / "source", lambda _: ready.release(), answer_s=0.0)
     else:
-        way_in = ScpiSocket(played.feed, on_port=lambda _: ready.release(), answer_s=0.0)
-    outages = Outages(way_in)
+        way_in = SocketServer(lambda: played.feed, on_port=lambda _: ready.release(), answer_s=0.0)
+    outages = FaultyServer(way_in)
     players = [outages.run]
-    scanner = ScpiSocket(
-        played_daq.Scanner(circuit, time.monotonic).feed, on_port=lambda _: ready.release(), answer_s=0.0
-    )
-    scanner_outages = Outages(scanner)
-    board = played_daq.EmulatedAdcBoard(
-        circuit, time.monotonic, period_s=1 / RATE_HZ, link=folder / "adc", on_port=lambda _: ready.release()
+    scanner = SocketServer(lambda: EmulatedScanner(circuit).feed, on_port=lambda _: ready.release(), answer_s=0.0)
+    scanner_outages = FaultyServer(scanner)
+    board = EmulatedAdcBoard(
+        circuit.voltages, period_s=1 / RATE_HZ, noise_v=NOISE_V, link=folder / "adc", on_port=lambda _: ready.release()
     )
     players.append(board.run if adc else scanner_outages.run)
     tasks = [asyncio.create_task(play()) for play in players]
@@ -96,17 +89,17 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         await ready.acquire()
 
     source_link = (
-        SerialLink(path=str(folder / "source"), baud=BAUD_RATE, policy=policy, on_event=on_event)
-        if isinstance(way_in, ScpiSerial)
+        SerialLink(path=str(folder / "source"), baud=SOURCE_BAUD, policy=policy, on_event=on_event)
+        if isinstance(way_in, PtyServer)
         else TcpLink("127.0.0.1", way_in.port, policy=policy, on_event=on_event)
     )
-    source = Keithley6430(source_link, period_s=0.01, reply_deadline_s=deadline_s)
+    source = Keithley6430(source_link, period_s=0.01, timeout_s=deadline_s)
     daq: Daq
     if adc:
         daq = AdcBoard(SerialLink(path=str(folder / "adc"), policy=policy, on_event=on_event), RATE_HZ)
     else:
         link = TcpLink("127.0.0.1", scanner.port, policy=policy, on_event=on_event)
-        daq = ScpiScanner(link, rate_hz=RATE_HZ, reply_deadline_s=deadline_s)
+        daq = ScpiScanner(link, rate_hz=RATE_HZ, timeout_s=deadline_s)
     skin = ShearSkin(source, daq)
     bench = Bench(
         circuit,
@@ -151,11 +144,11 @@ async def test_resistances_come_through_over_every_way_in(tmp_path: Path, serial
         assert all(a < b for a, b in pairwise(times))
         assert bench.circuit.output_on
         assert (bench.circuit.level_a, bench.circuit.compliance_v) == (5e-3, 1.0)
-        assert "MODEL 6430" in str(bench.skin.source_facts()["instrument"])
-        facts = bench.skin.facts()
+        assert "MODEL 6430" in str(bench.skin.source_diagnostics()["instrument"])
+        facts = bench.skin.diagnostics()
         assert facts["connected"]
         assert facts["samples"] == len(bench.samples)
-        assert facts.get("first_partials") == (facts["openings"] if adc else None)
+        assert facts.get("partial_lines") == (facts["connections"] if adc else None)
     assert not bench.circuit.output_on, "whoever stops measuring switches the current off"
 
 
@@ -187,11 +180,11 @@ async def test_each_fault_of_the_circuit_is_named_and_goes_away_with_its_cause(t
     async with a_bench(tmp_path, serial_source=False, adc=adc) as bench:
         await bench.next_says()
         for text, faults in FAULTS:
-            befall(bench.circuit, text, time.monotonic())
+            bench.circuit.command(text, time.monotonic())
             await bench.next_says(*faults)
-            befall(bench.circuit, "mend", time.monotonic())
+            bench.circuit.command("mend", time.monotonic())
             await bench.next_says()
-        errors = bench.skin.facts()["errors"]
+        errors = bench.skin.diagnostics()["errors"]
         assert isinstance(errors, dict)
         assert {"compliance", "open_1", "open_2", "short_1", "reversed_2", "sum"} <= set(errors)
 
@@ -211,7 +204,7 @@ async def test_a_source_that_is_silent_or_gone_is_named_and_set_up_again_without
             assert bench.circuit.output_on, "the current flows on while the cable is out"
             bench.source.command("normal")
             await bench.next_says()
-        openings = bench.skin.source_facts()["openings"]
+        openings = bench.skin.source_diagnostics()["connections"]
         assert isinstance(openings, int)
         assert openings >= 3
 
@@ -229,30 +222,30 @@ async def test_a_source_that_is_switched_off_by_hand_stays_off_and_says_so(tmp_p
 async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too(tmp_path: Path) -> None:
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=1.0) as bench:
         await bench.next_says()
-        openings = bench.skin.source_facts()["openings"]
-        sound = bench.played.face.feed
+        openings = bench.skin.source_diagnostics()["connections"]
+        sound = bench.played.interpreter.feed
 
         def switched_off_after_it_said_that_it_is_on(data: bytes) -> bytes:
             reply = sound(data)
             if b"OUTP?" in data:
                 bench.circuit.output_on = False
-                bench.played.face.feed = sound  # type: ignore[method-assign]
+                bench.played.interpreter.feed = sound  # type: ignore[method-assign]
             return reply
 
-        bench.played.face.feed = switched_off_after_it_said_that_it_is_on  # type: ignore[method-assign]
+        bench.played.interpreter.feed = switched_off_after_it_said_that_it_is_on  # type: ignore[method-assign]
         await bench.next_says(SkinFault.SOURCE_OFF)
         assert not bench.circuit.output_on
-        assert bench.skin.source_facts()["openings"] == openings
+        assert bench.skin.source_diagnostics()["connections"] == openings
 
 
 async def test_a_source_that_says_nonsense_is_not_believed(tmp_path: Path) -> None:
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=0.1) as bench:
         await bench.next_says()
-        sound = bench.played.face.feed
-        bench.played.face.feed = lambda data: sound(data) and b"%%%\n"  # type: ignore[method-assign]  # a bad cable
+        sound = bench.played.interpreter.feed
+        bench.played.interpreter.feed = lambda data: sound(data) and b"%%%\n"  # type: ignore[method-assign]  # a bad cable
         await bench.until(lambda: bench.source_errors.get("not understood", 0) >= 3)
         await bench.next_says(SkinFault.SOURCE_LOST)
-        bench.played.face.feed = sound  # type: ignore[method-assign]
+        bench.played.interpreter.feed = sound  # type: ignore[method-assign]
         await bench.next_says()
 
 
@@ -276,22 +269,22 @@ async def test_a_source_that_breaks_off_in_the_middle_of_an_answer_is_named_coun
 ) -> None:
     async with a_bench(tmp_path, serial_source=serial_source, adc=True) as bench:
         await bench.next_says()
-        sound = bench.played.face.feed
+        sound = bench.played.interpreter.feed
 
         def broken_off_at_the_query(data: bytes) -> bytes:
             if query.encode() in data:
                 bench.source.command("break-off")
-                bench.played.face.feed = sound  # type: ignore[method-assign]
+                bench.played.interpreter.feed = sound  # type: ignore[method-assign]
             return sound(data)
 
-        bench.played.face.feed = broken_off_at_the_query  # type: ignore[method-assign]
-        await bench.until(lambda: bench.skin.source_facts()["openings"] == 2)
+        bench.played.interpreter.feed = broken_off_at_the_query  # type: ignore[method-assign]
+        await bench.until(lambda: bench.skin.source_diagnostics()["connections"] == 2)
         await bench.next_says()
         # On a busy machine the converter board may be late too, which is no news here.
         (told,) = (event.sentence for event in bench.events if event.sentence.startswith("The current source"))
         assert told.startswith(f"The current source broke off in the middle of its answer to {query!r}: ")
         assert bench.source_errors == {"lost": 1, "unfinished": 1}
-        assert bench.skin.source_facts()["last_loss"] == told
+        assert bench.skin.source_diagnostics()["last_loss"] == told
         assert bench.circuit.output_on, "the current is not interrupted"
 
 
@@ -301,9 +294,9 @@ async def test_a_scanner_that_breaks_off_in_the_middle_of_an_answer_is_named_cou
     async with a_bench(tmp_path, serial_source=False, adc=False) as bench:
         await bench.next_says()
         bench.reader("break-off")
-        await bench.until(lambda: bench.skin.facts()["openings"] == 2)
+        await bench.until(lambda: bench.skin.diagnostics()["connections"] == 2)
         await bench.next_says()
-        facts = bench.skin.facts()
+        facts = bench.skin.diagnostics()
         assert facts["errors"] == {"lost": 1, "unfinished": 1, **errors_of_start(bench)}
         told = str(facts["last_loss"])
         assert told.startswith("The scanner broke off in the middle of its answer to 'READ?': 127.0.0.1:")
@@ -326,7 +319,7 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
             bench.reader(fault)
         count = len(bench.samples)
         await bench.until(lambda: len(bench.samples) > count + 10)
-        facts = bench.skin.facts()
+        facts = bench.skin.diagnostics()
         assert isinstance(facts["errors"], dict)
         assert facts["errors"]["not two decimals"] == 2
         bench.reader("stuck")
@@ -334,7 +327,7 @@ async def test_lines_of_the_board_that_are_missing_torn_or_garbage_are_counted(t
 
 
 async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
-    scanner = ScpiSocket(played_daq.Scanner(Circuit(lambda: (R1, R2)), time.monotonic).feed, answer_s=0.0)
+    scanner = SocketServer(lambda: EmulatedScanner(Circuit(lambda: (R1, R2))).feed, answer_s=0.0)
     sentences: asyncio.Queue[str] = asyncio.Queue()
 
     def on_event(event: LinkEvent) -> None:
@@ -342,7 +335,7 @@ async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
             sentences.put_nowait(event.sentence)
 
     async with asyncio.timeout(DEADLINE_S):
-        await scanner.bring_back()
+        await scanner.restore()
         source = Keithley6430(TcpLink("127.0.0.1", scanner.port, on_event=on_event))
 
         async def watch() -> None:
@@ -354,4 +347,4 @@ async def test_an_instrument_that_is_no_source_is_refused_by_name() -> None:
         assert "says it is 'Agilent Technologies,34972A" in await sentences.get()
         task.cancel()
         await asyncio.wait([task])
-        await scanner.lose()
+        await scanner.disconnect()

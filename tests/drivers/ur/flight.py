@@ -1,4 +1,4 @@
-"""A pilot that flies an arm of a test's own, cycle by cycle."""
+"""A handler that flies an arm of a test's own, cycle by cycle."""
 
 import dataclasses
 import math
@@ -106,8 +106,8 @@ class FakeArm:
             self.be(moving_linearly=False)
         return self.takes
 
-    def kick(self) -> bool:
-        self.hear("kick")
+    def send_heartbeat(self) -> bool:
+        self.hear("send_heartbeat")
         return True
 
     def clear_command(self) -> bool:
@@ -157,7 +157,7 @@ class FakeArm:
 
 
 class Flight:
-    """A pilot, its arm and the time."""
+    """A handler, its arm and the time."""
 
     def __init__(self, settings: UrSettings = SETTINGS, *, takes_over: bool = False) -> None:
         self.arm = FakeArm()
@@ -168,19 +168,19 @@ class Flight:
         self.begin_anew(takes_over=takes_over)
 
     def begin_anew(self, *, takes_over: bool) -> None:
-        """Put another pilot in the place of the one before."""
+        """Put another handler in the place of the one before."""
         self.cycle = 0
-        self.pilot = CommandHandler(self._settings, self.arm, self.now_ns, takes_over=takes_over)
+        self.handler = CommandHandler(self._settings, self.arm, self.now_ns, takes_over=takes_over)
 
     def be_alone(self) -> None:
-        """Let a cycle pass without a pilot; what is done then is the program's own."""
+        """Let a cycle pass without a handler; what is done then is the program's own."""
         self.arm.cycle()
         self.now_ns += CYCLE_NS
 
     def ask(self, command: Command) -> CommandReply:
         """Send a command and return its reply, letting cycles pass until it comes."""
         self.number += 1
-        reply = self.pilot.request(self.number, command, self.arm.reading, self.now_ns)
+        reply = self.handler.request(self.number, command, self.arm.reading, self.now_ns)
         for _ in range(6000):
             if reply is not None or self.number in self.decided:
                 break
@@ -190,8 +190,8 @@ class Flight:
     def fly(self, cycles: int, *, daemon_alive: bool = True) -> None:
         for _ in range(cycles):
             if daemon_alive:
-                self.pilot.heard(self.now_ns)
-            decided = self.pilot.tick(self.arm.reading, self.now_ns)
+                self.handler.note_daemon_alive(self.now_ns)
+            decided = self.handler.tick(self.arm.reading, self.now_ns)
             if decided is not None:
                 assert decided[0] not in self.decided
                 self.decided[decided[0]] = decided[1]
@@ -208,7 +208,7 @@ class Flight:
 
     @property
     def state(self) -> RobotState:
-        return self.pilot.state(self.arm.reading, self.cycle)
+        return self.handler.state(self.arm.reading, self.cycle)
 
     @property
     def wrist_speed(self) -> float:

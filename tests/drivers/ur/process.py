@@ -6,8 +6,7 @@ from typing import NoReturn
 import pytest
 
 from shearloop.drivers.ur import worker as child
-from shearloop.drivers.ur.messages import Configure, Message, RobotState, RtdeSample
-from shearloop.drivers.ur.wire import Decoder, encode
+from shearloop.drivers.ur.messages import Configure, Message, MessageDecoder, RobotState, RtdeSample, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 
@@ -24,8 +23,8 @@ class Daemon:
         os.set_blocking(self._stdout, False)
         self._all = [its_stdin, self._stdin, self._stdout, its_stdout]
         self.pipe = child.Pipe(its_stdin, its_stdout)
-        monkeypatch.setattr(child, "_alarm", lambda _seconds: None)
-        monkeypatch.setattr(child, "_leave", self._left)
+        monkeypatch.setattr(child, "_set_alarm", lambda _seconds: None)
+        monkeypatch.setattr(child, "_exit", self._left)
 
     @staticmethod
     def _left(_status: int) -> NoReturn:
@@ -36,7 +35,7 @@ class Daemon:
             os.write(self._stdin, encode(message, number))
 
     def hear(self) -> list[tuple[int, Message]]:
-        return Decoder().feed(os.read(self._stdout, 1 << 20))
+        return MessageDecoder().feed(os.read(self._stdout, 1 << 20))
 
     def close(self) -> None:
         for descriptor in self._all:
@@ -57,7 +56,7 @@ class CyclingArm(FakeArm):
 
 def fly(daemon: Daemon, arm: CyclingArm) -> None:
     with pytest.raises(LeftError):
-        child._fly(daemon.pipe, Configure(SETTINGS), arm)  # type: ignore[arg-type]  # an arm in all that counts
+        child._control(daemon.pipe, Configure(SETTINGS), arm)  # type: ignore[arg-type]  # an arm in all that counts
 
 
 class Time:

@@ -11,8 +11,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
+from shearloop.drivers.ur.controller import ReceivedSample
 from shearloop.drivers.ur.messages import MoveLinear, WristSpeed
-from shearloop.drivers.ur.receiver import Received
 from tests.drivers.ur.flight import SETTINGS
 
 SIX = (0.0,) * 6
@@ -30,9 +30,9 @@ class Client:
     def getScript(self) -> str:  # noqa: N802 - ur-rtde's name
         return "        keep_running = True\n"
 
-    def latest(self) -> Received:
+    def latest(self) -> ReceivedSample:
         """Be a controller whose program has ended while a command was done, and not ready again."""
-        return Received(1.0, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 2)
+        return ReceivedSample(1.0, SIX, SIX, SIX, SIX, 7, 1, 1, 1.0, 2)
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
             setattr(module, kind, Client)
         monkeypatch.setitem(sys.modules, name, module)
     arm = importlib.import_module("shearloop.drivers.ur.arm")
-    monkeypatch.setattr(arm, "Receiver", Client)
+    monkeypatch.setattr(arm, "RtdeReceiver", Client)
     yield arm
     del sys.modules["shearloop.drivers.ur.arm"]
 
@@ -59,7 +59,7 @@ def test_sample_that_has_waited_in_the_socket_is_read_as_old(arm: ModuleType, mo
     monkeypatch.setattr(reader, "_control", SimpleNamespace(isConnected=lambda: True))
     six = (0.0,) * 6
     for number, waited_ns in enumerate([0, 0, 200_000_000]):
-        sample = Received(50.0 + 0.008 * number, six, six, six, six, 7, 1, 2, 1.0, 1)
+        sample = ReceivedSample(50.0 + 0.008 * number, six, six, six, six, 7, 1, 2, 1.0, 1)
         monkeypatch.setattr(reader, "_receiver", SimpleNamespace(latest=lambda it=sample: it, connected=True))
         now_ns = 10**12 + 8_000_000 * number + waited_ns
         assert reader.read().age_ns == pytest.approx(waited_ns, abs=3_000_000)
@@ -70,7 +70,7 @@ def test_kernel_that_does_not_let_threads_be_woken_late_does_not_prevent_connect
 ) -> None:
     monkeypatch.setattr(ctypes, "CDLL", lambda *_, **__: SimpleNamespace(prctl=lambda *_: -1))
     assert arm.UrArm(SETTINGS, VERSION)._control.connected
-    assert "woken more often than needed" in capsys.readouterr().err
+    assert "wake more often than needed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("watchdog_hz", "slack_ms"), [(2.0, 16), (10.0, 16), (40.0, 4)])
@@ -115,9 +115,9 @@ def test_a_straight_move_is_asked_after_from_its_beginning_until_the_wrist_is_tu
     times_s = iter(range(1, 100))
     monkeypatch.setattr(
         arm,
-        "Receiver",
+        "RtdeReceiver",
         lambda *_: SimpleNamespace(
-            connected=True, latest=lambda: Received(float(next(times_s)), SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
+            connected=True, latest=lambda: ReceivedSample(float(next(times_s)), SIX, SIX, SIX, SIX, 7, 1, 2, 1.0, 1)
         ),
     )
     one = arm.UrArm(SETTINGS, VERSION)
@@ -156,7 +156,7 @@ def test_nothing_is_asked_of_the_client_for_which_it_would_wait_in_vain(
     monkeypatch.setattr(arm.rtde_control, "RTDEControlInterface", Hanging)
     one = arm.UrArm(SETTINGS, VERSION)
     assert one.zero_wrench()
-    assert not one.kick()
+    assert not one.send_heartbeat()
     assert not one.wrist(WristSpeed(0.1, 1.0))
     assert not one.move(MoveLinear(SIX, 0.1, 0.1))
     assert not one.stop_move(1.0)

@@ -25,7 +25,7 @@ def test_unlocking_that_a_disconnection_ends_is_answered(daemon: Daemon) -> None
     fly(daemon, arm)
     assert arm.calls == []
     replies = {number: message for number, message in daemon.hear() if isinstance(message, CommandReply)}
-    assert "disconnects" in replies[1].refused
+    assert "disconnects" in replies[1].refusal
     assert replies[2].accepted
 
 
@@ -78,7 +78,12 @@ def test_program_that_plays_and_was_started_here_is_ended(daemon: Daemon) -> Non
 
     arm = Ready()
     fly(daemon, arm)
-    assert [call for call in arm.calls if call != "kick"] == ["clear_command", "upload", "arm_watchdog", "end_program"]
+    assert [call for call in arm.calls if call != "send_heartbeat"] == [
+        "clear_command",
+        "upload",
+        "arm_watchdog",
+        "end_program",
+    ]
 
 
 def test_program_of_somebody_else_plays_on_when_the_process_leaves(daemon: Daemon) -> None:
@@ -128,7 +133,7 @@ class Arm(FakeArm):
 
 # As the client's threads may, this one keeps the interpreter from ending.
 threading.Thread(target=threading.Event().wait).start()
-child._configuration = lambda pipe: Configure(SETTINGS)
+child._receive_configuration = lambda pipe: Configure(SETTINGS)
 child._connect = lambda pipe, settings: Arm()
 child.main()
 """

@@ -22,7 +22,7 @@ def test_each_command_is_answered_at_once(daemon: Daemon) -> None:
     flight = flying()
     for acceleration, accepted in ((4.0, True), (-4.0, False)):
         daemon.say(WristSpeed(0.1, acceleration))
-        child._obey(daemon.pipe, flight.pilot, flight.state)
+        child._handle_commands(daemon.pipe, flight.handler, flight.state)
         assert [message.accepted for _, message in daemon.hear() if isinstance(message, CommandReply)] == [accepted]
 
 

@@ -16,7 +16,7 @@ def test_each_state_is_sent_and_the_robot_kept_awake_in_each_cycle(
     timed = Timed(daemon, monkeypatch, (0.405, Disconnect()))
     assert [state.cycle for state in timed.states] == [0, 0, 1, 1, 2, 2, *range(3, 52)]
     assert timed.arm.read_s[:51] == pytest.approx([0.008 * cycle for cycle in range(51)])
-    assert timed.arm.calls.count("kick") == 49
+    assert timed.arm.calls.count("send_heartbeat") == 49
 
 
 def test_a_late_cycle_begins_at_once_and_is_not_caught_up_with(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,10 +89,10 @@ def test_robot_that_is_made_ready_no_more_is_told_at_once_however_soon(
     arm.be(robot_mode=3)
     given_up = CommandHandler.tick
 
-    def tick(pilot: CommandHandler, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
-        if now_ns > 1000.1e9 and pilot._recovery is not None:
-            pilot._recovery.give_up("Nobody waits for it.")
-        return given_up(pilot, reading, now_ns)
+    def tick(handler: CommandHandler, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
+        if now_ns > 1000.1e9 and handler._recovery is not None:
+            handler._recovery.give_up("Nobody waits for it.")
+        return given_up(handler, reading, now_ns)
 
     monkeypatch.setattr("shearloop.drivers.ur.command_handler.CommandHandler.tick", tick)
     timed = Timed(daemon, monkeypatch, (0.201, Unlock()), (0.4, Disconnect()), arm=arm)

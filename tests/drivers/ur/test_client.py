@@ -25,7 +25,7 @@ async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5
     """Turn the wrist, and return when it is up to speed."""
     since_ns = time.monotonic_ns()
     reply = await robot.send(WristSpeed(speed, 4.0))
-    assert reply.accepted, reply.refused
+    assert reply.accepted, reply.refusal
     await controller.event("motion-started", since_ns)
     await until(robot, lambda state: abs(state.qd_rad_per_s[5]) > 0.9 * abs(speed))
 
@@ -36,9 +36,9 @@ def stopped_after_s(event: dict[str, int], since_ns: int) -> float:
 
 async def test_states_arrive_and_commands_are_answered_with_what_is_sent(controller: ControllerProcess) -> None:
     async with running(settings_for(controller.host)) as robot:
-        assert "not connected" in (await robot.send(Enable())).refused
+        assert "not connected" in (await robot.send(Enable())).refusal
         await until(robot, lambda state: state.program_running and not state.recovering)
-        assert "not been enabled" in (await robot.send(WristSpeed(0.1, 1.0))).refused
+        assert "not been enabled" in (await robot.send(WristSpeed(0.1, 1.0))).refusal
         await enable(robot)
 
         reply = await robot.send(WristSpeed(3.0, 9.0))
@@ -52,7 +52,7 @@ async def test_states_arrive_and_commands_are_answered_with_what_is_sent(control
 
         assert (await robot.send(Stop(4.0))).sent == Stop(4.0)
         state = await until(robot, lambda state: state.motion == "idle")
-        assert state.ended == "stopped on command"
+        assert state.end_reason == "stopped on command"
         assert (await robot.send(ZeroForceTorque())).accepted
 
         x, y, z, *turned = state.tcp_pose
@@ -61,7 +61,7 @@ async def test_states_arrive_and_commands_are_answered_with_what_is_sent(control
         assert reply.sent == MoveLinear(target, 0.1, 0.5)
         number = (await until(robot, lambda state: state.motion == "linear")).motion_id
         state = await until(robot, lambda state: state.motion == "idle")
-        assert (state.motion_id, state.ended) == (number, "arrived")
+        assert (state.motion_id, state.end_reason) == (number, "arrived")
         assert state.tcp_pose[2] == pytest.approx(z - 0.02, abs=1e-5)
 
 
@@ -74,10 +74,10 @@ async def test_a_linear_move_is_stopped_and_another_goes_on_from_there(controlle
         await until(robot, lambda state: state.tcp_pose[2] > z + 0.01)
         assert (await robot.send(Stop(4.0))).sent == Stop(4.0)
         state = await until(robot, lambda state: state.motion == "idle")
-        assert (state.ended, state.blocked) == ("stopped on command", "")
+        assert (state.end_reason, state.blocked) == ("stopped on command", "")
         assert state.tcp_pose[2] < z + 0.03
         assert (await robot.send(move)).accepted
-        await until(robot, lambda state: state.motion == "idle" and state.ended == "arrived")
+        await until(robot, lambda state: state.motion == "idle" and state.end_reason == "arrived")
         assert (await robot.next_state()).tcp_pose[2] == pytest.approx(z + 0.04, abs=1e-4)
 
 
@@ -108,7 +108,7 @@ async def test_twist_stops_when_the_client_is_killed(controller: ControllerProce
 
         state = await until(robot, lambda state: state.program_running and not state.recovering)
         assert "not been enabled" in state.blocked
-        assert "not been enabled" in (await robot.send(WristSpeed(0.1, 1.0))).refused
+        assert "not been enabled" in (await robot.send(WristSpeed(0.1, 1.0))).refusal
         await controller.event("watchdog-armed", stopped["t_mono_ns"])
         assert not controller.happened("motion-started", killed_ns), "a second motion"
         await enable(robot)
@@ -140,8 +140,8 @@ async def test_protective_stop_is_told_and_unlocked_in_the_same_process(controll
         asked_ns = await controller.fault("protective-stop")
         state = await until(robot, lambda state: state.protective_stop)
         assert "Protective stop" in state.blocked
-        assert "Protective stop" in (await robot.send(WristSpeed(0.1, 1.0))).refused
-        assert "Cannot unlock" in (await robot.send(Unlock())).refused
+        assert "Protective stop" in (await robot.send(WristSpeed(0.1, 1.0))).refusal
+        assert "Cannot unlock" in (await robot.send(Unlock())).refusal
         # The controller's own second has to pass.
         await until(robot, lambda later: later.timestamp_s > state.timestamp_s + 1.0)
         assert (await robot.send(Unlock())).accepted
@@ -158,7 +158,7 @@ async def test_emergency_stop_is_told_and_recovered_from(controller: ControllerP
         asked_ns = await controller.fault("emergency-stop")
         state = await until(robot, lambda state: state.emergency_stop)
         assert "Emergency stop" in state.blocked
-        assert "still pressed" in (await robot.send(Unlock())).refused
+        assert "still pressed" in (await robot.send(Unlock())).refusal
         await controller.fault("release")
         await until(robot, lambda state: not state.emergency_stop)
         assert (await robot.send(Unlock())).accepted
@@ -177,7 +177,7 @@ async def test_lost_rtde_ends_the_process_and_the_next_one_moves_nothing(control
         # What comes first is up to the client: our look at its connection, or its crash or hang in reconnecting.
         assert (await link.down()).kind in ("lost", "crashed", "hung")
         await until(robot, lambda state: state.program_running and not state.recovering)
-        assert "not been enabled" in (await robot.send(WristSpeed(0.5, 4.0))).refused
+        assert "not been enabled" in (await robot.send(WristSpeed(0.5, 4.0))).refusal
         await enable(robot)
         assert not controller.happened("motion-started", dropped_ns)
 
@@ -205,7 +205,7 @@ async def test_process_that_hangs_is_ended_and_started_again(controller: Control
         assert stopped_after_s(stopped, hung_ns) <= STOPPED_WITHIN_S
         unanswered = asyncio.create_task(robot.send(Stop(1.0)))
         assert (await link.down()).kind == "hung"
-        assert "ended before it answered" in (await unanswered).refused
+        assert "ended before it answered" in (await unanswered).refusal
         await enable(robot)
         assert not controller.happened("motion-started", hung_ns)
 
@@ -219,7 +219,7 @@ async def test_controller_that_falls_silent_is_told_and_the_robot_stops(controll
         stopped = await controller.event("motion-stopped", silent_ns)
         # Data is believed for state_timeout_s, then the watchdog is no longer kicked.
         assert stopped_after_s(stopped, silent_ns) <= robot.settings.state_timeout_s + STOPPED_WITHIN_S
-        assert "nothing new" in (await link.down(1)).sentence
+        assert "old: check its cable" in (await link.down(1)).sentence
         loss = await link.down(2)
         assert loss.kind == "silent"
         assert f"The UR controller at {controller.host} said nothing" in loss.sentence
@@ -245,7 +245,7 @@ async def test_connection_that_is_refused_is_explained(
         loss = await link.down()
         assert (loss.kind, robot.losses[kind]) == (kind, 1)
         assert said in loss.sentence
-        assert said in (await robot.send(Enable())).refused
+        assert said in (await robot.send(Enable())).refusal
 
 
 @pytest.mark.parametrize("told", [None, signal.SIGINT, signal.SIGTERM, signal.SIGHUP])

@@ -14,9 +14,8 @@ import pytest
 
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.client import UrRobot
-from shearloop.drivers.ur.messages import CommandReply, Failed, Stop
-from shearloop.drivers.ur.wire import encode
-from shearloop.drivers.ur.worker_connection import LAST_WORDS_BYTES, LostError, WorkerConnection, output
+from shearloop.drivers.ur.messages import CommandReply, Failed, Stop, encode
+from shearloop.drivers.ur.worker_connection import LAST_WORDS_BYTES, LostError, WorkerConnection, output_pipe
 from tests.drivers.ur.flight import SETTINGS, Flight, flying
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
@@ -74,10 +73,10 @@ async def test_long_line_of_a_process_is_heard_and_told_in_short(play: Callable[
 BRIEFLY = """
 import os, sys
 from shearloop.drivers.ur.messages import Configure
-from shearloop.drivers.ur.wire import Decoder, encode
+from shearloop.drivers.ur.messages import MessageDecoder, encode
 from tests.drivers.ur.flight import Flight
 
-decoder = Decoder()
+decoder = MessageDecoder()
 while not (heard := decoder.feed(os.read(0, 1 << 16))):
     pass
 with open(sys.argv[1], "a") as told:
@@ -92,11 +91,11 @@ LEAVES_IN_GOOD_ORDER = """
 import os, sys
 from shearloop.drivers.ur.messages import Disconnect
 from shearloop.drivers.ur.command_handler import CommandHandler
-from shearloop.drivers.ur.wire import Decoder, encode
+from shearloop.drivers.ur.messages import MessageDecoder, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
 os.write(1, encode(CommandHandler(SETTINGS, FakeArm(), 0).state(FakeArm().reading, 0)))
-decoder, last = Decoder(), None
+decoder, last = MessageDecoder(), None
 while heard := os.read(0, 1 << 16):
     for _, last in decoder.feed(heard):
         pass
@@ -120,11 +119,11 @@ async def test_process_is_ended_in_good_order_though_who_waits_for_a_reply_dies_
     async with asyncio.timeout(60):
         async with running(settings_for("127.0.0.254"), Link()) as robot:
             await robot.next_state()
-            robot.tell(Stop(1.0), dies)
-            robot.tell(Stop(1.0), replies.append)
+            robot.send_nowait(Stop(1.0), dies)
+            robot.send_nowait(Stop(1.0), replies.append)
     assert robot.pid is None
     assert told.read_text() == "True\n", "it was told to go, and went by itself"
-    assert ["ended before it answered" in reply.refused for reply in replies] == [True]
+    assert ["ended before it answered" in reply.refusal for reply in replies] == [True]
     assert [repr(context["exception"]) for context in unheard] == ["ZeroDivisionError('nothing to divide')"]
 
 
@@ -151,8 +150,8 @@ def lost_after(*readings: dict[str, int], flight: Flight) -> UrRobot:
     for reading in readings:
         flight.arm.be(**reading)
         flight.fly(1)
-        robot.take(0, flight.state)
-    robot._disconnected()
+        robot.handle_messages([(0, flight.state)])
+    robot._disconnect()
     return robot
 
 
@@ -187,9 +186,9 @@ async def test_stops_in_vain_are_counted_across_processes() -> None:
     robot = UrRobot(SETTINGS)
     for counts in ((0, 1, 1, 2), (0, 3)):
         for count in counts:
-            robot.take(0, replace(Flight().state, stops_in_vain=count))
-        robot._disconnected()
-    assert robot.stops_in_vain == 5
+            robot.handle_messages([(0, replace(Flight().state, failed_program_stops=count))])
+        robot._disconnect()
+    assert robot.failed_program_stops == 5
 
 
 async def test_of_states_that_are_read_at_once_only_the_last_is_the_newest() -> None:
@@ -198,25 +197,25 @@ async def test_of_states_that_are_read_at_once_only_the_last_is_the_newest() -> 
     robot.on_state = lambda _, is_newest: newest.append(is_newest)
     flight = Flight()
     flight.fly(1)
-    with output() as (stdout, its_stdout):
+    with output_pipe() as (stdout, its_stdout):
         process = Mock(spec=asyncio.subprocess.Process, stdin=Mock(), stderr=Mock())
-        conversation = WorkerConnection(robot, process, stdout)
+        connection = WorkerConnection(SETTINGS, process, stdout, robot.handle_messages)
         os.write(its_stdout.number, 3 * encode(flight.state) + encode(CommandReply(), 1))
-        conversation._hear()
+        connection._read()
         os.write(its_stdout.number, encode(flight.state))
-        conversation._hear()
+        connection._read()
     assert newest == [False, False, True, True]
 
 
 async def test_loss_that_is_told_when_nobody_listens_any_more_is_no_complaint_of_asyncio() -> None:
     complaints: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, said: complaints.append(said))
-    with output() as (stdout, its_stdout):
+    with output_pipe() as (stdout, its_stdout):
         process = Mock(spec=asyncio.subprocess.Process, stdin=Mock(), stderr=Mock())
-        conversation = WorkerConnection(UrRobot(SETTINGS), process, stdout)
+        connection = WorkerConnection(SETTINGS, process, stdout, UrRobot(SETTINGS).handle_messages)
         os.write(its_stdout.number, encode(Failed("lost", "The connection is lost.")))
-        conversation._hear()
-        del conversation
+        connection._read()
+        del connection
         gc.collect()
     assert complaints == []
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from shearloop.drivers.ur import worker_connection as conversation
+from shearloop.drivers.ur import worker_connection
 from shearloop.drivers.ur.worker_connection import HEARTBEAT, WorkerConnection
 from tests.drivers.ur.flight import SETTINGS
 
@@ -18,8 +18,8 @@ class Played:
     """A robot that is told a command each 8 ms until `commands_until_s`, and a clock that only sleeping moves on."""
 
     def __init__(self, commands_until_s: float, ends_s: float) -> None:
-        self.settings, self.takes_over, self.told_s = SETTINGS, False, 0.0
         self.now_s = 0.0
+        self.connection: Any = None
         self.signs_s: list[float] = []
         self._commands_until_s, self._ends_s = commands_until_s, ends_s
         self.transport = SimpleNamespace(get_write_buffer_size=lambda: 0)
@@ -35,7 +35,7 @@ class Played:
         # No sleep is as short as what rounding leaves.
         self.now_s += max(seconds, 1e-6)
         if self.now_s < self._commands_until_s:
-            self.told_s = self.now_s - self.now_s % 0.008
+            self.connection._sent_s = self.now_s - self.now_s % 0.008
         if self.now_s >= self._ends_s:
             raise asyncio.CancelledError
 
@@ -43,12 +43,13 @@ class Played:
 async def signs_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends_s: float) -> list[float]:
     """Return when signs of life were given."""
     played: Any = Played(commands_until_s, ends_s)
-    monkeypatch.setattr(conversation, "time", SimpleNamespace(monotonic=lambda: played.now_s))
-    talk = WorkerConnection(played, SimpleNamespace(stdin=played, stderr=object()), 0)  # type: ignore[arg-type]
+    monkeypatch.setattr(worker_connection, "time", SimpleNamespace(monotonic=lambda: played.now_s))
+    process: Any = SimpleNamespace(stdin=played, stderr=object())
+    played.connection = WorkerConnection(SETTINGS, process, 0, lambda _: None)
     with monkeypatch.context() as patched:
         patched.setattr(asyncio, "sleep", played.sleep)
         with pytest.raises(asyncio.CancelledError):
-            await talk.keep_alive()
+            await played.connection.keep_alive()
     return played.signs_s
 
 

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur import wire
+from shearloop.drivers.ur import messages as wire
 from shearloop.drivers.ur.messages import (
     CommandReply,
     Configure,
@@ -19,16 +19,17 @@ from shearloop.drivers.ur.messages import (
     Failed,
     Heartbeat,
     Message,
+    MessageDecoder,
     MoveLinear,
-    RobotPhase,
     RobotState,
     Stop,
     Unlock,
+    WorkerPhase,
     WristSpeed,
     ZeroForceTorque,
+    encode,
 )
 from shearloop.drivers.ur.settings import UrSettings
-from shearloop.drivers.ur.wire import Decoder, encode
 from tests.drivers.ur.test_limits import LIMITS
 
 finite = st.floats(allow_nan=False, allow_infinity=False)
@@ -44,7 +45,8 @@ mode, time_ns = st.integers(-(2**31), 2**31 - 1), st.integers(-(2**63), 2**63 - 
 states = st.builds(
     RobotState,
     t_mono_ns=time_ns, age_ns=time_ns, robot_mode=mode, safety_mode=mode, runtime_state=mode,
-    motion_id=st.integers(0, 2**32 - 1), cycle=st.integers(0, 2**64 - 1), stops_in_vain=st.integers(0, 2**32 - 1),
+    motion_id=st.integers(0, 2**32 - 1), cycle=st.integers(0, 2**64 - 1),
+    failed_program_stops=st.integers(0, 2**32 - 1),
     q_rad=six, qd_rad_per_s=six, tcp_pose=six, wrench=six, sent=sent, clipped=reasons,
     timestamp_s=finite, speed_scaling=finite, wrist_torque_nm=finite,
     motion=st.sampled_from(["idle", "wrist", "linear", "stopping"]),
@@ -52,7 +54,7 @@ states = st.builds(
 messages = st.one_of(
     wrist, line, stop, st.just(Enable()), st.just(Unlock()), st.just(ZeroForceTorque()), st.just(Disconnect()),
     st.just(Heartbeat()),
-    st.builds(CommandReply, st.text(), sent, reasons), st.builds(RobotPhase, st.text()),
+    st.builds(CommandReply, st.text(), sent, reasons), st.builds(WorkerPhase, st.text()),
     st.builds(Failed, st.sampled_from(["lost", "silent"]), st.text()), states,
     st.just(Configure(UrSettings(host="10.0.0.1", limits=LIMITS))),
 )  # fmt: skip
@@ -62,17 +64,17 @@ numbered = st.lists(st.tuples(st.integers(0, 2**32 - 1), messages), max_size=5)
 @given(numbered, st.lists(st.integers(0, 10_000), max_size=8))
 def test_messages_arrive_as_sent_in_any_pieces(entries: list[tuple[int, Message]], cuts: list[int]) -> None:
     stream = b"".join(encode(message, number) for number, message in entries)
-    decoder = Decoder()
+    decoder = MessageDecoder()
     edges = sorted({0, len(stream), *(cut for cut in cuts if cut < len(stream))})
     assert [entry for a, b in pairwise(edges) for entry in decoder.feed(stream[a:b])] == entries
 
 
 @given(st.binary(max_size=200))
 def test_foreign_bytes_are_refused_or_waited_on(data: bytes) -> None:
-    decoder = Decoder()
+    decoder = MessageDecoder()
     with contextlib.suppress(ProtocolError):
         for _, message in decoder.feed(data):
-            assert Decoder().feed(encode(message)) == [(0, message)]
+            assert MessageDecoder().feed(encode(message)) == [(0, message)]
 
 
 @pytest.mark.parametrize("fields", [(), ("0.1",), (math.nan,), (math.inf,), (0.1, 1.0), (None,), ((0.1, math.nan),)])
@@ -80,18 +82,18 @@ def test_command_with_anything_missing_wrong_or_more_is_refused(fields: tuple[ob
     stop = encode(Stop(0.1))
     code = msgpack.unpackb(stop)[1].code
     with pytest.raises(ProtocolError):
-        Decoder().feed(msgpack.packb((0, msgpack.ExtType(code, msgpack.packb(fields)))))
+        MessageDecoder().feed(msgpack.packb((0, msgpack.ExtType(code, msgpack.packb(fields)))))
 
 
 @pytest.mark.parametrize("message", [7, (1, 2), (0, "stop"), (0, LIMITS), ("0", Stop(0.1)), (0, Stop(0.1), 0)])
 def test_anything_but_a_numbered_message_is_refused(message: object) -> None:
     with pytest.raises(ProtocolError, match="no message"):
-        Decoder().feed(msgpack.packb(message, default=wire._packed))
+        MessageDecoder().feed(msgpack.packb(message, default=wire._packed))
 
 
 def test_message_of_an_unknown_type_is_refused() -> None:
     with pytest.raises(ProtocolError):
-        Decoder().feed(msgpack.packb((0, msgpack.ExtType(100, msgpack.packb(())))))
+        MessageDecoder().feed(msgpack.packb((0, msgpack.ExtType(100, msgpack.packb(())))))
 
 
 def test_states_carry_what_is_no_number() -> None:
@@ -99,7 +101,7 @@ def test_states_carry_what_is_no_number() -> None:
         0.0, (float("nan"),) * 6, (0.0,) * 6, (0.0,) * 6, (float("inf"),) * 6, 7, 1, 2, 1.0, 0, 0, True, False,
         0.0, False, False, "", False, "idle", 0, "", None, (), 3, False, 0,
     )  # fmt: skip
-    ((_, got),) = Decoder().feed(encode(state))
+    ((_, got),) = MessageDecoder().feed(encode(state))
     assert isinstance(got, RobotState)
     assert got.wrench == state.wrench
     assert all(map(math.isnan, got.q_rad))

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.ur.motion import is_close
+from shearloop.drivers.ur.motion_executor import is_close
 
 angles = st.floats(-math.pi, math.pi)
 vectors = st.tuples(angles, angles, angles)

@@ -95,7 +95,7 @@ async def test_our_paused_program_is_stopped_by_the_next_process(controller: Con
         os.kill(robot.pid, signal.SIGKILL)
         await link.down()
         assert (await controller.event("program-ended", since_ns))["detail"] == STOPPED
-        assert robot.stops_in_vain == hangs
+        assert robot.failed_program_stops == hangs
 
 
 async def test_dashboard_that_hangs_is_asked_again_and_the_operator_told_meanwhile(
@@ -109,5 +109,5 @@ async def test_dashboard_that_hangs_is_asked_again_and_the_operator_told_meanwhi
         assert state.runtime_state == PAUSED
         assert (await controller.event("program-ended", since_ns))["detail"] == STOPPED
         await until(robot, lambda state: "do not resume it" not in state.blocked)
-        assert robot.stops_in_vain == 1
+        assert robot.failed_program_stops == 1
         assert not robot.losses

@@ -1,4 +1,4 @@
-"""What the pilot sends and refuses: nothing moves before it is enabled, and what is sent is told."""
+"""What the handler sends and refuses: nothing moves before it is enabled, and what is sent is told."""
 
 import dataclasses
 
@@ -11,15 +11,15 @@ from tests.drivers.ur.flight import POSE, Flight, flying, turning
 def test_start_clears_the_last_command_uploads_and_arms_the_watchdog_in_this_order() -> None:
     flight = Flight()
     flight.fly(5)
-    assert flight.arm.calls == ["clear_command", "upload", "arm_watchdog", "kick", "kick"]
+    assert flight.arm.calls == ["clear_command", "upload", "arm_watchdog", "send_heartbeat", "send_heartbeat"]
 
 
 def test_nothing_moves_before_it_is_enabled() -> None:
     flight = Flight()
-    assert "made ready" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert "made ready" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     flight.fly(5)
-    assert "not been enabled" in flight.ask(WristSpeed(0.1, 1.0)).refused
-    assert "not been enabled" in flight.ask(MoveLinear(POSE, 0.1, 0.1)).refused
+    assert "not been enabled" in flight.ask(WristSpeed(0.1, 1.0)).refusal
+    assert "not been enabled" in flight.ask(MoveLinear(POSE, 0.1, 0.1)).refusal
     assert flight.state.blocked
     assert {"wrist", "move"}.isdisjoint(flight.arm.calls)
     assert flight.ask(Enable()).accepted
@@ -42,13 +42,13 @@ def test_what_was_sent_after_clipping_is_returned_and_reported() -> None:
 )
 def test_senseless_numbers_are_refused_in_a_sentence(command: Command) -> None:
     flight = flying()
-    assert "above 0" in flight.ask(command).refused
+    assert "above 0" in flight.ask(command).refusal
     assert not flight.arm.calls
 
 
 def test_wrench_is_zeroed_at_rest_only() -> None:
     flight = turning()
-    assert "only at rest" in flight.ask(ZeroForceTorque()).refused
+    assert "only at rest" in flight.ask(ZeroForceTorque()).refusal
     flight.fly_until(lambda state: state.motion == "idle")
     assert flight.ask(ZeroForceTorque()).accepted
     assert flight.arm.calls[-1] == "zero_wrench"
@@ -57,7 +57,7 @@ def test_wrench_is_zeroed_at_rest_only() -> None:
 def test_no_zero_hides_a_force_beyond_its_limit() -> None:
     flight = flying()
     flight.arm.be(wrench=(0.0, 0.0, 70.0, 0.0, 0.0, 0.0))
-    assert "Force is 70.00 N" in flight.ask(ZeroForceTorque()).refused
+    assert "Force is 70.00 N" in flight.ask(ZeroForceTorque()).refusal
     assert "zero_wrench" not in flight.arm.calls
 
 

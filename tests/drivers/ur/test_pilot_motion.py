@@ -20,13 +20,13 @@ def said_in(flight: Flight, cycles: int) -> list[int]:
 def test_wrist_speed_ends_when_it_is_not_renewed() -> None:
     flight = turning(0.5)
     state = flight.fly_until(lambda state: state.motion == "idle")
-    assert state.ended == "the wrist speed was not renewed within 0.3 s"
+    assert state.end_reason == "the wrist speed was not renewed within 0.3 s"
     assert flight.wrist_speed == 0
     # 0.3 s of turning, then 0.5/4 s of braking, then the speed thread is ended and the watchdog kicked.
     assert state.wrist_rad == pytest.approx(0.5 * 0.3, abs=0.03)
     assert flight.arm.calls[-1] == "end_speed"
     flight.fly(3)
-    assert flight.arm.calls[-1] == "kick"
+    assert flight.arm.calls[-1] == "send_heartbeat"
 
 
 def test_something_is_sent_in_each_cycle_of_a_motion() -> None:
@@ -38,7 +38,7 @@ def test_something_is_sent_in_each_cycle_of_a_motion() -> None:
     flight.fly_until(lambda state: state.motion == "idle")
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
     assert said_in(flight, 30) == [*range(30)]
-    assert flight.arm.calls[-1] == "kick"
+    assert flight.arm.calls[-1] == "send_heartbeat"
 
 
 @pytest.mark.parametrize("given_anew", [False, True])
@@ -76,7 +76,7 @@ def test_cycle_in_which_a_straight_move_comes_to_rest_gives_a_sign_of_life(cycle
     flight.arm.calls.clear()
     flight.fly(1)
     assert flight.state.motion == "idle"
-    assert flight.arm.calls == ["kick"]
+    assert flight.arm.calls == ["send_heartbeat"]
 
 
 def test_speed_that_is_the_one_before_another_motion_is_sent_after_it() -> None:
@@ -87,7 +87,7 @@ def test_speed_that_is_the_one_before_another_motion_is_sent_after_it() -> None:
     flight.fly(10)
     flight.arm.be(moving_linearly=False)
     flight.fly_until(lambda state: state.motion == "idle")
-    assert flight.arm.calls[-1] == "kick"
+    assert flight.arm.calls[-1] == "send_heartbeat"
     assert flight.ask(WristSpeed(0.0, 4.0)).accepted
     assert flight.arm.calls[-1] == "wrist"
 
@@ -99,7 +99,7 @@ def test_silence_of_the_daemon_ends_whatever_moves() -> None:
     assert flight.state.motion == "linear"
     flight.fly(30, daemon_alive=False)
     assert flight.state.motion == "idle"
-    assert "silent" in flight.state.ended
+    assert "silent" in flight.state.end_reason
     assert "stop_move" in flight.arm.calls
 
 
@@ -109,25 +109,25 @@ def test_linear_move_is_kicked_along_and_its_arrival_told() -> None:
     assert reply.sent == MoveLinear((-0.78, *POSE[1:]), 0.1, 0.1)
     assert len(reply.clipped) == 2
     flight.fly(20)
-    assert set(flight.arm.calls) == {"move", "kick"}
-    assert "linear move is under way" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert set(flight.arm.calls) == {"move", "send_heartbeat"}
+    assert "linear move is under way" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     flight.arm.be(moving_linearly=False, qd_rad_per_s=(0.1, 0.0, 0.0, 0.0, 0.0, 0.0))
-    flight.pilot.tick(flight.arm.reading, flight.now_ns)
+    flight.handler.tick(flight.arm.reading, flight.now_ns)
     assert flight.state.motion == "linear", "its joints are still said to move"
     flight.fly(2)
-    assert (flight.state.motion, flight.state.ended) == ("idle", "arrived")
+    assert (flight.state.motion, flight.state.end_reason) == ("idle", "arrived")
 
 
 def test_linear_move_has_a_deadline_and_inner_limits() -> None:
     flight = flying()
     flight.ask(MoveLinear(POSE, 0.1, 0.5))
     state = flight.fly_until(lambda state: state.motion == "idle")
-    assert "did not end within its time" in state.ended
+    assert "did not end within its time" in state.end_reason
     flight.ask(MoveLinear(POSE, 0.1, 0.5))
     flight.fly(3)
     flight.arm.be(wrench=(0.0, 0.0, 45.0, 0.0, 0.0, 0.0))
     flight.fly(2)
-    assert "force of 45.00 N is above the inner limit" in flight.state.ended
+    assert "force of 45.00 N is above the inner limit" in flight.state.end_reason
     assert flight.arm.calls.count("stop_move") == 2
 
 
@@ -137,10 +137,10 @@ def test_stop_ends_turning_before_anything_else_may_begin() -> None:
     assert reply.sent == Stop(2.0)
     flight.fly(1)
     assert flight.state.motion == "stopping"
-    assert "still stopping" in flight.ask(WristSpeed(0.5, 1.0)).refused
-    assert "stop it before" in flight.ask(MoveLinear(POSE, 0.1, 0.1)).refused
+    assert "still stopping" in flight.ask(WristSpeed(0.5, 1.0)).refusal
+    assert "stop it before" in flight.ask(MoveLinear(POSE, 0.1, 0.1)).refusal
     state = flight.fly_until(lambda state: state.motion == "idle")
-    assert state.ended == "stopped on command"
+    assert state.end_reason == "stopped on command"
     assert flight.ask(MoveLinear(POSE, 0.1, 0.1)).accepted
 
 
@@ -190,6 +190,6 @@ def test_disconnecting_stops_first() -> None:
     flight.arm.calls.clear()
     assert flight.ask(Disconnect()).accepted
     assert flight.arm.calls == ["wrist"], "at once, not in the next cycle"
-    assert not flight.pilot.at_rest
-    flight.fly_until(lambda _state: flight.pilot.at_rest)
+    assert not flight.handler.at_rest
+    flight.fly_until(lambda _state: flight.handler.at_rest)
     assert flight.wrist_speed == 0

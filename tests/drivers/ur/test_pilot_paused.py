@@ -1,11 +1,11 @@
-"""A program that is paused, in the pilot's own time: whose it is, when it is asked to stop, and what is told of it."""
+"""A program that is paused, in the handler's own time: its owner, and the requests to stop it."""
 
 from itertools import pairwise
 
 import pytest
 
 from shearloop.drivers.ur.messages import Disconnect, Enable, Unlock
-from shearloop.drivers.ur.paused import AGAIN_S
+from shearloop.drivers.ur.recovery import STOP_RETRIES_S
 from tests.drivers.ur.flight import CYCLE_NS, Flight, flying, turning
 
 ASKED = "stop_program"
@@ -21,14 +21,14 @@ def asked_s(flight: Flight, seconds: float) -> list[float]:
     return times
 
 
-def test_program_that_a_process_before_left_paused_is_stopped_before_anybody_resumes_it() -> None:
+def test_program_that_a_process_before_owns_paused_program_is_stopped_before_anybody_resumes_it() -> None:
     flight = Flight(takes_over=True)
     flight.arm.target = 0.5
     flight.arm.be(runtime_state=2)
     flight.arm.protective_stop()
     flight.fly(4)
     assert flight.arm.calls == ["stop_program"]
-    assert not flight.pilot.recovering
+    assert not flight.handler.recovering
     flight.arm.be_resumed_at_the_pendant()
     flight.fly(5)
     assert flight.wrist_speed == 0.0
@@ -39,7 +39,7 @@ def test_paused_program_that_cannot_be_stopped_keeps_nobody_from_unlocking() -> 
     flight.arm.stoppable = False
     flight.arm.be(safety_mode=3, runtime_state=4)
     flight.fly(300)
-    assert not flight.pilot.recovering
+    assert not flight.handler.recovering
     assert "Protective stop" in flight.state.blocked
     flight.arm.stoppable = True
     assert flight.ask(Unlock()).accepted
@@ -61,8 +61,8 @@ def test_dashboard_that_does_not_answer_is_asked_again_ever_less_often_and_not_f
     times = asked_s(flight, 200.0)
     pauses = [later - sooner for sooner, later in pairwise(times)]
     assert times[0] < 0.05
-    assert pauses == pytest.approx(AGAIN_S, abs=0.02)
-    assert flight.state.stops_in_vain == len(times)
+    assert pauses == pytest.approx(STOP_RETRIES_S, abs=0.02)
+    assert flight.state.failed_program_stops == len(times)
     assert "the dashboard does not answer): stop it at the teach pendant, do not resume it" in flight.state.blocked
     assert flight.state.blocked.startswith("Protective stop")
 
@@ -73,14 +73,14 @@ def test_dashboard_that_says_yes_and_does_nothing_is_asked_again_and_that_is_tol
     flight.arm.stop_program = lambda: None  # type: ignore[method-assign]
     flight.arm.protective_stop()
     flight.fly(100)
-    assert flight.state.stops_in_vain == 0, "it may take a moment"
+    assert flight.state.failed_program_stops == 0, "it may take a moment"
     flight.fly(50)
-    assert flight.state.stops_in_vain == 1
+    assert flight.state.failed_program_stops == 1
     assert "said that it is stopped, and it is not" in flight.state.blocked
     flight.arm.stop_program = stop_program  # type: ignore[method-assign]
     flight.fly_until(lambda state: "could not be stopped" not in state.blocked, 400)
     assert flight.arm.reading.runtime_state == 1
-    assert flight.state.stops_in_vain == 1
+    assert flight.state.failed_program_stops == 1
     assert len(flight.state.blocked) > 0
 
 
@@ -133,7 +133,7 @@ def test_program_that_is_begun_at_the_pendant_after_ours_has_ended_is_left_alone
     flight.fly(3)
     flight.arm.protective_stop()
     assert asked_s(flight, 5.0) == []
-    assert not flight.pilot.left_paused(flight.arm.reading)
+    assert not flight.handler.owns_paused_program(flight.arm.reading)
 
 
 def test_program_that_another_process_left_is_asked_for_once_more_when_this_one_leaves() -> None:
@@ -143,7 +143,7 @@ def test_program_that_another_process_left_is_asked_for_once_more_when_this_one_
     flight.fly(10)
     assert flight.ask(Disconnect()).accepted
     assert asked_s(flight, 5.0) == [], "while it leaves, by who leaves"
-    assert flight.pilot.left_paused(flight.arm.reading)
+    assert flight.handler.owns_paused_program(flight.arm.reading)
 
 
 def test_paused_program_that_is_stopped_is_started_by_the_operator_alone() -> None:
@@ -163,8 +163,8 @@ def test_program_that_is_just_being_started_is_ours_though_the_operator_starts_a
     flight = Flight()
     flight.fly(2)
     assert flight.arm.calls == ["clear_command", "upload"]
-    assert flight.pilot.request(1, Unlock(), flight.arm.reading, flight.now_ns) is None
-    assert flight.state.ours
+    assert flight.handler.request(1, Unlock(), flight.arm.reading, flight.now_ns) is None
+    assert flight.state.owns_program
 
 
 @pytest.mark.parametrize(("played_s", "times"), [(0.5, 1), (4.0, 0)])
@@ -199,7 +199,7 @@ def test_program_whose_states_are_old_is_not_taken_for_somebody_elses() -> None:
     assert len(asked_s(flight, 0.5)) == 1
 
 
-def test_program_that_both_a_process_and_its_daemon_left_paused_is_told_to_who_may_resume_it() -> None:
+def test_program_that_both_a_process_and_its_daemon_owns_paused_program_is_told_to_who_may_resume_it() -> None:
     """Once the protective stop is unlocked at the pendant, its button to play would turn the wrist."""
     flight = Flight()
     flight.arm.be(safety_mode=3, runtime_state=4)

@@ -1,4 +1,4 @@
-"""What the pilot does when the robot stops, is stopped or does not follow, and the way back on the operator's word."""
+"""Stops, faults and a robot that does not follow, and the recovery on the operator's request."""
 
 import pytest
 
@@ -10,13 +10,13 @@ from tests.drivers.ur.flight import POSE, SETTINGS, Flight, flying, turning
 def test_robot_that_does_not_take_a_command_is_left_to_its_watchdog(command: WristSpeed | Stop) -> None:
     flight = turning()
     flight.arm.takes = False
-    assert "does not answer" in flight.ask(command).refused
+    assert "does not answer" in flight.ask(command).refusal
     flight.arm.calls.clear()
     flight.fly(50)
     assert flight.arm.calls == []
     assert (flight.wrist_speed, flight.arm.reading.program_running) == (0, False)
     flight.arm.takes = True
-    assert "unlock" in flight.ask(Enable()).refused.lower()
+    assert "unlock" in flight.ask(Enable()).refusal.lower()
     assert flight.ask(Unlock()).accepted
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
@@ -40,7 +40,7 @@ def test_linear_move_that_does_not_take_its_stop_is_left_to_the_watchdog() -> No
     flight.arm.stops_moves = False
     flight.fly(60, daemon_alive=False)
     assert not flight.arm.reading.program_running
-    assert "silent" in flight.state.ended
+    assert "silent" in flight.state.end_reason
 
 
 def test_arm_that_moves_unasked_is_left_to_the_watchdog() -> None:
@@ -49,10 +49,10 @@ def test_arm_that_moves_unasked_is_left_to_the_watchdog() -> None:
     flight.fly(20)
     assert flight.state.motion == "idle"
     state = flight.fly_until(lambda state: bool(state.blocked), 30)
-    assert "although nothing was asked" in state.blocked
+    assert "without a command" in state.blocked
     flight.fly(30)
     assert flight.wrist_speed == 0
-    assert "unlock" in flight.ask(WristSpeed(0.1, 1.0)).refused.lower()
+    assert "unlock" in flight.ask(WristSpeed(0.1, 1.0)).refusal.lower()
 
 
 def test_program_that_someone_resumes_is_not_kept_going() -> None:
@@ -64,7 +64,7 @@ def test_program_that_someone_resumes_is_not_kept_going() -> None:
     flight.arm.calls.clear()
     flight.fly(1)
     assert flight.state.blocked.startswith("A program runs on the robot that someone else started or resumed")
-    assert "someone else" in flight.ask(Enable()).refused
+    assert "someone else" in flight.ask(Enable()).refusal
     flight.fly(40)
     assert flight.arm.calls == []
     assert flight.wrist_speed == 0
@@ -77,7 +77,7 @@ def test_program_that_somebody_else_runs_is_not_stopped_before_the_operator_says
     flight.arm.be(runtime_state=2)
     flight.fly(500)
     assert flight.arm.calls == []
-    assert "someone else" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert "someone else" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     assert flight.ask(Unlock()).accepted
     assert "stop_program" in flight.arm.calls
 
@@ -102,7 +102,7 @@ def test_program_that_was_begun_after_the_loss_of_ours_is_not_stopped_before_the
     flight.arm.be(runtime_state=4)
     flight.fly(50)
     assert flight.arm.calls == []
-    assert not flight.state.ours
+    assert not flight.state.owns_program
     assert flight.ask(Unlock()).accepted
 
 
@@ -112,26 +112,26 @@ def test_program_that_was_not_started_here_is_sent_nothing() -> None:
     flight.fly(5)
     flight.arm.be(safety_mode=1, runtime_state=2)
     flight.fly(5)
-    assert "someone else" in flight.ask(Enable()).refused
+    assert "someone else" in flight.ask(Enable()).refusal
     assert flight.arm.calls == []
     assert flight.ask(Unlock()).accepted
     assert flight.arm.calls[:4] == ["close_popups", "stop_program", "clear_command", "upload"]
 
 
-def test_program_that_plays_just_after_a_given_up_start_may_be_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_program_that_plays_just_after_a_given_up_start_may_own_program(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its upload was sent, and takes only after the operator's stop; ours ends by its watchdog before long."""
     flight = Flight()
     monkeypatch.setattr(flight.arm, "upload", lambda: True)
     flight.fly(5)
-    recovery = flight.pilot._recovery
+    recovery = flight.handler._recovery
     assert recovery is not None
     recovery.give_up("Nobody waits for it.")
     flight.fly(5)
     assert not flight.state.recovering
-    assert not flight.state.ours
-    assert flight.pilot.may_be_ours(flight.now_ns)
+    assert not flight.state.owns_program
+    assert flight.handler.may_own_program(flight.now_ns)
     flight.fly(250)
-    assert not flight.pilot.may_be_ours(flight.now_ns)
+    assert not flight.handler.may_own_program(flight.now_ns)
 
 
 def test_hard_limit_stops_and_holds_until_enabled_anew() -> None:
@@ -140,10 +140,10 @@ def test_hard_limit_stops_and_holds_until_enabled_anew() -> None:
     flight.fly(1)
     assert flight.state.motion == "stopping"
     flight.fly_until(lambda state: state.motion == "idle")
-    assert "Torque is 6.50 N m" in flight.ask(Enable()).refused
+    assert "Torque is 6.50 N m" in flight.ask(Enable()).refusal
     flight.arm.be(wrench=(0.0,) * 6)
     flight.fly(50)
-    assert "Torque is 6.50 N m" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert "Torque is 6.50 N m" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     assert flight.ask(Enable()).accepted
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
@@ -157,10 +157,10 @@ def test_protective_stop_ends_motion_and_is_cured_on_the_operators_word() -> Non
     assert flight.state.protective_stop
     assert flight.state.blocked.startswith("Protective stop")
     assert flight.arm.calls == ["stop_program"], "above all nothing is unlocked"
-    assert "Protective stop" in flight.ask(Enable()).refused
+    assert "Protective stop" in flight.ask(Enable()).refusal
 
     flight.arm.unlockable = False
-    assert "first 5 s" in flight.ask(Unlock()).refused
+    assert "first 5 s" in flight.ask(Unlock()).refusal
     flight.arm.unlockable = True
     flight.arm.calls.clear()
     assert flight.ask(Unlock()).accepted
@@ -176,7 +176,7 @@ def test_emergency_stop_is_cured_after_the_button_is_released() -> None:
     flight.arm.be(safety_mode=7, robot_mode=3)
     flight.fly(10)
     assert flight.state.emergency_stop
-    assert "still pressed" in flight.ask(Unlock()).refused
+    assert "still pressed" in flight.ask(Unlock()).refusal
     flight.arm.be(safety_mode=1)
     flight.fly(10)
     assert "not powered" in flight.state.blocked
@@ -201,7 +201,7 @@ def test_program_that_ended_is_said_and_started_again_on_the_operators_word() ->
     flight.arm.end_program()
     flight.fly(50)
     assert "does not run" in flight.state.blocked
-    assert "does not run" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert "does not run" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     assert flight.ask(Unlock()).accepted
 
 
@@ -211,8 +211,8 @@ def test_recovery_gives_up_in_time_and_says_where_it_stands() -> None:
     flight.arm.upload = lambda: True  # type: ignore[method-assign]  # an upload that never takes
     begun_ns = flight.now_ns
     reply = flight.ask(Unlock())
-    assert "within 30 s" in reply.refused
-    assert "program state 1" in reply.refused
+    assert "within 30 s" in reply.refusal
+    assert "program state 1" in reply.refusal
     assert flight.now_ns - begun_ns == pytest.approx(30e9, rel=0.01)
 
 
@@ -221,8 +221,8 @@ def test_old_data_is_not_believed() -> None:
     flight.arm.be(age_ns=300_000_000)
     flight.arm.calls.clear()
     flight.fly(10)
-    assert flight.arm.calls == [], "without a kick the robot's watchdog stops it"
-    assert "a state that is 0.30 s old" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert flight.arm.calls == [], "without a send_heartbeat the robot's watchdog stops it"
+    assert "is 0.30 s old" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     flight.arm.be(age_ns=0)
     flight.fly(40)
     assert flight.state.blocked, "what came back is not trusted by itself"
@@ -235,7 +235,7 @@ def test_old_data_of_an_arm_at_rest_needs_no_other_program() -> None:
     flight.fly(10)
     flight.arm.be(age_ns=0)
     flight.fly(10)
-    assert "nothing new" in flight.ask(WristSpeed(0.1, 1.0)).refused
+    assert "old: check its cable" in flight.ask(WristSpeed(0.1, 1.0)).refusal
     assert flight.ask(Enable()).accepted
     assert flight.ask(WristSpeed(0.1, 1.0)).accepted
 
@@ -246,11 +246,11 @@ def test_unlocking_is_ended_by_disconnecting_and_by_a_stop(command: Disconnect |
     flight.arm.be(robot_mode=3, runtime_state=1)
     flight.fly(1)
     flight.arm.calls.clear()
-    assert flight.pilot.request(98, Unlock(), flight.arm.reading, flight.now_ns) is None
-    flight.pilot.request(99, command, flight.arm.reading, flight.now_ns)
+    assert flight.handler.request(98, Unlock(), flight.arm.reading, flight.now_ns) is None
+    flight.handler.request(99, command, flight.arm.reading, flight.now_ns)
     flight.fly(300)
     assert flight.arm.calls == []
-    assert not flight.pilot.recovering
+    assert not flight.handler.recovering
     assert not flight.decided[98].accepted
 
 
@@ -259,9 +259,9 @@ def test_starting_the_program_is_ended_by_disconnecting() -> None:
     assert flight.ask(Disconnect()).accepted
     flight.fly(300)
     assert flight.arm.calls == []
-    assert flight.pilot.at_rest
+    assert flight.handler.at_rest
     for command in (Enable(), Unlock(), WristSpeed(0.1, 1.0)):
-        assert "disconnects" in flight.ask(command).refused
+        assert "disconnects" in flight.ask(command).refusal
 
 
 def test_unlocking_a_controller_whose_states_stay_old_is_answered_in_time() -> None:
@@ -271,7 +271,7 @@ def test_unlocking_a_controller_whose_states_stay_old_is_answered_in_time() -> N
     # As of a network that has become slow for good: not so old that the connection counts as lost.
     flight.arm.be(age_ns=400_000_000)
     since_ns = flight.now_ns
-    assert "did not get ready" in flight.ask(Unlock()).refused
+    assert "did not get ready" in flight.ask(Unlock()).refusal
     assert flight.now_ns - since_ns < (SETTINGS.recover_timeout_s + 1.0) * 1e9
     flight.arm.be(age_ns=0)
     flight.arm.calls.clear()

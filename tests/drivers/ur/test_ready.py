@@ -4,9 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from shearloop.drivers.ur import ready as ready_module
-from shearloop.drivers.ur.ready import Ready
-from shearloop.drivers.ur.receiver import Received
+from shearloop.drivers.ur import controller as ready_module
+from shearloop.drivers.ur.controller import ReceivedSample, ScriptReadiness
 
 SIX = (0.0,) * 6
 READY, DONE = 1, 2
@@ -22,9 +21,9 @@ class Samples:
         self.taken, self.now_s = 0, 5.0
         monkeypatch.setattr(ready_module, "time", SimpleNamespace(monotonic=lambda: self.now_s))
 
-    def latest(self) -> Received:
+    def latest(self) -> ReceivedSample:
         script_state, runtime_state = self._said[min(self.taken, len(self._said) - 1)]
-        return Received(50.0 + 0.008 * self.taken, SIX, SIX, SIX, SIX, 7, 1, runtime_state, 1.0, script_state)
+        return ReceivedSample(50.0 + 0.008 * self.taken, SIX, SIX, SIX, SIX, 7, 1, runtime_state, 1.0, script_state)
 
     def wait(self, seconds: float) -> bool:
         self.now_s += min(max(seconds, 0.0), 0.008)
@@ -34,14 +33,14 @@ class Samples:
 
 def test_where_no_command_was_done_nothing_is_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = Samples(monkeypatch, (DONE, STOPPED))
-    assert Ready(samples, 0.1).wait()
+    assert ScriptReadiness(samples, 0.1).wait()
     assert samples.taken == 0
 
 
 def test_only_a_sample_of_after_the_command_says_that_the_script_is_ready(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = Samples(monkeypatch, (READY, PLAYING), (DONE, PLAYING), (DONE, PLAYING), (READY, PLAYING))
-    ready = Ready(samples, 0.1)
-    ready.called()
+    ready = ScriptReadiness(samples, 0.1)
+    ready.command_sent()
     assert ready.wait()
     assert samples.taken == 3
     assert ready.wait()
@@ -54,8 +53,8 @@ def test_program_that_has_ended_or_pauses_is_not_waited_for(
 ) -> None:
     """The watchdog ends it in the middle of a command where the computer was away for long: ready it never becomes."""
     samples = Samples(monkeypatch, (DONE, PLAYING), (DONE, PLAYING), (DONE, runtime_state))
-    ready = Ready(samples, 0.1)
-    ready.called()
+    ready = ScriptReadiness(samples, 0.1)
+    ready.command_sent()
     assert not ready.wait()
     assert samples.taken == 2
     assert not ready.wait()
@@ -65,15 +64,15 @@ def test_script_that_stays_done_is_waited_for_no_longer_than_the_watchdog_is_pat
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     samples = Samples(monkeypatch, (DONE, PLAYING))
-    ready = Ready(samples, 0.1)
-    ready.called()
+    ready = ScriptReadiness(samples, 0.1)
+    ready.command_sent()
     assert not ready.wait()
     assert samples.now_s == pytest.approx(5.1, abs=0.01)
 
 
 def test_connection_that_has_ended_says_nothing_of_the_script(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = Samples(monkeypatch, (READY, PLAYING))
-    ready = Ready(samples, 0.1)
-    ready.called()
+    ready = ScriptReadiness(samples, 0.1)
+    ready.command_sent()
     samples.taken, samples.connected = 1, False
     assert not ready.wait()

@@ -12,9 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.errors import ProtocolError
-from shearloop.drivers.ur import receiver as receiver_module
-from shearloop.drivers.ur.probe import ProbeError
-from shearloop.drivers.ur.receiver import Received, Receiver, SampleParser
+from shearloop.drivers.ur import controller as receiver_module
+from shearloop.drivers.ur.controller import ProbeError, ReceivedSample, RtdeReceiver, SampleParser
 
 TYPES = b"DOUBLE,VECTOR6D,VECTOR6D,VECTOR6D,VECTOR6D,INT32,INT32,UINT32,DOUBLE,INT32"
 
@@ -35,7 +34,7 @@ def text(length: int) -> bytes:
 
 def test_sample_has_the_values_in_their_order() -> None:
     sample = SampleParser().feed(data(3))
-    assert sample == Received(
+    assert sample == ReceivedSample(
         timestamp_s=3.0,
         q_rad=(3.0, 3.01, 3.02, 3.03, 3.04, 3.05),
         qd_rad_per_s=(3.06, 3.07, 3.08, 3.09, 3.1, 3.11),
@@ -117,7 +116,7 @@ def play(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Controller]]
         controller.close()
 
 
-def arrived(receiver: Receiver, timestamp_s: float) -> bool:
+def arrived(receiver: RtdeReceiver, timestamp_s: float) -> bool:
     """Look until the sample is there, or the connection's end."""
     while receiver.latest().timestamp_s != timestamp_s and receiver.connected:
         pass
@@ -126,7 +125,7 @@ def arrived(receiver: Receiver, timestamp_s: float) -> bool:
 
 def test_outputs_are_asked_for_at_the_rate_and_the_newest_is_kept(play: Callable[..., Controller]) -> None:
     controller = play()
-    receiver = Receiver("127.0.0.1", 125.0, 5.0)
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     assert controller.asked[b"O"].startswith(struct.pack(">d", 125.0) + b"timestamp,actual_q,")
     assert receiver.latest().timestamp_s == 1.0
     controller.send(data(2) + data(3) + data(4)[:100])
@@ -145,7 +144,7 @@ def test_connection_that_ends_or_carries_something_else_is_no_connection(
     play: Callable[..., Controller], last: bytes
 ) -> None:
     controller = play()
-    receiver = Receiver("127.0.0.1", 125.0, 5.0)
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     controller.send(data(2) + last)
     if not last:
         controller.close()
@@ -160,7 +159,7 @@ def test_connection_that_the_network_gives_up_is_lost_and_nothing_else(
     play: Callable[..., Controller], number: int
 ) -> None:
     play()
-    receiver = Receiver("127.0.0.1", 125.0, 5.0)
+    receiver = RtdeReceiver("127.0.0.1", 125.0, 5.0)
     receiver.close()
     receiver.connected = True
     with mock.patch.object(receiver, "_connection") as connection:
@@ -179,4 +178,4 @@ def test_controller_that_does_not_send_what_is_needed_is_refused(
 ) -> None:
     play(*answers)
     with pytest.raises(ProbeError, match=told):
-        Receiver("127.0.0.1", 125.0, 5.0)
+        RtdeReceiver("127.0.0.1", 125.0, 5.0)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from shearloop.drivers.ur.sample_age import RISES, SampleAge
+from shearloop.drivers.ur.controller import _OFFSET_RISE, SampleAge
 
 PERIOD_NS = 8_000_000
 STARTED_NS = 7 * 10**12
@@ -44,14 +44,14 @@ def test_timestamp_that_is_no_number_is_nothing_new(bad: float) -> None:
     age = SampleAge()
     age.age_ns(5.0, STARTED_NS)
     assert age.age_ns(bad, STARTED_NS + 300_000_000) == 300_000_000
-    assert age.age_ns(5.3, STARTED_NS + 310_000_000) == pytest.approx(10_000_000, abs=1.01 * RISES * 310_000_000)
+    assert age.age_ns(5.3, STARTED_NS + 310_000_000) == pytest.approx(10_000_000, abs=1.01 * _OFFSET_RISE * 310_000_000)
 
 
 def test_controller_that_was_started_again_has_another_clock() -> None:
     age = SampleAge()
     age.age_ns(5000.0, STARTED_NS)
     assert age.age_ns(0.5, STARTED_NS + 10**9) == 0
-    assert age.age_ns(0.508, STARTED_NS + 10**9 + 28_000_000) == pytest.approx(20_000_000, abs=RISES * 29e6)
+    assert age.age_ns(0.508, STARTED_NS + 10**9 + 28_000_000) == pytest.approx(20_000_000, abs=_OFFSET_RISE * 29e6)
 
 
 @pytest.mark.parametrize("drift", [-1e-4, 1e-4, 5e-4, 5e-3])
@@ -66,7 +66,7 @@ def test_clock_that_is_slower_for_good_is_not_believed() -> None:
 
 
 def test_controller_whose_clock_stood_still_is_believed_again_in_time() -> None:
-    ages = ages_s([0.001] * 10 + [0.101] * round(1.01 * 0.1 / RISES / 0.008))
+    ages = ages_s([0.001] * 10 + [0.101] * round(1.01 * 0.1 / _OFFSET_RISE / 0.008))
     assert ages[10] > 0.09
     assert ages[-1] == 0.0
 
@@ -79,4 +79,4 @@ def test_age_is_the_wait_beyond_the_least_one_so_far_but_for_what_the_offset_may
         waits_s[number] = max(waits_s[number], waits_s[number - 1] - 0.008)
     for number, age_s in enumerate(ages_s(waits_s)):
         beyond_s = waits_s[number] - min(waits_s[: number + 1])
-        assert beyond_s - RISES * (number * 0.008 + 0.5) - 1e-6 <= age_s <= beyond_s + 1e-6
+        assert beyond_s - _OFFSET_RISE * (number * 0.008 + 0.5) - 1e-6 <= age_s <= beyond_s + 1e-6

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shearloop.drivers.ur.script import in_a_file, watched
+from shearloop.drivers.ur.arm import _memory_file, arm_watchdog_in
 from tests.drivers.ur.robots import ROOT
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
@@ -26,7 +26,7 @@ os._exit(0)
 def test_of_ur_rtdes_own_script_one_line_is_new_and_comes_before_it_reads_a_register() -> None:
     script_client = pytest.importorskip("script_client", reason="ur-rtde has wheels for CPython up to 3.12 only")
     text = script_client.ScriptClient("", 5, 17).getScript()
-    program = watched(text, 10.0)
+    program = arm_watchdog_in(text, 10.0)
     lines, its = program.splitlines(), ["def rtde_control():", *text.splitlines(), "end"]
     (at,) = [number for number, line in enumerate(lines) if "rtde_set_watchdog(" in line and ", 10," in line]
     assert lines[at].strip() == 'rtde_set_watchdog("input_int_register_0", 10, "stop")'
@@ -39,12 +39,12 @@ def test_of_ur_rtdes_own_script_one_line_is_new_and_comes_before_it_reads_a_regi
 
 
 def test_script_of_another_form_is_not_touched() -> None:
-    assert not watched("def other():\n  sync()\nend\n", 10.0)
-    assert not watched("        keep_running = True\n" * 2, 10.0)
+    assert not arm_watchdog_in("def other():\n  sync()\nend\n", 10.0)
+    assert not arm_watchdog_in("        keep_running = True\n" * 2, 10.0)
 
 
 def test_program_is_in_a_file_for_as_long_as_it_is_needed() -> None:
-    with in_a_file("a program\n") as path:
+    with _memory_file("a program\n") as path:
         assert [Path(path).read_text() for _ in range(2)] == ["a program\n"] * 2
 
 

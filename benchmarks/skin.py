@@ -1,0 +1,82 @@
+"""The shear skin's models, time against error to the converged 2-D solution.
+
+    python -m benchmarks.skin
+
+Follows one loading to 1 N and one hysteresis loop between ± 1 N under 1 N of normal force. Errors are the largest
+difference of response, relative to the largest response. Times are the best of several runs, per load step. The
+reference is converged to 2e-5.
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.skin.membrane import (
+    PAPER_SECTION,
+    loading_response,
+    paper_membrane,
+    response_of_strains,
+    section_membrane,
+)
+from shearloop.bank.skin.plane_strain import (
+    MESH_56,
+    MESH_112,
+    MESH_448,
+    MESH_1792,
+    MeshSize,
+    condense,
+    gauge_strains,
+    states_along,
+)
+from shearloop.bank.skin.statistics import loading, loop, responses
+
+NORMAL_N, AMPLITUDE_N = 1.0, 1.0
+Model = Callable[[FloatArray], FloatArray]
+
+
+def two_dimensional(mesh: MeshSize) -> Model:
+    """Return the 2-D model on a mesh."""
+    skin = condense(PAPER_SECTION, mesh)
+    return lambda path: response_of_strains(*gauge_strains(skin, states_along(skin, NORMAL_N, path.tolist())).T)
+
+
+def models() -> dict[str, Model]:
+    """Return the models by name."""
+    return {
+        "closed form": lambda path: np.array(
+            [loading_response(PAPER_SECTION, NORMAL_N, shear) for shear in path.tolist()]
+        ),
+        "1-D, paper's F/(EA)": partial(responses, paper_membrane(), normal_n=NORMAL_N),
+        "1-D, section's EA": partial(responses, section_membrane(), normal_n=NORMAL_N),
+        **{f"2-D, {mesh.elements} elements": two_dimensional(mesh) for mesh in (MESH_56, MESH_112, MESH_448)},
+    }
+
+
+def seconds(action: Callable[[], object], repeats: int = 5) -> float:
+    """Return the shortest time of several runs."""
+    times = []
+    for _ in range(repeats):
+        begun = time.perf_counter()
+        action()
+        times.append(time.perf_counter() - begun)
+    return min(times)
+
+
+def main() -> None:
+    """Measure and print a table."""
+    up, there_and_back = loading(AMPLITUDE_N), loop(AMPLITUDE_N)
+    reference = two_dimensional(MESH_1792)
+    true_up, true_loop = reference(up), reference(there_and_back)
+    scale = abs(true_loop).max()
+    print("| model | µs per step | loading | whole loop |\n|---|---|---|---|")
+    for name, model in models().items():
+        step_us = 1e6 * seconds(partial(model, there_and_back)) / len(there_and_back)
+        errors = abs(model(up) - true_up).max() / scale, abs(model(there_and_back) - true_loop).max() / scale
+        print(f"| {name} | {step_us:.1f} | {errors[0]:.3%} | {errors[1]:.3%} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,191 @@
+"""Records the emulated rig and calibrates its fingertips: `python -m shearloop.daemon.cli.demo_calibration`.
+
+As on a real rig, a recording holds idle frames, a grip, twists with the load cell's torque, and idle frames again, for
+several cylinders. It runs on the emulated rig's physics in simulated time, so that a seed always gives the same files:
+`rig-DDmm.mcap`, `rig.cal` for both fingertips together, and one calibration for each of them.
+"""
+
+import argparse
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.bank.eit.channels import channels_of_line
+from shearloop.bank.estimation import Calibration, FrameSeries, fit
+from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
+from shearloop.daemon.analysis.series import series_of
+from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.schema import DIAMETER_NOTE
+from shearloop.daemon.recording.writer import RecordingWriter
+from shearloop.daemon.synthetic import frame_maker
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S
+from shearloop.drivers.emulators.boards import LOAD_PERIOD_S
+from shearloop.drivers.emulators.rig import NOISE_NM, SIDES, FrameOf
+from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper
+from shearloop.drivers.emulators.scene import Scene
+
+# Three diameters are enough to interpolate; five halve the interval.
+DIAMETERS_MM = (10.0, 17.5, 25.0, 32.5, 40.0)
+# The time step; about the duration of an injection.
+STEP_S = 0.02
+IDLE_S, SETTLE_S = 12.0, 10.0
+N_TWISTS = 12
+# Ranges of the wrist's angles, speeds and holds in a grip.
+ANGLES_RAD, SPEEDS_RAD_PER_S, HOLDS_S = (-0.12, 0.25), (0.05, 0.5), (1.0, 15.0)
+# Gripper commands: activate, grip a tool with about 60 N, open.
+ACTIVATE, GRIP = Command(act=True), Command(act=True, gto=True, pos=255, spe=128, force=110)
+_OPEN = replace(GRIP, pos=0)
+
+Sides = tuple[str, ...]
+
+
+def lines_of(scene: Scene, frame_of: FrameOf) -> list[NDArray[np.float64]]:
+    """Return the lines of both boards, (1024,) in volts, for frames that end now."""
+    seen = scene.frame(FRAME_PERIOD_S)
+    return [frame_of(seen.grip, sign * seen.shear_torque_nm, seen.diameter_mm) for sign in SIDES.values()]
+
+
+@dataclass(slots=True)
+class RecordedTwists:
+    """Frames and torques with their simulated times."""
+
+    frame_s: list[float] = field(default_factory=list)
+    lines: list[list[NDArray[np.float64]]] = field(default_factory=list)
+    torque_s: list[float] = field(default_factory=list)
+    torque_nm: list[float] = field(default_factory=list)
+
+    def series(self, diameter_mm: float) -> FrameSeries:
+        """Return the series that a reader makes of the recording."""
+        t_s = np.array(self.frame_s)
+        channels = np.array([[channels_of_line(line) for line in pair] for pair in self.lines])
+        return FrameSeries(
+            "raw",
+            tuple(SIDES),
+            t_s,
+            channels,
+            np.array(self.torque_s),
+            np.array(self.torque_nm),
+            np.full(len(t_s), diameter_mm),
+        )
+
+    def write(self, path: Path, diameter_mm: float) -> None:
+        """Write a recording that begins at the Unix time 0."""
+        notes = {DIAMETER_NOTE: f"{diameter_mm:g}"}
+        with RecordingWriter(path, "the emulated rig, by shearloop.daemon.cli.demo_calibration", notes) as writer:
+            for t_s, pair in zip(self.frame_s, self.lines, strict=True):
+                for side, line in zip(SIDES, pair, strict=True):
+                    writer.add_frame(side, round(t_s * 1e9), round((t_s + FRAME_PERIOD_S / 2) * 1e9), line)
+            for t_s, torque_nm in zip(self.torque_s, self.torque_nm, strict=True):
+                writer.add_torque(round(t_s * 1e9), torque_nm)
+
+
+class TwistPlayer:
+    """One scene with a tool, and its recording."""
+
+    def __init__(self, frame_of: FrameOf, diameter_mm: float, seed: int) -> None:
+        self.recorded = RecordedTwists()
+        self._random = np.random.default_rng(seed)
+        self._frame_of = frame_of
+        self._gripper = Gripper(between=lambda _: diameter_mm)
+        self._scene = Scene(self._gripper)
+        self._wrist_rad = 0.0
+        self._due_frame_s, self._due_torque_s = FRAME_PERIOD_S, LOAD_PERIOD_S
+
+    def run(self) -> None:
+        """Idle, grip, twist, release."""
+        self._gripper.command = ACTIVATE
+        while self._gripper.sta != 3:
+            self._step()
+        self._still(IDLE_S)
+        self._gripper.command = GRIP
+        self._still(SETTLE_S)
+        for angle_rad in self._angles():
+            self._turn_to(angle_rad, self._random.uniform(*SPEEDS_RAD_PER_S))
+            self._still(self._random.uniform(*HOLDS_S))
+        self._turn_to(0.0, 0.2)
+        self._still(SETTLE_S)
+        self._gripper.command = _OPEN
+        self._still(IDLE_S)
+
+    def _angles(self) -> Iterator[float]:
+        """Yield angles over the whole range in random order, with a zero after every third."""
+        for number, share in enumerate(self._random.permutation(np.linspace(0.0, 1.0, N_TWISTS))):
+            yield ANGLES_RAD[0] + float(share) * (ANGLES_RAD[1] - ANGLES_RAD[0])
+            if number % 3 == 2:
+                yield 0.0
+
+    def _turn_to(self, angle_rad: float, speed_rad_per_s: float) -> None:
+        while self._wrist_rad != angle_rad:
+            step = np.clip(angle_rad - self._wrist_rad, -speed_rad_per_s * STEP_S, speed_rad_per_s * STEP_S)
+            self._wrist_rad = angle_rad if abs(angle_rad - self._wrist_rad) <= abs(step) else self._wrist_rad + step
+            self._step()
+
+    def _still(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self._step()
+
+    def _step(self) -> None:
+        self._scene.step(STEP_S, self._wrist_rad)
+        now_s = self._scene.time_s
+        if now_s >= self._due_frame_s:
+            self._due_frame_s += FRAME_PERIOD_S
+            self.recorded.frame_s.append(now_s - FRAME_PERIOD_S / 2)
+            self.recorded.lines.append(lines_of(self._scene, self._frame_of))
+        if now_s >= self._due_torque_s:
+            self._due_torque_s += LOAD_PERIOD_S
+            self.recorded.torque_s.append(now_s - LOAD_PERIOD_S / 2)
+            noise_nm = self._random.normal(0.0, NOISE_NM)
+            self.recorded.torque_nm.append(self._scene.conversion_nm(LOAD_PERIOD_S) + noise_nm)
+
+
+def record(
+    bank: Path, seed: int, diameters_mm: tuple[float, ...] = DIAMETERS_MM
+) -> Iterator[tuple[float, RecordedTwists]]:
+    """Yield each cylinder's diameter and recording."""
+    frame_of = frame_maker(bank, seed)
+    for number, diameter_mm in enumerate(diameters_mm):
+        play = TwistPlayer(frame_of, diameter_mm, seed + number)
+        play.run()
+        yield diameter_mm, play.recorded
+
+
+def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
+    """Return the default estimator's calibration for these fingertips."""
+    chosen = [one.select_sides(sides) for one in recordings]
+    return fit(
+        "motion_regression", chosen, "the emulated rig, by shearloop.daemon.cli.demo_calibration", timed_by=recordings
+    )
+
+
+def main() -> None:
+    """Record, calibrate, and print the calibrations' accuracy on a separate recording."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--bank", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True, help="folder for recordings and calibrations")
+    parser.add_argument("--seed", type=int, default=7)
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    recordings = []
+    for diameter_mm, recorded in record(args.bank, args.seed):
+        path = args.out / f"rig-{diameter_mm:g}mm.mcap"
+        recorded.write(path, diameter_mm)
+        recordings.append(series_of(read_recording(path)))
+    apart = [recorded.series(mm) for mm, recorded in record(args.bank, args.seed + 100, (20.0,))]
+    both: Sides = tuple(SIDES)
+    for sides in itertools.chain([both], ((side,) for side in both)):
+        calibration = calibrate(recordings, sides)
+        path = args.out / ("rig.cal" if sides == both else f"rig-{sides[0]}.cal")
+        calibration.save(path)
+        figures = figures_of([estimate_series(calibration, one) for one in apart])
+        print(
+            f"{path}: torque ± {figures['rmse_nm']:.4f} N·m, diameter ± {figures['diameter_rmse_mm']:.1f} mm, "
+            f"valid {figures['valid_fraction']:.2f} of the frames, intervals cover {figures['coverage_95']:.2f}"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""`shearloop emulate DEVICE`: plays one device on its own port or socket."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from shearloop.daemon.cli.emulate import boards, rig, robots, skin
+from shearloop.daemon.errors import UserError
+
+DEVICES = {**boards.DEVICES, **robots.DEVICES, **skin.DEVICES, **rig.DEVICES}
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add a sub-parser per device."""
+    devices = parser.add_subparsers(dest="device", metavar="DEVICE", required=True)
+    for name, device in DEVICES.items():
+        device.configure(devices.add_parser(name, help=device.summary, description=f"Play {device.summary}."))
+
+
+class _RaisingParser(argparse.ArgumentParser):
+    """Raises UserError instead of ending the program."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(message)
+
+
+def checked_arguments(device: str, arguments: Sequence[str], folder: Path) -> argparse.Namespace:
+    """Return the parsed arguments of a device, as a configuration in `folder` gives them.
+
+    Raises UserError for wrong arguments and for a missing bank.
+    """
+    parser = _RaisingParser(prog=device, allow_abbrev=False, add_help=False)
+    DEVICES[device].configure(parser)
+    args = parser.parse_args(arguments)
+    bank = getattr(args, "bank", None)
+    if bank is not None and not (folder / bank).exists():
+        raise UserError(f"--bank {bank}: there is no such file; make it with `shearloop bank build`")
+    return args
+
+
+def run(args: argparse.Namespace) -> int:
+    """Play the device until SIGINT or SIGTERM, or until standard input, if it is a pipe, is closed."""
+    return DEVICES[args.device].run(args)

@@ -1,0 +1,119 @@
+"""An emulator's console: runs until a signal or the end of its input, with commands on standard input."""
+
+import argparse
+import asyncio
+import contextlib
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Coroutine, Iterator
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.signals import ending_signals
+
+STDIN = 0
+READ_BYTES = 4096
+
+print_port = partial(print, flush=True)
+
+
+class Device(NamedTuple):
+    """The command of one emulated device."""
+
+    summary: str
+    configure: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], int]
+
+
+def print_event(event: str, **fields: object) -> None:
+    """Print an event as a JSON object on a line."""
+    print(json.dumps({"t_mono_ns": time.monotonic_ns(), "event": event, **fields}), flush=True)
+
+
+def play(device: Coroutine[None, None, None], on_command: Callable[[str], None]) -> None:
+    """Run `device` until it ends, SIGINT, SIGTERM or SIGHUP comes, or standard input is closed.
+
+    Each line of standard input, if that is a pipe or a terminal, goes to `on_command`; a ValueError is printed.
+    """
+    asyncio.run(_play(device, on_command))
+
+
+@contextlib.contextmanager
+def report_busy_address(what: str, cure: str) -> Iterator[None]:
+    """Turn an OSError, alone or in a group, into a UserError: an address or port is not available."""
+    try:
+        yield
+    except* OSError as errors:
+        error: BaseException = errors
+        while isinstance(error, BaseExceptionGroup):
+            error = error.exceptions[0]
+        raise UserError(f"{what}: {error}; {cure}") from None
+
+
+async def _play(device: Coroutine[None, None, None], on_command: Callable[[str], None]) -> None:
+    loop = asyncio.get_running_loop()
+    task = asyncio.create_task(device)
+    partial_line = bytearray()
+
+    def read() -> None:
+        data = os.read(STDIN, READ_BYTES)
+        if not data:
+            loop.remove_reader(STDIN)
+            task.cancel()
+        *lines, rest = (bytes(partial_line) + data).split(b"\n")
+        partial_line[:] = rest[:READ_BYTES]
+        for line in filter(None, (line.decode(errors="replace").strip() for line in lines)):
+            try:
+                on_command(line)
+            except ValueError as error:
+                print(error, file=sys.stderr, flush=True)
+
+    for number in ending_signals():
+        loop.add_signal_handler(number, task.cancel)
+    # A file or /dev/null cannot be watched, and gives no commands.
+    with contextlib.suppress(PermissionError):
+        loop.add_reader(STDIN, read)
+    try:
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+    finally:
+        loop.remove_reader(STDIN)
+
+
+def add_link(parser: argparse.ArgumentParser) -> None:
+    """Add `--link`."""
+    parser.add_argument("--link", type=Path, metavar="PATH", help="a name for the port that outlives its replugging")
+
+
+def checked_link(link: Path | None) -> Path | None:
+    """Return the path for the link, after making its folder; UserError if that fails."""
+    if link is None:
+        return None
+    try:
+        # Only one level: `run/` of a fresh checkout.
+        link.parent.mkdir(exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--link {link} cannot be made: {error.strerror}; choose another folder") from error
+    if link.exists() and not link.is_symlink():
+        raise UserError(f"--link {link} cannot be made: a file has this name; choose another")
+    return link
+
+
+def check_positive(args: argparse.Namespace, *names: str) -> None:
+    """Raise UserError for an argument that is not a positive number."""
+    for name in names:
+        value = getattr(args, name)
+        if not (math.isfinite(value) and value > 0):
+            raise UserError(f"--{name.replace('_', '-')} {value:g} is not above 0")
+
+
+def check_range(args: argparse.Namespace, name: str, low: float, high: float, unit: str = "") -> None:
+    """Raise UserError for an argument outside a range."""
+    value = getattr(args, name)
+    if not low <= value <= high:
+        raise UserError(f"--{name.replace('_', '-')} {value:g} is outside {low:g} to {high:g}{unit}")

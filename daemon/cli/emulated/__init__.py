@@ -1,1 +1,0 @@
-"""`shearloop emulate`, one module per device."""

@@ -1,0 +1,128 @@
+"""Clients of a daemon: receive its messages, send it a command."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import zmq
+
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.addresses import LARGEST_PORT, has_valid_port, needs_keys
+from shearloop.daemon.messaging.keys import ClientKeys
+from shearloop.daemon.messaging.messages import decode, encode
+
+# A running daemon sends `health` every second.
+QUIET_S = 3.0
+LONGEST_TIMEOUT_S = 86_400
+_ENVELOPE = frozenset({"timestamp", "t_mono_ns", "seq", "source"})
+
+
+def receive_messages(
+    address: str,
+    topics: Iterable[str],
+    timeout_s: float | None = None,
+    keys: ClientKeys | None = None,
+    on_quiet: Callable[[], None] = lambda: None,
+) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield (topic, content) of each message with a topic that starts with one of `topics`, or of all messages.
+
+    Calls `on_quiet` if no message arrives in the first QUIET_S. Raises UserError for a malformed address, and if no
+    message arrives for `timeout_s`.
+    """
+    with zmq.Context() as context, context.socket(zmq.SUB) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        connect(socket, address, keys)
+        for topic in tuple(topics) or ("",):
+            socket.setsockopt(zmq.SUBSCRIBE, topic.encode())
+        if timeout_s is None and not socket.poll(int(QUIET_S * 1000)):
+            on_quiet()
+        while True:
+            if timeout_s is not None and not socket.poll(int(timeout_s * 1000)):
+                raise UserError(
+                    f"no message came from {address} for {timeout_s:g} s; start the daemon with "
+                    "`shearloop run CONFIG`, or give the address of its `publish` key with --connect"
+                    f"{keys_hint(keys)}"
+                )
+            parts = socket.recv_multipart()
+            try:
+                name, payload = parts
+                content = decode(payload)
+                if missing := _ENVELOPE - content.keys():
+                    raise ValueError(f"it lacks {', '.join(sorted(missing))}")
+            except ValueError as error:
+                raise UserError(
+                    f"the messages of {address} are not shearloop's ({error}); give the address of the daemon's "
+                    "`publish` key with --connect"
+                ) from error
+            yield name.decode(errors="replace"), content
+
+
+def send_command(
+    address: str, content: Mapping[str, Any], timeout_s: float, keys: ClientKeys | None = None
+) -> dict[str, Any]:
+    """Send one command and return the daemon's reply; raises UserError if no reply comes in time."""
+    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
+        socket.setsockopt(zmq.LINGER, 0)
+        socket.setsockopt(zmq.SNDTIMEO, int(timeout_s * 1000))
+        connect(socket, address, keys)
+        try:
+            socket.send(encode(content))
+            answered = bool(socket.poll(int(timeout_s * 1000)))
+        except zmq.Again:
+            answered = False
+        if not answered:
+            raise no_reply(address, timeout_s, keys)
+        return decode_reply(socket.recv(), address)
+
+
+def no_reply(address: str, timeout_s: float, keys: ClientKeys | None) -> UserError:
+    """Return the error for a command without a reply."""
+    return UserError(
+        f"no daemon answered at {address} within {timeout_s:g} s; start it with `shearloop run CONFIG`, "
+        f"or give the address of its `commands` key with --connect{keys_hint(keys)}"
+    )
+
+
+def decode_reply(data: bytes, address: str) -> dict[str, Any]:
+    """Return a reply; raises UserError if it is not a daemon's."""
+    try:
+        return decode(data)
+    except ValueError as error:
+        raise UserError(
+            f"the program at {address} is not a shearloop daemon ({error}); give the address of the daemon's "
+            "`commands` key with --connect"
+        ) from error
+
+
+def connect(socket: "zmq.Socket[Any]", address: str, keys: ClientKeys | None = None) -> None:
+    """Connect a socket; raises UserError for a malformed address and for a network address without keys."""
+    if not has_valid_port(address):
+        raise UserError(
+            f"{address} has no valid port (a whole number up to {LARGEST_PORT}); give one such as tcp://127.0.0.1:7761"
+        )
+    if keys is not None:
+        keys.apply(socket)
+    elif needs_keys(address):
+        raise UserError(
+            f"{address} is not on this machine: give your key with --key and the daemon's with --server-key, "
+            "made by `shearloop keys`"
+        )
+    try:
+        socket.connect(address)
+    except zmq.ZMQError as error:
+        raise UserError(
+            f"{address!r} is not an address ({error.strerror}); it looks like tcp://127.0.0.1:7761"
+        ) from error
+
+
+def check_timeout_s(timeout_s: float) -> float:
+    """Return the value of --timeout; raises UserError if it is out of range."""
+    if not 0 < timeout_s <= LONGEST_TIMEOUT_S:
+        raise UserError(f"--timeout {timeout_s:g} is out of range; give seconds above 0, up to {LONGEST_TIMEOUT_S}")
+    return timeout_s
+
+
+def keys_hint(keys: ClientKeys | None) -> str:
+    """Return a hint about keys: a daemon on the network does not answer a wrong key at all."""
+    if keys is None:
+        return "; a daemon with a network address answers only with --key and --server-key"
+    return "; it answers only keys that `shearloop keys allow` has added"

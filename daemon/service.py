@@ -1,0 +1,201 @@
+"""The daemon as a systemd service: state notifications, installation and removal."""
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+from shearloop.daemon.errors import UserError
+
+UNIT = "shearloop.service"
+EXAMPLE = "etc/shearloop/shearloop.yaml"
+REAL_TIME = f"etc/systemd/system/{UNIT}.d/realtime.conf"
+# Target of each file of `systemd/`, relative to the system's root.
+PLACES = {
+    "shearloop.sysusers.conf": "etc/sysusers.d/shearloop.conf",
+    "shearloop.tmpfiles.conf": "etc/tmpfiles.d/shearloop.conf",
+    "60-shearloop.rules": "etc/udev/rules.d/60-shearloop.rules",
+    UNIT: f"etc/systemd/system/{UNIT}",
+}
+# The program's path in the unit file of `systemd/`.
+_PROGRAM = "/opt/shearloop/bin/shearloop"
+# Hidden from the service by ProtectHome and PrivateTmp.
+_HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - nothing is written there
+
+
+def notify(*states: str) -> bool:
+    """Send states such as `READY=1` by sd_notify(3) without blocking; return False if systemd does not get them."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return False
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as manager:
+        try:
+            # A leading @ stands for the zero byte of an abstract address.
+            manager.sendto("\n".join(states).encode(), f"\0{address[1:]}" if address[0] == "@" else address)
+        except OSError:
+            return False
+    return True
+
+
+class Step(NamedTuple):
+    """One step: a sentence that says what `run` does. `run` is None when nothing needs to be done."""
+
+    sentence: str
+    run: Callable[[], object] | None = None
+
+
+def service_file(name: str) -> str:
+    """Return the text of a file of `systemd/`."""
+    return resources.files("shearloop").joinpath("systemd", name).read_text(encoding="utf-8")
+
+
+def unit_for(program: Path) -> str:
+    """Return the unit file that runs this program."""
+    return service_file(UNIT).replace(_PROGRAM, str(program))
+
+
+def find_program() -> Path:
+    """Return the path of the running program; raise UserError if the service cannot start or see it."""
+    program = Path(sys.executable).parent / "shearloop"
+    if not program.exists():
+        raise UserError(
+            f"there is no program {program}: install the package with pip first, or give the program with --program"
+        )
+    for path in (program, Path(sys.base_prefix)):
+        if hidden := hidden_folder(path):
+            raise UserError(
+                f"{path} lies in {hidden}, which the service is not allowed to see: make an environment elsewhere "
+                "(`sudo /usr/bin/python3 -m venv /opt/shearloop`), install shearloop there, and run its own "
+                "`/opt/shearloop/bin/shearloop install`"
+            )
+    return program
+
+
+def hidden_folder(path: Path) -> str:
+    """Return the folder that hides a path from the service; empty if the service sees the path."""
+    return next((folder for folder in _HIDDEN if path.is_relative_to(folder)), "")
+
+
+def install_steps(root: Path, program: Path, *, real_time: bool, running: bool) -> Iterator[Step]:
+    """Yield the steps that install the service below `root`; `running`: systemd runs there.
+
+    Run each step before the next is taken: a step depends on the files that are there.
+    """
+    contents = {name: service_file(name).encode() for name in PLACES} | {UNIT: unit_for(program).encode()}
+    for name, place in PLACES.items():
+        yield _write(root / place, contents[name])
+    if real_time:
+        yield _write(root / REAL_TIME, service_file("realtime.conf").encode())
+    else:
+        yield from _remove_real_time(root)
+    yield _write(root / EXAMPLE, service_file("shearloop.yaml").encode(), keep=True)
+    at_root = [] if root == Path("/") else [f"--root={root}"]
+    yield _program(["systemd-sysusers", *at_root, "shearloop.conf"], "makes the user and the group shearloop")
+    yield _program(["systemd-tmpfiles", *at_root, "--create", "shearloop.conf"], "makes the daemon's folders")
+    if running:
+        yield _program(["udevadm", "control", "--reload"], "reads the rules for the boards")
+        yield _program(["udevadm", "trigger", "--subsystem-match=tty"], "applies them to boards already plugged in")
+        yield _program(["systemctl", "daemon-reload"], "reads the unit")
+    yield Step(
+        f"next: join the group with `sudo usermod -aG shearloop $USER`, edit {root / EXAMPLE}, run "
+        f"`shearloop check {root / EXAMPLE}`, then `sudo systemctl enable --now shearloop`"
+    )
+
+
+def uninstall_steps(root: Path, *, running: bool) -> Iterator[Step]:
+    """Yield the steps that remove the service; edited files and the user's own data stay."""
+    if running:
+        yield _program(["systemctl", "disable", "--now", UNIT], "stops the service", may_fail=True)
+    for place in reversed(PLACES.values()):
+        yield _remove(root / place)
+    yield from _remove_real_time(root)
+    yield _remove(root / EXAMPLE, unless_edited=service_file("shearloop.yaml").encode())
+    for folder in ("keys/clients", "keys", ""):
+        yield _remove_empty_folder(root / "etc/shearloop" / folder)
+    # The group goes with its user; a missing user is no failure.
+    prefix = [] if root == Path("/") else ["--prefix", str(root)]
+    yield _program(["userdel", *prefix, "shearloop"], "removes the user and its group", may_fail=True)
+    if running:
+        yield _program(["systemctl", "daemon-reload"], "forgets the unit")
+        yield _program(["udevadm", "control", "--reload"], "forgets the rules")
+    yield Step(f"left alone: {root / 'var/lib/shearloop'}, with your banks, calibrations and recordings")
+
+
+def _remove_real_time(root: Path) -> Iterator[Step]:
+    if (root / REAL_TIME).exists():
+        yield _remove(root / REAL_TIME)
+        yield _remove_empty_folder((root / REAL_TIME).parent)
+
+
+def _write(target: Path, content: bytes, *, keep: bool = False) -> Step:
+    """Write a file, readable by everyone; with `keep`, leave an existing one alone."""
+    exists = target.exists()
+    if exists and (keep or target.read_bytes() == content):
+        return Step(f"left as it is: {target}")
+
+    def write() -> None:
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(content)
+            target.chmod(0o644)
+        except OSError as error:
+            raise _file_error(target, "written", error) from error
+
+    return Step(f"{'replace' if exists else 'write'} {target}", write)
+
+
+def _remove(target: Path, unless_edited: bytes | None = None) -> Step:
+    """Remove a file; with `unless_edited`, only if it has this content."""
+    if not target.exists():
+        return Step(f"not there: {target}")
+    if unless_edited not in (None, target.read_bytes()):
+        return Step(f"left because it was edited: {target}")
+
+    def remove() -> None:
+        try:
+            target.unlink()
+        except OSError as error:
+            raise _file_error(target, "removed", error) from error
+
+    return Step(f"remove {target}", remove)
+
+
+def _remove_empty_folder(target: Path) -> Step:
+    if not target.is_dir():
+        return Step(f"not there: {target}")
+
+    def remove() -> None:
+        try:
+            if not any(target.iterdir()):
+                target.rmdir()
+        except OSError as error:
+            raise _file_error(target, "removed", error) from error
+
+    return Step(f"remove {target} if it is empty", remove)
+
+
+def _program(arguments: list[str], purpose: str, *, may_fail: bool = False) -> Step:
+    """Run a program of the system; `may_fail` ignores its exit status."""
+
+    def run() -> None:
+        program = shutil.which(arguments[0])
+        if program is None:
+            raise UserError(f"there is no program {arguments[0]} on this system; install it and try again")
+        done = subprocess.run(
+            [program, *arguments[1:]], capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL
+        )
+        if done.returncode != 0 and not may_fail:
+            output = " ".join((done.stderr or done.stdout).split())
+            raise UserError(f"`{' '.join(arguments)}` failed with status {done.returncode}: {output}")
+
+    return Step(f"run `{' '.join(arguments)}`, which {purpose}", run)
+
+
+def _file_error(path: Path, action: str, error: OSError) -> UserError:
+    cure = "; run it with sudo" if isinstance(error, PermissionError) else ""
+    return UserError(f"{path} cannot be {action}: {error.strerror}{cure}")

@@ -1,1 +1,0 @@
-"""The daemon as a systemd service: installation and real-time options."""

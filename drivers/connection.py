@@ -1,0 +1,410 @@
+"""Connections to devices: serial ports and TCP sockets in an asyncio loop, reopened after a loss. No threads.
+
+Pseudo-terminals work like any other port. Protocols belong to the device's own module.
+"""
+
+import asyncio
+import contextlib
+import errno
+import os
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, Self, TypeAlias
+
+import serial
+from serial.tools import list_ports
+
+from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DeviceUnavailableError, DriverError
+
+DEFAULT_BAUD = 115_200
+# The kernel keeps 4 kB for a pseudo-terminal and up to 64 kB for a USB port.
+READ_BYTES = 65_536
+# Then other tasks have their turn; the rest waits in the kernel.
+READS_PER_TURN = 8
+# A read shorter than one kernel buffer has emptied the port.
+SHORT_READ_BYTES = 4_000
+# Commands to these devices are a few bytes; a longer write is a bug.
+MAX_WRITE_BYTES = 4_096
+WRITE_TIMEOUT_S = 1.0
+CONNECT_TIMEOUT_S = 2.0
+
+# The values that a device reports in `health`, by name.
+Diagnostics: TypeAlias = Mapping[str, bool | int | float | str | Mapping[str, int] | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """Bytes, and the time when all of them had arrived (monotonic, ns)."""
+
+    data: bytes
+    t_arrival_ns: int
+
+
+class Port(Protocol):
+    """An open serial port or socket."""
+
+    @property
+    def path(self) -> str:
+        """Its name in messages."""
+
+    async def read(self, timeout_s: float) -> Received | None:
+        """Return arrived bytes, or None after `timeout_s`; DeviceLostError if the port is gone."""
+
+    async def write(self, data: bytes) -> None:
+        """Write all of `data`; DeviceLostError if the port is gone."""
+
+    def close(self) -> None:
+        """Close the port, also if it is gone already."""
+
+
+def find_port(*, serial_number: str | None = None, path: str | None = None) -> str:
+    """Return the path of the port with this USB serial number, or the given path if it exists.
+
+    Raises DeviceNotFoundError, which lists the available ports.
+    """
+    if (serial_number is None) == (path is None):
+        raise ValueError("give either the USB serial number of a port or its path")
+    if path is not None:
+        if not os.path.exists(path):
+            raise DeviceNotFoundError(f"There is no serial port {path}; {_available_ports()}.")
+        return path
+    found = [port.device for port in list_ports.comports() if port.serial_number == serial_number]
+    if not found:
+        raise DeviceNotFoundError(f"No port has the USB serial number {serial_number}; {_available_ports()}.")
+    if len(found) > 1:
+        ports = " and ".join(sorted(found))
+        raise DeviceNotFoundError(f"The USB serial number {serial_number} has the ports {ports}; name one by its path.")
+    return str(found[0])
+
+
+def _available_ports() -> str:
+    ports = [
+        f"{port.device} ({port.description}, serial number {port.serial_number})"
+        for port in sorted(list_ports.comports())
+        if port.serial_number
+    ]
+    return f"available: {', '.join(ports)}" if ports else "no USB serial port is plugged in"
+
+
+class SerialPort(contextlib.AbstractContextManager["SerialPort", None]):
+    """An open serial port: non-blocking, exclusive, eight bits, no parity, no flow control.
+
+    Raises DeviceNotFoundError or DeviceUnavailableError if it cannot be opened.
+    """
+
+    def __init__(self, path: str, baud: int = DEFAULT_BAUD) -> None:
+        self.path = path
+        try:
+            # An inter-byte timeout sets VMIN to 1, so that an empty read means a hang-up.
+            self._serial = serial.Serial(path, baud, timeout=0, inter_byte_timeout=0, exclusive=True)
+        except serial.SerialException as error:
+            raise _open_error(path, error) from error
+        self._descriptor: int = self._serial.fileno()
+        self._result: Received | DeviceLostError | None = None
+
+    def __exit__(self, *_: object) -> None:
+        """Close the port."""
+        self.close()
+
+    def close(self) -> None:
+        """Close the port, also if it is gone already."""
+        with contextlib.suppress(OSError):
+            self._serial.close()
+
+    async def read(self, timeout_s: float) -> Received | None:
+        """Return arrived bytes, or None after `timeout_s`; a cancelled read loses nothing.
+
+        Raises DeviceLostError if the port is gone.
+        """
+        if self._result is None:
+            loop = asyncio.get_running_loop()
+            done: asyncio.Future[None] = loop.create_future()
+            # Reading in the callback, before the task runs, gives the earliest time stamp.
+            loop.add_reader(self._descriptor, self._on_readable, done)
+            timer = loop.call_later(timeout_s, _finish, done)
+            try:
+                await done
+            finally:
+                timer.cancel()
+                loop.remove_reader(self._descriptor)
+        if self._result is None:
+            # The loop itself may have been late.
+            self._drain()
+        result, self._result = self._result, None
+        if isinstance(result, DeviceLostError):
+            raise result
+        return result
+
+    def _on_readable(self, done: asyncio.Future[None]) -> None:
+        if not done.done():
+            self._drain()
+            done.set_result(None)
+
+    def _drain(self) -> None:
+        parts: list[bytes] = []
+        lost: DeviceLostError | None = None
+        for _ in range(READS_PER_TURN):
+            try:
+                part = os.read(self._descriptor, READ_BYTES)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                lost = self._lost(error.strerror)
+                break
+            if not part:
+                lost = self._lost("hung up")
+                break
+            parts.append(part)
+            if len(part) < SHORT_READ_BYTES:
+                break
+        # Bytes before a hang-up come first; the next read meets the hang-up again.
+        self._result = Received(b"".join(parts), time.monotonic_ns()) if parts else lost
+
+    async def write(self, data: bytes) -> None:
+        """Write all of `data`; DeviceLostError if the port is gone or accepts nothing for a second."""
+        if len(data) > MAX_WRITE_BYTES:
+            raise ValueError(f"{len(data)} bytes in one write; at most {MAX_WRITE_BYTES} are allowed")
+        try:
+            async with asyncio.timeout(WRITE_TIMEOUT_S):
+                while data:
+                    try:
+                        data = data[os.write(self._descriptor, data) :]
+                    except BlockingIOError:
+                        await self._writable()
+        except TimeoutError as error:
+            raise DeviceLostError(f"{self.path} takes no bytes any more; unplug the device and plug it in.") from error
+        except OSError as error:
+            raise self._lost(error.strerror) from error
+
+    async def _writable(self) -> None:
+        loop = asyncio.get_running_loop()
+        done: asyncio.Future[None] = loop.create_future()
+        loop.add_writer(self._descriptor, _finish, done)
+        try:
+            await done
+        finally:
+            loop.remove_writer(self._descriptor)
+
+    def _lost(self, reason: str | None) -> DeviceLostError:
+        return DeviceLostError(f"{self.path} has gone ({reason}): unplugged, or without power.")
+
+
+def _finish(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)
+
+
+def _open_error(path: str, error: serial.SerialException) -> DriverError:
+    match error.errno:
+        case errno.ENOENT | errno.ENODEV | errno.ENXIO | errno.EIO:
+            return DeviceNotFoundError(f"There is no serial port {path}; {_available_ports()}.")
+        case errno.EACCES | errno.EPERM:
+            return DeviceUnavailableError(f"This user may not open {path}; add the user to the port's group.")
+        case errno.EAGAIN | errno.EBUSY:
+            return DeviceUnavailableError(f"{path} is in use by another program; close that first.")
+    return DeviceUnavailableError(f"{path} cannot be opened as a serial port: {error}.")
+
+
+class TcpPort:
+    """A connection to an instrument; `TcpLink` makes it."""
+
+    def __init__(self, path: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.path = path
+        self._reader = reader
+        self._writer = writer
+
+    async def read(self, timeout_s: float) -> Received | None:
+        """Return arrived bytes, or None after `timeout_s`; DeviceLostError if the other side is gone."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                data = await self._reader.read(READ_BYTES)
+        except TimeoutError:
+            return None
+        except OSError as error:
+            raise self._lost(error) from error
+        if not data:
+            raise DeviceLostError(f"{self.path} has closed the connection; see whether the instrument is still on.")
+        return Received(data, time.monotonic_ns())
+
+    async def write(self, data: bytes) -> None:
+        """Write all of `data`; DeviceLostError if the other side is gone or accepts nothing for a second."""
+        try:
+            async with asyncio.timeout(WRITE_TIMEOUT_S):
+                self._writer.write(data)
+                await self._writer.drain()
+        except TimeoutError as error:
+            raise DeviceLostError(f"{self.path} takes no bytes any more; switch the instrument off and on.") from error
+        except OSError as error:
+            raise self._lost(error) from error
+
+    def close(self) -> None:
+        """Drop the connection and all unsent bytes."""
+        # close() would wait for bytes to a peer that may be gone.
+        self._writer.transport.abort()
+
+    def _lost(self, error: OSError) -> DeviceLostError:
+        return DeviceLostError(f"The connection to {self.path} broke ({error.strerror or error}).")
+
+
+class Retry(NamedTuple):
+    """The pause before the next attempt, and whether this failure follows another one."""
+
+    wait_s: float
+    repeated: bool
+
+
+class ReconnectPolicy:
+    """Pauses between attempts: `first_s`, then twice as long each time, up to `longest_s`. No I/O."""
+
+    def __init__(self, first_s: float = 0.2, longest_s: float = 5.0) -> None:
+        self._first_s = first_s
+        self._longest_s = longest_s
+        self._failures = 0
+        self._connected_ns: int | None = None
+
+    def connected(self, now_ns: int) -> None:
+        """Note a new connection."""
+        self._connected_ns = now_ns
+
+    def failed(self, now_ns: int) -> Retry:
+        """Return when to retry after a failed attempt or a lost connection.
+
+        A connection shorter than the longest pause counts as a further failure, so a flapping device is not reopened
+        five times a second.
+        """
+        if self._connected_ns is not None and now_ns - self._connected_ns >= self._longest_s * 1e9:
+            self._failures = 0
+        self._connected_ns = None
+        retry = Retry(min(self._first_s * 2.0 ** min(self._failures, 32), self._longest_s), self._failures > 0)
+        self._failures += 1
+        return retry
+
+
+@dataclass(frozen=True, slots=True)
+class LinkEvent:
+    """A port was opened (`up`), lost or not found; `repeated` events are for the debug log."""
+
+    up: bool
+    sentence: str
+    repeated: bool
+
+
+class Link(ABC):
+    """Keeps a device connected: finds it, opens it, and reopens it after a loss.
+
+    Use it as a context, which closes the port at the end. `port` is the open port or None; `connections` counts how
+    often it was opened. `on_event` receives every change.
+    """
+
+    def __init__(
+        self, *, policy: ReconnectPolicy | None = None, on_event: Callable[[LinkEvent], None] = lambda _: None
+    ) -> None:
+        self._policy = policy or ReconnectPolicy()
+        self._on_event = on_event
+        self.port: Port | None = None
+        self.connections = 0
+        self.last_error = ""
+
+    @abstractmethod
+    async def _connect(self) -> Port:
+        """Open the port once; DriverError if that fails."""
+
+    def __enter__(self) -> Self:
+        """Return the link, not yet open."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the port."""
+        self._close()
+
+    def diagnostics(self) -> dict[str, bool | int | str]:
+        """Return the connection's part of `health`."""
+        return {"connected": self.port is not None, "connections": self.connections, "last_loss": self.last_error}
+
+    async def open(self) -> Port:
+        """Return the open port; waits until the device is there."""
+        while self.port is None:
+            try:
+                self.port = await self._connect()
+            except DriverError as error:
+                await self.lost(error)
+            else:
+                self.connections += 1
+                self._policy.connected(time.monotonic_ns())
+                self._on_event(LinkEvent(up=True, sentence=f"{self.port.path} is open.", repeated=False))
+        return self.port
+
+    async def lost(self, error: DriverError) -> None:
+        """Close the port, report the error, and pause before the next attempt."""
+        await asyncio.sleep(self.give_up(error).wait_s)
+
+    def give_up(self, error: DriverError) -> Retry:
+        """Close the port and report the error; return when to retry."""
+        self._close()
+        before, self.last_error = self.last_error, str(error)
+        retry = self._policy.failed(time.monotonic_ns())
+        # A different error is news even without a pause in between.
+        repeated = retry.repeated and _without_digits(before) == _without_digits(self.last_error)
+        self._on_event(LinkEvent(up=False, sentence=self.last_error, repeated=repeated))
+        return retry
+
+    def _close(self) -> None:
+        if self.port is not None:
+            self.port.close()
+            self.port = None
+
+
+def _without_digits(text: str) -> str:
+    return "".join(letter for letter in text if not letter.isdigit())
+
+
+class SerialLink(Link):
+    """Keeps a serial device connected, named by its USB serial number or the path of its port."""
+
+    def __init__(
+        self,
+        *,
+        serial_number: str | None = None,
+        path: str | os.PathLike[str] | None = None,
+        baud: int = DEFAULT_BAUD,
+        policy: ReconnectPolicy | None = None,
+        on_event: Callable[[LinkEvent], None] = lambda _: None,
+    ) -> None:
+        if (serial_number is None) == (path is None):
+            raise ValueError("give either the USB serial number of a device or the path of its port")
+        super().__init__(policy=policy, on_event=on_event)
+        self._serial_number = serial_number
+        self._path = None if path is None else os.fspath(path)
+        self._baud = baud
+
+    async def _connect(self) -> Port:
+        return SerialPort(find_port(serial_number=self._serial_number, path=self._path), self._baud)
+
+
+class TcpLink(Link):
+    """Keeps a TCP connection to an instrument open."""
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        *,
+        policy: ReconnectPolicy | None = None,
+        on_event: Callable[[LinkEvent], None] = lambda _: None,
+    ) -> None:
+        super().__init__(policy=policy, on_event=on_event)
+        self._host = host
+        self._port = port
+
+    async def _connect(self) -> Port:
+        name = f"{self._host}:{self._port}"
+        try:
+            async with asyncio.timeout(CONNECT_TIMEOUT_S):
+                reader, writer = await asyncio.open_connection(self._host, self._port)
+        except OSError as error:  # includes a timeout
+            raise DeviceNotFoundError(
+                f"Nothing answers at {name} ({error or 'no answer'}); see that it is on and its address is right."
+            ) from error
+        return TcpPort(name, reader, writer)

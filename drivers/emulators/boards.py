@@ -1,0 +1,438 @@
+"""The boards that send lines over a pseudo-terminal, emulated byte for byte: EIT-kit, load cell, converter board."""
+
+import asyncio
+import itertools
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from random import Random
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S, N_VALUES
+from shearloop.drivers.emulators.ports import Outage, PtyPort
+from shearloop.drivers.load_cell import COUNTS_MAX, COUNTS_MIN
+
+FLOOD_BYTES = 100_000
+# Lateness of this process that is made up for, so that fast rates are kept on average.
+CATCH_UP_S = 0.05
+# The mean over 4882 lines of the paper's rig.
+LOAD_PERIOD_S = 1 / 10.9
+# A line of the paper's board without its beginning, "0.0000": 38 µN·m became 38 MN·m.
+CORRUPTED = 38399996
+
+
+class BoardFaultKind(Enum):
+    """Faults of boards; the value is the name on the command line."""
+
+    # The next line arrives broken.
+    CUT_LINE = "cut-line"
+    WRONG_COUNT = "wrong-count"
+    NOT_A_NUMBER = "not-a-number"
+    NAN = "nan"
+    NEGATIVE = "negative"
+    ZERO = "zero"
+    SPIKE = "spike"
+    TORN = "torn"
+    MISSING = "missing"
+    # Bytes that are not a line.
+    GARBAGE = "garbage"
+    FLOOD = "flood"
+    # The next line comes twice.
+    REPEAT = "repeat"
+    # Lasts for a number of seconds.
+    SILENCE = "silence"
+    SATURATION = "saturation"
+    STUCK = "stuck"
+    UNPLUG = "unplug"
+    # Raises the torque by an offset in N·m.
+    JUMP = "jump"
+
+
+_K = BoardFaultKind
+TIMED_FAULTS = (_K.SILENCE, _K.SATURATION, _K.STUCK, _K.UNPLUG)
+
+
+@dataclass(frozen=True, slots=True)
+class BoardFault:
+    """One fault, with its seconds or N·m."""
+
+    kind: BoardFaultKind
+    amount: float | None = None
+
+
+def parse_fault(text: str, kinds: Collection[BoardFaultKind]) -> BoardFault:
+    """Return the fault `NAME`, `NAME:AMOUNT` or `NAME AMOUNT`; raises ValueError with a sentence."""
+    name, _, amount = text.strip().replace(" ", ":").partition(":")
+    kind = next((kind for kind in kinds if kind.value == name), None)
+    if kind is None:
+        raise ValueError(f"there is no fault {name!r}; there are {', '.join(kind.value for kind in kinds)}")
+    try:
+        value = float(amount) if amount else None
+    except ValueError:
+        value = math.nan
+    if kind is BoardFaultKind.JUMP:
+        if value is None or not math.isfinite(value):
+            raise ValueError("a jump needs its height in N·m; write for instance jump:0.05")
+    elif value is not None:
+        if kind not in TIMED_FAULTS:
+            raise ValueError(f"{name} has no duration; write {name} alone")
+        if not 0 <= value < math.inf:
+            raise ValueError(f"{amount!r} is no duration in seconds; write for instance {name}:3")
+    return BoardFault(kind, value)
+
+
+class PlayedBoard(ABC):
+    """An emulated board on a pseudo-terminal.
+
+    `on_port` receives the port's path whenever it appears. `inject` applies faults to the next lines, one each.
+    `sent` counts intact lines. Without a reader the terminal fills up and then the board waits.
+    """
+
+    faults: Collection[BoardFaultKind]
+
+    def __init__(
+        self,
+        period_s: float,
+        link: Path | None,
+        on_port: Callable[[str], None],
+        seed: int,
+        on_bytes: Callable[[bytes], None] = lambda _: None,
+    ) -> None:
+        self._period_s = period_s
+        self._on_port = on_port
+        self._random = Random(seed)
+        self._port = PtyPort(on_bytes, link)
+        self._injected: deque[BoardFault] = deque()
+        self.sent = 0
+        self.finished = asyncio.Event()
+
+    @property
+    def path(self) -> str:
+        """The port's path."""
+        return self._port.path
+
+    @property
+    def held_up(self) -> asyncio.Event:
+        """Set while the board waits for a reader."""
+        return self._port.held_up
+
+    @abstractmethod
+    async def run(self) -> None:
+        """Play until cancelled; at the end of the data the board stays plugged in and `finished` is set."""
+
+    @abstractmethod
+    def recover(self) -> None:
+        """End every fault and plug the port in."""
+
+    def inject(self, fault: BoardFault) -> None:
+        """Apply a fault to the next line; several apply to one line each, in order."""
+        self._injected.append(fault)
+
+    def command(self, text: str) -> None:
+        """Inject the fault in a command, or recover on `normal`; ValueError, with a sentence, for other text."""
+        if text.strip() == "normal":
+            self.recover()
+        else:
+            self.inject(parse_fault(text, self.faults))
+
+    def _plug(self) -> None:
+        self._port.plug()
+        self._on_port(self.path)
+
+    def _garbage(self, count: int) -> bytes:
+        return bytes(self._random.choices(range(128, 256), k=count))
+
+
+def format_line(values: NDArray[np.float64]) -> bytes:
+    """Return the line of the EIT-kit for (1024,) values in volts."""
+    return ("%.4f, " * N_VALUES % tuple(values.tolist()) + "\n").encode()
+
+
+class EitKitBoard(PlayedBoard):
+    """An EIT-kit: waits for a `y`, then sends `frames` (1024 values in volts each), and then is silent.
+
+    A frame is requested from the iterator at the end of its acquisition. `fault_at` maps frame numbers, from 0, to
+    faults. Only an unplugged board loses a frame; a silence without a duration lasts until the next `y`.
+    """
+
+    faults = (
+        *(_K.CUT_LINE, _K.WRONG_COUNT, _K.NOT_A_NUMBER, _K.NAN, _K.NEGATIVE, _K.ZERO),
+        *(_K.GARBAGE, _K.FLOOD, _K.REPEAT, _K.SILENCE, _K.UNPLUG),
+    )
+
+    def __init__(
+        self,
+        frames: Iterable[NDArray[np.float64]],
+        *,
+        period_s: float = FRAME_PERIOD_S,
+        link: Path | None = None,
+        fault_at: Mapping[int, BoardFault] | None = None,
+        on_port: Callable[[str], None] = lambda _: None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(period_s, link, on_port, seed, self._received)
+        self._frames = frames
+        self._fault_at = dict(fault_at or {})
+        self._started = asyncio.Event()
+        self._outage = Outage()
+        self._waits_for_start = False
+
+    def recover(self) -> None:
+        """End every fault and plug the port in."""
+        self._injected.clear()
+        self._outage.end()
+        if self._waits_for_start:
+            self._started.set()
+
+    async def run(self) -> None:
+        """Play until cancelled; at the end of the frames the board stays plugged in and `finished` is set."""
+        loop = asyncio.get_running_loop()
+        with self._port:
+            self._on_port(self.path)
+            due_s = 0.0
+            frames = iter(self._frames)
+            for number in itertools.count():
+                if not self._started.is_set():
+                    await self._started.wait()
+                    due_s = loop.time()
+                due_s += self._period_s
+                await asyncio.sleep(due_s - loop.time())
+                fault = self._fault_at.pop(number, None) or (self._injected.popleft() if self._injected else None)
+                if fault is not None and fault.kind is _K.SILENCE:
+                    await self._fall_silent(fault.amount)
+                    fault = None
+                values = next(frames, None)
+                if values is None:
+                    break
+                await self._send(format_line(values), fault)
+                if loop.time() - due_s > CATCH_UP_S:
+                    # Held up by the reader or a fault: the next frame takes a whole period from here.
+                    due_s = loop.time()
+            self.finished.set()
+            await loop.create_future()
+
+    def _received(self, data: bytes) -> None:
+        if b"y" in data:
+            self._started.set()
+
+    async def _send(self, line: bytes, fault: BoardFault | None) -> None:
+        match None if fault is None else fault.kind:
+            case None:
+                pass
+            case _K.UNPLUG:
+                await self._unplug(line, 1.0 if fault is None or fault.amount is None else fault.amount)
+                return
+            case _K.GARBAGE:
+                await self._port.write(self._garbage(700) + b"\n")
+            case _K.FLOOD:
+                await self._port.write(bytes(self._random.choices(b"0123456789., ", k=FLOOD_BYTES)) + b"\n")
+            case _K.REPEAT:
+                await self._port.write(line)
+                self.sent += 1
+            case kind:
+                await self._port.write(self._broken(line, kind))
+                return
+        await self._port.write(line)
+        self.sent += 1
+
+    def _broken(self, line: bytes, kind: BoardFaultKind) -> bytes:
+        if kind is _K.CUT_LINE:
+            return line[: self._random.randrange(len(line) // 10, len(line) - 10)] + b"\n"
+        values = line.split(b", ")
+        position = self._random.choice([n for n, value in enumerate(values[:-1]) if float(value)])
+        if kind is _K.WRONG_COUNT:
+            del values[position]
+        else:
+            values[position] = {
+                _K.NOT_A_NUMBER: b"0.1x34",
+                _K.NAN: b"nan",
+                _K.NEGATIVE: b"-" + values[position],
+                _K.ZERO: b"0.0000",
+            }[kind]
+        return b", ".join(values)
+
+    async def _fall_silent(self, seconds: float | None) -> None:
+        if seconds is not None:
+            await self._outage.wait(seconds)
+            return
+        self._started.clear()
+        self._waits_for_start = True
+        await self._started.wait()
+        self._waits_for_start = False
+
+    async def _unplug(self, line: bytes, seconds: float) -> None:
+        await self._port.write(line[: len(line) // 2])
+        await self._port.break_off()
+        # Without power the board forgets its start.
+        self._started.clear()
+        await self._outage.wait(seconds)
+        self._plug()
+
+
+class ConverterBoard(PlayedBoard):
+    """A board that sends a line for each conversion, whether or not anyone listens.
+
+    Timed faults without a duration last until the next one or `recover`.
+    """
+
+    def __init__(
+        self, period_s: float, link: Path | None = None, on_port: Callable[[str], None] = lambda _: None, seed: int = 0
+    ) -> None:
+        super().__init__(period_s, link, on_port, seed)
+        self._lasting: BoardFaultKind | None = None
+        self._lasts_until_s = 0.0
+        self._last_line = b""
+        self._offset = 0.0
+
+    @abstractmethod
+    def _convert(self) -> bytes:
+        """Return the line of one conversion; StopIteration at the end of the data."""
+
+    def recover(self) -> None:
+        """End every fault and plug the port in."""
+        self._injected.clear()
+        self._offset = 0.0
+        self._end_lasting()
+
+    async def run(self) -> None:
+        """Play until cancelled; at the end of the data the board stays plugged in and `finished` is set."""
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        with self._port:
+            self._on_port(self.path)
+            while True:
+                due_s = max(due_s + self._period_s, loop.time() - CATCH_UP_S)
+                await asyncio.sleep(due_s - loop.time())
+                try:
+                    line = self._convert()
+                except StopIteration:
+                    break
+                line = self._with_faults(line, loop.time())
+                if line:
+                    try:
+                        await self._port.write(line)
+                    except ConnectionError:  # unplugged while the line waited for a reader
+                        continue
+                    self.sent += 1
+            self.finished.set()
+            await loop.create_future()
+
+    def _with_faults(self, line: bytes, now_s: float) -> bytes:
+        if self._injected:
+            line = self._apply(self._injected.popleft(), line, now_s)
+        elif self._lasting is not None and now_s >= self._lasts_until_s:
+            self._end_lasting()
+        match self._lasting:
+            case _K.SILENCE | _K.UNPLUG:
+                return b""
+            case _K.STUCK:
+                line = self._last_line or line
+            case _K.SATURATION:
+                line = b"%d\r\n" % COUNTS_MAX
+        self._last_line = line
+        return line
+
+    def _apply(self, fault: BoardFault, line: bytes, now_s: float) -> bytes:
+        match fault.kind:
+            case _K.GARBAGE:
+                return self._garbage(12) + b"\r\n"
+            case _K.SPIKE:
+                return b"%d\r\n" % CORRUPTED
+            case _K.TORN:
+                return line[len(line) // 2 :]
+            case _K.MISSING:
+                return b""
+            case _K.JUMP:
+                self._offset += fault.amount or 0.0
+            case kind:
+                self._end_lasting()
+                self._lasting = kind
+                self._lasts_until_s = math.inf if fault.amount is None else now_s + fault.amount
+                if kind is _K.UNPLUG:
+                    self._port.unplug()
+        return line
+
+    def _end_lasting(self) -> None:
+        if self._lasting is _K.UNPLUG:
+            self._plug()
+        self._lasting = None
+
+
+@dataclass(frozen=True, slots=True)
+class Sketch:
+    """The board's conversion: counts_per_nm × torque + tare_counts, plus noise, with `decimals` places.
+
+    The default is our sketch with a 5 kg cell of 1 mV/V on a 35 mm lever arm: 420 counts a gram.
+    """
+
+    counts_per_nm: float = 420e3 / (9.80665 * 0.035)
+    tare_counts: float = 81_250.0
+    noise_counts: float = 120.0
+    decimals: int = 0
+
+
+# The paper's sketch sends N·m, with the noise of its recordings.
+PAPER_SKETCH = Sketch(counts_per_nm=1.0, tare_counts=0.0, noise_counts=2e-5, decimals=12)
+
+
+class Hx711Board(ConverterBoard):
+    """The load cell's board: converts what `torque_nm` returns, until that raises StopIteration."""
+
+    faults = (_K.GARBAGE, _K.SPIKE, _K.TORN, _K.SILENCE, _K.SATURATION, _K.STUCK, _K.UNPLUG, _K.JUMP)
+
+    def __init__(
+        self,
+        torque_nm: Callable[[], float],
+        sketch: Sketch | None = None,
+        *,
+        period_s: float = LOAD_PERIOD_S,
+        link: Path | None = None,
+        on_port: Callable[[str], None] = lambda _: None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(period_s, link, on_port, seed)
+        self._torque_nm = torque_nm
+        self._sketch = sketch or Sketch()
+
+    def _convert(self) -> bytes:
+        sketch = self._sketch
+        counts = sketch.tare_counts + sketch.counts_per_nm * (self._torque_nm() + self._offset)
+        counts += self._random.gauss(0.0, sketch.noise_counts)
+        return f"{min(max(counts, COUNTS_MIN), COUNTS_MAX):.{sketch.decimals}f}\r\n".encode()
+
+
+class EmulatedAdcBoard(ConverterBoard):
+    """The skin's converter board, an ADS1220: a line `v1,v2` in volts of what `voltages` returns."""
+
+    faults = (_K.MISSING, _K.GARBAGE, _K.TORN, _K.SILENCE, _K.STUCK, _K.UNPLUG)
+
+    # 24 bits over ±0.512 V, at gain 4.
+    FULL_SCALE_V, STEP_V = 0.512, 0.512 / 2**23
+
+    def __init__(
+        self,
+        voltages: Callable[[], tuple[float, float]],
+        *,
+        period_s: float,
+        noise_v: float,
+        link: Path | None = None,
+        on_port: Callable[[str], None] = lambda _: None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(period_s, link, on_port, seed)
+        self._voltages = voltages
+        self._noise_v = noise_v
+
+    def _convert(self) -> bytes:
+        v1_v, v2_v = self._voltages()
+        return f"{self._quantise(v1_v):.6f},{self._quantise(v2_v):.6f}\r\n".encode()
+
+    def _quantise(self, volts: float) -> float:
+        steps = round((volts + self._random.gauss(0.0, self._noise_v)) / self.STEP_V)
+        return min(max(steps * self.STEP_V, -self.FULL_SCALE_V), self.FULL_SCALE_V)

@@ -1,1 +1,0 @@
-"""The shear skin's instruments, played: current source, scanner and converter board around one circuit."""

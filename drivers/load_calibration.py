@@ -1,0 +1,198 @@
+"""The guided calibration of the load cell: rest, then known masses, then a straight line or the reason for none.
+
+`LoadCalibrator` is a state machine without I/O: it receives samples and the operator's confirmations.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from shearloop.drivers.errors import DeviceCalibrationError
+from shearloop.drivers.load_cell import LoadCalibration, LoadSample
+
+STANDARD_GRAVITY = 9.80665
+# Before the scale is known, any value may be a load.
+UNCALIBRATED = LoadCalibration(tare_counts=0.0, scale_n_per_count=1e-9)
+SAMPLES_PER_STEP = 30
+# The converter settles within four conversions (HX711 data sheet); the mass needs as long to hang still.
+SKIP_SAMPLES = 8
+# A quiet HX711 at gain 128 shows some hundred counts; ten times that is a loose wire or a swinging mass.
+MAX_NOISE_COUNTS = 5000.0
+# Relative to the measured change, for boards that send N·m.
+MAX_NOISE_FRACTION = 0.05
+MAX_RESIDUAL_FRACTION = 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class Level:
+    """The reading under one constant load: mean and standard deviation of `n` raw values."""
+
+    mass_g: float
+    mean: float
+    std: float
+    n: int
+
+
+@dataclass(frozen=True, slots=True)
+class LoadCalibrationResult:
+    """A calibration, its levels, the largest residual as a torque in N·m, and a report in sentences."""
+
+    calibration: LoadCalibration
+    levels: tuple[Level, ...]
+    residual_nm: float
+    sentences: tuple[str, ...]
+
+
+def measure_level(samples: Sequence[LoadSample], mass_g: float) -> Level:
+    """Return the level of samples under a constant load.
+
+    Up to a tenth may be corrupted. Raises DeviceCalibrationError if they are too few, saturated, flat or noisy.
+    """
+    if any(sample.saturated for sample in samples):
+        raise DeviceCalibrationError(
+            "The load cell's converter is at the end of its range: take load off the cell, and check that none of "
+            "its four wires is loose."
+        )
+    good = [sample.raw for sample in samples if not sample.spike and not sample.partial]
+    if len(samples) < SAMPLES_PER_STEP or len(good) < 0.9 * len(samples):
+        raise DeviceCalibrationError(
+            f"Only {len(good)} of the {SAMPLES_PER_STEP} readings needed were good: check the cable, and that "
+            "the board sends about 11 lines a second, then measure again."
+        )
+    mean, std = float(np.mean(good)), float(np.std(good, ddof=1))
+    if min(good) == max(good):
+        raise DeviceCalibrationError(
+            f"All {len(good)} readings are exactly {mean:g}: a live converter is never that still. "
+            "Check that the HX711 has power and that its DT and SCK wires are on the pins named in the sketch."
+        )
+    if std > MAX_NOISE_COUNTS:
+        raise DeviceCalibrationError(
+            f"The readings scatter by {std:.0f} counts, more than {MAX_NOISE_COUNTS:.0f}: let the mass hang "
+            "still, keep the robot off the arm, and check the cell's wires and their shield."
+        )
+    return Level(mass_g, mean, std, len(good))
+
+
+def fit_levels(levels: Sequence[Level], lever_arm_m: float, sign: int) -> LoadCalibrationResult:
+    """Return the least-squares line through the levels, raw against force; DeviceCalibrationError if none fits.
+
+    All levels have equal weight: how a mass hangs matters more than the converter's noise.
+    """
+    forces_n = np.array([level.mass_g for level in levels]) * 1e-3 * STANDARD_GRAVITY
+    means = np.array([level.mean for level in levels])
+    _check_levels(levels)
+    counts_per_n, tare_counts = (float(value) for value in np.polyfit(forces_n, means, 1))
+    calibration = LoadCalibration(
+        tare_counts=tare_counts,
+        scale_n_per_count=1 / counts_per_n,
+        lever_arm_m=lever_arm_m,
+        sign=-1 if sign < 0 else 1,
+    )
+    residuals = means - (tare_counts + counts_per_n * forces_n)
+    worst = int(np.argmax(np.abs(residuals)))
+    if abs(residuals[worst]) > MAX_RESIDUAL_FRACTION * float(np.ptp(means)):
+        raise DeviceCalibrationError(
+            f"The masses do not lie on a straight line: with {levels[worst].mass_g:g} g the reading is off by "
+            f"{abs(residuals[worst]) / abs(counts_per_n) / STANDARD_GRAVITY * 1e3:.1f} g. Check the masses that were "
+            "given and that each pressed on the cell alone, at the lever arm's place."
+        )
+    residual_nm = float(abs(residuals[worst] * calibration.nm_per_count))
+    noise_nm = max(level.std for level in levels) * abs(calibration.nm_per_count)
+    sentences = (
+        f"One count is {calibration.nm_per_count:.3e} N·m at a lever arm of {lever_arm_m * 1e3:g} mm.",
+        f"The cell at rest reads {tare_counts:.6g}.",
+        f"The noise is {noise_nm:.1e} N·m, the worst distance from the straight line {residual_nm:.1e} N·m.",
+    )
+    return LoadCalibrationResult(calibration, tuple(levels), residual_nm, sentences)
+
+
+def _check_levels(levels: Sequence[Level]) -> None:
+    empty, *loaded = levels
+    for level in loaded:
+        shift, noise = abs(level.mean - empty.mean), math.hypot(level.std, empty.std)
+        if shift < 5 * noise:
+            raise DeviceCalibrationError(
+                f"The reading did not change with {level.mass_g:g} g on the cell (by {shift:.3g}, with a noise of "
+                f"{noise:.3g}): check that the mass presses on the cell and that the cell's signal wires are connected."
+            )
+        if noise > MAX_NOISE_FRACTION * shift:
+            raise DeviceCalibrationError(
+                f"The readings scatter by {noise / shift:.0%} of what {level.mass_g:g} g change them by, more than "
+                f"{MAX_NOISE_FRACTION:.0%}: let the mass hang still, or use a larger one."
+            )
+    directions = {np.sign(b.mean - a.mean) for a, b in pairwise(sorted(levels, key=lambda level: level.mass_g))}
+    if len(directions) > 1:
+        raise DeviceCalibrationError(
+            "The reading does not change steadily in one direction as the mass grows: "
+            "were the masses put on in the order given?"
+        )
+
+
+@dataclass(slots=True)
+class LoadCalibrator:
+    """The guided calibration as a state machine.
+
+    `prompt` tells the operator what to do. Then call `start_step()` and `feed` samples until it returns True. A bad
+    signal raises DeviceCalibrationError from `feed`, and the step repeats. After the last step `finished` is True and
+    `result()` gives the calibration.
+    """
+
+    masses_g: Sequence[float]
+    lever_arm_m: float = 0.035
+    sign: int = 1
+    levels: list[Level] = field(default_factory=list, init=False)
+    _samples: list[LoadSample] | None = field(default=None, init=False)
+    _to_skip: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        """Refuse masses that do not define a line."""
+        if not self.masses_g or any(not (0 < mass < math.inf) for mass in self.masses_g):
+            raise DeviceCalibrationError("Give at least one mass in grams, each above zero.")
+        if len(set(self.masses_g)) < len(self.masses_g):
+            raise DeviceCalibrationError("Give every mass once; the same one twice says nothing about the line.")
+
+    @property
+    def finished(self) -> bool:
+        """Whether every step has been measured."""
+        return len(self.levels) == len(self.masses_g) + 1
+
+    @property
+    def prompt(self) -> str:
+        """The operator's instruction for the next step."""
+        if not self.levels:
+            return "Take every load off the lever arm and let it rest."
+        return f"Put {self._mass_g:g} g on the load cell, where the lever arm presses, and let it hang still."
+
+    @property
+    def _mass_g(self) -> float:
+        return self.masses_g[len(self.levels) - 1] if self.levels else 0.0
+
+    def start_step(self) -> None:
+        """Begin the step: the operator has followed the prompt."""
+        self._samples, self._to_skip = [], SKIP_SAMPLES
+
+    def feed(self, sample: LoadSample) -> bool:
+        """Add a sample; return True if it completes the step. Samples between steps are ignored."""
+        if self._samples is None:
+            return False
+        if self._to_skip:
+            self._to_skip -= 1
+            return False
+        self._samples.append(sample)
+        if len(self._samples) < SAMPLES_PER_STEP:
+            return False
+        samples, self._samples = self._samples, None
+        level = measure_level(samples, self._mass_g)
+        if self.levels:
+            _check_levels([*self.levels, level])
+        self.levels.append(level)
+        return True
+
+    def result(self) -> LoadCalibrationResult:
+        """Return the calibration; DeviceCalibrationError if the levels do not lie on a line, or a step is missing."""
+        if not self.finished:
+            raise DeviceCalibrationError(f"{len(self.masses_g) + 1 - len(self.levels)} steps are still to be measured.")
+        return fit_levels(self.levels, self.lever_arm_m, self.sign)

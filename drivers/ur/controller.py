@@ -1,0 +1,342 @@
+"""What the controller reports: a probe, a query of its mode, and RTDE samples with their age.
+
+RTDE: UR's RTDE guide, protocol 2. Dashboard: UR's "Dashboard Server e-Series" page, one line each way. ur-rtde does not
+check the answer to its protocol request and waits without a limit for a silent peer, so that this module asks first.
+"""
+
+import math
+import select
+import socket
+import struct
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Final, Protocol
+
+from shearloop.drivers.errors import DriverError, ProtocolError
+from shearloop.drivers.ur import error_messages
+from shearloop.drivers.ur.messages import RUNTIME_PLAYING, FailureKind, Sample
+
+RTDE_PORT, DASHBOARD_PORT = 30004, 29999
+SCRIPT_READY: Final = 1
+HEADER: Final = struct.Struct(">HB")
+_PROTOCOL, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA = b"VvOISU"
+_OTHER_PACKAGES = 20
+_LONGEST_LINE = 1024
+# The registers from which ur-rtde's control script takes its commands.
+_REGISTERS = ("input_int_register_0", "input_double_register_0")
+# The outputs and their types, in the order of a sample's fields.
+_TYPES: Final = {
+    "timestamp": "DOUBLE",
+    "actual_q": "VECTOR6D",
+    "actual_qd": "VECTOR6D",
+    "actual_TCP_pose": "VECTOR6D",
+    "actual_TCP_force": "VECTOR6D",
+    "robot_mode": "INT32",
+    "safety_mode": "INT32",
+    "runtime_state": "UINT32",
+    "speed_scaling": "DOUBLE",
+    "output_int_register_0": "INT32",
+}
+# The same outputs, after the header and the recipe's number.
+_VALUES: Final = struct.Struct(">d24d2iIdi")
+_PACKAGE_BYTES: Final = HEADER.size + 1 + _VALUES.size
+# One second of samples.
+_READ_BYTES = 1 << 15
+# The smallest clock offset may rise by this share of the time. Clocks drift by up to 500 ppm, and a simulator's may be
+# slow by some thousandths on a busy computer. A delay of 0.1 s is forgotten after 10 s.
+_OFFSET_RISE = 1e-2
+
+
+class ProbeError(DriverError):
+    """The controller cannot be used; `kind` says why."""
+
+    def __init__(self, kind: FailureKind, sentence: str) -> None:
+        super().__init__(sentence)
+        self.kind: FailureKind = kind
+
+
+@dataclass(frozen=True, slots=True)
+class ControllerInfo:
+    """A controller's mode. `remote` is None where the controller has no remote mode (CB series)."""
+
+    version: str
+    robot_mode: str
+    safety_mode: str
+    remote: bool | None
+    registers_free: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ReceivedSample(Sample):
+    """A sample with the state of ur-rtde's control script: 1 when ready, 2 when done with a command."""
+
+    script_state: int
+
+
+def probe_controller(host: str, timeout_s: float) -> str:
+    """Return the controller's version, as 5.17.3.0, after agreeing on protocol 2.
+
+    Raises:
+        ProbeError: it is not there, stays silent, or refuses the protocol.
+    """
+    with (
+        explain_failure(host, timeout_s, "greeting it"),
+        socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection,
+    ):
+        answer = _request(connection, _CONTROLLER_VERSION)
+        version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
+        accepted = _agree_on_protocol(connection)
+    if not accepted:
+        raise ProbeError("version", error_messages.version_refused(host, version))
+    return version
+
+
+def query_controller(host: str, timeout_s: float) -> ControllerInfo:
+    """Return a controller's mode without changing anything; DriverError where it is absent or silent."""
+    version = probe_controller(host, timeout_s)
+    with explain_failure(host, timeout_s, "asking for its mode"):
+        robot_mode, safety_mode, remote = _ask_dashboard(
+            host, timeout_s, ("robotmode", "safetymode", "is in remote control")
+        )
+        # A register belongs to a connection: closing it gives the register back.
+        with socket.create_connection((host, RTDE_PORT), timeout=timeout_s) as connection:
+            _agree_on_protocol(connection)
+            free = b"IN_USE" not in _request(connection, _INPUTS, ",".join(_REGISTERS).encode())
+    return ControllerInfo(
+        version,
+        robot_mode.removeprefix("Robotmode: "),
+        safety_mode.removeprefix("Safetymode: "),
+        {"true": True, "false": False}.get(remote.lower()),
+        free,
+    )
+
+
+def _ask_dashboard(host: str, timeout_s: float, questions: tuple[str, ...]) -> list[str]:
+    answers = []
+    with (
+        socket.create_connection((host, DASHBOARD_PORT), timeout=timeout_s) as connection,
+        connection.makefile("rb") as lines,
+    ):
+        lines.readline(_LONGEST_LINE)  # the banner
+        for question in questions:
+            connection.sendall(f"{question}\n".encode())
+            answer = lines.readline(_LONGEST_LINE)
+            if not answer:
+                raise DriverError(f"The dashboard server at {host} closed the connection at `{question}`.")
+            answers.append(answer.decode(errors="replace").strip())
+    return answers
+
+
+@contextmanager
+def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None]:
+    """Turn a failed or unanswered exchange with the controller into a ProbeError."""
+    try:
+        yield
+    except TimeoutError as error:
+        raise ProbeError("silent", error_messages.silent(host, timeout_s, activity)) from error
+    except (OSError, struct.error) as error:
+        reason = str(error) or type(error).__name__
+        raise ProbeError("unreachable", error_messages.unreachable(host, reason)) from error
+
+
+def _agree_on_protocol(connection: socket.socket) -> bool:
+    """Ask for protocol 2 and return whether the controller accepts it."""
+    return _request(connection, _PROTOCOL, b"\x00\x02")[:1] == b"\x01"
+
+
+def _request(connection: socket.socket, kind: int, payload: bytes = b"") -> bytes:
+    """Send an RTDE package and return the next one of its kind; OSError where the next twenty are of other kinds."""
+    connection.sendall(HEADER.pack(HEADER.size + len(payload), kind) + payload)
+    for _ in range(_OTHER_PACKAGES):
+        size, got = HEADER.unpack(_receive_exactly(connection, HEADER.size))
+        answer = _receive_exactly(connection, size - HEADER.size)
+        if got == kind:
+            return answer
+    raise OSError("something else than RTDE listens on its port")
+
+
+def _receive_exactly(connection: socket.socket, size: int) -> bytes:
+    data = b""
+    while len(data) < size:
+        part = connection.recv(size - len(data))
+        if not part:
+            raise OSError("the connection was closed")
+        data += part
+    return data
+
+
+class SampleParser:
+    """Finds the newest sample in the controller's byte stream. No I/O."""
+
+    def __init__(self) -> None:
+        self._buffer = b""
+
+    def feed(self, data: bytes) -> ReceivedSample | None:
+        """Return the newest sample that `data` completes, or None.
+
+        Raises:
+            ProtocolError: a package is invalid, so that the start of the next one is unknown.
+        """
+        data = self._buffer + data
+        start, newest, received = 0, -1, len(data)
+        while received - start >= HEADER.size:
+            size, kind = HEADER.unpack_from(data, start)
+            if size < HEADER.size or (kind == _DATA and size != _PACKAGE_BYTES):
+                raise ProtocolError(f"The controller sent a package of kind {kind} with {size} bytes.")
+            if received - start < size:
+                break
+            if kind == _DATA:
+                newest = start
+            start += size
+        self._buffer = data[start:]
+        if newest < 0:
+            return None
+        values = _VALUES.unpack_from(data, newest + HEADER.size + 1)
+        return ReceivedSample(values[0], values[1:7], values[7:13], values[13:19], values[19:25], *values[25:])
+
+
+class RtdeReceiver:
+    """A connection on which the controller sends samples; `connected` is False once it has ended.
+
+    Samples wait in the kernel until `latest` takes the newest one. ur-rtde's interface polls its socket instead, which
+    takes a third of the worker's processor time at rest.
+    """
+
+    def __init__(self, host: str, rate_hz: float, timeout_s: float) -> None:
+        """Connect and wait for the first sample.
+
+        Raises:
+            ProbeError: the controller is absent or silent, or does not send the outputs.
+        """
+        self._parser = SampleParser()
+        self.connected = True
+        with explain_failure(host, timeout_s, "asking for its state"):
+            self._connection = socket.create_connection((host, RTDE_PORT), timeout=timeout_s)
+            try:
+                self._sample = self._first_sample(rate_hz)
+            except BaseException:
+                self.close()
+                raise
+        self._connection.setblocking(False)
+
+    def close(self) -> None:
+        """Close the connection."""
+        self.connected = False
+        self._connection.close()
+
+    def _first_sample(self, rate_hz: float) -> ReceivedSample:
+        _agree_on_protocol(self._connection)
+        answer = _request(self._connection, _OUTPUTS, struct.pack(">d", rate_hz) + ",".join(_TYPES).encode())
+        types = answer[1:].decode(errors="replace")
+        if types != ",".join(_TYPES.values()):
+            raise OSError(f"its outputs are of the types {types}")
+        if _request(self._connection, _START) != b"\x01":
+            raise OSError("it does not send its state")
+        while self.connected:
+            sample = self._receive()
+            if sample is not None:
+                return sample
+        raise OSError("it closed the connection on which it was to send its state")
+
+    def latest(self) -> ReceivedSample:
+        """Return the newest sample received, without waiting."""
+        if self.connected:
+            self._sample = self._receive() or self._sample
+        return self._sample
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for data, at most this long, and return whether there is any."""
+        return self.connected and bool(select.select([self._connection], [], [], max(0.0, seconds))[0])
+
+    def _receive(self) -> ReceivedSample | None:
+        newest, more = None, True
+        while more:
+            try:
+                data = self._connection.recv(_READ_BYTES)
+                newest = self._parser.feed(data) or newest
+            except BlockingIOError:
+                break
+            except (OSError, ProtocolError) as error:
+                if isinstance(error, TimeoutError) and self._connection.gettimeout():
+                    # Only the first sample has a timeout of ours; a later one is the network's.
+                    raise
+                data = b""
+            self.connected, more = bool(data), len(data) == _READ_BYTES
+        return newest
+
+
+class SampleAge:
+    """The age of each sample by the controller's clock. No clock here: both times are arguments.
+
+    A sample that is new to us may have waited in a socket. The offset between the two clocks is unknown, but its
+    smallest value belongs to the fastest sample; later samples have waited for the difference.
+    """
+
+    def __init__(self) -> None:
+        self._timestamp_s = math.nan
+        self._made_ns = 0
+        self._offset_ns = self._seen_ns = 0
+
+    def age_ns(self, timestamp_s: float, now_ns: int) -> int:
+        """Return the time in ns since the sample was made; 0 for the first, and unchanged for a NaN timestamp."""
+        if timestamp_s != self._timestamp_s and math.isfinite(timestamp_s):
+            self._update(timestamp_s, now_ns)
+        return max(0, now_ns - self._made_ns)
+
+    def _update(self, timestamp_s: float, now_ns: int) -> None:
+        stamped_ns = round(timestamp_s * 1e9)
+        offset_ns = now_ns - stamped_ns
+        # A timestamp that runs backwards is a restarted controller, with a new clock.
+        if timestamp_s > self._timestamp_s:
+            risen_ns = self._offset_ns + round(_OFFSET_RISE * (now_ns - self._seen_ns))
+            offset_ns = min(offset_ns, risen_ns)
+        self._timestamp_s, self._offset_ns, self._seen_ns = timestamp_s, offset_ns, now_ns
+        self._made_ns = stamped_ns + offset_ns
+
+
+class SampleSource(Protocol):
+    """The part of `RtdeReceiver` that `ScriptReadiness` needs."""
+
+    connected: bool
+
+    def latest(self) -> ReceivedSample:
+        """Return the newest sample received."""
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for data, at most this long, and return whether there is any."""
+
+
+class ScriptReadiness:
+    """Waits until ur-rtde's control script is ready for the next command (output register 0).
+
+    ur-rtde waits for that itself at the start of each call: without sleeping, for up to 4 s, also after the program has
+    ended. Waiting here first keeps its calls short.
+    """
+
+    def __init__(self, samples: SampleSource, timeout_s: float) -> None:
+        """Wait for `timeout_s` at most: the time after which the robot's watchdog ends the program."""
+        self._samples, self._timeout_s = samples, timeout_s
+        # By the controller's clock; only a later sample shows the script after the command.
+        self._command_s = -math.inf
+        self._waiting = False
+
+    def command_sent(self) -> None:
+        """Note that a one-time command was sent, or a program started."""
+        self._command_s, self._waiting = self._samples.latest().timestamp_s, True
+
+    def wait(self) -> bool:
+        """Return whether the script is ready; False after the timeout or when the program does not play."""
+        if not self._waiting:
+            return True
+        until_s = time.monotonic() + self._timeout_s
+        while True:
+            sample = self._samples.latest()
+            if not self._samples.connected or sample.runtime_state != RUNTIME_PLAYING:
+                return False
+            if sample.timestamp_s > self._command_s and sample.script_state == SCRIPT_READY:
+                self._waiting = False
+                return True
+            if not self._samples.wait(until_s - time.monotonic()):
+                return False

@@ -1,0 +1,124 @@
+"""`bank design` on recorded slices: what it prints is what `bank build` takes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.io import savemat
+
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.build import build_bank
+from shearloop.bank.eit.channels import N_CHANNELS, N_LINE_VALUES
+from shearloop.bank.eit.design import MeasuredFrames, design_bank
+from shearloop.bank.eit.forward import ForwardModel
+from shearloop.bank.eit.models import conductivity
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
+from shearloop.bank.estimation.values import FrameSeries
+from shearloop.daemon.analysis.bank_design import design_yaml, designed_for, scene_of
+from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
+from shearloop.daemon.bank_config import FingertipGeometryConfig, load_bank_plan, load_geometry
+from shearloop.daemon.cli import main
+from shearloop.daemon.config_file import load_yaml_model
+from shearloop.daemon.recording.writer import RecordingWriter
+
+
+@pytest.fixture(scope="session")
+def built(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a design and the bank built by it, before any test is watched: tqdm keeps a thread."""
+    folder = tmp_path_factory.mktemp("design")
+    config = folder / "design.yaml"
+    assert main(["bank", "design", str(shared / "recordings" / "torque_slices"), "--out", str(config)]) == 0
+    assert main(["bank", "build", "--config", str(config), "--out", str(folder / "scene.bank"), "--jobs", "1"]) == 0
+    return folder
+
+
+def test_a_design_is_a_configuration_that_builds(built: Path) -> None:
+    config = built / "design.yaml"
+    text = config.read_text()
+    assert "of a difference frame" in text
+    assert "injections" in text
+    plan = load_bank_plan(config)
+    assert plan.k_grid[0] < 3.3 < plan.k_grid[-1]
+    bank = Bank.open(built / "scene.bank")
+    np.testing.assert_array_equal(bank.k_grid, plan.k_grid)
+    assert bank.valid.any()
+
+
+def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Path) -> None:
+    mesh = load_geometry(OWN_FINGERTIP)
+    forward = ForwardModel(mesh)
+    cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
+    frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+    # A third of a frame's size: a coarse mesh and few cells, built in no time.
+    frames += np.random.default_rng(0).normal(0.0, 8e-4, frames.shape)
+    design = design_bank(
+        MeasuredFrames(frames, 8e-4, None), load_yaml_model(OWN_FINGERTIP, FingertipGeometryConfig).fingertip()
+    )
+    config = tmp_path / "step.yaml"
+    config.write_text(design_yaml(design, OWN_FINGERTIP, tmp_path))
+    plan = load_bank_plan(config)
+    assert plan.model == "step"
+    assert len(plan.sigma_grid) == 1
+    build_bank(plan.mesh, plan.model, plan.k_grid, plan.sigma_grid, tmp_path / "step.bank")
+    place = RefinedMatcher(Bank.open(tmp_path / "step.bank"), NOT_TURNED).locate(frames[4])
+    assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.k_grid)[0]
+
+
+@pytest.mark.parametrize(("noise_v", "mixed_up"), [(1e-4, False), (5e-3, True)])
+def test_frames_that_no_model_explains_are_called_so_on_the_screen_and_in_the_configuration(
+    noise_v: float, mixed_up: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = load_geometry(OWN_FINGERTIP)
+    forward = ForwardModel(mesh)
+    cells = [conductivity(mesh, "step", k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
+    frames = 0.01 * np.abs([forward.voltages(cell) - forward.homogeneous() for cell in cells])
+    rng = np.random.default_rng(0)
+    frames = frames[:, rng.permutation(N_CHANNELS)] if mixed_up else frames
+    frames += rng.normal(0.0, noise_v, frames.shape)
+    for number, frame in enumerate(frames, 1):
+        savemat(tmp_path / f"Data_Slice_{number}.mat", {"data_diff": frame[None], "torque_value": 0.01 * number})
+    config = tmp_path / "design.yaml"
+    assert main(["bank", "design", str(tmp_path), "--out", str(config)]) == 0
+    told, text = capsys.readouterr().err, config.read_text()
+    for words in ("even the best model leaves ", "the noise is "):
+        assert (f"shearloop bank: {words}" in told) == (f"# NOTE: {words}" in text) == mixed_up
+    assert load_bank_plan(config).model in text
+
+
+def test_sizes_that_overflow_are_refused_without_a_warning() -> None:
+    t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 1e200, (12, 1, N_CHANNELS))
+    with pytest.raises(CalibrationError, match="no noise to design for"):
+        scene_of(FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan)))
+
+
+def test_a_recording_that_is_none_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bank", "design", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_recording_that_begins_gripped_is_designed_for_without_the_frame_that_stands_in_for_the_idle_one() -> None:
+    rng = np.random.default_rng(4)
+    t_s, frames = np.arange(12.0), rng.normal(0.3, 0.01, (12, 1, N_CHANNELS))
+    series = FrameSeries("raw", ("right",), t_s, frames, t_s, np.full(12, 0.1), np.full(12, np.nan))
+    found = scene_of(series)
+    np.testing.assert_array_equal(found.differences, frames[1:, 0] - frames[0, 0])
+
+
+def test_a_side_is_designed_for_by_its_own_frames_however_few_the_other_one_has(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng, period_ns = np.random.default_rng(5), 540_800_000
+    with RecordingWriter(tmp_path / "one.mcap", "a test") as writer:
+        for number in range(12):
+            t_ns = number * period_ns
+            writer.add_frame("left", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+            writer.add_torque(t_ns, 0.1)
+        # A board that was lost soon, and whose frames lie beside the other's.
+        for t_ns in (6 * period_ns, 20 * period_ns):
+            writer.add_frame("right", t_ns, t_ns, rng.uniform(0.3, 0.4, N_LINE_VALUES))
+    scenes: list[MeasuredFrames] = []
+    monkeypatch.setattr("shearloop.daemon.analysis.bank_design.design_bank", lambda scene, _: scenes.append(scene))
+    designed_for(tmp_path / "one.mcap", None, "left")
+    # Of the twelve the first stands in for the idle one.
+    assert scenes[0].differences.shape == (11, N_CHANNELS)

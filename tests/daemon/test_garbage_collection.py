@@ -1,0 +1,94 @@
+"""What Python's garbage collector looks through, before a daemon is ready, while it runs, and after it."""
+
+import gc
+import weakref
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+import zmq.asyncio
+
+from shearloop.daemon import app
+from shearloop.daemon.app import Daemon
+from shearloop.daemon.cli import main
+from shearloop.daemon.config import load_daemon_config
+from shearloop.daemon.gc_control import without_long_collections
+
+
+class Cycle:
+    """An object that only the collector can free."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+@pytest.fixture(autouse=True)
+def as_it_was() -> Iterator[None]:
+    gc.unfreeze()
+    yield
+    gc.unfreeze()
+    gc.enable()
+
+
+def forgotten() -> weakref.ref[Cycle]:
+    """Return a reference to an object that nobody else has one to."""
+    return weakref.ref(Cycle())
+
+
+def test_nothing_is_collected_until_all_that_lasts_is_there_and_then_only_what_comes() -> None:
+    with without_long_collections() as collect_what_comes:
+        assert not gc.isenabled()
+        before = forgotten()
+        collect_what_comes()
+        assert gc.isenabled()
+        after = forgotten()
+        gc.collect()
+        assert before() is not None
+        assert after() is None
+    gc.collect()
+    assert before() is None
+    assert gc.isenabled()
+    assert gc.get_freeze_count() == 0
+
+
+def test_what_ends_before_it_is_ready_leaves_the_collector_as_it_was() -> None:
+    with pytest.raises(SystemExit), without_long_collections():
+        raise SystemExit
+    assert gc.isenabled()
+
+
+def test_collector_that_was_off_stays_off() -> None:
+    gc.disable()
+    with without_long_collections() as collect_what_comes:
+        collect_what_comes()
+        assert not gc.isenabled()
+    assert not gc.isenabled()
+
+
+def test_daemon_of_the_command_line_is_collected_from_when_it_is_ready(
+    config: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    collected = []
+
+    async def run_daemon(_config: object, _listeners: object, _facts: object, on_ready: Callable[[], None]) -> bool:
+        collected.append(gc.isenabled())
+        on_ready()
+        collected.append(gc.isenabled() and gc.get_freeze_count() > 0)
+        return True
+
+    monkeypatch.setattr(app, "run_daemon", run_daemon)
+    assert main(["run", str(config())]) == 0
+    assert collected == [False, True]
+
+
+async def test_daemon_says_when_all_of_it_is_made(config: Callable[..., Path]) -> None:
+    said = []
+    with zmq.asyncio.Context() as context:
+        daemon = Daemon(load_daemon_config(config()), context)
+
+        def on_ready() -> None:
+            said.append("ready")
+            daemon.stop()
+
+        await daemon.run(on_ready)
+    assert said == ["ready"]

@@ -128,8 +128,8 @@ def tool_of(recording: Recording, t_ns: IntArray, given_mm: float | None = None)
         conflict = f"it names a tool of {named_mm:g} mm, and the gripper held one of {held[0].value:.1f} mm"
     if conflict and given_mm is None:
         raise UserError(
-            f"{recording.path}: {conflict}; record one tool at a time, correct the experiment's `tool_mm`, or calibrate "
-            "with --tool-mm if you know which it was"
+            f"{recording.path}: {conflict}; record one tool at a time, correct the experiment's `tool_mm`, or "
+            "calibrate with --tool-mm if you know which it was"
         )
     if given_mm is not None and (conflict or np.isnan(named_mm)):
         return given_mm, None

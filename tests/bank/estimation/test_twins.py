@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from shearloop.bank.eit.batch_forward import BatchForwardModel
+from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.estimation.novelty import _FIRST, _SECOND, NoveltyDetector, ReciprocityCheck
 from tests.bank.conftest import small_fingertip
 

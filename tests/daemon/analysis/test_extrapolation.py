@@ -113,7 +113,7 @@ def test_the_picture_marks_what_breaks_and_writes_how_many_slices_were_calibrate
     found = [
         Extrapolation(fault_curve(which, "N·m", name, levels), (29, 24, 14), (0.08, 0.04, None))
         for which in (SMALLER, LARGER)
-        for name in ("fused", "bank")
+        for name in ("motion_regression", "bank")
     ]
     made = extrapolation_figure("slices", found)
     assert len(made.axes) == 8

@@ -66,7 +66,7 @@ def test_the_experiment_names_its_tool(tmp_path: Path, capsys: pytest.CaptureFix
     path = recorded(tmp_path, (5, Measured(20.4, 1.2)), (35, None), named_mm=20.0)
     (series,) = read_series(path)
     assert series.tool_mm == Measured(20.0, 0.0), "and the gripper, which is not as exact, agrees"
-    assert series.gripped_mm is None
+    assert series.gripper_mm is None
     assert read_series(path, tool_mm=30.0)[0].tool_mm == Measured(20.0, 0.0), "a recording that names it knows better"
     assert summarise(path).tool_mm == "20"
     assert main(["recording", "info", str(path)]) == 0
@@ -79,7 +79,7 @@ def test_the_gripper_says_which_tool_it_held(tmp_path: Path) -> None:
     (series,) = read_series(path)
     assert series.tool_mm == TWENTY
     assert np.isnan(series.diameter_mm).all(), "which is no truth to fit a diameter to"
-    assert series.between(10, 20).of_sides(("right",)).tool_mm == TWENTY
+    assert series.between(10, 20).select_sides(("right",)).tool_mm == TWENTY
     assert read_series(path, tool_mm=20.0)[0].tool_mm == Measured(20.0, 0.0)
 
 

@@ -21,8 +21,7 @@ from shearloop.daemon.sensing.fingertip_task import (
     EstimatorTask,
     FingertipTask,
 )
-from shearloop.drivers.eit_format import FRAME_PERIOD_S
-from shearloop.drivers.eit_kit import EitKit, Frame
+from shearloop.drivers.eit_kit import FRAME_PERIOD_S, EitKit, Frame
 from shearloop.drivers.raw_event import InputKind, RawEvent
 
 MS = 1_000_000

@@ -10,6 +10,7 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
+from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, Measured, TactileFrame
 from shearloop.bank.estimation.bank_match import PaperMatcher
 from shearloop.bank.estimation.session import REPEATED_FRAME
@@ -126,7 +127,7 @@ def open_estimator(config: FingertipConfig, name: str) -> LiveEstimator:
             )
         if calibration.has_curves_only and config.bank is None:
             raise UserError(f"the paper's estimator of {name} needs its bank; add `bank:` to the fingertip")
-        return LiveEstimator(calibration, config)
+        return _live(config.calibration, calibration, config)
     if config.estimator not in (None, "paper"):
         found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
         raise UserError(
@@ -149,7 +150,7 @@ def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConf
             f"{config.calibration} is of {' and '.join(calibration.sides)}, and the fingertips are "
             f"{', '.join(fingertips)}; calibrate on a recording of both, and name the fingertips as its sides"
         )
-    return LiveEstimator(calibration, fingertips[calibration.sides[0]])
+    return _live(config.calibration, calibration, fingertips[calibration.sides[0]])
 
 
 def torque_sources(
@@ -180,6 +181,13 @@ def _shared_matcher(bank: Bank, matching: str) -> PrunedMatcher | PrunedZeroLagM
     if shared is None:
         shared = _in_use[key] = _MATCHERS[matching].from_bank(bank)
     return shared
+
+
+def _live(path: Path, calibration: Calibration, config: FingertipConfig) -> LiveEstimator:
+    try:
+        return LiveEstimator(calibration, config)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from error
 
 
 def _load(path: Path, wanted: str | None) -> Calibration:

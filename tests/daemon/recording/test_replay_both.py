@@ -131,10 +131,10 @@ def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
     torques = [one["torque_nm"] for _, one in replays[math.inf] if one["source"] == "right" and one["valid"]]
     assert len(torques) > 30
     assert np.ptp(torques) > 0.05
-    says = [(one["source"], "the tool is of 14 mm" in one["reason"]) for _, one in replays[math.inf]]
+    says = [(one["source"], "the tool has 14 mm" in one["reason"]) for _, one in replays[math.inf]]
     assert not any(refused for source, refused in says if source != "right")
     right = [one for _, one in replays[math.inf] if one["source"] == "right"]
-    refused = [number for number, one in enumerate(right) if "the tool is of 14 mm" in one["reason"]]
+    refused = [number for number, one in enumerate(right) if "the tool has 14 mm" in one["reason"]]
     # On a busy computer frames come so unevenly that a few are refused as coming after lost ones.
     assert refused
     assert set(refused) <= set(OTHER_TOOL)

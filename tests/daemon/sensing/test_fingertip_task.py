@@ -22,7 +22,7 @@ from shearloop.daemon.sensing.fingertip_task import (
     FingertipTask,
 )
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S, EitKit, Frame
-from shearloop.drivers.raw_event import InputKind, RawEvent
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 MS = 1_000_000
 PERIOD_S = 0.54
@@ -50,7 +50,7 @@ class RecordingPublisher:
             self._published.clear()
             await self._published.wait()
 
-    def wanted(self, _topic: str) -> bool:
+    def has_subscriber(self, _topic: str) -> bool:
         return False
 
     def numbers(self, topic: str, source: str) -> list[int]:

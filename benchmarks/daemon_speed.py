@@ -19,7 +19,7 @@ import tempfile
 import threading
 import time
 import tty
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,6 @@ import yaml
 import zmq
 from numpy.typing import NDArray
 
-from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.channels import line_of_channels
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
@@ -45,9 +43,9 @@ FLOOD_HZ = 500.0
 USB_PACKET_BYTES = 512
 # Before processor time counts: until everything is connected, and until the experiment has gripped its tool.
 SETTLING_S, GRIPPING_S = 10.0, 15.0
-RIG_RECORDING, RIG_BANK, RIG_BOTH_CALIBRATION = "rig-25mm.mcap", "demo.bank", "rig.cal"
-# The recording starts with idle frames and a grip; its 40th frame gives the first valid estimate.
-FIRST_FRAME, FIRST_VALID_FRAME = 12, 39
+RIG_RECORDING, RIG_BANK = "rig-25mm.mcap", "demo.bank"
+# Idle frames to skip, and the number of frames until the default estimator is valid in the grip.
+FIRST_FRAME, FIRST_VALID_FRAME = 12, 28
 TWISTS = {
     "name": "twists",
     "torque_source": "load_cell",
@@ -98,24 +96,6 @@ class PlayedBoard:
         """Close both ends."""
         os.close(self._master)
         os.close(self._slave)
-
-
-def lines_of_bank(bank: Bank, n: int, n_idle: int = 10) -> list[bytes]:
-    """Return n lines of a board: idle ones, then contacts from the whole bank, with noise."""
-    random = np.random.default_rng(0)
-    cells = np.argwhere(bank.valid)
-    # The bank's voltages have units of their own; the board sends up to 0.78 V.
-    scale = 0.3 / np.abs(bank.homogeneous).max()
-    volts = scale * np.abs(bank.homogeneous) + 0.02
-    found = []
-    for number in range(n):
-        signal = np.zeros(len(volts))
-        if number >= n_idle:
-            signal = scale * bank.signals[tuple(cells[random.integers(len(cells))])].astype(np.float64)
-            signal *= min(1.0, 0.25 / np.abs(signal).max())
-        channels = np.clip(volts + signal + random.normal(0, 0.002, len(volts)), 0.002, 0.77)
-        found.append(line_text(line_of_channels(channels)))
-    return found
 
 
 def line_text(values: NDArray[np.float64]) -> bytes:
@@ -201,68 +181,64 @@ def resident_mb(pid: int) -> float:
     raise RuntimeError(f"process {pid} has ended")
 
 
-def bank_latency(bank: Path, matching: str, n_frames: int, pause_s: float) -> dict[str, float]:
-    """Return the milliseconds from a frame's last byte to its estimate by matching in a bank."""
+def recorded_lines(rig: Path, side: str, n: int) -> list[bytes]:
+    """Return n lines of one board from the emulated rig's recording: idle ones, then a gripped tool being twisted."""
+    lines = [line_text(one) for one in read_recording(rig / RIG_RECORDING).sides[side].lines[FIRST_FRAME:]]
+    return [lines[number % len(lines)] for number in range(n)]
+
+
+def by_bank(args: argparse.Namespace, matching: str) -> dict[str, Any]:
+    """Return the configuration of one fingertip that is matched in a bank."""
+    return {"fingertips": {"right": {"bank": str(args.bank.resolve()), "matching": matching}}}
+
+
+def by_default(args: argparse.Namespace, sides: Sequence[str]) -> dict[str, Any]:
+    """Return the configuration of fingertips with the default estimator, and of the combined one for several."""
+    rig = args.rig.resolve()
+    fingertips = {
+        side: {"calibration": str(rig / f"rig-{side}.cal"), "estimator": "motion_regression"} for side in sides
+    }
+    combined = {COMBINED: {"calibration": str(rig / "rig.cal")}} if len(sides) > 1 else {}
+    return {"fingertips": fingertips, **combined}
+
+
+@contextlib.contextmanager
+def played(config: dict[str, Any], period_s: float) -> Iterator[tuple[dict[str, PlayedBoard], int, float, Any]]:
+    """Run a daemon on boards that the benchmark plays; yield them, its process id, ready time, and estimates."""
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
-        board = PlayedBoard(folder / "right")
-        opened.callback(board.close)
-        fingertip = {"device": {"path": str(folder / "right")}, "bank": str(bank.resolve()), "matching": matching}
-        config = write_config(folder, fingertips={"right": {**fingertip, "frame_period_s": pause_s}})
-        _, ready_s = opened.enter_context(running_daemon(config))
-        estimates = opened.enter_context(subscription(folder, "eit.estimate"))
-        board.wait_for_start()
-        taken = []
-        for line in lines_of_bank(Bank.open(bank), n_frames + 10):
-            time.sleep(pause_s)
-            sent_ns = board.send_in_packets(line)
-            arrived_ns, content = receive(estimates)
-            if content["k"] is not None:
-                taken.append((arrived_ns - sent_ns) / 1e6)
-    return {**_percentiles(taken), "ready_s": ready_s}
-
-
-def estimator_latency(rig: Path, sides: Sequence[str], n_frames: int, pause_s: float) -> dict[str, dict[str, float]]:
-    """Return by source the milliseconds from a frame's last byte to a valid estimate by the default estimator.
-
-    With two fingertips the combined estimate counts from the last byte of the later frame. Estimates that are not valid
-    or do not come are counted and not timed.
-    """
-    recorded = read_recording(rig / RIG_RECORDING).sides
-    frames = slice(FIRST_FRAME, FIRST_VALID_FRAME + n_frames)
-    lines = {side: [line_text(one) for one in recorded[side].lines[frames]] for side in sides}
-    taken: dict[str, list[float]] = {source: [] for source in ((*sides, COMBINED) if len(sides) > 1 else sides)}
-    missed = dict.fromkeys(taken, 0)
-    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
-        folder = Path(name)
-        boards = {side: PlayedBoard(folder / side) for side in sides}
-        for board in boards.values():
-            opened.callback(board.close)
-        content: dict[str, Any] = {
-            "fingertips": {
-                side: {
-                    "device": {"path": str(folder / side)},
-                    "frame_period_s": pause_s,
-                    "calibration": str((rig / f"rig-{side}.cal").resolve()),
-                    "estimator": "motion_regression",
-                }
-                for side in sides
-            }
+        boards = {
+            side: opened.enter_context(contextlib.closing(PlayedBoard(folder / side))) for side in config["fingertips"]
         }
-        if len(sides) > 1:
-            content[COMBINED] = {"calibration": str((rig / RIG_BOTH_CALIBRATION).resolve())}
-        opened.enter_context(running_daemon(write_config(folder, **content)))
+        for side, fingertip in config["fingertips"].items():
+            fingertip |= {"device": {"path": str(folder / side)}, "frame_period_s": period_s}
+        pid, ready_s = opened.enter_context(running_daemon(write_config(folder, **config)))
         estimates = opened.enter_context(subscription(folder, "eit.estimate"))
-        estimates.setsockopt(zmq.RCVTIMEO, 1000)
         for board in boards.values():
             board.wait_for_start()
-        for number in range(min(map(len, lines.values()))):
-            time.sleep(0.5 * pause_s)
+        yield boards, pid, ready_s, estimates
+
+
+def latency(config: dict[str, Any], rig: Path, n_frames: int, period_s: float) -> dict[str, dict[str, float]]:
+    """Return by source the milliseconds from a frame's last byte to its estimate.
+
+    The combined estimate counts from the last byte of the later frame. The first frames, until the default estimator is
+    valid, are not timed; an estimate that does not come within a second is missed.
+    """
+    sides = list(config["fingertips"])
+    lines = {side: recorded_lines(rig, side, FIRST_VALID_FRAME + n_frames) for side in sides}
+    last_sources = {sides[-1], COMBINED} if len(sides) > 1 else {sides[-1]}
+    taken: dict[str, list[float]] = {source: [] for source in (*sides, *last_sources)}
+    missed, latest = dict.fromkeys(taken, 0), dict.fromkeys(taken, -1)
+    with played(config, period_s) as (boards, _, ready_s, estimates):
+        estimates.setsockopt(zmq.RCVTIMEO, 1000)
+        for number in range(FIRST_VALID_FRAME + n_frames):
+            time.sleep(0.5 * period_s)
             for side, board in boards.items():
                 # Two boards do not keep step.
-                time.sleep(0.5 * pause_s / len(sides))
+                time.sleep(0.5 * period_s / len(sides))
                 sent_ns = board.send_in_packets(lines[side][number])
-                awaited = {side, COMBINED} if side == sides[-1] and len(sides) > 1 else {side}
+                awaited = set(last_sources) if side == sides[-1] else {side}
                 while awaited:
                     try:
                         arrived_ns, estimate = receive(estimates)
@@ -271,16 +247,14 @@ def estimator_latency(rig: Path, sides: Sequence[str], n_frames: int, pause_s: f
                             missed[source] += 1
                         break
                     source = estimate["source"]
-                    if estimate["frame"] != number or source not in awaited:
-                        continue
-                    awaited.remove(source)
-                    if estimate["valid"]:
-                        taken[source].append((arrived_ns - sent_ns) / 1e6)
-                    else:
-                        missed[source] += number >= FIRST_VALID_FRAME - FIRST_FRAME
-    if not all(taken.values()):
-        raise RuntimeError("no estimate was valid: run shearloop.daemon.cli.demo_calibration again")
-    return {source: {**_percentiles(found), "missed": missed[source]} for source, found in taken.items()}
+                    if source in awaited and estimate["frame"] > latest[source]:
+                        awaited.remove(source)
+                        latest[source] = estimate["frame"]
+                        if number >= FIRST_VALID_FRAME and (estimate["valid"] or estimate["k"] is not None):
+                            taken[source].append((arrived_ns - sent_ns) / 1e6)
+    return {
+        source: {**_percentiles(found), "missed": missed[source], "ready_s": ready_s} for source, found in taken.items()
+    }
 
 
 def _percentiles(taken_ms: Sequence[float]) -> dict[str, float]:
@@ -288,28 +262,20 @@ def _percentiles(taken_ms: Sequence[float]) -> dict[str, float]:
     return {"p50_ms": float(p50), "p99_ms": float(p99), "n": len(taken_ms)}
 
 
-def flood(bank: Path, n_frames: int) -> dict[str, Any]:
+def flood(args: argparse.Namespace, n_frames: int) -> dict[str, Any]:
     """Return the losses and the load at five hundred frames a second."""
-    with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
-        folder = Path(name)
-        board = PlayedBoard(folder / "right")
-        opened.callback(board.close)
-        fingertip = {"device": {"path": str(folder / "right")}, "bank": str(bank.resolve()), "matching": "zero_lag"}
-        config = write_config(folder, fingertips={"right": {**fingertip, "frame_period_s": 1 / FLOOD_HZ}})
-        played = lines_of_bank(Bank.open(bank), n_frames)
-        pid, _ = opened.enter_context(running_daemon(config))
-        estimates = opened.enter_context(subscription(folder, "eit.estimate"))
-        board.wait_for_start()
+    lines = recorded_lines(args.rig, "right", n_frames)
+    with played(by_bank(args, "zero_lag"), 1 / FLOOD_HZ) as (boards, pid, _, estimates):
         before, begun = cpu_s(pid), time.monotonic()
 
         def play() -> None:
-            for number, line in enumerate(played):
+            for number, line in enumerate(lines):
                 time.sleep(max(0.0, begun + number / FLOOD_HZ - time.monotonic()))
-                board.send(line)
+                boards["right"].send(line)
 
         player = threading.Thread(target=play)
         player.start()
-        frames = [receive(estimates)[1]["frame"] for _ in played]
+        frames = [receive(estimates)[1]["frame"] for _ in lines]
         took_s = time.monotonic() - begun
         player.join()
         busy = (cpu_s(pid) - before) / took_s
@@ -409,20 +375,21 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             found["build_10000_cells_s"] = command_s(*built)
         found["help_s"] = command_s("--help", repeats=REPEATS)
     if "latency" in args.only:
+        configs: dict[str, Callable[[], dict[str, Any]]] = {
+            "zero_lag": lambda: by_bank(args, "zero_lag"),
+            "all_lags": lambda: by_bank(args, "all_lags"),
+            "default_one_fingertip": lambda: by_default(args, ("right",)),
+            "default_both": lambda: by_default(args, ("right", "left")),
+        }
         found["latency"] = {
             name: {
-                "every_30_ms": latency(args.frames, PAUSE_S),
-                "at_the_boards_rate": latency(args.frames // 3, FRAME_PERIOD_S),
+                "every_30_ms": latency(config(), args.rig, args.frames, PAUSE_S),
+                "at_the_boards_rate": latency(config(), args.rig, args.frames // 3, FRAME_PERIOD_S),
             }
-            for name, latency in (
-                ("zero_lag", lambda n, pause_s: bank_latency(args.bank, "zero_lag", n, pause_s)),
-                ("all_lags", lambda n, pause_s: bank_latency(args.bank, "all_lags", n, pause_s)),
-                ("default_one_fingertip", lambda n, pause_s: estimator_latency(args.rig, ("right",), n, pause_s)),
-                ("default_both", lambda n, pause_s: estimator_latency(args.rig, ("right", "left"), n, pause_s)),
-            )
+            for name, config in configs.items()
         }
     if "flood" in args.only:
-        found["flood"] = flood(args.bank, 10 * args.frames)
+        found["flood"] = flood(args, 10 * args.frames)
     if "rated" in args.only:
         found["rated"] = rated(args.bank, args.rig / RIG_BANK, args.rated_s)
     if "twisting" in args.only:
@@ -435,7 +402,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bank", type=Path, required=True, help="the fingertips' bank, of 100 × 100 cells")
     parser.add_argument("--rig", type=Path, required=True, help="folder with rig-25mm.mcap, rig*.cal and demo.bank")
-    parser.add_argument("--frames", type=int, default=300, help="number of timed frames")
+    parser.add_argument("--frames", type=int, default=240, help="number of timed frames")
     parser.add_argument("--rated-s", type=float, default=30.0, help="seconds at rated speeds")
     parser.add_argument("--only", nargs="+", choices=MEASUREMENTS, default=MEASUREMENTS)
     parser.add_argument("--out", type=Path, required=True)

@@ -1,24 +1,22 @@
 """Where the twist loop becomes unstable: gain over delay and over lost frames, computed and simulated.
 
-    python -m benchmarks.stability_map --out DIR
+    python -m benchmarks.stability_map --out run/stability_map.json
 
 Three loops at the EIT's rate, without noise: one without a delay compensator, the twist controller with the right
 stiffness, and the twist controller with a tool twice as stiff as it believes. The simulated boundary is bisected with
 the real controller on the simulated plant. The computed one comes from the margins' equations (delay) and
-from the monodromy matrix of one cycle of lost frames. Writes stability_map.json and stability_map.png.
+from the monodromy matrix of one cycle of lost frames.
 """
 
 import argparse
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from shearloop.bank.arrays import FloatArray
-from shearloop.daemon.analysis.charts.drawing import figure
 from shearloop.daemon.analysis.charts.simulated_loop import (
     LoopController,
     Plant,
@@ -46,7 +44,6 @@ LOWEST, HIGHEST = 0.02, 4.0
 START_NM = 1e-3
 # Long enough to show growth of half a per cent a frame.
 FRAMES = 90
-_INK, _PALE, _TOP = "0.05", "0.85", 2.4
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +84,7 @@ class LoopCase:
 CASES = (
     LoopCase("no compensator", compensated=False),
     LoopCase("twist controller", compensated=True),
-    LoopCase("twist controller,\ntool twice as stiff as believed", compensated=True, stiffness_ratio=2.0),
+    LoopCase("twist controller, tool twice as stiff as believed", compensated=True, stiffness_ratio=2.0),
 )
 
 
@@ -166,74 +163,43 @@ def _lost_frame(size: int) -> FloatArray:
     return matrix
 
 
-def boundaries() -> dict[str, dict[str, list[list[float]]]]:
-    """Return by case and axis the rows [place, computed gain, simulated gain]."""
+def boundary(case: LoopCase, age_s: float, lost: int) -> dict[str, float | None]:
+    """Return the computed and the simulated gain at the boundary, None above HIGHEST."""
+    computed, simulated = computed_boundary(case, age_s, lost), simulated_boundary(case, age_s, lost)
     return {
-        case.name.replace("\n", " "): {
-            "age_s": [[age, computed_boundary(case, age, 0), simulated_boundary(case, age, 0)] for age in AGES_S],
-            "lost_of_8": [
-                [lost, computed_boundary(case, EIT_AGE_S, lost), simulated_boundary(case, EIT_AGE_S, lost)]
-                for lost in LOST
-            ],
-        }
-        for case in CASES
+        "age_s": age_s,
+        "lost": lost,
+        "computed": computed if np.isfinite(computed) else None,
+        "simulated": simulated if np.isfinite(simulated) else None,
     }
 
 
-def worst_disagreement(rows: Sequence[Sequence[float]]) -> float:
-    """Return the largest relative difference of computed and simulated gain; inf where only one is finite."""
-    differences = [abs(simulated / computed - 1.0) for _, computed, simulated in rows if np.isfinite(computed)]
-    one_sided = any(np.isfinite(computed) != np.isfinite(simulated) for _, computed, simulated in rows)
-    return np.inf if one_sided else max(differences, default=0.0)
-
-
-def draw(path: Path, cases: Mapping[str, Mapping[str, Sequence[Sequence[float]]]]) -> None:
-    """Draw the stable region of each case under its computed boundary, with the simulated one on top."""
-    made = figure(9.5, 5.6)
-    axes = made.subplots(2, len(cases), sharey=True, sharex="row")
-    for column, (name, rows) in enumerate(cases.items()):
-        _draw_region(axes[0, column], np.array(rows["age_s"]))
-        _draw_region(axes[1, column], np.array(rows["lost_of_8"]))
-        axes[0, column].set_title(name.replace(", ", ",\n", 1), fontsize=10)
-        axes[0, column].axvline(EIT_AGE_S, color=_INK, linewidth=0.8, linestyle=":")
-        axes[0, column].set_xlabel("age of a torque when it is used / s")
-        axes[1, column].set_xlabel("frames lost in a row, of every 8")
-    axes[0, 0].annotate("EIT", (EIT_AGE_S, 0.03), xytext=(3, 0), textcoords="offset points")
-    for axis in axes[:, 0]:
-        axis.set(ylabel="gain kp per frame", ylim=(0.0, _TOP))
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    made.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    made.suptitle("Where the twist loop becomes unstable (1.85 frames a second)", fontsize=11)
-    made.savefig(path, dpi=130)
-
-
-def _draw_region(axis: Axes, rows: FloatArray) -> None:
-    where, computed, simulated = np.minimum(rows, 10.0).T
-    axis.fill_between(where, 0.0, computed, color=_PALE, linewidth=0.0, label="stable")
-    axis.plot(where, computed, color=_INK, linewidth=1.4, label="boundary, computed")
-    axis.plot(where, simulated, "o", color=_INK, markerfacecolor="white", markersize=5.5, label="boundary, simulated")
+def worst_disagreement(rows: Iterable[Mapping[str, float | None]]) -> float:
+    """Return the largest relative difference of computed and simulated gain; inf where only one is known."""
+    worst = 0.0
+    for row in rows:
+        computed, simulated = row["computed"], row["simulated"]
+        if computed is not None and simulated is not None:
+            worst = max(worst, abs(simulated / computed - 1.0))
+        elif computed is not simulated:
+            return np.inf
+    return worst
 
 
 def main() -> None:
     """Measure, write the numbers, draw the chart."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for stability_map.json and .png")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    cases = boundaries()
-    worst = {name: {axis: worst_disagreement(rows) for axis, rows in axes.items()} for name, axes in cases.items()}
-    # JSON has no infinity: null stands for a boundary above the map.
-    finite = {
-        name: {
-            axis: [[value if np.isfinite(value) else None for value in row] for row in rows]
-            for axis, rows in axes.items()
-        }
-        for name, axes in cases.items()
-    }
-    result = {"eit_age_s": EIT_AGE_S, "boundaries": finite, "worst_disagreement": worst}
-    (args.out / "stability_map.json").write_text(json.dumps(result, indent=2) + "\n")
-    print(json.dumps({"worst_disagreement": worst}, indent=2))
-    draw(args.out / "stability_map.png", cases)
+    points = [(age, 0) for age in AGES_S] + [(EIT_AGE_S, lost) for lost in LOST[1:]]
+    found = {case.name: [boundary(case, *point) for point in points] for case in CASES}
+    print("| loop | age, s | lost of 8 | computed gain | simulated gain |\n|---|---|---|---|---|")
+    for name, rows in found.items():
+        for row in rows:
+            print(f"| {name} | {' | '.join('–' if value is None else f'{value:.3g}' for value in row.values())} |")
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(json.dumps(found, indent=1) + "\n")
+    print(f"largest disagreement {worst_disagreement([row for rows in found.values() for row in rows]):.1%}")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """A torque step on the emulated rig's physics, judged on the true torque over many seeds.
 
-    python -m benchmarks.step_response --out DIR [--seeds 200] [--bank run/demo.bank]
+    python -m benchmarks.step_response --out run/step_response.json [--seeds 200] [--bank run/demo.bank]
 
 For each seed the gel has another stiffness. The loop identifies it with the torque that drives, then steps to
 0.10 N·m. A fingertip errs by 0.012 N·m a frame. Then a screw is tightened to 0.12 N·m on the load cell. With `--bank`
 the default estimator also closes the loop on the rig's own frames from both fingertips, for 20 grips. Simulated time,
-so the numbers are the same on every machine. Writes step_response.json and step_response.png.
+so the numbers are the same on every machine.
 """
 
 import argparse
@@ -170,25 +170,20 @@ def step(plant: Plant, scenario: LoopScenario) -> tuple[FloatArray, bool]:
     return run(plant, controller, scenario.hold_s).torque_nm, refused
 
 
-def steps(scenario: LoopScenario, seeds: int, plant_of: PlantOf) -> tuple[FloatArray, dict[str, float]]:
-    """Return the true torques (seed, time) after the step, and their figures of merit."""
+def steps(scenario: LoopScenario, seeds: int, plant_of: PlantOf) -> dict[str, float]:
+    """Return the figures of merit of the true torque after the step, over many seeds."""
     rows, refused = [], 0
     for seed in range(seeds):
         torque_nm, is_refused = step(plant_of(scenario.sensor, np.random.default_rng((20, seed))), scenario)
         rows.append(torque_nm)
         refused += is_refused
-    table = _table(rows)
-    return table, judge_steps(table, scenario.settled_s) | {"refused_by_margins": refused}
+    return judge_steps(rows, scenario.settled_s) | {"refused_by_margins": refused}
 
 
-def _table(rows: Sequence[FloatArray]) -> FloatArray:
-    """Return the rows as one array; rounding of the time makes some one sample longer."""
-    return np.array([row[: min(map(len, rows))] for row in rows])
-
-
-def judge_steps(torque_nm: FloatArray, settled_s: float) -> dict[str, float]:
-    """Return the figures of merit of true torques (seed, time) after the step at time 0."""
-    error = torque_nm / TARGET_NM - 1.0
+def judge_steps(rows: Sequence[FloatArray], settled_s: float) -> dict[str, float]:
+    """Return the figures of merit of true torques, one row per seed, after the step at time 0."""
+    # Rounding of the time makes some rows one sample longer.
+    error = np.array([row[: min(map(len, rows))] for row in rows]) / TARGET_NM - 1.0
     late = error[:, round(settled_s / PERIOD_S) :]
     inside = np.abs(late) <= BAND
     return {
@@ -247,21 +242,17 @@ def tightened(seed: int) -> tuple[float, float]:
     return -plant.torque_nm - TIGHTEN_NM, plant.stiffness_nm_per_rad * TIGHTEN_RAD_PER_S * LOAD_CELL.period_s
 
 
-def measure(seeds: int) -> tuple[dict[str, Any], dict[str, FloatArray], FloatArray, FloatArray]:
-    """Return the figures, true torques (seed, time) by scenario, and overshoots of screws (seed,) with their limits."""
-    tables: dict[str, FloatArray] = {}
-    numbers: dict[str, Any] = {}
-    for scenario in TWIN_SCENARIOS:
-        tables[scenario.name], numbers[scenario.name] = steps(scenario, seeds, rig_twin)
-    ends = np.array([tightened(seed) for seed in range(seeds)])
-    beyond, allowed = ends[:, 0], 0.005 + ends[:, 1]
+def measure(seeds: int) -> dict[str, Any]:
+    """Return the figures of the steps by scenario, and of the screws."""
+    numbers: dict[str, Any] = {scenario.name: steps(scenario, seeds, rig_twin) for scenario in TWIN_SCENARIOS}
+    beyond_nm, travel_nm = np.array([tightened(seed) for seed in range(seeds)]).T
     numbers["tighten"] = {
-        "beyond_target_nm_mean": float(beyond.mean()),
-        "beyond_target_nm_worst": float(np.abs(beyond).max()),
-        "one_samples_travel_nm": [float(ends[:, 1].min()), float(ends[:, 1].max())],
-        "within_share": float(np.mean(np.abs(beyond) <= allowed)),
+        "beyond_target_nm_mean": float(beyond_nm.mean()),
+        "beyond_target_nm_worst": float(np.abs(beyond_nm).max()),
+        "one_samples_travel_nm": [float(travel_nm.min()), float(travel_nm.max())],
+        "within_share": float(np.mean(np.abs(beyond_nm) <= 0.005 + travel_nm)),
     }
-    return numbers, tables, beyond, allowed
+    return numbers
 
 
 def rig_calibration(bank: Path, seed: int) -> Calibration:
@@ -269,10 +260,8 @@ def rig_calibration(bank: Path, seed: int) -> Calibration:
     return calibrate([recorded.series(mm) for mm, recorded in record(bank, seed, (DIAMETER_MM,))], tuple(SIDES))
 
 
-def estimator_in_the_loop(
-    bank: Path, calibration: Calibration, seeds: Sequence[int]
-) -> tuple[FloatArray, dict[str, float]]:
-    """Return the true torques (seed, time) after a step driven by the default estimator, and their figures."""
+def estimator_in_the_loop(bank: Path, calibration: Calibration, seeds: Sequence[int]) -> dict[str, float]:
+    """Return the figures of merit of a step driven by the default estimator."""
     scenario = replace(TWIN_SCENARIOS[0], hold_s=30.0)
     rows, plants = [], []
     for seed in seeds:
@@ -282,55 +271,27 @@ def estimator_in_the_loop(
         )  # fmt: skip
         rows.append(step(plant, scenario)[0])
         plants.append(plant)
-    table = _table(rows)
     estimated, not_valid = sum(one.estimated for one in plants), sum(one.not_valid for one in plants)
-    return table, judge_steps(table, scenario.settled_s) | {
+    return judge_steps(rows, scenario.settled_s) | {
         "not_valid_share": not_valid / (estimated + not_valid),
         "coverage_95": 1.0 - sum(one.outside_interval for one in plants) / estimated if estimated else np.nan,
     }
 
 
-def draw(path: Path, tables: dict[str, FloatArray], beyond: FloatArray, allowed: FloatArray) -> None:
-    """Draw the true torques of all seeds, and the final torques of the screws."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 3.6), layout="constrained")
-    axes = figure.subplots(1, 3)
-    for axis, scenario in zip(axes, SCENARIOS, strict=False):
-        table = tables[scenario.name]
-        times = np.arange(table.shape[1]) * PERIOD_S
-        for row in table[:: max(len(table) // 40, 1)]:
-            axis.plot(times, row, color="tab:blue", linewidth=0.4, alpha=0.4)
-        low, middle, high = np.quantile(table, [0.025, 0.5, 0.975], axis=0)
-        axis.plot(times, middle, color="black", linewidth=1.2, label="median")
-        axis.plot(times, low, color="black", linewidth=0.7, linestyle="--", label="95 % of the seeds")
-        axis.plot(times, high, color="black", linewidth=0.7, linestyle="--")
-        axis.axhspan(TARGET_NM * (1 - BAND), TARGET_NM * (1 + BAND), color="tab:green", alpha=0.15, label="± 10 %")
-        axis.axvline(scenario.settled_s, color="tab:red", linewidth=0.8, label=f"{scenario.settled_s:g} s")
-        axis.set(title=f"driven by {scenario.name.replace('_', ' ')}", xlabel="time since the set point, s")
-        axis.set_ylabel("true torque, N·m")
-        axis.legend(fontsize=7, loc="lower right")
-    axes[2].hist(1e3 * beyond, bins=20, color="tab:blue")
-    axes[2].axvline(1e3 * float(allowed.min()), color="tab:red", linewidth=0.8, label="5 mN·m + one sample's travel")
-    axes[2].set(title=f"tighten to {TIGHTEN_NM:g} N·m", xlabel="true torque beyond the target, mN·m", ylabel="seeds")
-    axes[2].legend(fontsize=7)
-    figure.savefig(path, dpi=120)
-
-
 def main() -> None:
     """Measure, write the numbers, draw the chart."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, required=True, help="folder for step_response.json and .png")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--bank", type=Path, help="the emulated rig's bank, to close the loop with the estimator too")
     args = parser.parse_args()
-    args.out.mkdir(parents=True, exist_ok=True)
-    numbers, tables, beyond, allowed = measure(args.seeds)
+    numbers = measure(args.seeds)
     if args.bank is not None:
-        numbers["estimator"] = estimator_in_the_loop(args.bank, rig_calibration(args.bank, 7), range(20))[1]
-    (args.out / "step_response.json").write_text(json.dumps(numbers, indent=2) + "\n")
-    draw(args.out / "step_response.png", tables, beyond, allowed)
-    print(json.dumps(numbers, indent=2))
+        numbers["estimator"] = estimator_in_the_loop(args.bank, rig_calibration(args.bank, 7), range(20))
+    text = json.dumps(numbers, indent=2)
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(text + "\n")
+    print(text)
 
 
 if __name__ == "__main__":

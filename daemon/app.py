@@ -169,9 +169,9 @@ class Daemon:
     def _make_health(self) -> HealthReporter:
         health = HealthReporter(self.publisher, self.supervisor, self._clock)
         for name, task in self._fingertips.items():
-            health.add(name, task.facts)
+            health.add(name, task.diagnostics)
         if self._combined is not None:
-            health.add(COMBINED, self._combined.facts)
+            health.add(COMBINED, self._combined.diagnostics)
         if self._skin is not None:
             health.add(SKIN, self._skin.diagnostics)
             health.add(SKIN_SOURCE, self._skin.source_diagnostics)

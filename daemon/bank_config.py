@@ -1,17 +1,18 @@
 """The configuration of banks and fingertips: `config/banks/*.yaml` and `config/fingertips/*.yaml`."""
 
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.eit.bank_file import BankDefinition
 from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, Side
 from shearloop.bank.eit.mesh import Mesh, load_mesh
-from shearloop.bank.eit.models import PLAIN, QUARTER_DEG, Variation
+from shearloop.bank.eit.models import QUARTER_DEG, Variation
 from shearloop.bank.errors import GeometryError
 from shearloop.daemon.config_file import ConfigModel, load_yaml_model, mistakes
 from shearloop.daemon.errors import UserError
@@ -36,7 +37,7 @@ class GridConfig(ConfigModel):
             raise ValueError(f"a count of 1 needs low and high to be the same, not {self.low:g} and {self.high:g}")
         return self
 
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> FloatArray:
         """Return the grid, (count,)."""
         return np.linspace(self.low, self.high, self.count)
 
@@ -150,15 +151,11 @@ class FingertipGeometryConfig(ConfigModel):
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BankPlan:
-    """The inputs of `build_bank`; k_grid (K,) and sigma_grid (S,) are in the model's units."""
+class BankPlan(NamedTuple):
+    """A configured bank."""
 
     mesh: Mesh
-    model: str
-    k_grid: NDArray[np.float64]
-    sigma_grid: NDArray[np.float64]
-    variation: Variation = PLAIN
+    definition: BankDefinition
 
 
 def load_bank_plan(
@@ -195,7 +192,9 @@ def load_bank_plans(
             meshes[key] = _mesh_of(path, config, geometry)
         if (name := _shown(chosen)) in plans:
             raise UserError(f"{path}: two banks of `over` would be named {name}; take fewer values, or further apart")
-        plans[name] = BankPlan(meshes[key], model, k.values(), sigma.values(), Variation(**varied))
+        mesh = meshes[key]
+        definition = BankDefinition(mesh.digest, model, k.values(), sigma.values(), Variation(**varied))
+        plans[name] = BankPlan(mesh, definition)
     return plans
 
 

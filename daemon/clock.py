@@ -6,8 +6,8 @@ import time
 class Clock:
     """Reads the monotonic clock and translates its readings into Unix time.
 
-    The offset between the two is held between calls of `synchronise`, so that stamps taken close together keep
-    their distance even while the system's clock is being set.
+    The offset between the two changes only in `synchronise`: stamps taken close together keep their distance even while
+    the system's clock is being set.
     """
 
     def __init__(self) -> None:
@@ -23,11 +23,11 @@ class Clock:
 
     @property
     def offset_ns(self) -> int:
-        """Unix time less the monotonic clock, in nanoseconds, as it is used at present."""
+        """Unix time minus the monotonic clock, in nanoseconds."""
         return self._offset_ns
 
     def synchronise(self) -> float:
-        """Measure the offset anew, as a service does once a second; return by how many seconds it had moved."""
+        """Measure the offset again; return its change in seconds. The daemon calls it once a second."""
         before, self._offset_ns = self._offset_ns, _measured_offset_ns()
         return (self._offset_ns - before) / 1e9
 

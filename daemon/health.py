@@ -1,4 +1,4 @@
-"""Once a second: how the process and each task are, as one message."""
+"""Publishes the health of the process and of each task once a second."""
 
 import asyncio
 import os
@@ -20,7 +20,7 @@ TaskFacts = Mapping[str, Scalar | Mapping[str, int]]
 
 @dataclass(slots=True)
 class _Usage:
-    """CPU time used so far, to tell the use since the last message."""
+    """Measures the CPU use since the last message."""
 
     cpu_s: float
     at_s: float
@@ -33,7 +33,7 @@ class _Usage:
 
 
 class HealthReporter:
-    """Gathers what the supervisor and the tasks' own counters know, and publishes it."""
+    """Collects the supervisor's records and the tasks' own counters, and publishes them."""
 
     def __init__(self, publisher: Publisher, supervisor: Supervisor, clock: Clock) -> None:
         self._publisher = publisher
@@ -42,11 +42,11 @@ class HealthReporter:
         self._facts: dict[str, Callable[[], TaskFacts]] = {}
 
     def add(self, name: str, facts: Callable[[], TaskFacts]) -> None:
-        """Ask `facts` for what a task counts (frames, refusals by kind, rate) at every message."""
+        """Add a function that returns a task's counters (frames, errors by kind, rate); called for every message."""
         self._facts[name] = facts
 
     def tasks(self) -> dict[str, TaskFacts]:
-        """Return what is known of each task now."""
+        """Return the present state of each task."""
         gathered: dict[str, TaskFacts] = {}
         for name, record in self._supervisor.records.items():
             gathered[name] = {
@@ -69,10 +69,10 @@ class HealthReporter:
             await asyncio.sleep(max(0.0, due_s - loop.time()))
             lag_s = loop.time() - due_s
             if lag_s > HEALTH_PERIOD_S:
-                # After a long stall: one late message, not a burst of them.
+                # After a long stall, send one late message instead of a burst.
                 due_s = loop.time()
             self._clock.synchronise()
-            self._tell_systemd()
+            self._notify_systemd()
             self._publisher.publish(
                 Health(
                     source="daemon",
@@ -84,8 +84,8 @@ class HealthReporter:
                 )
             )
 
-    def _tell_systemd(self) -> None:
-        """Feed the service manager's watchdog, unless a task is dead: one that stays dead ends the service."""
+    def _notify_systemd(self) -> None:
+        """Feed systemd's watchdog unless a task is dead; a task that stays dead ends the service."""
         dead = self._supervisor.dead
         if dead:
             notify(f"STATUS=dead, restarting: {', '.join(dead)}")
@@ -94,7 +94,7 @@ class HealthReporter:
 
 
 def resident_memory_mb() -> float:
-    """Return the resident memory of this process in megabytes (the peak, where the system tells no more)."""
+    """Return the resident memory of this process in megabytes (the peak, if the system reports no more)."""
     statistics = Path("/proc/self/statm")
     if statistics.exists():
         return int(statistics.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6

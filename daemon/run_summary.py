@@ -1,6 +1,6 @@
-"""What happened in an experiment, in the lines that are printed at its end: made of the daemon's own messages.
+"""The summary of an experiment, printed at its end and made from the daemon's own messages.
 
-On an emulated rig the truth is known too, and what was done to it; then the summary says what was really held.
+An emulated rig adds the true torque and the disturbances.
 """
 
 from collections import Counter
@@ -13,26 +13,26 @@ import numpy as np
 from shearloop.bank.arrays import FloatArray
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
 
-# The share of the set point within which a torque counts as held.
+# A torque within this share of the set point counts as held.
 BAND = 0.10
-# Back after a disturbance is who stays in the band for so long.
+# A torque has recovered from a disturbance when it stays in the band for this time.
 STAYS_S = 1.0
-# Topics whose messages carry a torque.
+# Topics with a torque.
 TORQUES = ("eit.estimate", "load.torque", "skin.shear")
 _MOVING, _ENDS = "running", ("done", "stopped")
 
 
 @dataclass(frozen=True, slots=True)
-class Known:
-    """A torque over time: stamps in ns (CLOCK_MONOTONIC) and N·m, both (n,)."""
+class TorqueSeries:
+    """A torque over time: ns of CLOCK_MONOTONIC and N·m, both (n,)."""
 
     t_ns: FloatArray
     torque_nm: FloatArray
 
-    def between(self, from_ns: float, to_ns: float) -> "Known":
-        """Return the part that belongs to a time."""
+    def between(self, from_ns: float, to_ns: float) -> "TorqueSeries":
+        """Return the part within a time interval."""
         inside = (self.t_ns >= from_ns) & (self.t_ns <= to_ns)
-        return Known(self.t_ns[inside], self.torque_nm[inside])
+        return TorqueSeries(self.t_ns[inside], self.torque_nm[inside])
 
 
 @dataclass(slots=True)
@@ -43,9 +43,8 @@ class _Step:
     to_ns: int
     holds: int = 0
     set_point_nm: float | None = None
-    # From the first to the last message of a closed loop that holds.
+    # The first message of the closed loop that holds.
     held_from_ns: int | None = None
-    # The wrist's own angle at its beginning and at its end.
     wrist_from_rad: float | None = None
     wrist_to_rad: float | None = None
 
@@ -60,7 +59,7 @@ class _Run:
     steps: list[_Step] = field(default_factory=list)
     identified: tuple[float, float, float] | None = None
     held_s: float = 0.0
-    held_why: Counter[str] = field(default_factory=Counter)
+    hold_reasons: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
     invalid: Counter[str] = field(default_factory=Counter)
     torques: dict[str, list[tuple[int, float]]] = field(default_factory=dict)
@@ -69,40 +68,40 @@ class _Run:
 
 
 class RunSummary:
-    """Listens to every message of a daemon; `tell` is called with a summary's lines when an experiment has ended."""
+    """Collects every message of a daemon and passes the summary's lines to `on_summary` when an experiment ends."""
 
     def __init__(
         self,
-        tell: Callable[[Sequence[str]], object],
-        truth: Callable[[], Known | None] = lambda: None,
-        happened: Callable[[], Sequence[tuple[int, str]]] = tuple,
+        on_summary: Callable[[Sequence[str]], object],
+        true_torque: Callable[[], TorqueSeries | None] = lambda: None,
+        disturbances: Callable[[], Sequence[tuple[int, str]]] = tuple,
     ) -> None:
-        """Take what prints, what is really so, and what was done to an emulated rig (time in ns, words)."""
-        self._tell = tell
-        self._truth = truth
-        self._happened = happened
+        """Take sources of the true torque and of disturbances (time in ns, description), for an emulated rig."""
+        self._on_summary = on_summary
+        self._true_torque = true_torque
+        self._disturbances = disturbances
         self._run: _Run | None = None
 
     def __call__(self, topic: str, content: Mapping[str, Any]) -> None:
-        """Take one message in."""
+        """Handle one message."""
         if topic == "loop.state":
-            self._loop(content)
+            self._on_loop_state(content)
         elif self._run is not None:
-            self._sense(self._run, topic, content)
+            self._on_sample(self._run, topic, content)
 
-    def _loop(self, content: Mapping[str, Any]) -> None:
+    def _on_loop_state(self, content: Mapping[str, Any]) -> None:
         run, phase = self._run, content["phase"]
         if phase == "idle" or (run is None and phase in _ENDS):
             return
         if run is None:
             named = content["experiment"], content["torque_source"], content["steps"]
             run = self._run = _Run(*named, content["t_mono_ns"], content["tool_mm"])
-        _note(run, content)
+        _update(run, content)
         if phase in _ENDS:
             self._run = None
-            self._tell(tuple(_lines(run, phase, self._truth(), self._happened())))
+            self._on_summary(tuple(_lines(run, phase, self._true_torque(), self._disturbances())))
 
-    def _sense(self, run: _Run, topic: str, content: Mapping[str, Any]) -> None:
+    def _on_sample(self, run: _Run, topic: str, content: Mapping[str, Any]) -> None:
         source, gripped = content["source"], run.steps and run.steps[-1].holds
         if topic == "robot.state" and run.steps:
             step = run.steps[-1]
@@ -116,13 +115,13 @@ class RunSummary:
             run.diameters.setdefault(source, []).append(content["diameter_mm"])
 
 
-def _note(run: _Run, content: Mapping[str, Any]) -> None:
+def _update(run: _Run, content: Mapping[str, Any]) -> None:
     now_ns = content["t_mono_ns"]
     if run.last is not None and run.last["phase"] == "held":
         run.held_s += (now_ns - run.last["t_mono_ns"]) / 1e9
     if content["response"] == "hold" and (run.last is None or run.last["response"] != "hold"):
-        # What it was, without the numbers of the moment.
-        run.held_why[content["reasons"].split(":")[0].rstrip(".")] += 1
+        # The reason without its numbers.
+        run.hold_reasons[content["reasons"].split(":")[0].rstrip(".")] += 1
     if "a command was refused" in content["reasons"]:
         run.refused[content["reasons"]] += 1
     run.last = content
@@ -144,7 +143,7 @@ def _note(run: _Run, content: Mapping[str, Any]) -> None:
         run.identified = (content["stiffness_nm_per_rad"], content["delay_s"], content["noise_nm"])
 
 
-def _lines(run: _Run, phase: str, truth: Known | None, happened: Sequence[tuple[int, str]]) -> Iterator[str]:
+def _lines(run: _Run, phase: str, truth: TorqueSeries | None, disturbances: Sequence[tuple[int, str]]) -> Iterator[str]:
     end_ns = run.last["t_mono_ns"] if run.last is not None else run.from_ns
     ended = "done" if phase == "done" else "STOPPED before its end"
     yield f"What happened: {run.name!r} was {ended}, after {(end_ns - run.from_ns) / 1e9:.0f} s."
@@ -152,16 +151,16 @@ def _lines(run: _Run, phase: str, truth: Known | None, happened: Sequence[tuple[
         yield f"  {run.last['activity']}"
     for step in run.steps:
         took_s = (step.to_ns - step.from_ns) / 1e9
-        yield f"  step {step.number} of {run.steps_planned}  {step.name:<12} {took_s:6.1f} s{_beside(step, run)}"
+        yield f"  step {step.number} of {run.steps_planned}  {step.name:<12} {took_s:6.1f} s{_details(step, run)}"
         if step.set_point_nm is not None and step.held_from_ns is not None:
-            here = [event for event in happened if step.from_ns <= event[0] <= step.to_ns]
+            here = [event for event in disturbances if step.from_ns <= event[0] <= step.to_ns]
             yield from _held(step, step.set_point_nm, step.held_from_ns, run, truth, here)
         if step.name == "tighten":
             yield from _turned(step, run, truth)
     yield from _counted(run)
 
 
-def _beside(step: _Step, run: _Run) -> str:
+def _details(step: _Step, run: _Run) -> str:
     if step.name == "identify" and run.identified is not None:
         stiffness, delay_s, noise_nm = run.identified
         return f"   stiffness {stiffness:.3f} N·m/rad, delay {delay_s:.2f} s, noise of one torque {noise_nm:.4f} N·m"
@@ -170,77 +169,81 @@ def _beside(step: _Step, run: _Run) -> str:
     return ""
 
 
-def _turned(step: _Step, run: _Run, truth: Known | None) -> Iterator[str]:
+def _turned(step: _Step, run: _Run, truth: TorqueSeries | None) -> Iterator[str]:
     if step.wrist_from_rad is not None and step.wrist_to_rad is not None:
-        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; what drove: {run.driving}"
-    for name, known in _known(run, truth).items():
-        turning = known.between(step.from_ns, step.to_ns).torque_nm
-        if turning.size and name in ("the truth", run.driving):
+        yield f"    turned by {step.wrist_to_rad - step.wrist_from_rad:+.3f} rad; torque source: {run.driving}"
+    for name, series in _all_torques(run, truth).items():
+        turning = series.between(step.from_ns, step.to_ns).torque_nm
+        if turning.size and name in ("true", run.driving):
             largest_nm = turning[np.abs(turning).argmax()]
-            yield f"    {name:<10} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at the most"
+            yield f"    {name:<10} {turning[-1]:+.4f} N·m at the end, {largest_nm:+.4f} at most"
 
 
-def _known(run: _Run, truth: Known | None) -> dict[str, Known]:
-    sources = {name: Known(*map(np.array, zip(*values, strict=True))) for name, values in run.torques.items()}
-    return sources if truth is None else {"the truth": truth, **sources}
+def _all_torques(run: _Run, truth: TorqueSeries | None) -> dict[str, TorqueSeries]:
+    sources = {name: TorqueSeries(*map(np.array, zip(*values, strict=True))) for name, values in run.torques.items()}
+    return sources if truth is None else {"true": truth, **sources}
 
 
 def _held(
-    step: _Step, set_nm: float, from_ns: int, run: _Run, truth: Known | None, happened: list[tuple[int, str]]
+    step: _Step, set_nm: float, from_ns: int, run: _Run, truth: TorqueSeries | None, disturbances: list[tuple[int, str]]
 ) -> Iterator[str]:
     held_s = (step.to_ns - from_ns) / 1e9
-    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; what drove: {run.driving}"
-    sources = _known(run, truth)
-    for name, known in sources.items():
-        held = known.between(from_ns, step.to_ns).torque_nm
+    yield f"    set point {set_nm:+.3f} N·m, held for {held_s:.0f} s; torque source: {run.driving}"
+    sources = _all_torques(run, truth)
+    for name, series in sources.items():
+        held = series.between(from_ns, step.to_ns).torque_nm
         if held.size:
             share = np.mean(np.abs(held - set_nm) <= BAND * abs(set_nm))
             yield (
                 f"    {name:<10} {held.mean():+.4f} N·m on average, ± {held.std():.4f}, "
                 f"within ± {BAND:.0%} for {share:.0%} of the time"
             )
-    # The truth, or the load cell, or whatever else did not drive: who judges itself is always right.
-    names = sorted(set(sources) - {run.driving}, key=lambda name: (name != "the truth", name != LOAD_CELL, name))
+    # Judge by the true torque, the load cell or another source, never by the one that drove the loop.
+    names = sorted(set(sources) - {run.driving}, key=lambda name: (name != "true", name != LOAD_CELL, name))
     if not names:
         return
     judge = sources[names[0]]
-    if (reached_s := _back_s(judge.between(step.from_ns, step.to_ns), step.from_ns, set_nm)) is not None:
-        yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point was given, by {names[0]}"
-    for t_ns, words in happened:
+    if (reached_s := _recovery_s(judge.between(step.from_ns, step.to_ns), step.from_ns, set_nm)) is not None:
+        yield f"    within ± {BAND:.0%} {reached_s:.1f} s after the set point changed, by {names[0]}"
+    for t_ns, description in disturbances:
         after = judge.between(t_ns, step.to_ns)
         if after.torque_nm.size:
-            back_s, worst_nm = _back_s(after, t_ns, set_nm), float(np.abs(after.torque_nm - set_nm).max())
-            back = f"back within ± {BAND:.0%} after {back_s:.1f} s" if back_s is not None else "not back by the end"
-            yield f"    disturbed after {(t_ns - from_ns) / 1e9:.1f} s ({words}): {worst_nm:.3f} N·m off, {back}"
+            recovery_s, worst_nm = _recovery_s(after, t_ns, set_nm), float(np.abs(after.torque_nm - set_nm).max())
+            back = (
+                f"back within ± {BAND:.0%} after {recovery_s:.1f} s"
+                if recovery_s is not None
+                else "not back by the end"
+            )
+            yield f"    disturbed after {(t_ns - from_ns) / 1e9:.1f} s ({description}): {worst_nm:.3f} N·m off, {back}"
 
 
-def _back_s(known: Known, since_ns: float, set_nm: float) -> float | None:
-    """Return how long after a moment the torque came into the band to stay there; None where that was not seen."""
-    inside = np.abs(known.torque_nm - set_nm) <= BAND * abs(set_nm)
-    seen = known.t_ns <= known.t_ns[-1:] - STAYS_S * 1e9
+def _recovery_s(series: TorqueSeries, since_ns: float, set_nm: float) -> float | None:
+    """Return the time until the torque enters the band and stays there; None if it does not."""
+    inside = np.abs(series.torque_nm - set_nm) <= BAND * abs(set_nm)
+    seen = series.t_ns <= series.t_ns[-1:] - STAYS_S * 1e9
     for at in np.flatnonzero(inside & seen):
-        stays = inside[(known.t_ns >= known.t_ns[at]) & (known.t_ns <= known.t_ns[at] + STAYS_S * 1e9)]
+        stays = inside[(series.t_ns >= series.t_ns[at]) & (series.t_ns <= series.t_ns[at] + STAYS_S * 1e9)]
         if stays.all():
-            return float(known.t_ns[at] - since_ns) / 1e9
+            return float(series.t_ns[at] - since_ns) / 1e9
     return None
 
 
 def _counted(run: _Run) -> Iterator[str]:
     if run.tool_mm is not None:
-        yield f"  the tool is of {run.tool_mm:g} mm, as the experiment names it"
+        yield f"  tool diameter {run.tool_mm:g} mm, from the experiment"
     for source, values in run.diameters.items():
         yield f"  diameter by {source}: {np.mean(values):.1f} mm ± {np.std(values):.1f} of one reading"
-    total = sum(run.held_why.values())
+    total = sum(run.hold_reasons.values())
     if total:
-        why = "; ".join(f"{count} times {reason}" for reason, count in run.held_why.most_common())
-        yield f"  the wrist was held for {run.held_s:.1f} s in all: {why}"
+        reasons = "; ".join(f"{count} times {reason}" for reason, count in run.hold_reasons.most_common())
+        yield f"  the wrist was held for {run.held_s:.1f} s in all: {reasons}"
     else:
         yield "  the wrist was never held"
     for source, count in run.invalid.items():
-        # Who never gave a torque is there for something else.
+        # A source without any torque has another purpose.
         if source in run.torques:
-            of = count + len(run.torques[source])
-            yield f"  {count} of {of} torques of {source} were not valid, as while it took its zero, and were not used"
+            total = count + len(run.torques[source])
+            yield f"  {count} of {total} torques of {source} were not valid and not used"
     if run.refused:
         for reason, count in run.refused.most_common():
             yield f"  {count} times {reason}"

@@ -1,4 +1,4 @@
-"""Keeps tasks alive: one that dies is started again after a pause that grows, and the death is counted and told."""
+"""Restarts crashed tasks after a growing pause, and counts and reports the crashes."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
@@ -10,24 +10,24 @@ from shearloop.drivers.errors import is_cancelled
 
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 30.0
-# A task that ran this long before it died had recovered: its next pause is short again.
+# After a run of this length, the next pause is short again.
 RECOVERED_AFTER_S = 60.0
-# Of what a task died of, so much is told on the wire and to the operator; the log has all of it.
-LONGEST_ERROR = 300
+# Characters of an error in messages; the log has the whole text.
+MAX_ERROR_LENGTH = 300
 
 
 def restart_pause_s(deaths_in_a_row: int) -> float:
-    """Return how long to wait before the next start: doubling from half a second to half a minute."""
+    """Return the pause before the next start: it doubles from 0.5 s to 30 s."""
     return float(min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2.0 ** (deaths_in_a_row - 1)))
 
 
 @dataclass(slots=True)
 class TaskRecord:
-    """What health tells of one task."""
+    """The state of one task, for health."""
 
     name: str
     alive: bool = False
-    # It has returned by itself, as an experiment does: nothing is amiss.
+    # Returned normally, as an experiment does.
     done: bool = False
     restarts: int = 0
     last_error: str = ""
@@ -35,21 +35,21 @@ class TaskRecord:
 
 @dataclass(slots=True)
 class Supervisor:
-    """Runs coroutines so that none of their deaths ends the daemon."""
+    """Runs coroutines, so that no crash ends the daemon."""
 
     records: dict[str, TaskRecord] = field(default_factory=dict)
 
     @property
     def dead(self) -> tuple[str, ...]:
-        """The tasks that should run and do not: between a death and the next start."""
+        """Names of crashed tasks that wait for their restart."""
         return tuple(self.deaths())
 
     def deaths(self) -> dict[str, str]:
-        """Return what each of them died of; asked for at every state of the robot."""
+        """Return the error of each dead task."""
         return {name: record.last_error for name, record in self.records.items() if not (record.alive or record.done)}
 
     async def keep_running(self, name: str, run: Callable[[], Awaitable[None]]) -> None:
-        """Run `run()` until it returns; when it raises, tell it and start it again."""
+        """Run `run()` until it returns; if it raises, log the error and restart it."""
         record = self.records.setdefault(name, TaskRecord(name))
         log = structlog.get_logger().bind(task=name)
         loop = asyncio.get_running_loop()
@@ -58,15 +58,15 @@ class Supervisor:
             record.alive, started_s = True, loop.time()
             try:
                 await run()
-            except Exception as error:  # whatever kills one task must not kill the others
+            except Exception as error:  # an error of one task must not end the others
                 if is_cancelled():
-                    log.exception("the task died as it was ended")
+                    log.exception("the task crashed while it was cancelled")
                     raise asyncio.CancelledError from error
                 deaths = 1 if loop.time() - started_s > RECOVERED_AFTER_S else deaths + 1
                 pause_s = restart_pause_s(deaths)
                 record.restarts += 1
-                record.last_error = f"{type(error).__name__}: {error}"[:LONGEST_ERROR]
-                log.exception("the task died and is started again", pause_s=pause_s)
+                record.last_error = f"{type(error).__name__}: {error}"[:MAX_ERROR_LENGTH]
+                log.exception("the task crashed and restarts", pause_s=pause_s)
             else:
                 record.done = True
                 return

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import TypeAlias
 
@@ -144,18 +145,14 @@ def twist_frames(
     k: float,
     sigma_of_torque: Callable[[float], float],
     period_s: float,
-) -> Iterator[SyntheticFrame]:
-    """Yield the frames of a programme without end, one every `period_s`.
+) -> Iterator[FloatArray]:
+    """Yield the lines (1024,) of a programme without end, one every `period_s`.
 
     `sigma_of_torque` is the inverse of a calibration: the σ of a torque in N·m. Raises UserError as `Synthesiser.line`.
     """
-    number = 0
-    while True:
-        t_s = (number + 0.5) * period_s
-        grip, torque_nm = programme.at(t_s)
-        sigma = sigma_of_torque(torque_nm)
-        yield SyntheticFrame(synthesiser.line(k, sigma, grip), t_s, torque_nm, grip, k, sigma)
-        number += 1
+    for number in count():
+        grip, torque_nm = programme.at((number + 0.5) * period_s)
+        yield synthesiser.line(k, sigma_of_torque(torque_nm), grip)
 
 
 def _neighbours(grid: FloatArray, values: FloatArray, name: str) -> Iterator[tuple[NDArray[np.int64], FloatArray]]:

@@ -5,14 +5,9 @@ Wrist angle → stretch of contact and membrane in series → shear force → st
 """
 
 import math
-from dataclasses import dataclass
 from random import Random
 
-import numpy as np
-
-from shearloop.bank.skin.calibration import CalibrationTable
-from shearloop.bank.skin.membrane import PAPER_SECTION, UNSTRETCHED, Membrane, paper_membrane
-from shearloop.bank.skin.statistics import loop
+from shearloop.bank.skin.membrane import PAPER_SECTION, UNSTRETCHED, paper_membrane
 
 # Real gauges differ, so swapped ones can be recognised.
 REST_OHM = (24.6, 25.3)
@@ -26,26 +21,14 @@ DRIFT_STD, DRIFT_TIME_S = 1.48e-4, 600.0
 CROSSTALK_PER_N = 1.24e-4 / 2
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SyntheticSkinSettings:
-    """Properties of the skin and its contact."""
-
-    rest_ohm: tuple[float, float] = REST_OHM
-    contact_n_per_mm: float = CONTACT_N_PER_MM
-    radius_mm: float = RADIUS_MM
-    normal_n: float = NORMAL_N
-
-
 class SyntheticSkin:
     """One skin and the tool on it. Forces in N; positive shear stretches gauge 1."""
 
-    def __init__(
-        self, settings: SyntheticSkinSettings | None = None, membrane: Membrane | None = None, seed: int = 0
-    ) -> None:
-        """Start unstretched, with the normal force of the settings."""
-        self.settings = settings or SyntheticSkinSettings()
-        self.membrane = membrane or paper_membrane()
-        self.normal_n = self.settings.normal_n
+    def __init__(self, *, radius_mm: float = RADIUS_MM, normal_n: float = NORMAL_N, seed: int = 0) -> None:
+        """Start unstretched, touched with a normal force at a radius."""
+        self.membrane = paper_membrane()
+        self.radius_mm = radius_mm
+        self.normal_n = normal_n
         self.shear_n = 0.0
         self._state = UNSTRETCHED
         self._random = Random(seed)
@@ -59,7 +42,7 @@ class SyntheticSkin:
     @property
     def torque_nm(self) -> float:
         """The torque of the shear force about the wrist's axis."""
-        return self.shear_n * self.settings.radius_mm * 1e-3
+        return self.shear_n * self.radius_mm * 1e-3
 
     def push(self, shear_n: float) -> None:
         """Set the shear force."""
@@ -72,8 +55,8 @@ class SyntheticSkin:
         Contact and membrane stretch together. While the skin sticks only the contact yields; once force and tension
         differ by μFₙ the skin slips.
         """
-        way_mm = angle_rad * self.settings.radius_mm
-        contact, membrane = self.settings.contact_n_per_mm, self.stiffness_n_per_mm
+        way_mm = angle_rad * self.radius_mm
+        contact, membrane = CONTACT_N_PER_MM, self.stiffness_n_per_mm
         hold_n = self.membrane.friction * self.normal_n
         net_n = self._state.net_tension_n
         shear_n = contact * (way_mm - net_n / membrane)
@@ -95,32 +78,6 @@ class SyntheticSkin:
         crosstalk = CROSSTALK_PER_N * self.normal_n
         changes = (factor * self._state.strain_1 + crosstalk, factor * self._state.strain_2)
         r1, r2 = (
-            rest * (1.0 + change + wander)
-            for rest, change, wander in zip(self.settings.rest_ohm, changes, self._wander, strict=True)
+            rest * (1.0 + change + wander) for rest, change, wander in zip(REST_OHM, changes, self._wander, strict=True)
         )
         return r1, r2
-
-
-def calibration_table(
-    skin: SyntheticSkin, noise: float, normals_n: tuple[float, ...] = (0.5, 1.0, 2.0), up_to_n: float = 5.0
-) -> CalibrationTable:
-    """Return a bench's recording of this skin: loops to 1.2 N and to `up_to_n`, each after two rows at rest.
-
-    `noise` is the standard deviation of one relative resistance.
-    """
-    random, rows = Random(1), []
-
-    def record(shear_n: float, normal_n: float) -> None:
-        skin.normal_n = normal_n
-        skin.push(shear_n)
-        skin.rest(1.0)
-        r1, r2 = (ohm * (1.0 + random.gauss(0.0, noise)) for ohm in skin.resistances_ohm())
-        rows.append((r1, r2, shear_n, normal_n))
-
-    for normal_n in normals_n:
-        for amplitude_n in (1.2, up_to_n):
-            for _ in range(2):
-                record(0.0, 0.0)
-            for shear_n in loop(amplitude_n).tolist():
-                record(shear_n, normal_n)
-    return CalibrationTable(*np.array(rows).T)

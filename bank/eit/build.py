@@ -21,7 +21,7 @@ from shearloop.bank.eit.bank_file import MIN_SIGNAL_NORM, BankDefinition, unwrit
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.mesh import Mesh
-from shearloop.bank.eit.models import PLAIN, ConductivityModel, Variation
+from shearloop.bank.eit.models import ConductivityModel
 from shearloop.bank.errors import BankFileError, EmptyBankError
 
 _JOURNAL_MAGIC = b"\x8eSHLPART"
@@ -75,25 +75,21 @@ class RowSolver:
 
 def build_bank(
     mesh: Mesh,
-    model: str,
-    k_grid: FloatArray,
-    sigma_grid: FloatArray,
+    definition: BankDefinition,
     path: Path,
     *,
-    variation: Variation = PLAIN,
     jobs: int = 1,
     elsewhere: RowsSolver | None = None,
     on_row: Callable[[int, int], None] = lambda *_: None,
     on_notice: Callable[[str], None] = lambda _: None,
 ) -> None:
-    """Build a bank file of (K,) k and (S,) σ, resuming an interrupted build of the same bank.
+    """Build a bank file on the mesh of its definition, resuming an interrupted build of the same bank.
 
     `on_row(done, total)` is called once at the start and after each row that is safely on the disk; `on_notice` gets
     sentences for the user. Rows are solved in `jobs` threads, or by `elsewhere`, with the same bytes. An existing bank
-    is replaced only by a finished one. Raises ModelError, GeometryError, EmptyBankError where no cell is valid, and
+    is replaced only by a finished one. Raises GeometryError, EmptyBankError where no cell is valid, and
     BankFileError where the bank cannot be written or another build works on it.
     """
-    definition = BankDefinition(mesh.digest, model, k_grid, sigma_grid, variation)
     if path.is_dir():
         raise BankFileError(f"{path} is a directory; give the name of a file in it to --out")
     if path.exists() and not path.is_file():

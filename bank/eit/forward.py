@@ -6,7 +6,7 @@ electrode e with contact impedance z_e, and I_e the current into it, for all tes
     ∫ s ∇u·∇v dx + Σ_e 1/z_e ∫_e (u − U_e)(v − V_e) ds = Σ_e I_e V_e
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -32,18 +32,14 @@ class CompleteElectrodeModel:
     def __init__(self, mesh: Mesh) -> None:
         """Assemble the parts that do not depend on conductivity."""
         self.mesh = mesh
-        stiffness, contact = assemble(mesh)
+        terms, source, place = _placed_terms(mesh)
         n, n_triangles = len(mesh.nodes) + mesh.n_electrodes, len(mesh.triangles)
-        place = elimination_order(mesh, stiffness)
-        rows = place[np.concatenate([stiffness.rows, contact.rows])]
-        columns = place[np.concatenate([stiffness.columns, contact.columns])]
-        values = np.concatenate([stiffness.values, contact.values])
-        source = _sources(stiffness, contact, n_triangles)
-        kept = (rows >= 0) & (columns >= 0)
+        rows, columns = place[terms.rows], place[terms.columns]
+        kept: Any = (rows >= 0) & (columns >= 0)
         keys, entry = np.unique(columns[kept] * n + rows[kept], return_inverse=True)
         # Entry p of the grounded matrix, in compressed columns, is Σ_t shares[p, t] · (s, 1)_t.
         self._shares = sp.csr_array(
-            (values[kept], (entry, source[kept])), shape=(len(keys), n_triangles + 1), dtype=np.float64
+            (terms.values[kept], (entry, source[kept])), shape=(len(keys), n_triangles + 1), dtype=np.float64
         )
         column, row = np.divmod(keys, n)
         self._indices = row.astype(np.int32)
@@ -129,18 +125,12 @@ class BatchForwardModel:
 
         self.mesh = mesh
         self.direct = ForwardModel(mesh)
-        stiffness, contact = assemble(mesh)
-        n_nodes, n_triangles = len(mesh.nodes), len(mesh.triangles)
-        place = elimination_order(mesh, stiffness)
+        terms, source, place = _placed_terms(mesh)
         # The node that the direct solve grounds is the last one here.
+        n_nodes = len(mesh.nodes)
         place[n_nodes:] += 1
         place[place < 0] = n_nodes - 1
-        pattern = Pattern(
-            place[np.concatenate([stiffness.rows, contact.rows])],
-            place[np.concatenate([stiffness.columns, contact.columns])],
-            np.concatenate([stiffness.values, contact.values]),
-            _sources(stiffness, contact, n_triangles),
-        )
+        pattern = Pattern(place[terms.rows], place[terms.columns], terms.values, source)
         self._elimination = Elimination(pattern, n_nodes + N_ELECTRODES, N_ELECTRODES)
 
     def voltages(self, conductivities: FloatArray) -> FloatArray:
@@ -245,11 +235,16 @@ def elimination_order(mesh: Mesh, stiffness: Terms) -> IntArray:
     return place
 
 
-def _sources(stiffness: Terms, contact: Terms, n_triangles: int) -> IntArray:
-    """Return the factor of each term: its triangle's conductivity, or the constant 1, after them, of the contacts."""
-    source = np.full(len(stiffness.values) + len(contact.values), n_triangles)
-    source[: len(stiffness.values)] = np.tile(np.arange(n_triangles), 9)
-    return source
+def _placed_terms(mesh: Mesh) -> tuple[Terms, IntArray, IntArray]:
+    """Return all terms of a mesh, the factor of each, and each unknown's place.
+
+    A factor is the conductivity of a triangle or, numbered after them, the contacts' constant 1.
+    """
+    stiffness, contact = assemble(mesh)
+    terms = Terms(*(np.concatenate(pair) for pair in zip(stiffness, contact, strict=True)))
+    source = np.full(len(terms.values), len(mesh.triangles))
+    source[: len(stiffness.values)] = np.tile(np.arange(len(mesh.triangles)), 9)
+    return terms, source, elimination_order(mesh, stiffness)
 
 
 def _facets_of(domain: MeshTri, edges: IntArray) -> IntArray:

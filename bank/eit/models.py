@@ -121,57 +121,31 @@ def conductivity(mesh: "Mesh", model: str, k: float, sigma: float, variation: Va
 
     It need not be positive. Raises ModelError for an unknown model, and for σ ≤ 0 where the model divides by it.
     """
-    heights = _heights(mesh, variation)[mesh.triangles] @ averaging_points().T
-    values: FloatArray = _mean(_pieces(heights), _centre(mesh), model, k, sigma, variation)
-    return values
+    return ConductivityModel(mesh, variation).conductivity(model, k, sigma)
 
 
 class ConductivityModel:
-    """The conductivity for many parameters on one mesh: bit-identical to `conductivity`, alike triangles only once."""
+    """The conductivity for many parameters on one mesh; triangles of equal heights are averaged once."""
 
     def __init__(self, mesh: "Mesh", variation: Variation = PLAIN) -> None:
         """Find the triangles whose corners have the same heights."""
-        heights = _heights(mesh, variation)
-        corners = heights[mesh.triangles]
-        _, first, self._alike = np.unique(corners, axis=0, return_index=True, return_inverse=True)
-        self._heights = _pieces((corners @ averaging_points().T)[first])
-        self._centre = _centre(mesh)
+        x, y = mesh.nodes.T
+        self._centre = float((y.min() + y.max()) / 2)
         self._variation = variation
+        turn, middle = np.deg2rad(variation.tilt_deg), (x.min() + x.max()) / 2
+        heights = self._centre + (y - self._centre) * np.cos(turn) + (x - middle) * np.sin(turn) if turn else y
+        corners, self._alike = np.unique(heights[mesh.triangles], axis=0, return_inverse=True)
+        points = corners @ averaging_points().T
+        self._heights = [np.ascontiguousarray(part.T) for part in np.array_split(points, -(-len(points) // _AT_ONCE))]
 
     def conductivity(self, model: str, k: float, sigma: float) -> FloatArray:
         """Return the (T,) conductivity; errors as `conductivity`."""
-        values: FloatArray = _mean(self._heights, self._centre, model, k, sigma, self._variation)[self._alike]
+        basis = model_named(model)
+        if not (np.isfinite(k) and np.isfinite(sigma)):
+            raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
+        if sigma <= 0 and basis.sigma_unit != "not used":
+            raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
+        means = [basis.function(heights, k, sigma, self._centre).sum(axis=0) for heights in self._heights]
+        shape = np.concatenate(means) / len(self._heights[0])
+        values: FloatArray = (1.0 + self._variation.offset + self._variation.amplitude * shape)[self._alike]
         return values
-
-
-def _heights(mesh: "Mesh", variation: Variation) -> FloatArray:
-    """Return the (N,) heights of the nodes along the axis, in cm."""
-    x, y = mesh.nodes.T
-    if variation.tilt_deg == 0:
-        return np.asarray(y)
-    turn = np.deg2rad(variation.tilt_deg)
-    middle = (x.min() + x.max()) / 2
-    return np.asarray(_centre(mesh) + (y - _centre(mesh)) * np.cos(turn) + (x - middle) * np.sin(turn))
-
-
-def _centre(mesh: "Mesh") -> float:
-    return float((mesh.nodes[:, 1].min() + mesh.nodes[:, 1].max()) / 2)
-
-
-def _pieces(heights: FloatArray) -> list[FloatArray]:
-    """Cut (T, 15) heights into pieces (15, ≤ _AT_ONCE)."""
-    return [np.ascontiguousarray(piece.T) for piece in np.array_split(heights, -(-len(heights) // _AT_ONCE))]
-
-
-def _mean(
-    pieces: list[FloatArray], centre: float, model: str, k: float, sigma: float, variation: Variation
-) -> FloatArray:
-    basis = model_named(model)
-    if not (np.isfinite(k) and np.isfinite(sigma)):
-        raise ModelError(f"k and sigma must be finite numbers, not k = {k} and sigma = {sigma}")
-    if sigma <= 0 and basis.sigma_unit != "not used":
-        raise ModelError(f"sigma must be above 0 for the model {model}, not {sigma}")
-    shape = np.concatenate([basis.function(heights, k, sigma, centre).sum(axis=0) for heights in pieces])
-    shape /= len(pieces[0])
-    values: FloatArray = 1.0 + variation.offset + variation.amplitude * shape
-    return values

@@ -52,7 +52,7 @@ COMMANDS = {
     )
 }
 
-EXIT_OK, EXIT_FAILURE, EXIT_USAGE = 0, 1, 2
+EXIT_OK, EXIT_USAGE = 0, 2
 # Of `run`: the experiment of `stop_when_done` did not finish.
 EXIT_UNFINISHED = 3
 

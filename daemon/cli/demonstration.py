@@ -14,7 +14,7 @@ import structlog
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import EmulatorConfig
-    from shearloop.daemon.run_summary import Known
+    from shearloop.daemon.run_summary import TorqueSeries
 
 
 class TruthFile:
@@ -33,9 +33,9 @@ class TruthFile:
         """The emulator's arguments for the file."""
         return () if self.path is None else ("--truth", str(self.path))
 
-    def torques(self) -> "Known | None":
+    def torques(self) -> "TorqueSeries | None":
         """Return the true torque so far; None if it is unknown."""
-        from shearloop.daemon.run_summary import Known
+        from shearloop.daemon.run_summary import TorqueSeries
 
         if self.path is None or not self.path.exists():
             return None
@@ -43,7 +43,7 @@ class TruthFile:
         lines = self.path.read_text(encoding="utf-8").rpartition("\n")[0].splitlines()
         rows = [(row["t_mono_ns"], row["torque_nm"]) for row in map(json.loads, lines)]
         table = np.array(rows, dtype=float).reshape(-1, 2)
-        return Known(table[:, 0], table[:, 1])
+        return TorqueSeries(table[:, 0], table[:, 1])
 
     def close(self) -> None:
         """Remove the file."""

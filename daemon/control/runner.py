@@ -17,7 +17,7 @@ from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, Torque
 from shearloop.daemon.control.step_runner import Experiment
 from shearloop.daemon.messaging.messages import LoopState, RobotStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.supervisor import LONGEST_ERROR
+from shearloop.daemon.supervisor import MAX_ERROR_LENGTH
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Enable, RobotState, Stop, Unlock
 
@@ -368,4 +368,4 @@ def robot_state(state: RobotState) -> RobotStateMessage:
 
 
 def _text(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"[:LONGEST_ERROR]
+    return f"{type(error).__name__}: {error}"[:MAX_ERROR_LENGTH]

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.io import savemat
 
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.recording.reader import open_recording
-from shearloop.daemon.recording.schema import schema_name, with_missing_keys
+from shearloop.daemon.recording.reader import check_identity, open_recording
+from shearloop.daemon.recording.schema import METADATA, schema_name, with_missing_keys
 
 _LOG_TIME = "log_time_ns"
 Rows = list[dict[str, Any]]
@@ -19,8 +19,9 @@ Progress = Callable[[int], None]
 
 
 def count_messages(path: Path) -> dict[str, int]:
-    """Return the number of messages of each topic; raises UserError for an unreadable recording."""
+    """Return the number of messages of each topic; raises UserError for a file that cannot be used."""
     with open_recording(path) as recording:
+        check_identity(path, recording.metadata().get(METADATA))
         return recording.counts
 
 

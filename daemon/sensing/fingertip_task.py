@@ -186,7 +186,7 @@ class CombinedFingertipTask:
         if (pair := self._pairing.add(side, frame.t_mid_ns, frame)) is not None:
             self.estimator_task.submit(*pair[1])
 
-    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values for the health message."""
         task = self.estimator_task
         return {"expected_hz": 1.0 / self._period_s, "estimates": task.count, "backlog": task.backlog}
@@ -230,13 +230,13 @@ class FingertipTask:
             if wanted and not self.estimator_task.backlog:
                 await self._publish_heatmap(frame)
 
-    def facts(self) -> Mapping[str, Scalar | Mapping[str, int]]:
+    def diagnostics(self) -> Mapping[str, Scalar | Mapping[str, int]]:
         """Return the values for the health message."""
-        facts = self._board.diagnostics()
+        board = self._board.diagnostics()
         return {
-            **facts,
-            "rate_hz": facts["measured_hz"],
-            "error": facts["last_frame_error"] if facts["connected"] else facts["last_loss"],
+            **board,
+            "rate_hz": board["measured_hz"],
+            "error": board["last_frame_error"] if board["connected"] else board["last_loss"],
             "estimates": self.estimator_task.count,
             "backlog": self.estimator_task.backlog,
         }

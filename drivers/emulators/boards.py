@@ -87,7 +87,7 @@ def parse_fault(text: str, kinds: Collection[BoardFaultKind]) -> BoardFault:
     return BoardFault(kind, value)
 
 
-class PlayedBoard(ABC):
+class EmulatedBoard(ABC):
     """An emulated board on a pseudo-terminal.
 
     `on_port` receives the port's path whenever it appears. `inject` applies faults to the next lines, one each.
@@ -154,7 +154,7 @@ def format_line(values: NDArray[np.float64]) -> bytes:
     return ("%.4f, " * N_VALUES % tuple(values.tolist()) + "\n").encode()
 
 
-class EitKitBoard(PlayedBoard):
+class EitKitBoard(EmulatedBoard):
     """An EIT-kit: waits for a `y`, then sends `frames` (1024 values in volts each), and then is silent.
 
     A frame is requested from the iterator at the end of its acquisition. `fault_at` maps frame numbers, from 0, to
@@ -275,7 +275,7 @@ class EitKitBoard(PlayedBoard):
         self._plug()
 
 
-class ConverterBoard(PlayedBoard):
+class ConverterBoard(EmulatedBoard):
     """A board that sends a line for each conversion, whether or not anyone listens.
 
     Timed faults without a duration last until the next one or `recover`.

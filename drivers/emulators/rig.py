@@ -13,15 +13,11 @@ from typing import Literal
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 from shearloop.drivers.emulators.boards import LOAD_PERIOD_S, EitKitBoard, Hx711Board, Sketch
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
-from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
-from shearloop.drivers.emulators.robotiq.player import GripperPlayer
-from shearloop.drivers.emulators.robotiq.urcap_face import PORT, UrcapServer
+from shearloop.drivers.emulators.robotiq.servers import URCAP_PORT, GripperPlayer, ModbusServer, UrcapServer
 from shearloop.drivers.emulators.scene import FloatArray, Joint, Scene, Truth, TwinSettings
 from shearloop.drivers.emulators.skin import Gauges, SkinInstruments
-from shearloop.drivers.emulators.ur.faults import FAULTS, obey
-from shearloop.drivers.emulators.ur.make import Make
-from shearloop.drivers.emulators.ur.robot import Robot, RobotEvent
-from shearloop.drivers.emulators.ur.server import Controller
+from shearloop.drivers.emulators.ur.robot import ControllerSpec, Robot, RobotEvent
+from shearloop.drivers.emulators.ur.server import FAULTS, Controller, apply_fault
 
 # Returns a frame (1024,) in volts from each injection's grip (0…1) and shear torque in N·m, (32,) each, and the tool's
 # diameter in mm.
@@ -58,7 +54,7 @@ class RigSettings:
     run_dir: Path
     host: str = "127.0.0.1"
     gripper: Literal["socket", "modbus"] = "socket"
-    gripper_port: int = PORT
+    gripper_port: int = URCAP_PORT
     twin: TwinSettings = field(default_factory=TwinSettings)
     diameter_mm: float | None = 20.0
     speed: float = 1.0
@@ -66,7 +62,7 @@ class RigSettings:
     rate_hz: float = 500.0
     # Whether a finger has a shear skin.
     skin: bool = False
-    make: Make = field(default_factory=Make)
+    make: ControllerSpec = field(default_factory=ControllerSpec)
     sketch: Sketch = field(default_factory=lambda: Sketch(noise_counts=NOISE_NM * Sketch().counts_per_nm))
     seed: int = 0
 
@@ -160,7 +156,7 @@ class EmulatedRig:
             case [device, *words] if device in self._devices and words:
                 self._command_device(device, " ".join(words))
             case [name, *_] if name in FAULTS:
-                obey(self.controller, text)
+                apply_fault(self.controller, text)
             case _:
                 raise ValueError(f"{text!r} is no command; there are {COMMANDS}")
 
@@ -176,7 +172,7 @@ class EmulatedRig:
         self._check_device(device)
         kind = text.split(maxsplit=1)[0]
         if device == "robot":
-            obey(self.controller, text)
+            apply_fault(self.controller, text)
         elif device == "gripper":
             self.player.command({"drop": "object none", "unplug": text.replace("unplug", "lose")}.get(kind, text))
         elif device == "load":

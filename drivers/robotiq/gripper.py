@@ -89,7 +89,7 @@ class RobotiqGripper:
         return {
             "connected": self.connected,
             "states": self._seq,
-            "openings": self._connections,
+            "connections": self._connections,
             "last_loss": self.last_error,
         }
 

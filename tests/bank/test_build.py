@@ -20,20 +20,26 @@ from shearloop.bank.errors import BankFileError, ConductivityError
 MODEL = "gaussian_derivative"
 K, SIGMA = np.linspace(0.4, 9.0, 5), np.linspace(0.3, 1.2, 4)
 
+
+def defined(mesh: Mesh, sigma=SIGMA) -> BankDefinition:
+    return BankDefinition(mesh.digest, MODEL, K, sigma)
+
+
 # Builds the same bank in a process of its own, and waits for a line before it goes on after each row.
 BUILDER = """
 import sys
 from pathlib import Path
 from shearloop.bank.eit.build import build_bank
 from tests.bank.conftest import small_fingertip
-from tests.bank.test_build import K, MODEL, SIGMA
+from tests.bank.test_build import defined
 
 def on_row(done, total):
     print(done, flush=True)
     sys.stdin.readline()
 
 if __name__ == "__main__":
-    build_bank(small_fingertip(), MODEL, K, SIGMA, Path(sys.argv[1]), jobs=int(sys.argv[2]), on_row=on_row)
+    mesh = small_fingertip()
+    build_bank(mesh, defined(mesh), Path(sys.argv[1]), jobs=int(sys.argv[2]), on_row=on_row)
 """
 
 
@@ -41,7 +47,7 @@ if __name__ == "__main__":
 def finished(fingertip: Mesh, tmp_path_factory) -> Path:
     """Return a bank built in one go by one process."""
     path = tmp_path_factory.mktemp("finished") / "one.bank"
-    build_bank(fingertip, MODEL, K, SIGMA, path)
+    build_bank(fingertip, defined(fingertip), path)
     return path
 
 
@@ -50,9 +56,7 @@ def build(mesh, path, **options):
     progress, notices = [], []
     build_bank(
         mesh,
-        MODEL,
-        K,
-        options.pop("sigma", SIGMA),
+        defined(mesh, options.pop("sigma", SIGMA)),
         path,
         on_row=lambda *state: progress.append(state),
         on_notice=notices.append,
@@ -129,7 +133,7 @@ def test_a_build_that_is_killed_goes_on_without_solving_a_row_again(finished, fi
 def interrupted(fingertip, tmp_path):
     """Return where a bank was being built, with three rows in its journal, out of order."""
     path = tmp_path / "half.bank"
-    definition = BankDefinition(fingertip.digest, MODEL, K, SIGMA)
+    definition = defined(fingertip)
     solver = RowSolver(fingertip, definition)
     with RowJournal(path, definition, pytest.fail) as journal:
         for row in (3, 0, 4):
@@ -170,7 +174,7 @@ def test_a_foreign_file_in_the_journals_place_is_left_alone(fingertip, tmp_path)
 
 
 def test_two_builds_of_one_target_do_not_mix(fingertip, interrupted):
-    definition = BankDefinition(fingertip.digest, MODEL, K, SIGMA)
+    definition = defined(fingertip)
     with (
         RowJournal(interrupted, definition, lambda _: None),
         pytest.raises(BankFileError, match=r"half\.bank: another build is at work"),

@@ -74,12 +74,13 @@ def test_the_papers_electrodes_are_where_the_papers_mesh_has_them(shared):
 
 def test_a_plan_has_the_grids_and_the_mesh_and_what_is_given_takes_their_place(config):
     plan = load_bank_plan(config)
-    np.testing.assert_array_equal(plan.k_grid, [0.5, 1.75, 3])
-    np.testing.assert_array_equal(plan.sigma_grid, [0.9, 2])
-    assert plan.model == "gaussian_derivative"
+    np.testing.assert_array_equal(plan.definition.k_grid, [0.5, 1.75, 3])
+    np.testing.assert_array_equal(plan.definition.sigma_grid, [0.9, 2])
+    assert plan.definition.model == "gaussian_derivative"
     config.write_text(BANK + "mesh_size_cm: 0.1\n")
     assert len(load_bank_plan(config).mesh.nodes) > len(plan.mesh.nodes)
     changed = load_bank_plan(config, model="step", k=GridConfig(low=1, high=2, count=2))
+    changed = changed.definition
     assert (changed.model, changed.k_grid.tolist(), changed.sigma_grid.tolist()) == ("step", [1, 2], [0.9, 2])
     with pytest.raises(UserError, match=r"bank\.yaml: sigma must begin above 0 for the model linear, not at -1"):
         load_bank_plan(config, model="linear", sigma=GridConfig(low=-1, high=2, count=2))
@@ -133,7 +134,7 @@ def test_a_configuration_over_more_parameters_is_a_bank_for_each_combination(con
     assert list(plans) == [
         f"amplitude={amplitude},electrode_width_cm={width}" for amplitude in ("0.5", "1") for width in ("0.15", "0.2")
     ]
-    assert [plan.variation.amplitude for plan in plans.values()] == [0.5, 0.5, 1.0, 1.0]
+    assert [plan.definition.variation.amplitude for plan in plans.values()] == [0.5, 0.5, 1.0, 1.0]
     narrow, wide, *_ = (plan.mesh.digest for plan in plans.values())
     assert narrow != wide
     with pytest.raises(UserError, match="`over` makes 4 banks, and here one is wanted"):

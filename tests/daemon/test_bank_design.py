@@ -39,9 +39,9 @@ def test_a_design_is_a_configuration_that_builds(built: Path) -> None:
     assert "of a difference frame" in text
     assert "injections" in text
     plan = load_bank_plan(config)
-    assert plan.k_grid[0] < 3.3 < plan.k_grid[-1]
+    assert plan.definition.k_grid[0] < 3.3 < plan.definition.k_grid[-1]
     bank = Bank.open(built / "scene.bank")
-    np.testing.assert_array_equal(bank.k_grid, plan.k_grid)
+    np.testing.assert_array_equal(bank.k_grid, plan.definition.k_grid)
     assert bank.valid.any()
 
 
@@ -58,11 +58,11 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Pat
     config = tmp_path / "step.yaml"
     config.write_text(design_yaml(design, OWN_FINGERTIP, tmp_path))
     plan = load_bank_plan(config)
-    assert plan.model == "step"
-    assert len(plan.sigma_grid) == 1
-    build_bank(plan.mesh, plan.model, plan.k_grid, plan.sigma_grid, tmp_path / "step.bank")
+    assert plan.definition.model == "step"
+    assert len(plan.definition.sigma_grid) == 1
+    build_bank(*plan, tmp_path / "step.bank")
     place = RefinedMatcher(Bank.open(tmp_path / "step.bank"), NOT_TURNED).locate(frames[4])
-    assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.k_grid)[0]
+    assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.definition.k_grid)[0]
 
 
 @pytest.mark.parametrize(("noise_v", "mixed_up"), [(1e-4, False), (5e-3, True)])
@@ -83,7 +83,7 @@ def test_frames_that_no_model_explains_are_called_so_on_the_screen_and_in_the_co
     told, text = capsys.readouterr().err, config.read_text()
     for words in ("even the best model leaves ", "the noise is "):
         assert (f"shearloop bank: {words}" in told) == (f"# NOTE: {words}" in text) == mixed_up
-    assert load_bank_plan(config).model in text
+    assert load_bank_plan(config).definition.model in text
 
 
 def test_sizes_that_overflow_are_refused_without_a_warning() -> None:

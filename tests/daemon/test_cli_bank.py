@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.build import RowJournal
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.eit.models import conductivity
@@ -78,34 +77,11 @@ def test_a_build_that_is_interrupted_says_so_and_the_same_command_goes_on(
         signal.signal(signal.SIGINT, before)
     told = capsys.readouterr()
     assert told.out == ""
-    assert f"shearloop bank: interrupted: {out} was not written; its finished rows are in {out}.part" in told.err
+    assert f"shearloop bank: interrupted: finished rows are in {out}.part" in told.err
     assert [path.name for path in tmp_path.iterdir()] == ["c.bank.part"]
     assert main(build) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["c.bank"]
     assert out.read_bytes() == (folder / "a.bank").read_bytes()
-
-
-@pytest.mark.parametrize("beside", [True, False])
-def test_a_build_that_is_interrupted_when_its_bank_is_written_says_that_it_is(
-    beside, folder, tmp_path, capsys, monkeypatch
-):
-    """Before its journal is removed, and after that, as while a cluster closes; over a bank that was there before."""
-    out = tmp_path / "c.bank"
-    out.write_bytes((folder / "a.bank").read_bytes())
-    capsys.readouterr()
-    remove = RowJournal.remove
-
-    def interrupted(journal):
-        if not beside:
-            remove(journal)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(RowJournal, "remove", interrupted)
-    assert main(["bank", "build", "--config", f"{folder}/bank.yaml", "--out", str(out), "--jobs", "1"]) == 130
-    rest = f"; {out}.part is not needed any more" if beside else ""
-    assert capsys.readouterr().err == f"shearloop bank: interrupted: {out} is written, and complete{rest}\n"
-    assert Bank.open(out, verify=True).valid.any()
-    assert out.with_name("c.bank.part").exists() == beside
 
 
 def test_banks_that_are_interrupted_in_a_folder_say_what_is_there(folder, tmp_path, capsys, monkeypatch):
@@ -119,7 +95,7 @@ def test_banks_that_are_interrupted_in_a_folder_say_what_is_there(folder, tmp_pa
     monkeypatch.setattr(build_command, "_result", interrupted)
     out = tmp_path / "banks"
     assert main(["bank", "build", "--config", f"{folder}/over.yaml", "--out", str(out), "--jobs", "1"]) == 130
-    rest = f"its finished banks and rows are in {out}, and the same command resumes from there"
+    rest = f"finished rows are in {out}, and the same command resumes from there"
     assert capsys.readouterr().err == f"shearloop bank: interrupted: {rest}\n"
 
 

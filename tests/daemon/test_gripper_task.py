@@ -78,7 +78,7 @@ async def test_a_grip_that_is_broken_off_is_halted_and_keeps_the_connection(way:
             assert not rig.model.gto
             assert felt[-1].uncertain
             assert not felt[-1].holding
-        assert rig.driver.diagnostics()["openings"] == 1
+        assert rig.driver.diagnostics()["connections"] == 1
         read.cancel()
 
 

@@ -3,7 +3,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shearloop.daemon.run_summary import Known, RunSummary
+from shearloop.daemon.run_summary import RunSummary, TorqueSeries
 
 S = 1_000_000_000
 
@@ -31,7 +31,7 @@ def loop_state(t_s: float, **changes: Any) -> dict[str, Any]:
     }
 
 
-def told(truth: Known | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
+def told(truth: TorqueSeries | None, happened: list[tuple[int, str]], *more: dict[str, Any]) -> str:
     lines: list[str] = []
     summary = RunSummary(lines.extend, lambda: truth, lambda: happened)
     first = {"step": 1, "step_name": "identify", "set_point_nm": None}
@@ -45,10 +45,10 @@ def told(truth: Known | None, happened: list[tuple[int, str]], *more: dict[str, 
     return "\n".join(lines)
 
 
-def truth_that_falls_at(t_s: float, for_s: float) -> Known:
+def truth_that_falls_at(t_s: float, for_s: float) -> TorqueSeries:
     times = np.arange(0.0, 44.0, 0.1)
     torque = np.where(times < 13.0, 0.0, 0.1) - 0.03 * ((times >= t_s) & (times < t_s + for_s))
-    return Known(times * S, torque)
+    return TorqueSeries(times * S, torque)
 
 
 def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturbance() -> None:
@@ -56,12 +56,12 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
     assert "'hold' was done, after 44 s" in text
     assert "  step 1 of 3  identify       10.0 s   stiffness" in text
     assert "  step 2 of 3  hold_torque    34.0 s\n" in text
-    assert "set point +0.100 N·m, held for 30 s; what drove: right" in text
+    assert "set point +0.100 N·m, held for 30 s; torque source: right" in text
     assert "stiffness 0.750 N·m/rad, delay 0.80 s" in text
     assert "right      +0.0980 N·m on average" in text
     # 5.5 of 30 s were out of the band.
-    assert "the truth  +0.0945 N·m on average, ± 0.0116, within ± 10% for 82% of the time" in text
-    assert "within ± 10% 3.0 s after the set point was given, by the truth" in text
+    assert "true       +0.0945 N·m on average, ± 0.0116, within ± 10% for 82% of the time" in text
+    assert "within ± 10% 3.0 s after the set point changed, by true" in text
     assert "disturbed after 12.0 s (kick -0.03): 0.030 N·m off, back within ± 10% after 5.5 s" in text
     assert "1 of 61 torques of right were not valid" in text
     assert "the wrist was never held" in text
@@ -69,7 +69,7 @@ def test_what_was_held_is_told_with_its_truth_and_the_way_back_after_a_disturban
 
 
 def test_without_a_truth_nothing_is_said_of_it() -> None:
-    assert "truth" not in told(None, [])
+    assert "true" not in told(None, [])
 
 
 def test_a_tool_that_the_experiment_names_is_told() -> None:
@@ -77,8 +77,8 @@ def test_a_tool_that_the_experiment_names_is_told() -> None:
     summary = RunSummary(lines.extend)
     for phase in ("running", "done"):
         summary("loop.state", loop_state(0, tool_mm=20.0, phase=phase))
-    assert "  the tool is of 20 mm, as the experiment names it" in lines
-    assert "the tool is" not in told(None, [])
+    assert "  tool diameter 20 mm, from the experiment" in lines
+    assert "tool diameter" not in told(None, [])
 
 
 def test_a_disturbance_that_is_not_overcome_is_said_to_be_none() -> None:
@@ -103,7 +103,7 @@ def test_without_a_truth_who_judges_is_the_load_cell_and_is_named(others: tuple[
             reading = {"source": source, "t_mono_ns": round(t_s * S), "torque_nm": torque_nm, "valid": True}
             summary("eit.estimate", reading)
     summary("loop.state", loop_state(20, phase="done"))
-    assert f"    within ± 10% 3.0 s after the set point was given, by {judge}" in lines
+    assert f"    within ± 10% 3.0 s after the set point changed, by {judge}" in lines
 
 
 def test_holds_and_refusals_are_counted_by_their_kind() -> None:
@@ -137,7 +137,7 @@ def test_nothing_is_told_of_what_was_not_heard_from_its_beginning(phase: str) ->
 
 def test_where_a_screw_ended_and_what_it_took_is_told() -> None:
     lines: list[str] = []
-    truth = Known(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
+    truth = TorqueSeries(np.array([10.0, 11.0, 12.0]) * S, np.array([-0.05, -0.18, -0.119]))
     summary = RunSummary(lines.extend, lambda: truth)
     turning = {"step_name": "tighten", "torque_source": "load_cell", "set_point_nm": None}
     summary("loop.state", loop_state(10, **turning))
@@ -146,6 +146,6 @@ def test_where_a_screw_ended_and_what_it_took_is_told() -> None:
         summary("load.torque", {"source": "load_cell", "t_mono_ns": round(t_s * S), "torque_nm": torque_nm})
     summary("loop.state", loop_state(12.1, phase="done", **turning))
     told = "\n".join(lines)
-    assert "    turned by -0.500 rad; what drove: load_cell" in told
-    assert "    the truth  -0.1190 N·m at the end, -0.1800 at the most" in told
-    assert "    load_cell  -0.1210 N·m at the end, -0.1760 at the most" in told
+    assert "    turned by -0.500 rad; torque source: load_cell" in told
+    assert "    true       -0.1190 N·m at the end, -0.1800 at most" in told
+    assert "    load_cell  -0.1210 N·m at the end, -0.1760 at most" in told

@@ -65,4 +65,4 @@ async def test_a_task_that_dies_of_being_cancelled_is_not_started_again(monkeypa
     task.cancel()
     with capture_logs() as logs, pytest.raises(asyncio.CancelledError):
         await task
-    assert [entry["event"] for entry in logs] == ["the task died as it was ended"]
+    assert [entry["event"] for entry in logs] == ["the task crashed while it was cancelled"]

@@ -26,7 +26,7 @@ from shearloop.daemon.control.settings import LoopConfig
 from shearloop.daemon.control.step_runner import Action, ExperimentPhase, Tare
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
-from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
+from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.daemon.workers import Executor, in_order
 from shearloop.drivers.shear_skin.skin import SkinSample
 
@@ -77,8 +77,7 @@ class SkinLoop:
     def __init__(self, case: SkinLoopCase, calibration: SkinCalibration) -> None:
         """Put the tool on the skin, at rest."""
         self._random = np.random.default_rng(case.seed)
-        settings = SyntheticSkinSettings(radius_mm=RADIUS_MM, normal_n=case.normal_n)
-        self.skin = SyntheticSkin(settings, seed=case.seed)
+        self.skin = SyntheticSkin(radius_mm=RADIUS_MM, normal_n=case.normal_n, seed=case.seed)
         configured_n = case.normal_n if case.configured_n is None else case.configured_n
         if not case.knows_friction:
             calibration = replace(calibration, friction=0.0)

@@ -100,7 +100,8 @@ def cached_bank(name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int, on_r
 
     `on_row(name, done, total)` is called during the build. Raises BankFileError where it cannot be written.
     """
-    identity = BankDefinition(mesh.digest, MODEL, grid.k, grid.sigma).identity
+    definition = BankDefinition(mesh.digest, MODEL, grid.k, grid.sigma)
+    identity = definition.identity
     path = folder / f"{name}-{identity[:12]}.bank"
     if path.exists():
         try:
@@ -115,9 +116,7 @@ def cached_bank(name: str, grid: Grid, mesh: Mesh, folder: Path, jobs: int, on_r
         raise UserError(f"{folder}: the folder for banks cannot be made: {error.strerror}") from error
     build_bank(
         mesh,
-        MODEL,
-        grid.k,
-        grid.sigma,
+        definition,
         path,
         jobs=jobs,
         on_row=lambda done, total: on_row(name, done, total),

@@ -54,33 +54,12 @@ def add_overrides(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Build the bank, with progress on stderr."""
-    before = _version(args.out)
     try:
         return _build(args)
     except KeyboardInterrupt as interrupt:
-        return report_interrupt(f"shearloop bank: interrupted: {_left(args.out, before)}", interrupt)
-
-
-def _version(path: Path) -> tuple[int, int] | None:
-    """Return numbers that change when a file is replaced, None where there is no file."""
-    try:
-        found = path.stat()
-    except OSError:
-        return None
-    return found.st_ino, found.st_mtime_ns
-
-
-def _left(out: Path, before: tuple[int, int] | None) -> str:
-    """Return what an interrupted build leaves on the disk; its bank may already be complete."""
-    journal = out.with_name(f"{out.name}.part")
-    if out.is_dir():
-        return f"its finished banks and rows are in {out}, and the same command resumes from there"
-    if _version(out) != before:
-        rest = f"; {journal} is not needed any more" if journal.exists() else ""
-        return f"{out} is written, and complete{rest}"
-    if journal.exists():
-        return f"{out} was not written; its finished rows are in {journal}, and the same command resumes from there"
-    return f"{out} was not written; nothing is left"
+        kept = args.out if args.out.is_dir() else f"{args.out}.part"
+        sentence = f"shearloop bank: interrupted: finished rows are in {kept}, and the same command resumes from there"
+        return report_interrupt(sentence, interrupt)
 
 
 def _build(args: argparse.Namespace) -> int:
@@ -113,14 +92,10 @@ def _build(args: argparse.Namespace) -> int:
                 built.append(path)
                 continue
             try:
-                with progress_bar(path.name, len(plan.k_grid), "row") as show:
+                with progress_bar(path.name, len(plan.definition.k_grid), "row") as show:
                     build_bank(
-                        plan.mesh,
-                        plan.model,
-                        plan.k_grid,
-                        plan.sigma_grid,
+                        *plan,
                         path,
-                        variation=plan.variation,
                         jobs=jobs,
                         elsewhere=on_cluster if args.cluster is not None else None,
                         on_row=lambda done, _: show(done),
@@ -154,14 +129,13 @@ def _paths(out: Path, names: list[str]) -> list[Path]:
 
 def _is_built(path: Path, plan: "BankPlan") -> bool:
     """Return whether an earlier build of a folder has finished this bank."""
-    from shearloop.bank.eit.bank_file import Bank, BankDefinition
+    from shearloop.bank.eit.bank_file import Bank
     from shearloop.bank.errors import BankFileError
 
     if not path.exists():
         return False
-    definition = BankDefinition(plan.mesh.digest, plan.model, plan.k_grid, plan.sigma_grid, plan.variation)
     try:
-        return Bank.open(path, verify=True).identity == definition.identity
+        return Bank.open(path, verify=True).identity == plan.definition.identity
     except BankFileError:
         print(f"{path}: it cannot be used, and is built again", file=sys.stderr)
         return False

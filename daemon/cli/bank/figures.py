@@ -1,5 +1,6 @@
 """Figures of a bank: its signals over the grid, and conductivity and signals of the five basis models."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 
 from shearloop.bank.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from shearloop.bank.eit.bank_file import Bank, BankDefinition
+from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.build import RowSolver
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.forward import ForwardModel
@@ -40,11 +41,12 @@ def grid_of_bank(bank: Bank) -> SignalGrid:
 
 def grid_of_plan(plan: BankPlan) -> SignalGrid:
     """Solve up to ten rows and columns, evenly spread over a planned bank."""
-    k, sigma = plan.k_grid[_spread(len(plan.k_grid))], plan.sigma_grid[_spread(len(plan.sigma_grid))]
-    solver = RowSolver(plan.mesh, BankDefinition(plan.mesh.digest, plan.model, k, sigma))
+    whole = plan.definition
+    k, sigma = whole.k_grid[_spread(len(whole.k_grid))], whole.sigma_grid[_spread(len(whole.sigma_grid))]
+    solver = RowSolver(plan.mesh, replace(whole, k_grid=k, sigma_grid=sigma))
     rows = [solver.solve(row) for row in range(len(k))]
     return SignalGrid(
-        plan.model, k, sigma, np.stack([cells.signals for cells in rows]), np.stack([cells.valid for cells in rows])
+        whole.model, k, sigma, np.stack([cells.signals for cells in rows]), np.stack([cells.valid for cells in rows])
     )
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from shearloop.bank.eit.mesh import Mesh
     from shearloop.daemon.synthetic import Signals
-    from shearloop.drivers.emulators.boards import BoardFault, PlayedBoard
+    from shearloop.drivers.emulators.boards import BoardFault, EmulatedBoard
 
 DEMO_BANK = Path(__file__).resolve().parents[3] / "config" / "banks" / "demo.yaml"
 # The paper's screwdriver: σ at rest and at the largest torque of its peak samples, in N·m.
@@ -89,7 +89,7 @@ def _run_eit_kit(args: argparse.Namespace) -> int:
     return 0
 
 
-def _parse_fault(argument: str, name: str, board: "type[PlayedBoard]") -> "BoardFault":
+def _parse_fault(argument: str, name: str, board: "type[EmulatedBoard]") -> "BoardFault":
     from shearloop.drivers.emulators.boards import parse_fault
 
     try:
@@ -128,8 +128,7 @@ def _synthetic(args: argparse.Namespace, period_s: float) -> Iterator["NDArray[n
     # Report a wrong sigma before a port appears.
     for torque_nm in (0.0, LARGEST_TORQUE_NM):
         synthesiser.signal(args.k, sigma_of_torque(torque_nm))
-    frames = twist_frames(synthesiser, TwistProgramme(), k=args.k, sigma_of_torque=sigma_of_torque, period_s=period_s)
-    return (frame.line for frame in frames)
+    return twist_frames(synthesiser, TwistProgramme(), k=args.k, sigma_of_torque=sigma_of_torque, period_s=period_s)
 
 
 def _demo_mesh() -> "Mesh":

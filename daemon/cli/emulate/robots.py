@@ -19,9 +19,8 @@ from shearloop.daemon.errors import UserError
 
 if TYPE_CHECKING:
     from shearloop.drivers.emulators.robotiq.gripper import Gripper
-    from shearloop.drivers.emulators.robotiq.player import Server
-    from shearloop.drivers.emulators.ur.make import Make
-    from shearloop.drivers.emulators.ur.robot import RobotEvent
+    from shearloop.drivers.emulators.robotiq.servers import GripperServer
+    from shearloop.drivers.emulators.ur.robot import ControllerSpec, RobotEvent
     from shearloop.drivers.emulators.ur.server import Controller
 
 UR_FAULTS = """Prints events, a JSON object a line. Faults, one a line on standard input:
@@ -46,13 +45,13 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tool-length-m", type=float, default=0.0, help="flange to tool centre point (default: 0)")
 
 
-def robot_make(args: argparse.Namespace, version: tuple[int, ...] | None = None) -> "Make":
+def robot_make(args: argparse.Namespace, version: tuple[int, ...] | None = None) -> "ControllerSpec":
     """Return the controller's make; UserError for a wrong rate."""
-    from shearloop.drivers.emulators.ur.make import Make
+    from shearloop.drivers.emulators.ur.robot import ControllerSpec
 
     check_range(args, "rate_hz", 50, 1000)
     times = {name: getattr(args, name) for name in ("unlock_wait_s", "power_on_s", "tool_length_m")}
-    return Make(**times) if version is None else Make(version=version, **times)
+    return ControllerSpec(**times) if version is None else ControllerSpec(version=version, **times)
 
 
 def print_robot_event(event: "RobotEvent") -> None:
@@ -77,9 +76,8 @@ def _configure_ur(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_ur(args: argparse.Namespace) -> int:
-    from shearloop.drivers.emulators.ur.faults import obey
     from shearloop.drivers.emulators.ur.robot import Robot
-    from shearloop.drivers.emulators.ur.server import Controller
+    from shearloop.drivers.emulators.ur.server import Controller, apply_fault
 
     try:
         version = tuple(int(part) for part in args.version.split("."))
@@ -89,7 +87,7 @@ def _run_ur(args: argparse.Namespace) -> int:
     controller = Controller(robot, host=args.host, rate_hz=args.rate_hz, on_event=print_robot_event)
 
     def on_command(line: str) -> None:
-        obey(controller, line)
+        apply_fault(controller, line)
         print_event("obeyed", detail=line)
 
     with report_busy_address(f"the controller cannot listen on {args.host}", "choose another --host"):
@@ -127,7 +125,7 @@ def _configure_gripper_modbus(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_gripper_socket(args: argparse.Namespace) -> int:
-    from shearloop.drivers.emulators.robotiq.urcap_face import UrcapServer
+    from shearloop.drivers.emulators.robotiq.servers import UrcapServer
 
     if not 0 <= args.port <= 65535:
         raise UserError(f"--port {args.port} is no port; give 0 to 65535")
@@ -135,15 +133,15 @@ def _run_gripper_socket(args: argparse.Namespace) -> int:
 
 
 def _run_gripper_modbus(args: argparse.Namespace) -> int:
-    from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
+    from shearloop.drivers.emulators.robotiq.servers import ModbusServer
 
     link = checked_link(args.link)
     return _play_gripper(args, lambda gripper: ModbusServer(gripper, link, print_port))
 
 
-def _play_gripper(args: argparse.Namespace, make_server: Callable[["Gripper"], "Server"]) -> int:
+def _play_gripper(args: argparse.Namespace, make_server: Callable[["Gripper"], "GripperServer"]) -> int:
     from shearloop.drivers.emulators.robotiq.gripper import Gripper
-    from shearloop.drivers.emulators.robotiq.player import GripperPlayer
+    from shearloop.drivers.emulators.robotiq.servers import GripperPlayer
 
     check_positive(args, "speed")
     gripper = Gripper()

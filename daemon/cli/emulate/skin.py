@@ -50,6 +50,7 @@ class PushedSkin:
 
     def __init__(self, skin: "SyntheticSkin", sweep_n: float = 0.0) -> None:
         self.skin = skin
+        self._normal_n = skin.normal_n
         self._sweep_n = sweep_n
         self._began_s = self._rested_s = time.monotonic()
         self._angle_rad: float | None = None
@@ -73,7 +74,7 @@ class PushedSkin:
 
     def follow_grip(self, torque_nm: float, *, gripped: bool, lever_m: float) -> None:
         """Shear the skin by a gripped tool's torque at a lever; an open grip does not touch it."""
-        self.skin.normal_n = self.skin.settings.normal_n if gripped else 0.0
+        self.skin.normal_n = self._normal_n if gripped else 0.0
         self.skin.push(torque_nm / lever_m if gripped else 0.0)
 
     def command(self, line: str) -> bool:
@@ -137,11 +138,10 @@ def _configure_skin(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_skin(args: argparse.Namespace) -> int:
-    from shearloop.daemon.synthetic_skin import SyntheticSkin, SyntheticSkinSettings
+    from shearloop.daemon.synthetic_skin import SyntheticSkin
     from shearloop.drivers.emulators.skin import SkinInstruments
-    from shearloop.drivers.emulators.ur.faults import obey
     from shearloop.drivers.emulators.ur.robot import Robot
-    from shearloop.drivers.emulators.ur.server import Controller
+    from shearloop.drivers.emulators.ur.server import Controller, apply_fault
 
     check_positive(args, "speed")
     if not abs(args.sweep_n) <= 5.0:
@@ -151,8 +151,8 @@ def _run_skin(args: argparse.Namespace) -> int:
     check_range(args, "rate_hz", 50, 1000)
     if args.robot is not None and args.sweep_n:
         raise UserError("a skin that a robot turns is not swept: leave --sweep-n or --robot out")
-    settings = SyntheticSkinSettings(radius_mm=args.radius_mm, normal_n=args.normal_n)
-    pushed = PushedSkin(SyntheticSkin(settings, seed=args.seed), args.sweep_n)
+    skin = SyntheticSkin(radius_mm=args.radius_mm, normal_n=args.normal_n, seed=args.seed)
+    pushed = PushedSkin(skin, args.sweep_n)
     instruments = SkinInstruments(
         pushed.resistances_ohm,
         _address(args, "source_"),
@@ -169,7 +169,7 @@ def _run_skin(args: argparse.Namespace) -> int:
     def on_command(line: str) -> None:
         name, _, fault = line.partition(" ")
         if name == "robot" and controller is not None:
-            obey(controller, fault)
+            apply_fault(controller, fault)
         elif not pushed.command(line):
             instruments.command(line)
 

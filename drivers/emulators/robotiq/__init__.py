@@ -1,1 +1,21 @@
-"""A Robotiq 2F-140, played: one gripper behind two faces, the URCap's socket and Modbus RTU."""
+"""An emulated Robotiq 2F-140 behind the URCap's socket or Modbus RTU."""
+
+from shearloop.drivers.emulators.robotiq.gripper import Command, Gripper, GripperMechanics
+from shearloop.drivers.emulators.robotiq.servers import (
+    URCAP_PORT,
+    GripperPlayer,
+    GripperServer,
+    ModbusServer,
+    UrcapServer,
+)
+
+__all__ = [
+    "URCAP_PORT",
+    "Command",
+    "Gripper",
+    "GripperMechanics",
+    "GripperPlayer",
+    "GripperServer",
+    "ModbusServer",
+    "UrcapServer",
+]

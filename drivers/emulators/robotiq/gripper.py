@@ -1,4 +1,4 @@
-"""The gripper itself: spindle, fingers, registers, activation, faults. No I/O; time is passed in by `step`."""
+"""The emulated 2F-140: spindle, fingers, registers, activation, faults. No I/O; `step` passes the time."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ FORCE_N = (10.0, 125.0)
 
 @dataclass(frozen=True, slots=True)
 class GripperMechanics:
-    """What this gripper measures: positions at which its fingers stop, and how fast it activates."""
+    """The positions at which the fingers stop, and the speeds of activation and release."""
 
     open_counts: float = 3.0
     open_mm: float = 140.0
@@ -24,7 +24,7 @@ class GripperMechanics:
 
     @property
     def mm_per_count(self) -> float:
-        """The width that one count takes away, mm."""
+        """The width per count, mm."""
         return self.open_mm / (self.closed_counts - self.open_counts)
 
     def counts(self, width_mm: float) -> float:
@@ -44,14 +44,14 @@ class _Activation(Enum):
     ACTIVE = auto()
 
 
-def nothing(force_n: float) -> float | None:  # noqa: ARG001 - nothing yields to no force
-    """Return the width of what is between the fingers: nothing is."""
+def no_object(force_n: float) -> float | None:  # noqa: ARG001 - a callback's signature
+    """Return None: there is no object between the fingers."""
     return None
 
 
 @dataclass(slots=True)
 class Command:
-    """The command registers, as the last writer left them."""
+    """The command registers."""
 
     act: bool = False
     gto: bool = False
@@ -63,25 +63,25 @@ class Command:
 
 
 class Gripper:
-    """One gripper. Faces write `command` and read the status; `step` moves the fingers.
+    """One gripper. Servers write `command` and read the status; `step` moves the fingers.
 
-    `between` is asked for the width, mm, at which something between the fingers stops them when they press with a
-    force in N, or None when nothing is there; `around` likewise for what an opening hand meets from inside. Commands
-    are taken up at the next step: until then the status is that of the motion before, as on the real one.
+    `between` returns the width in mm at which an object stops closing fingers that press with a force in N, or None
+    without an object; `around` does so for opening fingers. The next step takes up commands: until then the status
+    belongs to the motion before, as on the real gripper.
     """
 
     def __init__(
         self,
         mechanics: GripperMechanics | None = None,
-        between: Callable[[float], float | None] = nothing,
-        around: Callable[[float], float | None] = nothing,
+        between: Callable[[float], float | None] = no_object,
+        around: Callable[[float], float | None] = no_object,
     ) -> None:
-        """Start as after power-on: not activated, half open."""
+        """Start as after power-on: reset, half open."""
         self.mechanics = mechanics or GripperMechanics()
         self.between = between
         self.around = around
         self.command = Command()
-        # After so much time without a request the gripper reports a fault; None where its master is the controller.
+        # The time without a request after which the gripper reports a fault; None where its master is the controller.
         self.watchdog_s: float | None = None
         self._silent_s = 0.0
         self._position = float(COUNTS_MAX // 2)
@@ -144,11 +144,11 @@ class Gripper:
 
     @property
     def grip_force_n(self) -> float:
-        """The force on what is between the fingers, N; 0 when they do not hold anything."""
+        """The force on the object between the fingers, N; 0 without one."""
         return self._force_n() if self._obj == 2 else 0.0
 
     def fail(self, code: int) -> None:
-        """Report a fault; the motion stops, and from 10 on only a rising edge of ACT ends it."""
+        """Report a fault and stop; from 10 on only a rising edge of ACT ends it."""
         self._fault, self._current = code, 0
 
     def clear_minor(self) -> None:
@@ -156,17 +156,17 @@ class Gripper:
         if self._fault < FIRST_MAJOR_FAULT:
             self._fault = 0
 
-    def heard(self) -> None:
-        """Note that a request came in, for the watchdog."""
+    def feed_watchdog(self) -> None:
+        """Note a request."""
         self._silent_s = 0.0
 
     def status_was_read(self) -> None:
-        """Note that the status went out: a silence that is over has then been reported."""
+        """Note that the status was read, which clears the report of a silence."""
         if self._fault == NO_COMMUNICATION:
             self._fault = 0
 
     def step(self, dt_s: float) -> None:
-        """Advance by dt_s: take up the command registers, then move."""
+        """Take up the command registers, then move for dt_s."""
         self._watch(dt_s)
         self._take_up()
         if self._fault >= FIRST_MAJOR_FAULT and self._fault != RELEASE_RUNNING:
@@ -226,15 +226,15 @@ class Gripper:
         return low + (high - low) * self._taken.force / COUNTS_MAX
 
     def _approach(self, target: float, speed_mm_s: float, dt_s: float) -> bool:
-        """Move towards a position until there, or against something; return whether the fingers have stopped."""
+        """Move towards a position; return whether the fingers have stopped, there or at an object."""
         travel = speed_mm_s * dt_s / self.mechanics.mm_per_count
         closing = target > self._position
-        # The fingers' own stops count as reaching the target: a real one closing on air reports no object.
+        # The fingers' own stops count as the target: a real gripper that closes on air reports no object.
         target = min(max(target, self.mechanics.open_counts), self.mechanics.closed_counts)
         met = self._obstacle(closing=closing)
         stop = target if met is None else (min if closing else max)(target, met)
         if closing:
-            # Something thicker than the fingers are open pushes them: they end up where it lets them.
+            # An object wider than the opening pushes the fingers apart.
             self._position = min(self._position + travel, stop)
         else:
             self._position = max(self._position - travel, stop)

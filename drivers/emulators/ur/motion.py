@@ -1,27 +1,98 @@
-"""How the emulated arm moves: one object per kind of motion, advanced one control cycle at a time."""
+"""Kinematics of a UR5e, and the emulated arm's motions, one control cycle at a time.
+
+The Denavit-Hartenberg table is Universal Robots' own ("DH Parameters for calculations of kinematics and dynamics").
+Poses are UR's: position and rotation vector. The tool is a point on the flange's z axis, so that wrist 3 turns the tool
+about its own axis.
+"""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shearloop.drivers.emulators.ur.kinematics import (
-    Matrix,
-    Vector,
-    jacobian,
-    link_frames,
-    rotation_matrix,
-    rotation_vector,
-)
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
 
-# The fastest that the joints of a UR5e turn (data sheet: 180 degrees per second); a linear move that asks for more,
-# as it does near a singularity, ends in a protective stop.
+A_M = (0.0, -0.425, -0.3922, 0.0, 0.0, 0.0)
+D_M = (0.1625, 0.0, 0.0, 0.1333, 0.0997, 0.0996)
+ALPHA_RAD = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
+# Data sheet of the UR5e: 180 degrees per second. A linear move that needs more, near a singularity, ends in a
+# protective stop.
 JOINT_SPEED_LIMIT_RAD_PER_S = math.pi
 
 
+def link_frames(q_rad: Vector, tool_length_m: float) -> list[Matrix]:
+    """Return the seven frames (4, 4) from the base to the tool centre point, in base coordinates."""
+    frames = [np.eye(4)]
+    for theta, a, d, alpha in zip(q_rad, A_M, D_M, ALPHA_RAD, strict=True):
+        c, s, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
+        link = np.array(
+            [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0.0, sa, ca, d], [0.0, 0.0, 0.0, 1.0]]
+        )
+        frames.append(frames[-1] @ link)
+    frames[-1] = frames[-1].copy()
+    frames[-1][:3, 3] += tool_length_m * frames[-1][:3, 2]
+    return frames
+
+
+def jacobian(frames: list[Matrix]) -> Matrix:
+    """Return the geometric Jacobian (6, 6): joint speeds to the tool's linear and angular velocity in the base."""
+    axes = np.array([frame[:3, 2] for frame in frames[:-1]])
+    arms = frames[-1][:3, 3] - np.array([frame[:3, 3] for frame in frames[:-1]])
+    return np.hstack([np.cross(axes, arms), axes]).T
+
+
+def pose_of(frame: Matrix) -> Vector:
+    """Return a frame as UR's pose (6,): x, y, z in m and the rotation vector in rad."""
+    return np.concatenate([frame[:3, 3], rotation_vector(frame[:3, :3])])
+
+
+def rotation_vector(rotation: Matrix) -> Vector:
+    """Return the rotation vector (3,) in rad of a rotation matrix, of magnitude at most pi.
+
+    By the quaternion's largest component, which is exact also for half turns: a tool that points down is one.
+    """
+    r = rotation
+    squares = np.array(
+        [
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+        ]
+    )
+    largest = int(np.argmax(squares))
+    skew = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    if largest == 0:
+        quaternion = np.concatenate([[squares[0]], skew])
+    else:
+        k = largest - 1
+        column = r[:, k] + r[k, :]
+        column[k] = squares[largest]
+        quaternion = np.concatenate([[skew[k]], column])
+    quaternion /= np.linalg.norm(quaternion)
+    if quaternion[0] < 0:
+        quaternion = -quaternion
+    sine = float(np.linalg.norm(quaternion[1:]))
+    scale: float = 2.0 if sine < 1e-12 else 2 * math.atan2(sine, float(quaternion[0])) / sine
+    return np.asarray(quaternion[1:] * scale, dtype=np.float64)
+
+
+def rotation_matrix(vector: Vector) -> Matrix:
+    """Return the rotation matrix (3, 3) of a rotation vector in rad (Rodrigues)."""
+    angle = float(np.linalg.norm(vector))
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation: Matrix = np.eye(3) + math.sin(angle) * k + (1 - math.cos(angle)) * (k @ k)
+    return rotation
+
+
 class Advanced(NamedTuple):
-    """Where the arm is after a cycle."""
+    """The arm after a cycle."""
 
     q_rad: Vector
     qd_rad_per_s: Vector
@@ -41,7 +112,7 @@ class Motion(Protocol):
 
 @dataclass
 class Speed:
-    """speedJ: turn towards `target_rad_per_s`, every joint no faster than `acceleration`; never over by itself."""
+    """speedJ: turn towards `target_rad_per_s`, each joint within `acceleration`; it never finishes."""
 
     target_rad_per_s: Vector
     acceleration_rad_per_s2: float
@@ -55,7 +126,7 @@ class Speed:
 
 @dataclass
 class Halt:
-    """stopJ, stopL, speedStop and the end of a program: slow every joint down to rest."""
+    """stopJ, speedStop and the end of a program: slow every joint down to rest."""
 
     deceleration_rad_per_s2: float
 
@@ -66,76 +137,29 @@ class Halt:
 
 
 @dataclass
-class Line:
-    """A trapezoid of speed along a length: the clockwork of moveJ and moveL."""
-
-    length: float
-    speed: float
-    acceleration: float
-    done: float = 0.0
-    rate: float = 0.0
-
-    def advance(self, dt_s: float) -> float:
-        """Return the part of the length covered, 0 to 1, one cycle later."""
-        left = self.length - self.done
-        self.rate = min(self.speed, self.rate + self.acceleration * dt_s, math.sqrt(2 * self.acceleration * left))
-        # The last cycle of a discrete trapezoid would creep for ever.
-        if left <= max(self.rate * dt_s, 1e-9):
-            self.done, self.rate = self.length, 0.0
-        else:
-            self.done += self.rate * dt_s
-        return 1.0 if self.length <= 0 else self.done / self.length
-
-    @property
-    def finished(self) -> bool:
-        """Whether the end is reached."""
-        return self.done >= self.length
-
-
-@dataclass
-class JointMove:
-    """moveJ: straight in joint space; the joint with the longest way has the speed asked for."""
-
-    start_rad: Vector
-    target_rad: Vector
-    speed: float
-    acceleration: float
-    line: Line = field(init=False)
-
-    def __post_init__(self) -> None:
-        """Lay the way out."""
-        self.line = Line(float(np.abs(self.target_rad - self.start_rad).max()), self.speed, self.acceleration)
-
-    def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:  # noqa: ARG002 - on its own rails
-        """Return the arm one cycle later."""
-        q = self.start_rad + self.line.advance(dt_s) * (self.target_rad - self.start_rad)
-        return _arrived(q) if self.line.finished else Advanced(q, (q - q_rad) / dt_s, finished=False)
-
-
-@dataclass
 class LinearMove:
-    """moveL: the tool goes straight, its orientation turning evenly; joints follow by the inverse Jacobian."""
+    """moveL: the tool goes straight and turns evenly, with a trapezoid of speed; joints by the inverse Jacobian."""
 
     start: Matrix
     target: Matrix
     speed: float
     acceleration: float
     tool_length_m: float
-    line: Line = field(init=False)
 
     def __post_init__(self) -> None:
-        """Lay the way out; a move that only turns is measured in radians."""
+        """Compute the length; a move that only turns is measured in radians."""
         way_m = float(np.linalg.norm(self.target[:3, 3] - self.start[:3, 3]))
         self._turn = rotation_vector(self.start[:3, :3].T @ self.target[:3, :3])
-        self.line = Line(way_m if way_m > 1e-6 else float(np.linalg.norm(self._turn)), self.speed, self.acceleration)
+        self._length = way_m if way_m > 1e-6 else float(np.linalg.norm(self._turn))
+        self._done = self._rate = 0.0
 
     def advance(self, q_rad: Vector, qd_rad_per_s: Vector, dt_s: float) -> Advanced:  # noqa: ARG002 - on its own rails
-        """Return the arm one cycle later; `PathError` where no joint speed within the limits follows the line."""
-        part = self.line.advance(dt_s)
+        """Return the arm one cycle later; `PathError` where the joints cannot follow within their limits."""
+        share = self._advance_trapezoid(dt_s)
         frames = link_frames(q_rad, self.tool_length_m)
         here = frames[-1]
-        where = self.start[:3, 3] + part * (self.target[:3, 3] - self.start[:3, 3])
-        turned = self.start[:3, :3] @ rotation_matrix(part * self._turn)
+        where = self.start[:3, 3] + share * (self.target[:3, 3] - self.start[:3, 3])
+        turned = self.start[:3, :3] @ rotation_matrix(share * self._turn)
         error = np.concatenate([where - here[:3, 3], rotation_vector(turned @ here[:3, :3].T)])
         try:
             step = np.linalg.solve(jacobian(frames), error)
@@ -143,8 +167,16 @@ class LinearMove:
             raise PathError("the line leads through a singularity") from singular
         if np.abs(step).max() > JOINT_SPEED_LIMIT_RAD_PER_S * dt_s:
             raise PathError("the line asks a joint for more than its largest speed")
-        return _arrived(q_rad + step) if self.line.finished else Advanced(q_rad + step, step / dt_s, finished=False)
+        finished = self._done >= self._length
+        return Advanced(q_rad + step, np.zeros(6) if finished else step / dt_s, finished)
 
-
-def _arrived(q_rad: Vector) -> Advanced:
-    return Advanced(q_rad, np.zeros(6), finished=True)
+    def _advance_trapezoid(self, dt_s: float) -> float:
+        """Return the covered share of the length one cycle later."""
+        left = self._length - self._done
+        self._rate = min(self.speed, self._rate + self.acceleration * dt_s, math.sqrt(2 * self.acceleration * left))
+        # The last cycle of a discrete trapezoid would creep for ever.
+        if left <= max(self._rate * dt_s, 1e-9):
+            self._done, self._rate = self._length, 0.0
+        else:
+            self._done += self._rate * dt_s
+        return 1.0 if self._length <= 0 else self._done / self._length

@@ -24,7 +24,7 @@ def recording(tmp_path: Path) -> Path:
     return path
 
 
-def test_info_says_what_is_in_it(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_shows_the_content(recording: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["recording", "info", str(recording)]) == 0
     told = capsys.readouterr().out
     assert "a bench" in told
@@ -36,7 +36,7 @@ def test_info_says_what_is_in_it(recording: Path, capsys: pytest.CaptureFixture[
     assert (told["closed"], told["same_code"], told["size_bytes"]) == (True, True, recording.stat().st_size)
 
 
-def test_a_torn_recording_is_refused_with_its_cure_and_repaired(
+def test_a_torn_recording_is_refused_and_repaired(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = recording.read_bytes()
@@ -57,7 +57,7 @@ def test_a_torn_recording_is_refused_with_its_cure_and_repaired(
     assert "exists already" in capsys.readouterr().err
 
 
-def test_a_damaged_chunk_is_left_out_and_told(
+def test_a_damaged_chunk_is_left_out_and_counted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shearloop.daemon.recording.writer._FLUSH_EVERY", 1)
@@ -77,7 +77,7 @@ def test_a_damaged_chunk_is_left_out_and_told(
     assert len(kept) == told["messages"] >= 24
 
 
-def test_csv_parquet_and_matlab_hold_the_same(
+def test_csv_parquet_and_matlab_exports_agree(
     recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pyarrow_parquet = pytest.importorskip("pyarrow.parquet", reason="needs the extra `export`")

@@ -36,9 +36,7 @@ def recorded(content: dict[str, Any]) -> RecordedEvent:
         ({"reason": ""}, {"reason": "no grip"}, "reason was"),
     ],
 )
-def test_a_message_is_the_recorded_one_bit_for_bit_or_told_with_what_differs(
-    then: dict[str, Any], now: dict[str, Any], told: str
-) -> None:
+def test_a_difference_is_described(then: dict[str, Any], now: dict[str, Any], told: str) -> None:
     comparison = ReplayComparison(("eit.estimate.right",))
     comparison.add_computed(TOPIC, estimate(**now))
     comparison.compare(recorded(estimate(**then)))
@@ -48,7 +46,7 @@ def test_a_message_is_the_recorded_one_bit_for_bit_or_told_with_what_differs(
     assert comparison.unrecorded == 0
 
 
-def test_what_was_recorded_and_not_made_again_differs() -> None:
+def test_a_missing_message_is_a_difference() -> None:
     comparison = ReplayComparison(("eit.estimate.right", "eit.estimate.left"))
     comparison.add_computed(TOPIC, estimate(source="left"))
     comparison.compare(recorded(estimate()))
@@ -57,7 +55,7 @@ def test_what_was_recorded_and_not_made_again_differs() -> None:
     assert comparison.unrecorded == 1, "the left one has no message beside it"
 
 
-def test_what_is_in_no_topic_of_the_recording_is_counted_and_not_kept() -> None:
+def test_messages_of_unrecorded_topics_are_only_counted() -> None:
     comparison = ReplayComparison(("eit.estimate.right",))
     for _ in range(3):
         comparison.add_computed(TOPIC, estimate(source="left"))

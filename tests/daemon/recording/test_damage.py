@@ -90,7 +90,7 @@ def sound(content: bytes, tmp_path_factory: pytest.TempPathFactory) -> dict[str,
 
 @settings(max_examples=200, deadline=None)
 @given(where=st.floats(0, 0.9999), length=st.integers(1, 30), cut=st.booleans(), reader=st.sampled_from(READERS))
-def test_damage_ends_in_a_sentence_that_names_the_file_or_does_no_harm(
+def test_damage_is_an_error_that_names_the_file_or_harmless(
     content: bytes,
     sound: dict[str, Any],
     tmp_path_factory: pytest.TempPathFactory,
@@ -144,7 +144,7 @@ def spoilt(content: bytes, what: str) -> bytes:
         *((["calibrate", "{path}", "--out", "{out}"], what) for what in ("chunk", "cut", "short")),
     ],
 )
-def test_every_command_ends_with_status_2_and_one_sentence(
+def test_each_command_exits_with_status_2(
     arguments: list[str], what: str, content: bytes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "x.mcap"
@@ -157,7 +157,7 @@ def test_every_command_ends_with_status_2_and_one_sentence(
     assert "Traceback" not in said
 
 
-def test_a_check_that_compared_nothing_is_not_passed(
+def test_a_check_without_a_comparison_fails(
     config: Callable[..., Path], mat_folder: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     imported = tmp_path / "imported.mcap"
@@ -168,7 +168,7 @@ def test_a_check_that_compared_nothing_is_not_passed(
     assert main(["replay", str(imported), *arguments, "--check"]) == 1
 
 
-def test_nothing_is_kept_of_what_is_not_compared(
+def test_a_replay_without_comparison_stores_nothing(
     config: Callable[..., Path], mat_folder: Callable[..., Path], tmp_path: Path
 ) -> None:
     imported = tmp_path / "imported.mcap"

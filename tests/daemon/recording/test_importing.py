@@ -12,7 +12,7 @@ from shearloop.daemon.recording.writer import RecordingWriter
 PERIOD_S = 0.5408
 
 
-def test_frames_belong_to_the_middle_of_their_acquisition_however_late_they_were_read(mat_folder, tmp_path):
+def test_late_frames_get_the_middle_of_their_acquisition(mat_folder, tmp_path):
     late = [(20, 0.3), (21, 0.12), (40, 1.4), (41, 0.9), (42, 0.35)]
     import_mat([mat_folder(late=late)], tmp_path / "a.mcap")
     frames = read_recording(tmp_path / "a.mcap").sides["right"]
@@ -21,7 +21,7 @@ def test_frames_belong_to_the_middle_of_their_acquisition_however_late_they_were
     np.testing.assert_allclose(found, expected, atol=0.01)
 
 
-def test_a_load_that_was_read_once_per_frame_gets_its_own_pace_back(mat_folder, tmp_path):
+def test_a_load_read_once_per_frame_gets_its_own_period(mat_folder, tmp_path):
     imported = import_mat([mat_folder(one_loop=True)], tmp_path / "a.mcap")
     assert "read once per frame" in imported.remarks[0]
     found = read_recording(tmp_path / "a.mcap")
@@ -37,7 +37,7 @@ def test_damaged_load_values_are_counted_and_left_out(mat_folder, tmp_path):
     assert "2 load values beyond 20 N·m" in imported.remarks[0]
 
 
-def test_the_diameter_that_files_of_cylinders_are_named_by_is_noted(mat_folder, tmp_path):
+def test_the_diameter_in_the_files_names_is_noted(mat_folder, tmp_path):
     folder = mat_folder()
     for path in list(folder.iterdir()):
         path.rename(folder / f"12.5mm_1_{path.name}")
@@ -64,7 +64,7 @@ def test_two_sides_are_paired_by_time(mat_folder, tmp_path):
         part_of(both, 0, 0.001)
 
 
-def test_what_cannot_be_imported_is_named(mat_folder, tmp_path):
+def test_unusable_files_are_refused_by_name(mat_folder, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match=r"holds no \.mat files"):
         import_mat([tmp_path / "empty"], tmp_path / "a.mcap")
@@ -84,7 +84,7 @@ def test_what_cannot_be_imported_is_named(mat_folder, tmp_path):
 
 
 @pytest.mark.parametrize("decimals", [4, 6, 7, 17])
-def test_a_line_is_written_as_each_of_its_numbers_is_rounded(tmp_path, decimals):
+def test_lines_are_rounded_number_by_number(tmp_path, decimals):
     line = np.round(np.random.default_rng(decimals).uniform(-1, 1, N_LINE_VALUES), decimals)
     with RecordingWriter(tmp_path / "a.mcap", "a test") as writer:
         writer.add_frame("right", 1, 2, line)

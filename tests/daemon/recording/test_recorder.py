@@ -71,7 +71,7 @@ def topics(path: Path) -> dict[str, list[dict]]:
     return found
 
 
-def test_everything_is_recorded_with_its_schema_and_its_time(tmp_path: Path) -> None:
+def test_messages_are_recorded_with_schema_and_time(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path / "new" / "folder", IDENTITY, clock)
     recorder.input_recorder("right")(RawEvent(InputKind.OPENED, 5))
@@ -100,7 +100,7 @@ def test_everything_is_recorded_with_its_schema_and_its_time(tmp_path: Path) -> 
     assert told.metadata["source"] == "a test"
 
 
-def test_a_live_recording_is_read_as_an_imported_one(tmp_path: Path) -> None:
+def test_a_live_recording_is_read_like_an_import(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
     frames = [frame(clock, n) for n in range(3)]
@@ -116,7 +116,7 @@ def test_a_live_recording_is_read_as_an_imported_one(tmp_path: Path) -> None:
     assert found.torque_nm.tolist() == [0.1] * 3, "what is not valid is no truth"
 
 
-def test_a_frame_that_the_board_sent_again_is_read_once(tmp_path: Path) -> None:
+def test_a_repeated_frame_is_read_once(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
     frames = [frame(clock, n) for n in range(2)]
@@ -127,7 +127,7 @@ def test_a_frame_that_the_board_sent_again_is_read_once(tmp_path: Path) -> None:
     assert found.t_mid_ns.tolist() == [one["t_mono_ns"] + clock.offset_ns for one in frames]
 
 
-def test_each_experiment_has_a_file_which_bears_its_name(tmp_path: Path) -> None:
+def test_each_experiment_has_a_file_with_its_name(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
     recorder.record_message("load.torque", torque(clock, 0))
@@ -147,9 +147,7 @@ def test_each_experiment_has_a_file_which_bears_its_name(tmp_path: Path) -> None
     assert topics(second)["input.clock"], "each can be replayed by itself"
 
 
-def test_without_an_experiment_a_file_is_no_longer_than_an_hour(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_new_file_begins_after_an_hour_without_experiment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     clock = Clock()
     busy = True
     recorder = Recorder(tmp_path, IDENTITY, clock, is_busy=lambda: busy)
@@ -217,9 +215,7 @@ ENDLESS["itself"] = ENDLESS
     ],
     ids=["object", "no UTF-8", "500", "5000", "endless"],
 )
-def test_a_message_without_a_json_form_is_left_out_and_counted_and_the_recorder_goes_on(
-    raw: object, why: str, tmp_path: Path
-) -> None:
+def test_a_message_without_a_json_form_is_counted(raw: object, why: str, tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
     recorder.record_experiment("first")
@@ -242,7 +238,7 @@ def test_a_message_without_a_json_form_is_left_out_and_counted_and_the_recorder_
     assert [summarise(path).dropped for path in (first, second)] == [1, 0]
 
 
-def test_what_is_nested_a_hundred_times_is_recorded(tmp_path: Path) -> None:
+def test_a_hundred_levels_are_recorded(tmp_path: Path) -> None:
     clock = Clock()
     recorder = Recorder(tmp_path, IDENTITY, clock)
     recorder.record_message("load.torque", {**torque(clock, 0), "raw": nested(100)})
@@ -250,7 +246,7 @@ def test_what_is_nested_a_hundred_times_is_recorded(tmp_path: Path) -> None:
     assert topics(recorder.finished[0])["load.torque"][0]["raw"] == nested(100)
 
 
-async def test_a_recording_that_cannot_be_closed_leaves_no_socket_open(
+async def test_a_recorder_that_fails_to_close_leaves_no_socket_open(
     config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with zmq.asyncio.Context() as context:

@@ -24,7 +24,7 @@ def written(path, n=4):
     return frames
 
 
-def test_what_was_written_is_read(tmp_path):
+def test_a_recording_round_trips(tmp_path):
     frames = written(tmp_path / "a.mcap")
     found = read_recording(tmp_path / "a.mcap")
     assert found.source == "a bench"
@@ -43,7 +43,7 @@ def test_messages_out_of_order_are_sorted(tmp_path):
     np.testing.assert_array_equal(read_recording(tmp_path / "a.mcap").torque_nm, [1, 2, 3])
 
 
-def test_what_was_not_closed_is_kept_under_another_name(tmp_path):
+def test_an_unfinished_recording_stays_partial(tmp_path):
     def interrupted():
         with RecordingWriter(tmp_path / "a.mcap", "x") as writer:
             writer.add_torque(1, 1.0)
@@ -55,7 +55,7 @@ def test_what_was_not_closed_is_kept_under_another_name(tmp_path):
     assert read_recording(tmp_path / "a.mcap.partial").torque_nm.tolist() == [1.0]
 
 
-def test_foreign_and_stale_files_are_refused(tmp_path, monkeypatch):
+def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch):
     (tmp_path / "text.mcap").write_text("hello")
     with pytest.raises(UserError, match=r"text\.mcap: this is not an MCAP file"):
         read_recording(tmp_path / "text.mcap")
@@ -87,7 +87,7 @@ def test_a_side_that_no_file_has_is_not_to_be_imported(tmp_path):
         read_series(tmp_path / "a.mcap", ("up",))
 
 
-def test_a_folder_whose_name_is_no_text_is_refused_in_a_sentence(config):
+def test_a_folder_name_that_is_not_utf8_is_an_error(config):
     recorded = RecordingConfig(folder=Path(os.fsdecode(b"caf\xe9")))
     with pytest.raises(
         UserError, match=r"not UTF-8 \(the folder of the recordings is 'caf\\udce9'\); choose another name"

@@ -92,7 +92,7 @@ def recorded(config: Write, tmp_path: Path) -> Callable[..., Path]:
     return run
 
 
-def test_a_replay_is_what_was_recorded_bit_for_bit_at_any_speed(
+def test_a_replay_equals_the_recording_at_any_speed(
     recorded: Callable[..., Any], tmp_path: Path, tiny_calibration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, live = recorded()
@@ -132,7 +132,7 @@ def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pyte
     assert f"eit.estimate: {comparison.compared['eit.estimate']} of {comparison.compared['eit.estimate']}" in told
 
 
-def test_a_real_recording_gives_the_estimates_that_it_gave(shared: Path, config: Write, tmp_path: Path) -> None:
+def test_a_real_recording_gives_the_stored_estimates(shared: Path, config: Write, tmp_path: Path) -> None:
     """Guards parser, frame clock, baseline and matching. Renew: run with SHEARLOOP_RENEW=1, and say why it changed."""
     path = tmp_path / "stream.mcap"
     folder = shared / "recordings" / "streams" / "2024-12-03_16-09"
@@ -183,7 +183,7 @@ def test_mistakes_end_in_one_sentence(
     assert message in capsys.readouterr().err
 
 
-def test_what_is_not_a_number_goes_on_the_wire_as_it_went() -> None:
+def test_nan_is_restored() -> None:
     from shearloop.daemon.recording.replay import restored_wire_map
 
     on_wire = restored_wire_map({"seq": 3, "joints_rad": [1.5, None, 2.5], "reason": ""})

@@ -58,7 +58,7 @@ async def record(config: Path, stream: Path) -> list[dict[str, Any]]:
     return estimates
 
 
-def test_numbers_zeros_and_tools_of_a_later_file_are_replayed_as_they_were(
+def test_a_later_file_replays_frame_numbers_tares_and_tools(
     config: Callable[..., Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     live = asyncio.run(record(config(recording={"folder": "recordings"}), recording(tmp_path, 60)))

@@ -46,12 +46,12 @@ def without_values(message: Message) -> Message:
 
 
 @pytest.mark.parametrize("name", schemas())
-def test_every_schema_is_valid_and_within_what_foxglove_takes(name: str) -> None:
+def test_each_schema_is_valid_for_foxglove(name: str) -> None:
     Draft202012Validator.check_schema(schemas()[name])
     assert refused(schemas()[name]) == []
 
 
-def test_foxglove_would_refuse_what_it_is_said_to() -> None:
+def test_the_check_for_foxglove_refuses() -> None:
     several = {"type": "object", "properties": {"torque_nm": {"type": ["number", "null"]}}}
     assert refused(several) == [".torque_nm: ['number', 'null']"]
     assert refused({"type": "object", "properties": {"tasks": {"type": "object"}}}) == [
@@ -60,7 +60,7 @@ def test_foxglove_would_refuse_what_it_is_said_to() -> None:
 
 
 @pytest.mark.parametrize("topic", TOPICS)
-def test_every_message_is_what_its_schema_says_with_and_without_values(topic: str) -> None:
+def test_each_message_matches_its_schema(topic: str) -> None:
     full = sample(TOPICS[topic])
     # A frame's age makes its time of arrival: there is always one.
     for message in (full,) if topic == EitFrame.topic else (full, without_values(full)):
@@ -78,7 +78,7 @@ def test_every_message_is_what_its_schema_says_with_and_without_values(topic: st
                 assert restored[item.name] == (None if missing else value), item.name
 
 
-def test_raw_inputs_are_what_their_schema_says() -> None:
+def test_raw_input_matches_its_schema() -> None:
     written = json.loads(input_json(RawEvent(InputKind.DATA, 7, bytes(range(256)))))
     Draft202012Validator(schemas()[INPUT]).validate(written)
 

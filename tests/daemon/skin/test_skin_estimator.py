@@ -2,15 +2,18 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from random import Random
 
+import numpy as np
 import pytest
 
-from shearloop.bank.skin.calibration import SkinCalibration, fit_calibration, load_calibration
+from shearloop.bank.skin.calibration import CalibrationTable, SkinCalibration, fit_calibration, load_calibration
 from shearloop.bank.skin.membrane import Direction
+from shearloop.bank.skin.statistics import loop
 from shearloop.daemon.sensing.skin_estimator import DRIFT_PER_HOUR, SkinEstimator, SkinReading
-from shearloop.daemon.synthetic_skin import REST_OHM, SyntheticSkin, SyntheticSkinSettings, calibration_table
+from shearloop.daemon.synthetic_skin import CONTACT_N_PER_MM, REST_OHM, SyntheticSkin
 from shearloop.drivers.shear_skin.skin import SkinFault, SkinSample
 
 NOISE = 1e-4
@@ -20,6 +23,25 @@ PERIOD_NS = 100_000_000
 @pytest.fixture(scope="module")
 def calibration() -> SkinCalibration:
     return load_calibration(Path(__file__).parents[3] / "config" / "calibrations" / "skin_demo.yaml")
+
+
+def calibration_table(skin: SyntheticSkin, noise: float) -> CalibrationTable:
+    """Return a bench's recording: loops to 1.2 and 5 N, each after two rows at rest; `noise` of one resistance."""
+    random, rows = Random(1), []
+
+    def record(shear_n: float, normal_n: float) -> None:
+        skin.normal_n = normal_n
+        skin.push(shear_n)
+        skin.rest(1.0)
+        r1, r2 = (ohm * (1.0 + random.gauss(0.0, noise)) for ohm in skin.resistances_ohm())
+        rows.append((r1, r2, shear_n, normal_n))
+
+    for normal_n, amplitude_n in product((0.5, 1.0, 2.0), (1.2, 5.0)):
+        record(0.0, 0.0)
+        record(0.0, 0.0)
+        for shear_n in loop(amplitude_n).tolist():
+            record(shear_n, normal_n)
+    return CalibrationTable(*np.array(rows).T)
 
 
 class Bench:
@@ -255,10 +277,10 @@ def test_a_force_beyond_the_curve_is_not_a_force(calibration: SkinCalibration) -
 
 
 def test_turning_the_tool_stretches_contact_and_skin_in_series() -> None:
-    skin = SyntheticSkin(SyntheticSkinSettings(normal_n=1.0))
+    skin = SyntheticSkin(normal_n=1.0)
     hold_n = skin.membrane.friction
-    contact = skin.settings.contact_n_per_mm * skin.settings.radius_mm
-    series = 1 / (1 / skin.settings.contact_n_per_mm + 1 / skin.stiffness_n_per_mm) * skin.settings.radius_mm
+    contact = CONTACT_N_PER_MM * skin.radius_mm
+    series = 1 / (1 / CONTACT_N_PER_MM + 1 / skin.stiffness_n_per_mm) * skin.radius_mm
     sticking_rad = hold_n / contact
     assert skin.turn(0.5 * sticking_rad) == pytest.approx(0.5 * hold_n)
     loaded_n = skin.turn(0.05)

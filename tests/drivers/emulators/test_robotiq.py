@@ -5,8 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
-from shearloop.drivers.emulators.robotiq.modbus_face import ModbusFace, crc16
-from shearloop.drivers.emulators.robotiq.urcap_face import UrcapFace
+from shearloop.drivers.emulators.robotiq.servers import ModbusSlave, UrcapSession, crc16
 
 READ_STATUS = bytes.fromhex("09 03 07D0 0003")
 
@@ -127,7 +126,7 @@ def test_frames_are_the_manuals_byte_for_byte() -> None:
     assert framed(bytes.fromhex("0904 07D0 0003"))[-2:] == bytes.fromhex("B1CE")
     assert framed(bytes.fromhex("0903 06 B900 00FF BD00"))[-2:] == bytes.fromhex("1D7C")
     gripper = active_gripper()
-    face = ModbusFace(gripper)
+    face = ModbusSlave(gripper)
     assert face.feed(bytes.fromhex("0910 03E8 0003 06 0900 00FF FFFF 4229"), 0.0) == framed(
         bytes.fromhex("0910 03E8 0003")
     )
@@ -149,7 +148,7 @@ def test_modbus_requests_come_in_any_slices(widths: list[int]) -> None:
         framed(bytes.fromhex("0103 07D0 0003")),
         framed(bytes.fromhex("0904 07D1 0001")),
     ]
-    whole, sliced = ModbusFace(active_gripper()), ModbusFace(active_gripper())
+    whole, sliced = ModbusSlave(active_gripper()), ModbusSlave(active_gripper())
     expected = b"".join(whole.feed(request, 0.0) for request in requests)
     data, got, n = b"".join(requests), b"", 0
     while data:
@@ -171,12 +170,12 @@ def test_modbus_requests_come_in_any_slices(widths: list[int]) -> None:
     ],
 )
 def test_what_the_gripper_does_not_have_is_refused_in_its_words(request_hex: str, reply_hex: str) -> None:
-    assert ModbusFace(Gripper()).feed(framed(bytes.fromhex(request_hex)), 0.0) == framed(bytes.fromhex(reply_hex))
+    assert ModbusSlave(Gripper()).feed(framed(bytes.fromhex(request_hex)), 0.0) == framed(bytes.fromhex(reply_hex))
 
 
 @given(st.binary(max_size=600), st.integers(1, 50))
 def test_noise_on_the_line_is_survived_and_bounded(noise: bytes, width: int) -> None:
-    face = ModbusFace(Gripper())
+    face = ModbusSlave(Gripper())
     for start in range(0, len(noise), width):
         face.feed(noise[start : start + width], 0.0)
     # After a pause the next frame is understood.
@@ -185,7 +184,7 @@ def test_noise_on_the_line_is_survived_and_bounded(noise: bytes, width: int) -> 
 
 def test_the_socket_answers_as_the_urcap_does() -> None:
     gripper = active_gripper()
-    face = UrcapFace(gripper)
+    face = UrcapSession(gripper)
     assert face.feed(b"SET POS 100 SPE 255 FOR 50 GTO 1\n") == b"ack"
     steps(gripper, 1.0)
     assert face.feed(b"GET POS\nGET OBJ\nGET P") == b"POS 100\nOBJ 3\n"
@@ -199,7 +198,7 @@ def test_the_socket_answers_as_the_urcap_does() -> None:
 @given(st.binary(max_size=2000), st.integers(1, 100))
 def test_a_client_that_talks_nonsense_gets_nothing_and_moves_nothing(noise: bytes, width: int) -> None:
     gripper = active_gripper()
-    face = UrcapFace(gripper)
+    face = UrcapSession(gripper)
     for start in range(0, len(noise), width):
         face.feed(noise[start : start + width])
     assert (gripper.command.pos, gripper.command.gto) == (0, False)
@@ -208,7 +207,7 @@ def test_a_client_that_talks_nonsense_gets_nothing_and_moves_nothing(noise: byte
 
 @pytest.mark.parametrize("line", [b"SET POS 256\n", b"SET POS -1\n", b"SET POS\n", b"SET XYZ 1\n", b"SET\n", b"\n"])
 def test_a_wrong_set_is_not_acknowledged(line: bytes) -> None:
-    assert UrcapFace(active_gripper()).feed(line) == b""
+    assert UrcapSession(active_gripper()).feed(line) == b""
 
 
 def test_positions_and_widths_are_each_others_inverse() -> None:

@@ -2,9 +2,8 @@
 
 import pytest
 
-from shearloop.drivers.emulators.ur.faults import obey
 from shearloop.drivers.emulators.ur.robot import Robot
-from shearloop.drivers.emulators.ur.server import Controller
+from shearloop.drivers.emulators.ur.server import Controller, apply_fault
 
 
 def test_faults_are_carried_out_and_ended() -> None:
@@ -14,13 +13,13 @@ def test_faults_are_carried_out_and_ended() -> None:
         "registers-in-use", "local-control", "refuse-protocol on", "stop-hangs 2", "protective-stop",
         "emergency-stop",
     ):  # fmt: skip
-        obey(controller, line)
+        apply_fault(controller, line)
     assert controller.stop_hangs == 2
     assert (robot.registers_taken, robot.remote_control, controller.protocol_refused) == (True, False, True)
     assert robot.safety_mode == 7
-    obey(controller, "registers-in-use off")
+    apply_fault(controller, "registers-in-use off")
     assert not robot.registers_taken
-    obey(controller, "normal")
+    apply_fault(controller, "normal")
     assert (robot.remote_control, controller.protocol_refused, robot.safety_mode) == (True, False, 1)
     assert controller.stop_hangs == 0
 
@@ -31,4 +30,4 @@ def test_faults_are_carried_out_and_ended() -> None:
 )
 def test_what_is_no_fault_is_told(line: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
-        obey(Controller(Robot()), line)
+        apply_fault(Controller(Robot()), line)

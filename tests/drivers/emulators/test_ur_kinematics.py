@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from shearloop.drivers.emulators.ur.kinematics import jacobian, link_frames, pose_of, rotation_matrix, rotation_vector
+from shearloop.drivers.emulators.ur.motion import jacobian, link_frames, pose_of, rotation_matrix, rotation_vector
 
 angles = st.floats(-math.pi, math.pi)
 joints = st.tuples(*[angles] * 6).map(np.array)

@@ -10,10 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from shearloop.drivers.emulators.ur import server
-from shearloop.drivers.emulators.ur.make import Make
-from shearloop.drivers.emulators.ur.registers import pack, unpack
-from shearloop.drivers.emulators.ur.robot import Robot
-from shearloop.drivers.emulators.ur.rtde import NotRtdeError, RtdeSession, package
+from shearloop.drivers.emulators.ur.robot import ControllerSpec, Robot
+from shearloop.drivers.emulators.ur.rtde import NotRtdeError, RtdeSession, pack, package, unpack
 
 GREETING = package(ord("V"), b"\x00\x02") + package(ord("v"), b"")
 COMMAND = b"input_int_register_0,input_double_register_0,"
@@ -27,7 +25,7 @@ CONVERSATION = (
 
 
 def session(**make: object) -> RtdeSession:
-    return RtdeSession(Robot(Make(**make)), 500.0)  # type: ignore[arg-type]
+    return RtdeSession(Robot(ControllerSpec(**make)), 500.0)  # type: ignore[arg-type]
 
 
 def replies(data: bytes) -> list[tuple[int, bytes]]:

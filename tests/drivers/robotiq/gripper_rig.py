@@ -14,8 +14,7 @@ import pytest
 
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
 from shearloop.drivers.emulators.robotiq.gripper import Gripper, GripperMechanics
-from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
-from shearloop.drivers.emulators.robotiq.urcap_face import UrcapServer
+from shearloop.drivers.emulators.robotiq.servers import ModbusServer, UrcapServer
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperClient
 from shearloop.drivers.robotiq.modbus_client import ModbusClient

@@ -9,8 +9,7 @@ import pytest
 from pymodbus.client import AsyncModbusSerialClient
 from pymodbus.pdu import ModbusPDU
 
-from shearloop.drivers.emulators.robotiq.modbus_face import ModbusServer
-from shearloop.drivers.emulators.robotiq.urcap_face import UrcapServer
+from shearloop.drivers.emulators.robotiq.servers import ModbusServer, UrcapServer
 from shearloop.drivers.errors import DeviceLostError, DeviceNotFoundError, DriverError
 from shearloop.drivers.robotiq.messages import ActivationStatus, GripperCommand
 from tests.drivers.robotiq.gripper_rig import WAYS, a_rig
@@ -78,7 +77,7 @@ async def test_it_comes_back_by_itself_and_says_so(way: str, tmp_path: Path) -> 
         second = await coming
         assert second.t_ns >= lost_ns
         assert second.seq > first.seq
-        openings = rig.driver.diagnostics()["openings"]
+        openings = rig.driver.diagnostics()["connections"]
         assert openings == 2
         ups = [event.up for event in rig.events]
         assert ups[0]

@@ -47,6 +47,8 @@ def arm(monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
         for kind in kinds:
             setattr(module, kind, Client)
         monkeypatch.setitem(sys.modules, name, module)
+    # Another test may have imported it over the real clients.
+    monkeypatch.delitem(sys.modules, "shearloop.drivers.ur.arm", raising=False)
     arm = importlib.import_module("shearloop.drivers.ur.arm")
     monkeypatch.setattr(arm, "RtdeReceiver", Client)
     yield arm

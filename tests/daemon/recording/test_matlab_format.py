@@ -42,7 +42,7 @@ def written_by_hand(order: str, stored: int, numbers: bytes, shape: tuple[int, i
 
 
 @given(st.dictionaries(NAMES, MATRICES, max_size=3), st.booleans())
-def test_matrices_are_read_as_they_were_saved(variables: dict[str, np.ndarray], compressed: bool) -> None:
+def test_matrices_round_trip(variables: dict[str, np.ndarray], compressed: bool) -> None:
     found = read_variables(saved(dict(variables), compressed))
     assert found.keys() == variables.keys()
     for name, values in variables.items():
@@ -53,7 +53,7 @@ def test_matrices_are_read_as_they_were_saved(variables: dict[str, np.ndarray], 
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
-def test_numbers_may_be_stored_narrower_than_their_class_and_in_either_byte_order(order: str) -> None:
+def test_narrow_numbers_in_both_byte_orders(order: str) -> None:
     found = read_variables(written_by_hand(order, 3, struct.pack(f"{order}4h", 1, -2, 3, 300)))
     np.testing.assert_array_equal(found["x"], [[1, 3], [-2, 300]])
 
@@ -68,7 +68,7 @@ def test_numbers_may_be_stored_narrower_than_their_class_and_in_either_byte_orde
         (np.ones((2, 3, 4)), "2 × 3 × 4 real numbers"),
     ],
 )
-def test_other_kinds_are_named(value: object, what: str) -> None:
+def test_other_kinds_of_variables_are_described(value: object, what: str) -> None:
     found = read_variables(saved({"x": value, "y": 2.0}))
     assert found["x"] == NotAMatrix(what)
     assert isinstance(found["y"], np.ndarray)
@@ -91,12 +91,12 @@ def test_other_kinds_are_named(value: object, what: str) -> None:
         (saved({})[:128] + element(15, zlib.compress(bytes(100))[:-6], "<"), "is not complete"),
     ],
 )
-def test_what_is_wrong_is_said(content: bytes, says: str) -> None:
+def test_damaged_content_is_an_error(content: bytes, says: str) -> None:
     with pytest.raises(MatFileError, match=says):
         read_variables(content)
 
 
-def test_recordings_saved_by_matlab_are_read_as_by_scipy(shared: Path) -> None:
+def test_files_of_matlab_are_read_like_scipy_does(shared: Path) -> None:
     for name in ("torque_slices/Data_Slice_7", "diameter_slices/10mm_Data_2", "streams/cylinders/10mm_1_truth"):
         path = shared / "recordings" / f"{name}.mat"
         expected = {key: value for key, value in loadmat(path).items() if not key.startswith("__")}

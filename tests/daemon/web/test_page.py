@@ -5,8 +5,8 @@ import itertools
 import pytest
 
 from shearloop.daemon.web.latest import conductivity_profile
-from tests.daemon.view.conftest import Browsed
-from tests.daemon.view.fake_daemon import MESSAGES, REASONS
+from tests.daemon.web.conftest import Browsed
+from tests.daemon.web.fake_daemon import MESSAGES, REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 

@@ -62,7 +62,7 @@ class FakeDaemon:
     def start(self) -> None:
         if self._process is None:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "tests.daemon.view.fake_daemon", str(self._folder)],
+                [sys.executable, "-m", "tests.daemon.web.fake_daemon", str(self._folder)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,

@@ -4,8 +4,8 @@ from typing import Any
 
 import pytest
 
-from tests.daemon.view.conftest import Browsed
-from tests.daemon.view.fake_daemon import REASONS
+from tests.daemon.web.conftest import Browsed
+from tests.daemon.web.fake_daemon import REASONS
 
 pytestmark = pytest.mark.usefixtures("fresh")
 COMMANDS = ("tare", "start", "pause", "resume", "unlock")

@@ -102,7 +102,7 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
 
 
 @pytest.mark.real_time
-def test_both_fingertips_and_fused_are_replayed_bit_for_bit_at_any_speed(
+def test_combined_fingertips_are_replayed_at_any_speed(
     config: Callable[..., Path], tiny_bank: Path, twists: Twists, tmp_path: Path
 ) -> None:
     fingertips = {

@@ -36,16 +36,16 @@ def read(value: Any) -> Any:
 @given(st.dictionaries(texts, values))
 @example({"torque_nm": math.nan})
 @example({"whole": [math.inf, -0.0, 5e-324, 0.1 + 0.2, 1e22]})
-def test_what_is_written_reads_the_same(content: dict[str, Any]) -> None:
+def test_json_round_trips(content: dict[str, Any]) -> None:
     assert read(json.loads(as_json(content), parse_constant=not_json)) == read(content)
 
 
-def test_mapping_that_is_no_dict_is_written_as_one() -> None:
+def test_other_mappings_are_written_like_a_dict() -> None:
     assert as_json(MappingProxyType({"tasks": MappingProxyType({"loop": (1, math.nan)})})) == (
         b'{"tasks":{"loop":[1,null]}}'
     )
 
 
-def test_raw_input_reads_the_same_byte_for_byte() -> None:
+def test_raw_input_round_trips() -> None:
     told = RawEvent(InputKind.DATA, 123456789012345678, bytes(range(256)))
     assert input_event(json.loads(input_json(told))) == told

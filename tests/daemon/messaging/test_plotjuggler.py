@@ -18,7 +18,7 @@ from shearloop.daemon.clock import Clock
 from shearloop.daemon.messaging.messages import TOPICS, Message
 from shearloop.daemon.messaging.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
-from tests.daemon.view.fake_daemon import MESSAGES, made
+from tests.daemon.web.fake_daemon import MESSAGES, made
 
 
 def messages() -> list[Message]:
@@ -67,7 +67,7 @@ def frames(tmp_path: Path) -> dict[str, list[bytes]]:
     return received
 
 
-def test_every_message_is_a_topic_that_it_passes_over_and_a_map_that_it_takes(frames: dict[str, list[bytes]]) -> None:
+def test_plotjuggler_ignores_the_topic_and_parses_the_map(frames: dict[str, list[bytes]]) -> None:
     assert set(frames) == set(TOPICS) - {"eit.frame"}
     for topic, (name, payload) in frames.items():
         assert name == topic.encode(), "so that its topic filter finds it"
@@ -77,7 +77,7 @@ def test_every_message_is_a_topic_that_it_passes_over_and_a_map_that_it_takes(fr
         assert parsed(topic.encode()) is None
 
 
-def test_every_scalar_is_a_series_with_its_time_and_no_array_is(frames: dict[str, list[bytes]]) -> None:
+def test_each_scalar_is_a_series_and_no_array_is(frames: dict[str, list[bytes]]) -> None:
     for given in MESSAGES.values():
         kind: type[Message] = given["kind"]
         series = dict(plotted(parsed(frames[kind.topic][1])))

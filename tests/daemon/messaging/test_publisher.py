@@ -21,7 +21,7 @@ def until(is_so: Callable[[], bool]) -> None:
         time.sleep(0.001)
 
 
-def test_the_publisher_knows_which_topics_are_prefixes_to(tmp_path: Path) -> None:
+def test_the_publisher_knows_the_subscribed_topics(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/publish"
     with zmq.Context() as context:
         publisher = Publisher(context, address, Clock())
@@ -40,7 +40,7 @@ def test_the_publisher_knows_which_topics_are_prefixes_to(tmp_path: Path) -> Non
         publisher.close()
 
 
-def test_what_cannot_be_sent_spoils_no_other_message(tmp_path: Path) -> None:
+def test_an_unsendable_message_does_not_affect_the_next(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/publish"
     with (
         zmq.Context() as context,
@@ -58,7 +58,7 @@ def test_what_cannot_be_sent_spoils_no_other_message(tmp_path: Path) -> None:
         assert (topic, list(map(decode, payload))) == (b"health", [{"number": 1}])
 
 
-def test_subscriptions_to_what_there_is_not_are_not_kept(tmp_path: Path) -> None:
+def test_subscriptions_to_unknown_topics_are_not_kept(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/publish"
     with zmq.Context() as context:
         publisher = Publisher(context, address, Clock())
@@ -110,7 +110,7 @@ def test_subscribers_come_and_go_while_messages_are_sent(tmp_path: Path) -> None
         until(lambda: not publisher.has_subscribers())
 
 
-def test_who_listens_where_nobody_speaks_is_told_so_once_and_hears_who_comes_later(
+def test_a_subscriber_is_warned_once_and_receives_a_later_daemon(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shearloop.daemon.messaging.client.QUIET_S", 0.02)

@@ -28,21 +28,21 @@ def heatmap(scores: np.ndarray) -> EitHeatmap:
 
 
 @given(ARRAYS)
-def test_arrays_come_back_as_they_were_sent(scores: np.ndarray) -> None:
+def test_arrays_round_trip(scores: np.ndarray) -> None:
     content = decode(encode(wire_map(heatmap(scores), timestamp=1.5, seq=3)))
     np.testing.assert_array_equal(content["scores"], scores)
     assert "scores_shape" not in content
     assert (content["timestamp"], content["seq"], content["source"], content["t_mono_ns"]) == (1.5, 3, "right", 5)
 
 
-def test_an_array_is_bin_with_its_shape_beside_it_so_that_plotting_tools_pass_over_it() -> None:
+def test_an_array_is_bin_with_a_shape_key() -> None:
     content = wire_map(heatmap(np.array([[0.25, np.nan]])), timestamp=0.0, seq=0)
     assert content["scores"] == np.array([0.25, np.nan], "<f4").tobytes()
     assert content["scores_shape"] == [1, 2]
 
 
 @given(st.lists(st.floats(), max_size=8))
-def test_a_few_numbers_go_as_an_array_of_them_would(numbers: list[float]) -> None:
+def test_a_tuple_is_encoded_like_an_array(numbers: list[float]) -> None:
     with np.errstate(over="ignore"):
         array = np.array(numbers).astype("<f4")
     content = wire_map(dataclasses.replace(sample(RobotStateMessage), joints_rad=tuple(numbers)), 0.0, 0)  # type: ignore[call-arg]
@@ -51,18 +51,18 @@ def test_a_few_numbers_go_as_an_array_of_them_would(numbers: list[float]) -> Non
 
 
 @given(st.dictionaries(st.text().filter(lambda key: not key.endswith("_shape")), SCALARS))
-def test_scalars_come_back_as_they_were_sent(content: dict[str, object]) -> None:
+def test_scalars_round_trip(content: dict[str, object]) -> None:
     assert decode(encode(content)) == content
 
 
-def test_a_message_that_cannot_be_encoded_leaves_nothing_in_the_next() -> None:
+def test_a_failed_encoding_does_not_affect_the_next_message() -> None:
     with pytest.raises(TypeError):
         encode({"source": "left", "k": object()})
     assert decode(encode({"source": "right"})) == {"source": "right"}
 
 
 @given(st.binary(max_size=300))
-def test_what_is_not_a_message_is_refused_with_a_value_error(payload: bytes) -> None:
+def test_foreign_bytes_raise_a_value_error(payload: bytes) -> None:
     try:
         content = decode(payload)
     except ValueError:
@@ -70,7 +70,7 @@ def test_what_is_not_a_message_is_refused_with_a_value_error(payload: bytes) -> 
     assert all(isinstance(key, str) for key in content)
 
 
-def test_a_shape_that_does_not_fit_its_array_is_refused() -> None:
+def test_a_wrong_shape_is_refused() -> None:
     with pytest.raises(ValueError, match="'scores' does not fit its shape"):
         decode(encode({"scores": b"\0" * 8, "scores_shape": [3]}))
     with pytest.raises(ValueError, match="does not fit"):

@@ -44,7 +44,7 @@ def ada(folder: Path) -> ClientKeys:
     return ClientKeys(load_key_pair(folder / "ada/client.key_secret"), load_public_key(folder / "keys/server.key"))
 
 
-def test_what_can_be_reached_from_the_network() -> None:
+def test_local_and_network_addresses() -> None:
     for address in ("tcp://127.0.0.1:1", "tcp://[::1]:1", "ipc:///run/x", "ipc://@x"):
         assert is_local(address), address
     for address in ("tcp://0.0.0.0:1", "tcp://*:1", "tcp://10.0.0.1:1", "tcp://pc:1", "tcp://127.0.0.1:1;0.0.0.0:2"):
@@ -53,7 +53,7 @@ def test_what_can_be_reached_from_the_network() -> None:
     assert needs_keys("tcp://pc:1")
 
 
-def test_which_addresses_end_in_a_port_that_there_is() -> None:
+def test_valid_ports() -> None:
     for address in ("tcp://127.0.0.1:1", "tcp://[::1]:65535", "tcp://0.0.0.0:*", "ipc:///run/x", "ipc://@x:70000"):
         assert has_valid_port(address), address
     for port in ("65536", "70000", "0000070000", "7761a", "-1", "", "²", "1" * 5000):
@@ -64,13 +64,13 @@ def test_which_addresses_end_in_a_port_that_there_is() -> None:
 
 
 @pytest.mark.parametrize("command", ["run", "check"])
-def test_no_network_address_without_keys(command: str, config: Write, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_network_address_needs_keys(command: str, config: Write, capsys: pytest.CaptureFixture[str]) -> None:
     for key in ("publish", "commands"):
         assert main([command, str(config(**{key: "tcp://0.0.0.0:7769"}))]) == 2
         assert f"`{key}: tcp://0.0.0.0:7769` would open the robot to the network" in capsys.readouterr().err
 
 
-def test_nor_one_whose_keys_are_not_there(config: Write, keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_network_address_needs_existing_keys(config: Write, keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
     missing = {"server_key": str(keys / "none.key_secret"), "clients": str(keys / "keys/clients")}
     path = str(config(commands=NETWORK, curve=missing))
     for command in ("run", "check"):
@@ -106,7 +106,7 @@ def address_of(socket: Any) -> str:
     return str(socket.getsockopt_string(zmq.LAST_ENDPOINT)).replace("//0.0.0.0:", "//127.0.0.1:")
 
 
-async def test_only_the_allowed_come_in_and_only_encrypted(
+async def test_only_allowed_clients_connect_and_only_encrypted(
     config: Write, keys: Path, connect: Callable[..., Any]
 ) -> None:
     path = config(publish=NETWORK, commands=NETWORK, curve=curve(keys))
@@ -150,7 +150,7 @@ async def _stop_without_a_key(daemon: Daemon, connect: Callable[..., Any]) -> No
     await daemon.stopped()
 
 
-def test_the_open_stop_is_named_by_the_port() -> None:
+def test_the_local_stop_socket_is_named_by_the_port() -> None:
     assert (
         local_stop_address("tcp://0.0.0.0:7762")
         == local_stop_address("tcp://127.0.0.1:7762")
@@ -158,7 +158,7 @@ def test_the_open_stop_is_named_by_the_port() -> None:
     )
 
 
-def test_a_client_never_speaks_in_the_clear_to_another_machine(
+def test_a_client_needs_keys_for_another_machine(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
@@ -170,7 +170,7 @@ def test_a_client_never_speaks_in_the_clear_to_another_machine(
     assert "copy the daemon's server.key there" in capsys.readouterr().err
 
 
-def test_keys_are_made_once_shown_and_taken_back(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_keys_are_made_listed_and_revoked(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = keys / "keys"
     assert (folder / "server.key_secret").stat().st_mode & 0o777 == 0o600
     assert (folder / "clients/ada.key").stat().st_mode & 0o777 == 0o644
@@ -190,7 +190,7 @@ def test_keys_are_made_once_shown_and_taken_back(keys: Path, capsys: pytest.Capt
     assert "no client may connect yet" in capsys.readouterr().out
 
 
-def test_a_damaged_key_is_a_sentence(keys: Path) -> None:
+def test_a_damaged_key_is_an_error(keys: Path) -> None:
     secret = keys / "keys/server.key_secret"
     other = KeyPair(*zmq.curve_keypair())
     for text, part in (
@@ -204,7 +204,7 @@ def test_a_damaged_key_is_a_sentence(keys: Path) -> None:
             load_key_pair(secret)
 
 
-def test_under_systemd_the_credential_takes_the_files_place(
+def test_a_systemd_credential_replaces_the_key_file(
     keys: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handed = tmp_path / "handed"
@@ -218,6 +218,6 @@ def test_under_systemd_the_credential_takes_the_files_place(
         load_server_keys(Path("/etc/shearloop/keys/server.key_secret"))
 
 
-def test_a_key_is_not_shown_by_accident() -> None:
+def test_repr_hides_the_secret_key() -> None:
     pair = KeyPair(*zmq.curve_keypair())
     assert pair.secret.decode() not in repr(pair)

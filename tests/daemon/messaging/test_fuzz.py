@@ -30,7 +30,7 @@ from shearloop.drivers.ur.messages import CommandReply
 
 FRAMES = REQUESTS = 50_000
 DEADLINE_S = 120
-ROBOT = str(Path(__file__).resolve().parents[2] / "config/ur.yaml")
+ROBOT = str(Path(__file__).resolve().parents[3] / "config/ur.yaml")
 # What the daemon may keep of it all: caches, free lists, its sockets' buffers.
 MOST_GROWTH_MB = 16.0
 COMMANDS = ("tare", "start", "pause", "resume", "stop", "status", "unlock", "set")
@@ -188,7 +188,7 @@ def write_all(board: int, lines: Iterator[bytes]) -> None:
         batch = batch[os.write(board, batch) :]
 
 
-def test_the_limit_is_a_clients_own_and_lets_go_again() -> None:
+def test_the_rate_limit_of_a_client_recovers() -> None:
     limit = RateLimit()
     allowed = [limit.allow(b"loud", 0) for _ in range(1000)]
     assert sum(allowed) == CLIENT_BURST
@@ -196,7 +196,7 @@ def test_the_limit_is_a_clients_own_and_lets_go_again() -> None:
     assert sum(limit.allow(b"loud", 10**9) for _ in range(1000)) == CLIENT_PER_S
 
 
-def test_many_clients_have_no_more_than_one_limit_together() -> None:
+def test_many_clients_share_the_total_limit() -> None:
     limit = RateLimit()
     allowed = sum(limit.allow(b"%d" % number, number * 1000) for number in range(100_000))
     assert allowed <= TOTAL_BURST + 0.1 * TOTAL_PER_S + 1

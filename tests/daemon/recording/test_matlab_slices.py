@@ -58,9 +58,9 @@ class Sweep:
             torque = {"t_mono_ns": round(self.t_s * S), "torque_nm": torque_nm, "valid": valid}
             self.recorder("load.torque", torque)
 
-    def hold(self, number: int, torque_nm: float, for_s: float = 5.0, *, valid: bool = True) -> None:
+    def hold(self, number: int, torque_nm: float, for_s: float = 5.0, **frames: bool) -> None:
         self._loop(hold=number)
-        self.frames(torque_nm, for_s, valid=valid)
+        self.frames(torque_nm, for_s, **frames)
         self._loop()
         self.frames(0.0, 1.0)
 
@@ -72,7 +72,7 @@ class Sweep:
         self.recorder.close()
 
 
-def test_each_hold_of_a_torque_sweep_becomes_a_slice_that_reproduce_reads(tmp_path: Path) -> None:
+def test_each_hold_becomes_a_slice_for_reproduce(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
     for number, torque_nm in enumerate((0.05, 0.1, 0.15), start=1):
         sweep.hold(number, torque_nm)
@@ -86,7 +86,7 @@ def test_each_hold_of_a_torque_sweep_becomes_a_slice_that_reproduce_reads(tmp_pa
     assert sweep.recorder.summary == "3 torque slices"
 
 
-def test_a_second_sweep_goes_on_where_the_first_ended(tmp_path: Path) -> None:
+def test_a_second_sweep_continues_the_numbers(tmp_path: Path) -> None:
     for diameter_mm in (10.2, 20.4):
         sweep = Sweep(tmp_path, "diameter")
         sweep.gripped(diameter_mm)
@@ -97,7 +97,7 @@ def test_a_second_sweep_goes_on_where_the_first_ended(tmp_path: Path) -> None:
     np.testing.assert_allclose(slices.diameter_mm, [10, 10, 20, 20])
 
 
-def test_a_second_sweep_leaves_the_raw_frame_of_the_first(tmp_path: Path) -> None:
+def test_a_second_sweep_keeps_the_first_raw_frame(tmp_path: Path) -> None:
     """One raw frame a run, of its largest torque; that of another run is nowhere else."""
     for torques_nm in ((0.05, 0.15), (0.1, 0.2)):
         sweep = Sweep(tmp_path)
@@ -114,7 +114,7 @@ def test_a_second_sweep_leaves_the_raw_frame_of_the_first(tmp_path: Path) -> Non
     )
 
 
-def test_frames_and_torques_are_smoothed_alike_around_the_middle_of_a_hold(tmp_path: Path) -> None:
+def test_frames_and_torques_are_smoothed_around_the_same_middle(tmp_path: Path) -> None:
     """The gel relaxes while it is held: what is said of its frame has to be said of its torque."""
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)
@@ -131,7 +131,7 @@ def test_frames_and_torques_are_smoothed_alike_around_the_middle_of_a_hold(tmp_p
     np.testing.assert_allclose(slices.torque_nm[0], slices.differences[0].mean(), rtol=0.02)
 
 
-def test_the_frame_that_was_under_way_when_the_tare_began_is_no_homogeneous_one(tmp_path: Path) -> None:
+def test_the_frame_before_the_tare_is_not_homogeneous(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path, tared=False)
     sweep.frames(0.3, 4.0)
     sweep.t_s += 0.3 * PERIOD_S
@@ -145,7 +145,7 @@ def test_the_frame_that_was_under_way_when_the_tare_began_is_no_homogeneous_one(
     np.testing.assert_allclose(read_torque_slices(tmp_path / "torque_slices").differences, 0.1, atol=1e-6)
 
 
-def test_frames_of_a_hold_that_arrive_after_its_end_are_of_it(tmp_path: Path) -> None:
+def test_frames_of_a_hold_may_arrive_after_its_end(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)
     sweep.frames(0.1, 1.0)
@@ -158,7 +158,7 @@ def test_frames_of_a_hold_that_arrive_after_its_end_are_of_it(tmp_path: Path) ->
     assert sweep.recorder.written["torque"] == 1, sweep.recorder.summary
 
 
-def test_the_raw_frame_beside_the_slices_is_clipped_as_the_papers(tmp_path: Path) -> None:
+def test_the_raw_frame_is_clipped_like_the_papers(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
     sweep.hold(1, 0.3)
     sweep.done()
@@ -167,7 +167,7 @@ def test_the_raw_frame_beside_the_slices_is_clipped_as_the_papers(tmp_path: Path
     np.testing.assert_allclose(raw, np.minimum(sweep.rest + 0.3, 0.45), atol=1e-6)
 
 
-def test_a_daemon_that_ends_with_the_last_hold_loses_no_slice(tmp_path: Path) -> None:
+def test_closing_writes_the_last_slice(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)
     sweep.frames(0.1, 5.0)
@@ -176,7 +176,7 @@ def test_a_daemon_that_ends_with_the_last_hold_loses_no_slice(tmp_path: Path) ->
     assert sweep.recorder.written["torque"] == 1
 
 
-def test_a_hold_that_safety_interrupts_is_one_slice(tmp_path: Path) -> None:
+def test_a_hold_with_a_safety_interruption_is_one_slice(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path)
     sweep._loop(hold=1)
     sweep.frames(0.1, 2.0)
@@ -190,44 +190,33 @@ def test_a_hold_that_safety_interrupts_is_one_slice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tared", "for_s", "why"), [(False, 5.0, "no `tare` step"), (True, 0.5, "fewer than 3 frames")]
+    ("tared", "for_s", "frames", "reason"),
+    [
+        (False, 5.0, {}, "no `tare` step"),
+        (True, 0.5, {}, "fewer than 3 frames"),
+        (True, 5.0, {"repeated": True}, "fewer than 3 frames"),
+        (True, 5.0, {"valid": False}, "or no torque"),
+    ],
+    ids=["no tare", "short hold", "repeated frames", "invalid load"],
 )
-def test_a_hold_that_yields_no_slice_is_counted_with_its_reason(
-    tmp_path: Path, tared: bool, for_s: float, why: str
+def test_a_missed_slice_is_counted_with_its_reason(
+    tmp_path: Path, tared: bool, for_s: float, frames: dict[str, bool], reason: str
 ) -> None:
     sweep = Sweep(tmp_path, tared=tared)
-    sweep.hold(1, 0.1, for_s)
+    sweep.hold(1, 0.1, for_s, **frames)
     sweep.done()
     assert not sweep.recorder.written
-    assert why in sweep.recorder.summary
+    assert reason in sweep.recorder.summary
 
 
-def test_a_load_cell_that_is_not_to_be_believed_is_the_torque_of_no_slice(tmp_path: Path) -> None:
-    sweep = Sweep(tmp_path)
-    sweep.hold(1, 0.1, valid=False)
-    sweep.done()
-    assert not sweep.recorder.written
-    assert "or no torque" in sweep.recorder.summary
-
-
-def test_a_board_that_sends_its_last_frame_again_and_again_makes_no_slice(tmp_path: Path) -> None:
-    sweep = Sweep(tmp_path)
-    sweep._loop(hold=1)
-    sweep.frames(0.1, 5.0, repeated=True)
-    sweep._loop()
-    sweep.done()
-    assert not sweep.recorder.written
-    assert "fewer than 3 frames" in sweep.recorder.summary
-
-
-def test_an_experiment_that_asks_for_no_slices_leaves_none(tmp_path: Path) -> None:
+def test_slices_need_a_request_of_the_experiment(tmp_path: Path) -> None:
     sweep = Sweep(tmp_path, "")
     sweep.hold(1, 0.1)
     sweep.done()
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_that_cannot_be_made_is_said_so(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(UserError, match="cannot be made"):
         SliceRecorder(tmp_path / "file" / "slices")
@@ -248,7 +237,7 @@ def unwritable(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pyte
     return tmp_path
 
 
-def test_a_folder_that_cannot_be_written_kills_nobody_and_is_told(unwritable: Path) -> None:
+def test_an_unwritable_folder_is_reported(unwritable: Path) -> None:
     sweep = Sweep(unwritable)
     sweep.hold(1, 0.1)
     sweep.hold(2, 0.1)
@@ -261,7 +250,7 @@ def test_a_folder_that_cannot_be_written_kills_nobody_and_is_told(unwritable: Pa
     assert not list(unwritable.glob("torque_slices/*")), "nothing half written is left"
 
 
-def test_no_message_waits_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_do_not_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     let_go, threads = threading.Event(), set()
 
     def slow(_file: object, _arrays: object) -> None:

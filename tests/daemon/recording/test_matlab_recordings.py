@@ -30,7 +30,7 @@ def stream_table(rows: int, width: int) -> np.ndarray:
 @pytest.mark.parametrize(
     "name", ["Right_Data", "Left_Data", "plotthis1", "plotthis2", "plotthis_right", "plotthis_left"]
 )
-def test_a_stream_is_read_under_each_of_its_names(tmp_path: Path, name: str) -> None:
+def test_a_stream_has_several_names(tmp_path: Path, name: str) -> None:
     savemat(tmp_path / "device.mat", {name: stream_table(5, 1024)})
     stream = read_stream(tmp_path / "device.mat")
     assert stream.lines.shape == (5, 1024)
@@ -41,7 +41,7 @@ def test_a_stream_is_read_under_each_of_its_names(tmp_path: Path, name: str) -> 
 
 
 @pytest.mark.parametrize("name", ["Load_Data", "plotthis3", "plotthis_truth"])
-def test_a_load_stream_is_read_with_its_glitches(tmp_path: Path, name: str) -> None:
+def test_a_load_stream_keeps_damaged_values(tmp_path: Path, name: str) -> None:
     table = stream_table(4, 1)
     table[2, 1] = 3.84e7
     savemat(tmp_path / "load.mat", {name: table})
@@ -50,7 +50,7 @@ def test_a_load_stream_is_read_with_its_glitches(tmp_path: Path, name: str) -> N
     assert load.unix_s.shape == (4,)
 
 
-def test_of_both_fingertips_in_one_file_one_must_be_chosen(tmp_path: Path) -> None:
+def test_a_file_with_two_fingertips_needs_a_side(tmp_path: Path) -> None:
     left, right = stream_table(2, 1024), stream_table(3, 1024)
     savemat(tmp_path / "both.mat", {"Left_Data": left, "Right_Data": right})
     assert len(read_stream(tmp_path / "both.mat", side="left").lines) == 2
@@ -59,7 +59,7 @@ def test_of_both_fingertips_in_one_file_one_must_be_chosen(tmp_path: Path) -> No
         read_stream(tmp_path / "both.mat")
 
 
-def test_torque_slices_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+def test_torque_slices_are_sorted_by_number(tmp_path: Path) -> None:
     for number in (10, 2, 1, 37):
         savemat(
             tmp_path / f"Data_Slice_{number}.mat",
@@ -72,7 +72,7 @@ def test_torque_slices_come_in_the_order_of_their_numbers(tmp_path: Path) -> Non
     assert slices.torque_nm.tolist() == [0.01, 0.02, 0.1, 0.37]
 
 
-def test_diameter_slices_come_by_rising_diameter(tmp_path: Path) -> None:
+def test_diameter_slices_are_sorted_by_diameter(tmp_path: Path) -> None:
     for name in ("40mm_Data_1", "9.5mm_Data_2", "9.5mm_Data_1", "100mm_Data_10"):
         savemat(tmp_path / f"{name}.mat", {"data_diff": np.ones((896, 1)), "mean_torque": [[0.1]]})
     slices = read_diameter_slices(tmp_path)
@@ -105,9 +105,7 @@ Reader = Callable[[Path], object]
         (read_line, {"clipped_data": np.ones((1, 896))}, "expected 1 × 1024 values, found 1 × 896"),
     ],
 )
-def test_what_is_no_such_recording_is_refused(
-    tmp_path: Path, read: Reader, variables: dict[str, object], says: str
-) -> None:
+def test_other_variables_are_refused(tmp_path: Path, read: Reader, variables: dict[str, object], says: str) -> None:
     path = tmp_path / "device.mat"
     savemat(path, variables)
     with pytest.raises(UserError, match=says) as refusal:
@@ -115,7 +113,7 @@ def test_what_is_no_such_recording_is_refused(
     assert str(path) in str(refusal.value)
 
 
-def test_slices_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
+def test_unusable_slices_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"has no torque slices: expected files named Data_Slice_1\.mat"):
         read_torque_slices(tmp_path)
     with pytest.raises(UserError, match=r"has no diameter slices: expected files named 10mm_Data_1\.mat"):
@@ -159,7 +157,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureR
     return path.read_bytes()
 
 
-def test_a_recording_cut_off_anywhere_is_refused_in_a_sentence(tmp_path: Path, recording: bytes) -> None:
+def test_a_truncated_recording_is_refused(tmp_path: Path, recording: bytes) -> None:
     path = tmp_path / "Data_Slice_1.mat"
     for length in [*range(0, len(recording), 97), len(recording) - 1]:
         path.write_bytes(recording[:length])
@@ -170,7 +168,7 @@ def test_a_recording_cut_off_anywhere_is_refused_in_a_sentence(tmp_path: Path, r
 
 @given(data=st.data())
 @settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_a_damaged_recording_is_refused_or_still_of_the_right_shape(
+def test_a_damaged_recording_is_refused_or_has_the_right_shape(
     tmp_path: Path, recording: bytes, data: st.DataObject
 ) -> None:
     damaged = bytearray(recording)

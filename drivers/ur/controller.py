@@ -24,7 +24,7 @@ HEADER: Final = struct.Struct(">HB")
 _PROTOCOL, _CONTROLLER_VERSION, _OUTPUTS, _INPUTS, _START, _DATA = b"VvOISU"
 _OTHER_PACKAGES = 20
 _LONGEST_LINE = 1024
-# The registers from which ur-rtde's control script takes its commands.
+# The command registers of ur-rtde's control script.
 _REGISTERS = ("input_int_register_0", "input_double_register_0")
 # The outputs and their types, in the order of a sample's fields.
 _TYPES: Final = {
@@ -198,7 +198,7 @@ class SampleParser:
 
 
 class RtdeReceiver:
-    """A connection on which the controller sends samples; `connected` is False once it has ended.
+    """A connection that receives the controller's samples; `connected` is False once it has ended.
 
     Samples wait in the kernel until `latest` takes the newest one. ur-rtde's interface polls its socket instead, which
     takes a third of the worker's processor time at rest.

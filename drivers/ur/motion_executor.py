@@ -45,7 +45,7 @@ class MotionExecutor:
         self._limits = settings.limits
         self._arm = arm
         self.motion: MotionKind = "idle"
-        # The command that began the motion, why the motion ended, and what was last sent for it.
+        # The number of the motion's command, why the motion ended, and the command last sent.
         self.motion_id = 0
         self.end_reason = ""
         self.sent: WristSpeed | MoveLinear | Stop | None = None

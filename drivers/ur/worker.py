@@ -1,7 +1,7 @@
 """The robot's worker process, `python -m shearloop.drivers.ur.worker`: commands on stdin, states and replies on stdout.
 
 It runs 125 cycles a second and sends the state of each. ur-rtde may hang or crash at any time, so that the worker
-holds nothing worth saving. Before each stretch that may hang it sets an alarm with which the kernel ends it; the
+holds nothing worth saving. Before each stretch that may hang it sets an alarm, and the kernel ends it in time; the
 robot's watchdog then ends the motion. When stdin ends the daemon is gone: the worker stops the arm and exits.
 """
 

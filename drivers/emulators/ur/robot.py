@@ -88,8 +88,6 @@ class Robot:
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
 
-    # ---- time -----------------------------------------------------------------------------------------------------
-
     def step(self, dt_s: float) -> None:
         """Run one control cycle."""
         self.time_s += dt_s
@@ -121,8 +119,6 @@ class Robot:
         self._frames = link_frames(self.q_rad, self.spec.tool_length_m)
         if moving != bool(self.qd_rad_per_s.any()):
             self._note("motion-stopped" if moving else "motion-started")
-
-    # ---- program --------------------------------------------------------------------------------------------------
 
     def upload(self, watchdog_hz: float = 0.0) -> None:
         """Run a control script that arms its watchdog at `watchdog_hz` by itself; 0 for one that does not."""
@@ -160,8 +156,6 @@ class Robot:
     def program_running(self) -> bool:
         """Whether a program is loaded and has not ended; a paused one counts."""
         return self._script is not None
-
-    # ---- faults and recovery --------------------------------------------------------------------------------------
 
     def protective_stop(self, cause: str) -> None:
         """Stop for safety and pause the program."""
@@ -214,8 +208,6 @@ class Robot:
         self.remote_control, self.registers_taken = self.spec.remote_control, False
         self._note("faults-cleared")
 
-    # ---- registers and variables ----------------------------------------------------------------------------------
-
     def write(self, name: str, value: float) -> None:
         """Set an input register, as a client does over RTDE; registers outlive their client."""
         self._registers[name] = value
@@ -254,8 +246,6 @@ class Robot:
         """Make the present wrench zero."""
         self._wrench_zero = self._wrench.copy()
         self._note("wrench-zeroed")
-
-    # ---- inside ---------------------------------------------------------------------------------------------------
 
     def _stop_for_safety(self, mode: int, name: str, cause: str) -> None:
         self.safety_mode = mode

@@ -88,6 +88,11 @@ class Robot:
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
 
+    @property
+    def clock_s(self) -> float:
+        """The controller's clock, which never stands still."""
+        return self.time_s + self.stood_still_s
+
     def step(self, dt_s: float) -> None:
         """Run one control cycle."""
         self.time_s += dt_s
@@ -183,7 +188,7 @@ class Robot:
         """End a protective stop; False within `unlock_wait_s` of its beginning."""
         if self.safety_mode != SAFETY_PROTECTIVE_STOP:
             return True
-        if self.time_s - self._safety_since_s < self.spec.unlock_wait_s:
+        if self.clock_s - self._safety_since_s < self.spec.unlock_wait_s:
             return False
         self.safety_mode = SAFETY_NORMAL
         self._note("protective-stop-unlocked")
@@ -249,7 +254,7 @@ class Robot:
 
     def _stop_for_safety(self, mode: int, name: str, cause: str) -> None:
         self.safety_mode = mode
-        self._safety_since_s = self.time_s
+        self._safety_since_s = self.clock_s
         self._halt(SAFETY_DECELERATION)
         self._note(name, cause)
 
@@ -266,7 +271,7 @@ class Robot:
 
 
 _VARIABLES: dict[str, Callable[[Robot], Value]] = {
-    "timestamp": lambda r: r.time_s + r.stood_still_s,
+    "timestamp": lambda r: r.clock_s,
     "actual_q": lambda r: [*r.q_rad],
     "target_q": lambda r: [*r.q_rad],
     "actual_qd": lambda r: [*r.qd_rad_per_s],

@@ -35,7 +35,7 @@ demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
 	$(BIN)/shearloop run $(DEMO) --show
 
 # Recordings of the emulated rig, and the calibrations made from them.
-run/rig.cal: run/demo.bank daemon/cli/demo_calibration.py | install
+run/rig.cal: run/demo.bank src/shearloop/daemon/cli/demo_calibration.py | install
 	$(BIN)/python -m shearloop.daemon.cli.demo_calibration --bank $< --out run
 
 run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install

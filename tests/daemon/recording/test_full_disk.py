@@ -13,6 +13,7 @@ import pytest
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import recorder as recorder_module
+from shearloop.daemon.recording.export import count_messages
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import repair, summarise
 from shearloop.daemon.recording.writer import McapFile
@@ -87,6 +88,7 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path) -> None
     recorder.close()
     (path,) = recorder.finished
     assert [one["frame"] for one in topics(path)["eit.frame.right"]] == list(range(20))
+    assert count_messages(path)["eit.frame.right"] == 20, "the checksums are those of one write"
 
 
 def test_a_file_that_cannot_be_started_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -252,7 +252,7 @@ ROBOT = str(Path(__file__).parents[3] / "config" / "demo_ur.yaml")
         ),
         (
             {"skin": section({"adc": {"device": {"path": "./skin-source"}}})},
-            "`skin.source.serial` and `skin.daq.adc.device` are both the port FOLDER/skin-source; each device needs its own",
+            "`skin.source.serial` and `skin.daq.adc.device` are both the port FOLDER/skin-source; each device",
         ),
         (
             {"skin": section(SCANNER, source=SOCKET)},

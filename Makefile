@@ -2,14 +2,14 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Many small solves: one BLAS thread each, on every machine.
+# Our products are small: one BLAS thread is fastest.
 export OPENBLAS_NUM_THREADS := 1
-# Some containers forbid Python to keep what it compiled; every process of the tests would then compile all of them anew.
+# Without bytecode files every test process would compile all modules again.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: install install-dev system-packages demo docs test lint format clean
 
-# What running and drawing take; the tools of the tests and the static checks come with `install-dev`.
+# `install` is for running and drawing; `install-dev` adds the tools of tests and checks.
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
@@ -22,30 +22,29 @@ $(VENV)/.installed-dev: pyproject.toml $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@
 
-# From Debian: for the tests of the service and of the live view's page alone, which skip without them.
+# Debian packages for the tests of the service and of the live page, which are skipped without them.
 system-packages:
 	missing=; \
 	command -v systemd-analyze >/dev/null || missing="$$missing systemd"; \
 	command -v chromium >/dev/null || missing="$$missing chromium fonts-dejavu-core"; \
 	[ -z "$$missing" ] || { apt-get update -qq -o Acquire::Retries=2 -o Acquire::http::Timeout=30 && apt-get install -y -qq --no-install-recommends $$missing; }
 
-# The whole emulated rig; with RECORDING=FILE one fingertip, whose board plays a recorded stream (.mat).
+# The whole emulated rig; with RECORDING=FILE one fingertip that plays a recorded stream (.mat).
 DEMO := $(if $(RECORDING),config/fingertip_demo.yaml --recording '$(RECORDING)',config/demo.yaml)
 demo: install run/demo.bank $(if $(RECORDING),,run/rig.cal)
 	$(BIN)/shearloop run $(DEMO) --show
 
-# Recordings of the emulated rig, and the calibrations of its fingertips that are made from them.
-run/rig.cal: run/demo.bank daemon/cli/demo_calibration.py | install
+# Recordings of the emulated rig, and the calibrations made from them.
+run/rig.cal: run/demo.bank src/shearloop/daemon/cli/demo_calibration.py | install
 	$(BIN)/python -m shearloop.daemon.cli.demo_calibration --bank $< --out run
 
 run/demo.bank: config/banks/demo.yaml config/fingertips/paper.yaml | install
 	mkdir -p run
 	$(BIN)/shearloop bank build --config $< --out $@
 
-# Files are shared out over the processors, the longest first (tests/conftest.py); those that wait for devices leave
-# theirs to the others. What drives a robot runs by itself afterwards, the longest test beside all others: a robot stops
-# when its computer is busy. Others may keep it busy all the same, so such a test has a second and a third try, which
-# the summary names. (Status 5: nothing of this kind was asked for.)
+# Test files run in parallel, the longest first (tests/conftest.py). Tests that drive a robot run afterwards with less
+# load, because a robot stops when its computer is busy; they may be repeated twice, and the summary names them. Status 5:
+# no test was selected.
 PYTEST := $(BIN)/pytest
 test: install-dev
 	$(PYTEST) -n 3 --dist loadfile --no-loadscope-reorder -m 'not real_time' $(PYTEST_ARGS) || [ $$? -eq 5 ]
@@ -61,7 +60,7 @@ format: install-dev
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The pages that are written from the code.
+# The generated pages.
 docs: install
 	$(BIN)/python -m shearloop.daemon.docgen
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError, field_validator, model_validator
 
+from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import BankDefinition
 from shearloop.bank.eit.fingertip import ElectrodePlace, Fingertip, Side
 from shearloop.bank.eit.mesh import Mesh, load_mesh
@@ -37,7 +37,7 @@ class GridConfig(ConfigModel):
             raise ValueError(f"a count of 1 needs low and high to be the same, not {self.low:g} and {self.high:g}")
         return self
 
-    def values(self) -> NDArray[np.float64]:
+    def values(self) -> FloatArray:
         """Return the grid, (count,)."""
         return np.linspace(self.low, self.high, self.count)
 

@@ -127,7 +127,7 @@ def safety_table() -> str:
         response = RESPONSES[rule.response]
         if rule.hold_at_most_s is not None:
             response += f"; stop after {rule.hold_at_most_s:g} s"
-        rows.append((event.value, response, rule.sentence.format(detail="…").replace("….", "…"), rule.cure))
+        rows.append((event.text, response, rule.sentence.format(detail="…").replace("….", "…"), rule.cure))
     return table(("fault", "response", "message", "what to do"), rows)
 
 

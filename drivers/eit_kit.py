@@ -304,11 +304,10 @@ class EitKit(SerialSensor[Frame]):
         on_raw: OnRaw = ignore_raw,
         on_frame: Callable[[Frame], None] = lambda _: None,
     ) -> None:
-        super().__init__(SerialLink(serial_number=serial_number, path=path, on_event=on_event), on_raw)
+        link = SerialLink(serial_number=serial_number, path=path, on_event=on_event)
+        super().__init__(link, frame_period_s, on_raw)
         self._parser = FrameParser(zero_slots, nominal_period_ns=round(frame_period_s * 1e9))
         self._on_frame = on_frame
-        self._expected_hz = 1.0 / frame_period_s
-        self._starts = 0
         self._silences = 0
 
     def frames(self) -> AsyncGenerator[Frame]:
@@ -331,7 +330,7 @@ class EitKit(SerialSensor[Frame]):
             "partial_lines": parser.partial_lines,
             "unfinished": parser.unfinished,
             "silences": self._silences,
-            "expected_hz": self._expected_hz,
+            "expected_hz": 1.0 / self._period_s,
             "measured_hz": 1.0 / self.period_s if parser.clock.learned else None,
         }
 
@@ -342,22 +341,17 @@ class EitKit(SerialSensor[Frame]):
         return frames
 
     async def _on_open(self, port: Port) -> None:
-        self._starts = 0
         await port.write(START)
 
     def _timeout_s(self) -> float:
         return max(SILENT_PERIODS * self.period_s, MIN_SILENCE_S)
 
-    def _on_data(self) -> None:
-        self._starts = 0
-
     async def _on_timeout(self, port: Port, _waited_s: float) -> None:
-        if self._starts == STARTS_BEFORE_REOPENING:
+        if self._timeouts > STARTS_BEFORE_REOPENING:
             raise DeviceLostError(
                 f"{port.path} is open but silent, though the board was started {STARTS_BEFORE_REOPENING} times more; "
                 "see that it has power and that it is an EIT-kit."
             )
-        self._starts += 1
         self._silences += 1
         self._dispatch(InputKind.STARTED, time.monotonic_ns())
         await port.write(START)

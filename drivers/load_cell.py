@@ -20,7 +20,7 @@ from shearloop.drivers.serial_sensor import (
     LineSplitter,
     OnRaw,
     RawEvent,
-    StreamingSensor,
+    SerialSensor,
     ignore_raw,
     transfer_ns,
 )
@@ -239,8 +239,10 @@ def describe_errors(errors: Counter[str], sentences: dict[str, str] = LINE_ERROR
     return " ".join(f"{sentences[kind]} ({count} times)" for kind, count in sorted(errors.items()))
 
 
-class LoadCell(StreamingSensor[LoadSample]):
+class LoadCell(SerialSensor[LoadSample]):
     """One board, by USB serial number or path; it only sends."""
+
+    silence_hint = "check that it is the load cell's board and that the HX711 has power and its DT and SCK wires."
 
     def __init__(
         self,
@@ -254,15 +256,9 @@ class LoadCell(StreamingSensor[LoadSample]):
         on_raw: OnRaw = ignore_raw,
     ) -> None:
         """Name the board and its lines per second; nothing is opened yet."""
-        super().__init__(
-            SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, policy=policy, on_event=on_event),
-            # A fast board may seem silent to a busy computer; reopening would reset it.
-            period_s=1.0 / min(rate_hz, RATE_HZ),
-            silence_hint=(
-                "check that it is the load cell's board and that the HX711 has power and its DT and SCK wires."
-            ),
-            on_raw=on_raw,
-        )
+        link = SerialLink(serial_number=serial_number, path=path, baud=BAUD_RATE, policy=policy, on_event=on_event)
+        # A fast board may seem silent to a busy computer; reopening would reset it.
+        super().__init__(link, 1.0 / min(rate_hz, RATE_HZ), on_raw)
         self._parser = LoadParser(calibration, rate_hz)
         self._samples = 0
         self._flagged = 0

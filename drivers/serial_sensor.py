@@ -102,12 +102,18 @@ class LineSplitter:
 
 
 class SerialSensor(ABC, Generic[ValueT]):
-    """One board behind a link, kept connected, with a parser for its bytes."""
+    """One board behind a link, kept connected, with a parser for its bytes. A silent board counts as lost."""
 
-    def __init__(self, link: Link, on_raw: OnRaw = ignore_raw) -> None:
-        """Use the link, not yet open; `on_raw` receives every input of the parser."""
+    # The operator's checklist when nothing comes.
+    silence_hint = ""
+
+    def __init__(self, link: Link, period_s: float, on_raw: OnRaw = ignore_raw) -> None:
+        """Use the link, not yet open, of a board with a line every `period_s`; `on_raw` receives every parser input."""
         self._link = link
+        self._period_s = period_s
         self._on_raw = on_raw
+        self._has_sent = False
+        self._timeouts = 0
 
     async def values(self) -> AsyncGenerator[ValueT]:
         """Yield the values of every line, in order and without end; reconnects when the board disappears.
@@ -141,58 +147,27 @@ class SerialSensor(ABC, Generic[ValueT]):
         if port is None:
             port = await self._link.open()
             self._dispatch(InputKind.OPENED, time.monotonic_ns())
+            self._has_sent, self._timeouts = False, 0
             await self._on_open(port)
         timeout_s = self._timeout_s()
         received = await port.read(timeout_s)
         if received is None:
+            self._timeouts += 1
             await self._on_timeout(port, timeout_s)
         else:
-            self._on_data()
+            self._has_sent, self._timeouts = True, 0
         return received
 
     @abstractmethod
     def _parse(self, event: RawEvent) -> Sequence[ValueT]:
         """Return the values that an event completes."""
 
-    @abstractmethod
     async def _on_open(self, port: Port) -> None:
         """Set up a board after its port was opened."""
 
-    @abstractmethod
     def _timeout_s(self) -> float:
-        """Return how long the board may be silent."""
-
-    @abstractmethod
-    def _on_data(self) -> None:
-        """Note that bytes arrived."""
-
-    @abstractmethod
-    async def _on_timeout(self, port: Port, waited_s: float) -> None:
-        """Wake a silent board; DeviceLostError if that is impossible."""
-
-
-class StreamingSensor(SerialSensor[ValueT]):
-    """A board that only sends: lost when it falls silent."""
-
-    def __init__(self, link: Link, *, period_s: float, silence_hint: str, on_raw: OnRaw = ignore_raw) -> None:
-        """Use the link, not yet open, of a board with a line every `period_s`.
-
-        `silence_hint` is the operator's checklist when nothing comes.
-        """
-        super().__init__(link, on_raw)
-        self._silence_s = SILENT_PERIODS * period_s
-        self._silence_hint = silence_hint
-        self._has_sent = False
-
-    async def _on_open(self, _port: Port) -> None:
-        self._has_sent = False
-
-    def _timeout_s(self) -> float:
-        return self._silence_s if self._has_sent else BOOT_S
-
-    def _on_data(self) -> None:
-        self._has_sent = True
+        return SILENT_PERIODS * self._period_s if self._has_sent else BOOT_S
 
     async def _on_timeout(self, port: Port, waited_s: float) -> None:
-        hint = self._silence_hint
+        hint = self.silence_hint
         raise DeviceLostError(f"{port.path} is open but has sent nothing for {waited_s:.1f} s; {hint}")

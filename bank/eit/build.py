@@ -6,13 +6,13 @@ The finished bank has the same bytes however often the build was interrupted and
 import fcntl
 import hashlib
 import os
-import struct
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Self
+from typing import Self
 
 import numpy as np
 
@@ -23,9 +23,9 @@ from shearloop.bank.eit.forward import BatchForwardModel
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import ConductivityModel
 from shearloop.bank.errors import BankFileError, EmptyBankError
+from shearloop.files import replace_file
 
-_JOURNAL_MAGIC = b"\x8eSHLPART"
-_RECORD = struct.Struct("<Q32s")
+_CHECKSUM_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -153,11 +153,11 @@ def _why_empty(highest: float) -> str:
 
 
 class RowJournal:
-    """The finished rows of an unfinished bank, in a file `TARGET.part`; a context manager that holds the file's lock.
+    """The finished rows of an unfinished bank, one file each in the folder `TARGET.part`; a context manager.
 
-    The file begins with a mark and the bank's identity; then one record with a checksum for each row, all of one size.
-    A truncated record is dropped and its row solved again. `rows` are those of earlier builds of the same bank, and
-    those appended since.
+    It holds a lock on the folder. A file begins with the checksum of the bank's identity, the row and its cells, so
+    that damaged rows and those of another bank are solved again. `rows` are those of earlier builds of the same bank,
+    and those appended since.
     """
 
     def __init__(self, target: Path, definition: BankDefinition, on_notice: Callable[[str], None]) -> None:
@@ -165,97 +165,73 @@ class RowJournal:
         self.path = target.with_name(f"{target.name}.part")
         self.rows: dict[int, BankRow] = {}
         self._target = target
+        self._definition = definition
         self._on_notice = on_notice
-        self._mark = _JOURNAL_MAGIC + bytes.fromhex(definition.identity)
-        self._n_rows = len(definition.k_grid)
-        self._n_cells = len(definition.sigma_grid)
-        self._file: BinaryIO | None = None
+        self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        """Open the journal and read its rows; raises BankFileError where that is not possible."""
-        try:
-            # Neither truncated nor created exclusively: the content is judged under the lock.
-            handle = os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644)
-        except OSError as error:
-            raise unwritable(self.path, error) from error
-        file = os.fdopen(handle, "r+b")
-        with ExitStack() as on_error:
-            on_error.callback(file.close)
+        """Lock the folder and read its rows; raises BankFileError where that is not possible."""
+        with self._stack as on_error:
             try:
+                self.path.mkdir(exist_ok=True)
+                handle = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
+                on_error.callback(os.close, handle)
                 fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                self._resume(file)
+                self._read_rows()
+            except FileExistsError as error:
+                raise self._in_the_way() from error
             except BlockingIOError as error:
                 raise BankFileError(
                     f"{self._target}: another build is at work on this bank; wait for it or choose another --out"
                 ) from error
             except OSError as error:
                 raise unwritable(self.path, error) from error
-            on_error.pop_all()
-        self._file = file
+            self._stack = on_error.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the file; it stays for the next build unless it was removed."""
-        if self._file is not None:
-            # `append` has already reported what could not be flushed.
-            with suppress(OSError):
-                self._file.close()
+        """Release the folder; it stays for the next build unless it was removed."""
+        self._stack.close()
 
     def append(self, row: int, cells: BankRow) -> None:
         """Write a finished row to the disk. Raises BankFileError when the disk refuses it."""
-        if self._file is None:
-            raise BankFileError(f"{self.path}: the journal is not open")
         body = cells.min_conductivity.astype("<f8").tobytes() + cells.valid.astype("|b1").tobytes()
         body += cells.signals.astype("<f4").tobytes()
         try:
-            self._file.write(_RECORD.pack(row, _checksum(row, body)) + body)
-            self._file.flush()
-            os.fsync(self._file.fileno())
+            with replace_file(self.path / f"{row}.row") as file:
+                file.write(self._checksum(row, body) + body)
         except OSError as error:
             raise unwritable(self.path, error) from error
         self.rows[row] = cells
 
     def remove(self) -> None:
         """Delete the journal of a finished bank."""
-        self.path.unlink(missing_ok=True)
+        shutil.rmtree(self.path, ignore_errors=True)
 
-    def _resume(self, file: BinaryIO) -> None:
-        mark, end = file.read(len(self._mark)), 0
-        if mark == self._mark:
-            end = self._read_rows(file)
-            if self.rows:
-                self._on_notice(f"{self.path}: resuming, {len(self.rows)} of {self._n_rows} rows are already solved")
-        elif mark:
-            if not mark.startswith(_JOURNAL_MAGIC):
-                raise BankFileError(
-                    f"{self.path} is in the way: it is not the journal of an unfinished bank; move it or choose "
-                    "another --out"
+    def _read_rows(self) -> None:
+        found = list(self.path.iterdir())
+        if any(path.suffix not in (".row", ".tmp") for path in found):
+            raise self._in_the_way()
+        n, total = len(self._definition.sigma_grid), len(self._definition.k_grid)
+        for row in range(total):
+            path = self.path / f"{row}.row"
+            content = path.read_bytes() if path.exists() else b""
+            checksum, body = content[:_CHECKSUM_BYTES], content[_CHECKSUM_BYTES:]
+            if checksum == self._checksum(row, body):
+                self.rows[row] = BankRow(
+                    np.frombuffer(body, "<f8", n),
+                    np.frombuffer(body, "|b1", n, offset=8 * n),
+                    np.frombuffer(body, "<f4", n * N_CHANNELS, offset=9 * n).reshape(n, N_CHANNELS),
                 )
-            self._on_notice(f"{self.path}: its rows belong to another bank and are discarded")
-        file.seek(end)
-        file.truncate(end)
-        if end == 0:
-            file.write(self._mark)
-            file.flush()
+        if self.rows:
+            self._on_notice(f"{self.path}: resuming, {len(self.rows)} of {total} rows are already solved")
+        elif found:
+            self._on_notice(f"{self.path}: its rows belong to another bank or are damaged, and are discarded")
 
-    def _read_rows(self, file: BinaryIO) -> int:
-        """Read the rows up to the first damaged record, and return where that begins."""
-        size = self._n_cells * (8 + 1 + 4 * N_CHANNELS)
-        while True:
-            start = file.tell()
-            head, body = file.read(_RECORD.size), file.read(size)
-            if len(head) < _RECORD.size or len(body) < size:
-                return start
-            row, checksum = _RECORD.unpack(head)
-            if checksum != _checksum(row, body) or row >= self._n_rows:
-                return start
-            n = self._n_cells
-            self.rows[row] = BankRow(
-                np.frombuffer(body, "<f8", n),
-                np.frombuffer(body, "|b1", n, offset=8 * n),
-                np.frombuffer(body, "<f4", n * N_CHANNELS, offset=9 * n).reshape(n, N_CHANNELS),
-            )
+    def _checksum(self, row: int, body: bytes) -> bytes:
+        return hashlib.sha256(f"{self._definition.identity} {row} ".encode() + body).digest()
 
-
-def _checksum(row: int, body: bytes) -> bytes:
-    return hashlib.sha256(row.to_bytes(8, "little") + body).digest()
+    def _in_the_way(self) -> BankFileError:
+        return BankFileError(
+            f"{self.path} is in the way: it is not the journal of an unfinished bank; move it or choose another --out"
+        )

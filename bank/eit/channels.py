@@ -11,7 +11,8 @@ driven electrode. The board sends all 32 × 32 pairs and writes those four as ex
 import hashlib
 
 import numpy as np
-from numpy.typing import NDArray
+
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 
 N_ELECTRODES = 32
 N_CHANNELS = 896
@@ -20,7 +21,7 @@ N_LINE_VALUES = N_ELECTRODES * N_ELECTRODES
 STIMULATION_CURRENT = 5.0
 
 
-def _table() -> NDArray[np.int64]:
+def _table() -> IntArray:
     injection, pair = np.divmod(np.arange(N_LINE_VALUES), N_ELECTRODES)
     sink, source = injection, (injection + N_ELECTRODES // 2) % N_ELECTRODES
     positive, negative = pair, (pair + 1) % N_ELECTRODES
@@ -29,11 +30,11 @@ def _table() -> NDArray[np.int64]:
 
 _ALL_PAIRS = _table()
 # True at the 128 values of a line whose pair touches a driven electrode.
-ZERO_SLOTS: NDArray[np.bool_] = (_ALL_PAIRS[:, :2, None] == _ALL_PAIRS[:, None, 2:]).any(axis=(1, 2))
+ZERO_SLOTS: BoolArray = (_ALL_PAIRS[:, :2, None] == _ALL_PAIRS[:, None, 2:]).any(axis=(1, 2))
 # (896,) position of each channel among the 1024 values of a line.
-LINE_SLOTS: NDArray[np.int64] = np.flatnonzero(~ZERO_SLOTS)
+LINE_SLOTS: IntArray = np.flatnonzero(~ZERO_SLOTS)
 # (896, 4) electrodes of each channel: sink (−I), source (+I), positive and negative measuring electrode.
-CHANNELS: NDArray[np.int64] = _ALL_PAIRS[LINE_SLOTS]
+CHANNELS: IntArray = _ALL_PAIRS[LINE_SLOTS]
 for _array in (ZERO_SLOTS, LINE_SLOTS, CHANNELS):
     _array.setflags(write=False)
 
@@ -42,12 +43,12 @@ CHANNEL_TABLE_HASH = hashlib.sha256(
 ).hexdigest()
 
 
-def channels_of_line(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def channels_of_line(values: FloatArray) -> FloatArray:
     """Return the (…, 896) channels of (…, 1024) line values, in volts and line order."""
     return values[..., LINE_SLOTS]
 
 
-def line_of_channels(channels: NDArray[np.float64]) -> NDArray[np.float64]:
+def line_of_channels(channels: FloatArray) -> FloatArray:
     """Return the (…, 1024) line values of (…, 896) channels, with exact zeros where the board writes them."""
     values = np.zeros((*channels.shape[:-1], N_LINE_VALUES))
     values[..., LINE_SLOTS] = channels
@@ -59,6 +60,6 @@ _WINDOW = np.exp(-0.5 * (np.arange(-4, 5) / (9 / 5)) ** 2)
 _WINDOW_WITHIN = np.convolve(np.ones(N_CHANNELS), _WINDOW, "same")
 
 
-def smoothed_along_channels(differences: NDArray[np.float64]) -> NDArray[np.float64]:
+def smoothed_along_channels(differences: FloatArray) -> FloatArray:
     """Return (n, 896) differences averaged over nine channels, as the paper did with its cylinders (its section 2)."""
     return np.asarray(np.array([np.convolve(row, _WINDOW, "same") for row in differences]) / _WINDOW_WITHIN)

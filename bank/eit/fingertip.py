@@ -11,8 +11,8 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import N_ELECTRODES
 from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.errors import GeometryError
@@ -100,7 +100,7 @@ class Fingertip:
                 raise GeometryError(f"electrodes {before} and {electrode} on the {side} side touch or overlap")
             end_before, before = end, electrode
 
-    def _lines(self, sides: Sequence[Side], length: float) -> NDArray[np.float64]:
+    def _lines(self, sides: Sequence[Side], length: float) -> FloatArray:
         ends = np.array([end for place in self.electrodes if place.side in sides for end in self.ends_cm(place)])
         inside = np.sort(ends[(ends > _SAME_CM) & (ends < length - _SAME_CM)])
         stops = np.concatenate([[0.0], inside[np.diff(inside, prepend=0.0) > _SAME_CM], [length]])
@@ -113,9 +113,7 @@ class Fingertip:
             lines = np.insert(lines, [1, len(lines) - 1], [lines[:2].mean(), lines[-2:].mean()])
         return lines
 
-    def _electrode_edges(
-        self, x: NDArray[np.float64], y: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def _electrode_edges(self, x: FloatArray, y: FloatArray) -> tuple[IntArray, IntArray]:
         number = np.arange(len(x) * len(y)).reshape(len(y), len(x))
         along = {
             "left": (y, number[:, 0]),
@@ -132,7 +130,7 @@ class Fingertip:
         return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
 
 
-def _chessboard(columns: int, rows: int) -> NDArray[np.int64]:
+def _chessboard(columns: int, rows: int) -> IntArray:
     """Return the triangles of a grid of columns × rows nodes, numbered along x first: (2 (columns−1)(rows−1), 3)."""
     i, j = np.meshgrid(np.arange(columns - 1), np.arange(rows - 1))
     lower_left = (j * columns + i).ravel()

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import connected_components
 
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.channels import N_ELECTRODES
 from shearloop.bank.errors import GeometryError
 
@@ -30,11 +31,11 @@ class Mesh:
     over the unit of conductivity. Raises GeometryError for a mesh that the equations cannot be solved on.
     """
 
-    nodes: NDArray[np.float64]
-    triangles: NDArray[np.int64]
-    electrode_edges: NDArray[np.int64]
-    electrode_of_edge: NDArray[np.int64]
-    contact_impedance: NDArray[np.float64]
+    nodes: FloatArray
+    triangles: IntArray
+    electrode_edges: IntArray
+    electrode_of_edge: IntArray
+    contact_impedance: FloatArray
 
     def __post_init__(self) -> None:
         """Take read-only copies and check them."""
@@ -92,18 +93,18 @@ class Mesh:
         )
 
 
-def boundary_edges(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+def boundary_edges(triangles: IntArray) -> IntArray:
     """Return the (B, 2) edges that belong to one triangle only, each with the smaller node number first."""
     edges, of_side = _edges(triangles)
-    found: NDArray[np.int64] = edges[np.bincount(of_side.ravel()) == 1]
+    found: IntArray = edges[np.bincount(of_side.ravel()) == 1]
     return found
 
 
-def doubled_areas(nodes: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.float64]:
+def doubled_areas(nodes: FloatArray, triangles: IntArray) -> FloatArray:
     """Return twice the signed area of every triangle, (T,), in cm²."""
     a, b, c = np.moveaxis(nodes[triangles], 1, 0)
     u, v = b - a, c - a
-    twice: NDArray[np.float64] = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+    twice: FloatArray = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
     return twice
 
 
@@ -193,9 +194,7 @@ def _eidors_fields(path: Path) -> dict[str, Any]:
     }
 
 
-def _edges_of_electrodes(
-    boundary: NDArray[np.int64], members: list[NDArray[np.int64]]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _edges_of_electrodes(boundary: IntArray, members: list[IntArray]) -> tuple[IntArray, IntArray]:
     """Return the boundary edges between each electrode's nodes, as EIDORS reads them."""
     edges = [boundary[np.isin(boundary, nodes).all(axis=1)] for nodes in members]
     return np.vstack(edges), np.repeat(np.arange(len(edges)), [len(each) for each in edges])
@@ -271,7 +270,7 @@ def _check_electrodes(mesh: Mesh) -> None:
         )
 
 
-def _edges(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _edges(triangles: IntArray) -> tuple[IntArray, IntArray]:
     """Return the sorted (E, 2) edges of a mesh, and the (T, 3) rows in them of the sides ab, bc and ca."""
     ends = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
     # One number for each pair: numpy is much slower at finding equal rows.
@@ -280,7 +279,7 @@ def _edges(triangles: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.
     return np.column_stack(np.divmod(keys, n)), of_side.reshape(-1, 3)
 
 
-def _rows_of(edges: NDArray[np.int64], among: NDArray[np.int64], n_nodes: int) -> NDArray[np.int64]:
+def _rows_of(edges: IntArray, among: IntArray, n_nodes: int) -> IntArray:
     """Return where each of (E, 2) sorted edges stands in a lexically sorted (B, 2) list, or −1."""
     keys, wanted = among @ [n_nodes, 1], edges @ [n_nodes, 1]
     at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)

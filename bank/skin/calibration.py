@@ -379,8 +379,6 @@ def _knots(tension: FloatArray, linear_to_n: float) -> FloatArray:
 def _fit_friction(curve: _CurveFit) -> float:
     from scipy.optimize import minimize_scalar
 
-    # Imported here: the daemon loads calibrations and does not fit them.
-
     coarse = np.linspace(0.0, MAX_FRICTION, 26)
     best = coarse[int(np.argmin([curve.squares(mu) for mu in coarse]))]
     bounds = max(best - coarse[1], 0.0), min(best + coarse[1], MAX_FRICTION)

@@ -101,7 +101,7 @@ async def _replay(
             publisher.add_listener(EstimatePrinter(sys.stdout))
         while args.wait and not publisher.has_subscribers():  # noqa: ASYNC110 - the publisher has no event
             await asyncio.sleep(0.05)
-        progress = opened.enter_context(progress_bar(run.path.name, run.messages, "message"))
+        progress = opened.enter_context(progress_bar(run.path.name, run.message_count, "message"))
         await replay.play(speed, progress)
         # The last messages are still being sent.
         await asyncio.sleep(0.1)

@@ -26,10 +26,7 @@ COMES_TO_REST_S = 2.0
 
 
 class VelocityCommandSender:
-    """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop.
-
-    `sent_rad_per_s` is the speed that the process accepted last. `on_error` receives exceptions of sending and replies.
-    """
+    """Sends wrist velocities and stops to the robot's process, and reports the results to the control loop."""
 
     def __init__(
         self,
@@ -38,6 +35,7 @@ class VelocityCommandSender:
         acceleration_rad_per_s2: float,
         on_error: Callable[[Exception], None],
     ) -> None:
+        # The speed that the robot's process accepted last.
         self.sent_rad_per_s = 0.0
         self._robot = robot
         self._control_loop = control_loop
@@ -63,21 +61,18 @@ class VelocityCommandSender:
         self._unanswered += 1
         try:
             self._robot.send_nowait(command, self._on_reply)
-        except Exception as error:  # noqa: BLE001 - reported by the next tick, which ends the experiment
+        except Exception as error:  # noqa: BLE001 - the next decision ends the experiment
             self._unanswered -= 1
             self._on_error(error)
 
     def _on_reply(self, reply: CommandReply) -> None:
         self._unanswered -= 1
-        try:
-            if not reply.accepted and self._robot.state is None:
-                self._control_loop.on_command_unanswered(reply.refusal)
-            elif not reply.accepted:
-                self._control_loop.on_command_refused(reply.refusal)
-            self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
-            self._control_loop.on_speed_sent(self.sent_rad_per_s)
-        except Exception as error:  # noqa: BLE001 - an error of the loop must not end the robot's process
-            self._on_error(error)
+        if not reply.accepted and self._robot.state is None:
+            self._control_loop.on_command_unanswered(reply.refusal)
+        elif not reply.accepted:
+            self._control_loop.on_command_refused(reply.refusal)
+        self.sent_rad_per_s = reply.sent.rad_per_s if isinstance(reply.sent, WristSpeed) else 0.0
+        self._control_loop.on_speed_sent(self.sent_rad_per_s)
 
 
 class ActionExecutor:

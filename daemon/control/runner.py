@@ -311,7 +311,6 @@ class ControlLoopRunner:
 def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) -> LoopState:
     """Return the `loop.state` message at now_ns."""
     status, experiment = control_loop.status, control_loop.experiment
-    progress = experiment.progress() if experiment is not None else None
     driving = experiment.file.torque_source if experiment is not None else ""
     latest = control_loop.inputs.torques.get(driving)
     controller = control_loop.controller
@@ -322,14 +321,14 @@ def loop_state(control_loop: ControlLoop, sent_rad_per_s: float, now_ns: int) ->
         t_mono_ns=now_ns,
         phase=status.phase,
         experiment=experiment.file.name if experiment is not None else "",
-        step=progress.step if progress else 0,
-        steps=progress.steps if progress else 0,
+        step=experiment.step_number if experiment is not None else 0,
+        steps=len(experiment.file.steps) if experiment is not None else 0,
         step_name=experiment.step.do if experiment is not None else "",
         slices=experiment.file.slices or "" if experiment is not None else "",
         hold=experiment.command.hold_number if experiment is not None else 0,
         activity=status.activity,
-        progress=progress.share if progress else 0.0,
-        remaining_s=progress.remaining_s if progress else 0.0,
+        progress=experiment.progress if experiment is not None else 0.0,
+        remaining_s=experiment.remaining_s if experiment is not None else 0.0,
         tool_mm=experiment.file.tool_mm if experiment is not None else None,
         torque_source=driving,
         torque_nm=latest.torque_nm if latest is not None else None,

@@ -19,35 +19,6 @@ class Response(IntEnum):
     STOP_AND_RELEASE = 4  # the wrist is stopped, the experiment ends, the gripper opens
 
 
-class FaultCode(Enum):
-    """Kinds of faults."""
-
-    ESTIMATE_STALE = "estimate stale"
-    ESTIMATE_INVALID = "estimate invalid"
-    ESTIMATE_JUMPED = "estimate jumped"
-    TORQUE_LIMIT = "torque limit"
-    ANGLE_LIMIT = "angle limit"
-    TORQUES_DISAGREE = "torques disagree"
-    PROTECTIVE_STOP = "protective stop"
-    EMERGENCY_STOP = "emergency stop"
-    GRIPPER_FAULT = "gripper fault"
-    GRIP_LOST = "grip lost"
-    NOT_RELEASED = "not released"
-    STATE_STALE = "state stale"
-    DEVICE_AWAITED = "device awaited"
-    DEVICE_LOST = "device lost"
-    ROBOT_LOST = "robot lost"
-    ROBOT_BLOCKED = "robot blocked"
-    TASK_DIED = "task died"
-    DAEMON_PAUSED = "daemon paused"
-    LOOP_LATE = "loop late"
-    HELD_TOO_LONG = "held too long"
-    RECORDING_FAILED = "recording failed"
-    COMMAND_REFUSED = "command refused"
-    COMMAND_UNANSWERED = "command unanswered"
-    STEP_OVERDUE = "step overdue"
-
-
 @dataclass(frozen=True, slots=True)
 class Rule:
     """One row: the response, the operator's sentence with its cure, and how long a hold may last before it stops.
@@ -70,140 +41,144 @@ DECAY = 0.5
 
 _KEEP, _RELEASE, _HOLD = Response.STOP_AND_KEEP_GRIP, Response.STOP_AND_RELEASE, Response.HOLD
 
-TABLE: Mapping[FaultCode, Rule] = {
-    FaultCode.ESTIMATE_STALE: Rule(
+
+class FaultCode(Enum):
+    """The safety table: kinds of faults with their rules."""
+
+    ESTIMATE_STALE = Rule(
         _HOLD,
         "no new torque has arrived: {detail}.",
         "Check the sensor's cable and its task in `shearloop listen health`.",
         hold_at_most_s=5.0,
-    ),
-    FaultCode.ESTIMATE_INVALID: Rule(
+    )
+    ESTIMATE_INVALID = Rule(
         _HOLD,
         "the torque estimate is not valid: {detail}.",
         "Wait for the next valid estimate, or tare with nothing gripped and start again.",
         hold_at_most_s=5.0,
-    ),
-    FaultCode.ESTIMATE_JUMPED: Rule(
+    )
+    ESTIMATE_JUMPED = Rule(
         _HOLD,
         "the torque jumped without a motion of the wrist: {detail}.",
         "Check whether the tool slipped or the screw broke loose.",
         hold_at_most_s=5.0,
-    ),
-    FaultCode.TORQUE_LIMIT: Rule(
+    )
+    TORQUE_LIMIT = Rule(
         _RELEASE,
         "the torque is beyond its limit: {detail}.",
         "Check what blocks the tool; raise `limits.torque_nm` only if tool and gel bear it.",
-    ),
-    FaultCode.ANGLE_LIMIT: Rule(
+    )
+    ANGLE_LIMIT = Rule(
         _KEEP,
         "the wrist has reached its angle limit: {detail}.",
         "The tool may be slipping; regrip it, or widen `limits.angle_rad`.",
-    ),
-    FaultCode.TORQUES_DISAGREE: Rule(
+    )
+    TORQUES_DISAGREE = Rule(
         _HOLD,
         "two torque measurements disagree: {detail}.",
         "Tare both with nothing gripped; if they still disagree, calibrate again.",
         hold_at_most_s=3.0,
-    ),
-    FaultCode.PROTECTIVE_STOP: Rule(
+    )
+    PROTECTIVE_STOP = Rule(
         _KEEP,
         "the robot is in a protective stop: {detail}.",
         "Clear what the robot touched, then `shearloop command unlock`.",
-    ),
-    FaultCode.EMERGENCY_STOP: Rule(
+    )
+    EMERGENCY_STOP = Rule(
         _KEEP,
         "the robot's emergency stop is pressed: {detail}.",
         "Release the button, power the arm on the pendant, then `shearloop command unlock`.",
-    ),
-    FaultCode.GRIPPER_FAULT: Rule(
+    )
+    GRIPPER_FAULT = Rule(
         _KEEP,
         "the gripper reports a fault: {detail}.",
         "Clear the fault; `shearloop command unlock` then activates the gripper again.",
-    ),
-    FaultCode.GRIP_LOST: Rule(
-        _KEEP,
-        "the gripper no longer holds an object: {detail}.",
-        "Put the tool back and start the experiment again.",
-    ),
-    FaultCode.NOT_RELEASED: Rule(
+    )
+    GRIP_LOST = Rule(
+        _KEEP, "the gripper no longer holds an object: {detail}.", "Put the tool back and start the experiment again."
+    )
+    NOT_RELEASED = Rule(
         _KEEP,
         "the gripper did not open, the tool is still gripped: {detail}.",
         "Open it by hand and clear the fault, then `shearloop command unlock`.",
-    ),
-    FaultCode.STATE_STALE: Rule(
+    )
+    STATE_STALE = Rule(
         _HOLD,
         "a device's state is out of date: {detail}.",
         "It resumes with the next state; check the cable, and whether this computer is overloaded.",
         hold_at_most_s=2.0,
-    ),
-    FaultCode.DEVICE_AWAITED: Rule(
+    )
+    DEVICE_AWAITED = Rule(
         _KEEP,
         "a device that the experiment needs is not connected yet: {detail}.",
         "Switch it on and connect it; it is found automatically. `shearloop doctor CONFIG` examines it.",
-    ),
-    FaultCode.DEVICE_LOST: Rule(
+    )
+    DEVICE_LOST = Rule(
         _KEEP,
         "a device that the experiment needs is gone: {detail}.",
         "Plug it in again; it is found automatically. Then start the experiment again.",
-    ),
-    FaultCode.ROBOT_LOST: Rule(
+    )
+    ROBOT_LOST = Rule(
         _KEEP,
         "the robot, or the daemon's process that drives it, is gone: {detail}.",
         "It reconnects automatically; then `shearloop command unlock`, and start the experiment again.",
-    ),
-    FaultCode.ROBOT_BLOCKED: Rule(
+    )
+    ROBOT_BLOCKED = Rule(
         _KEEP,
         "the robot does not move: {detail}.",
         "Clear the cause and `shearloop command unlock`, then start the experiment again.",
-    ),
-    FaultCode.TASK_DIED: Rule(
+    )
+    TASK_DIED = Rule(
         _KEEP,
         "a task of the daemon crashed and restarts: {detail}.",
         "Read the log above this line; report the crash if it recurs.",
-    ),
-    FaultCode.DAEMON_PAUSED: Rule(
+    )
+    DAEMON_PAUSED = Rule(
         _HOLD,
         "the daemon itself was not running: {detail}.",
         "Do not pause it (SIGSTOP, Ctrl-Z), nor suspend or overload the computer, while an experiment runs.",
         hold_at_most_s=5.0,
         is_past=True,
         explains=True,
-    ),
-    FaultCode.LOOP_LATE: Rule(
+    )
+    LOOP_LATE = Rule(
         _HOLD,
         "the daemon is too slow for its devices: {detail}.",
         "End other programs on this computer, or see the service's real-time options.",
         hold_at_most_s=5.0,
         is_past=True,
-    ),
-    FaultCode.HELD_TOO_LONG: Rule(
+    )
+    HELD_TOO_LONG = Rule(
         _KEEP,
         "the wrist was held for too long by several faults: {detail}.",
         "Clear the longest one first, then start the experiment again.",
-    ),
-    FaultCode.RECORDING_FAILED: Rule(
+    )
+    RECORDING_FAILED = Rule(
         Response.REFUSE_START,
         "the recording cannot be written: {detail}.",
         "Make room on the disk or name another folder; the running experiment continues unrecorded.",
-    ),
-    FaultCode.COMMAND_REFUSED: Rule(
-        Response.NOTE,
-        "a command was refused: {detail}.",
-        "Nothing was done; correct the command and send it again.",
-    ),
-    FaultCode.COMMAND_UNANSWERED: Rule(
+    )
+    COMMAND_REFUSED = Rule(
+        Response.NOTE, "a command was refused: {detail}.", "Nothing was done; correct the command and send it again."
+    )
+    COMMAND_UNANSWERED = Rule(
         Response.NOTE,
         "the robot's process ended before it answered a command: {detail}.",
         "It restarts automatically; once the robot is connected again, `shearloop command unlock`.",
-    ),
-    FaultCode.STEP_OVERDUE: Rule(
+    )
+    STEP_OVERDUE = Rule(
         _KEEP,
         "a step took longer than it may: {detail}.",
         "Check what delayed it; lengthen `timeout_s` of the step if it is too short.",
-    ),
-}
+    )
+
+    @property
+    def text(self) -> str:
+        """The name in words."""
+        return self.name.lower().replace("_", " ")
 
 
+TABLE: Mapping[FaultCode, Rule] = {code: code.value for code in FaultCode}
 # Faults that only hold the wrist count as consequences of an explaining fault for this time: queued data is read, and
 # boards that seemed lost send again.
 SETTLES_S = 2.0
@@ -356,7 +331,7 @@ class SafetyMonitor:
     def _hold_report(self) -> str:
         """Return the hold time of each fault, the longest first."""
         longest_first = sorted(self._share_ns.items(), key=lambda held: -held[1])
-        return ", ".join(f"{code.value} for {held_ns / 1e9:.1f} s" for code, held_ns in longest_first)
+        return ", ".join(f"{code.text} for {held_ns / 1e9:.1f} s" for code, held_ns in longest_first)
 
 
 def _counted(held_ns: int, passed_ns: int, *, held: bool) -> int:

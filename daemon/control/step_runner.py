@@ -130,19 +130,6 @@ class ExperimentPhase(Enum):
     STOPPED = "stopped"  # before its end: by the operator, by safety, or by a step that failed
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """Progress of an experiment, for the operator."""
-
-    phase: ExperimentPhase
-    step: int
-    steps: int
-    activity: str
-    share: float
-    remaining_s: float
-    overdue: str = ""
-
-
 class StepFailedError(Exception):
     """A step cannot continue; the message says why."""
 
@@ -236,22 +223,20 @@ class Experiment:
         if self.running:
             self.phase, self.stop_reason, self.command = ExperimentPhase.STOPPED, reason, StepCommand()
 
-    def progress(self) -> Progress:
-        """Return the progress."""
-        ahead_s = sum(self._expected_s[self._index + 1 :])
+    @property
+    def remaining_s(self) -> float:
+        """The approximate remaining time."""
+        if not self.running:
+            return 0.0
         here_s = max(0.0, self._expected_s[self.step_number - 1] - self._spent_s)
-        remaining_s = here_s + ahead_s if self.running else 0.0
-        return Progress(
-            phase=self.phase,
-            step=self.step_number,
-            steps=len(self.file.steps),
-            activity=self.activity,
-            share=1.0
-            if self.phase is ExperimentPhase.DONE
-            else max(0.0, 1.0 - remaining_s / max(sum(self._expected_s), 1e-9)),
-            remaining_s=remaining_s,
-            overdue=self.overdue,
-        )
+        return here_s + sum(self._expected_s[self._index + 1 :])
+
+    @property
+    def progress(self) -> float:
+        """The completed share, 0 to 1."""
+        if self.phase is ExperimentPhase.DONE:
+            return 1.0
+        return max(0.0, 1.0 - self.remaining_s / max(sum(self._expected_s), 1e-9))
 
     def _begin_next(self) -> None:
         while self._index + 1 < len(self.file.steps):

@@ -157,7 +157,7 @@ class RobotStateMessage(Message):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GripperStateMessage(Message):
-    """The state of the gripper; the width at which it stops on an object is a diameter measurement."""
+    """The state of the gripper; its width when it stops on an object is a diameter measurement."""
 
     topic: ClassVar[str] = "gripper.state"
     rate_hz: ClassVar[float | None] = 10.0

@@ -37,7 +37,7 @@ RAW_FRAME, RAW_HOMOGENEOUS = "TorqueSlice.mat", "TorqueSliceHom.mat"
 
 
 @dataclass(frozen=True, slots=True)
-class _Frame:
+class _SliceFrame:
     t_ns: int
     channels: FloatArray
     line: FloatArray
@@ -70,10 +70,10 @@ class SliceRecorder:
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="slices")
         # Protects the two counters.
         self._lock = threading.Lock()
-        self._frames: dict[str, deque[_Frame]] = {}
+        self._frames: dict[str, deque[_SliceFrame]] = {}
         self._torques: deque[tuple[int, float]] = deque(maxlen=MAX_TORQUES)
         # The frames of the running `tare` step and its start, None outside such a step.
-        self._tare_frames: dict[str, list[_Frame]] = {}
+        self._tare_frames: dict[str, list[_SliceFrame]] = {}
         self._tare_from_ns: int | None = None
         self._homogeneous: dict[str, tuple[FloatArray, FloatArray]] = {}
         self._diameter_mm: float | None = None
@@ -119,7 +119,7 @@ class SliceRecorder:
 
     def _add_frame(self, content: Mapping[str, Any]) -> None:
         source, t_ns = content["source"], content["t_mono_ns"]
-        frame = _Frame(t_ns, _wire_array(content["channels"]), _wire_array(content["line"]))
+        frame = _SliceFrame(t_ns, _wire_array(content["channels"]), _wire_array(content["line"]))
         self._frames.setdefault(source, deque(maxlen=MAX_FRAMES)).append(frame)
         if self._tare_from_ns is not None:
             self._tare_frames.setdefault(source, []).append(frame)
@@ -244,7 +244,7 @@ def _save_mat(path: Path, **arrays: Any) -> None:
         file.write(content.getbuffer())
 
 
-def _half_period_ns(frames: Collection[_Frame]) -> float:
+def _half_period_ns(frames: Collection[_SliceFrame]) -> float:
     """Return half the duration of an acquisition, 0 for fewer than two frames."""
     return 0.5 * float(np.median(np.diff([frame.t_ns for frame in frames]))) if len(frames) > 1 else 0.0
 

@@ -113,7 +113,7 @@ class RecordedRun:
         return any(topic.startswith(f"{INPUT}.") and topic != CLOCK_TOPIC for topic in self.counts)
 
     @property
-    def messages(self) -> int:
+    def message_count(self) -> int:
         """The number of messages."""
         return sum(self.counts.values())
 

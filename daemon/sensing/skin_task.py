@@ -17,20 +17,22 @@ from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
 from shearloop.daemon.waiting import Waiting
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkEvent, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
-from shearloop.drivers.shear_skin.instruments import (
+from shearloop.drivers.shear_skin import (
     SOURCE_PERIOD_S,
     AdcBoard,
     Daq,
     Keithley6430,
     PairParser,
+    RecordedInstrument,
+    SampleValidator,
     ScpiScanner,
+    ShearSkin,
+    SkinSample,
     SourceReading,
     Voltages,
     recorded_scanner,
     recorded_source,
 )
-from shearloop.drivers.shear_skin.scpi import RecordedInstrument
-from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinSample
 
 SKIN = "skin"
 # The instruments' names in health and in recordings.

@@ -252,7 +252,7 @@ class RobotiqGripper:
 
     def _note_loss(self, error: DriverError) -> None:
         if self.connected:
-            # `states` reports it, whichever call meets it.
+            # `states` reports the loss.
             self._loss = error
         self.connected, self.latest = False, None
 

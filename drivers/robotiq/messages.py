@@ -186,7 +186,7 @@ class GripperState:
 
     @property
     def diameter_mm(self) -> float | None:
-        """The diameter of the object between the fingers, or None: the width at which they stopped while closing."""
+        """The diameter of the object between the fingers, or None: their width after a contact while closing."""
         return self.width_mm if self.object is ObjectStatus.CONTACT_CLOSING else None
 
     @property

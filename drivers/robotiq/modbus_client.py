@@ -67,7 +67,7 @@ def readout_of(registers: Sequence[int]) -> Readout:
 
 
 class ModbusClient:
-    """One serial connection. Any failure closes it: Modbus RTU cannot tell a late answer from the next one."""
+    """One serial connection. Any failure closes it: Modbus RTU does not distinguish a late answer from the next one."""
 
     def __init__(
         self,

@@ -1,12 +1,27 @@
 """The microfluidic shear skin: two gauges in series with a current source, and two voltages."""
 
-from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner, SourceReading, Voltages
+from shearloop.drivers.shear_skin.instruments import (
+    SOURCE_PERIOD_S,
+    AdcBoard,
+    Daq,
+    Keithley6430,
+    PairParser,
+    ScpiScanner,
+    SourceReading,
+    Voltages,
+    recorded_scanner,
+    recorded_source,
+)
+from shearloop.drivers.shear_skin.scpi import RecordedInstrument
 from shearloop.drivers.shear_skin.skin import SampleValidator, ShearSkin, SkinFault, SkinSample
 
 __all__ = [
+    "SOURCE_PERIOD_S",
     "AdcBoard",
     "Daq",
     "Keithley6430",
+    "PairParser",
+    "RecordedInstrument",
     "SampleValidator",
     "ScpiScanner",
     "ShearSkin",
@@ -14,4 +29,6 @@ __all__ = [
     "SkinSample",
     "SourceReading",
     "Voltages",
+    "recorded_scanner",
+    "recorded_source",
 ]

@@ -14,7 +14,7 @@ from shearloop.drivers.serial_sensor import (
     LineSplitter,
     OnRaw,
     RawEvent,
-    StreamingSensor,
+    SerialSensor,
     ignore_raw,
     transfer_ns,
 )
@@ -309,8 +309,10 @@ class PairParser:
         )
 
 
-class AdcBoard(StreamingSensor[Voltages]):
+class AdcBoard(SerialSensor[Voltages]):
     """A cheap converter board on a serial port: sends a line `v1,v2` in volts for each pair of conversions."""
+
+    silence_hint = "check that it is the skin's converter board and that it has power."
 
     def __init__(
         self,
@@ -320,12 +322,7 @@ class AdcBoard(StreamingSensor[Voltages]):
         on_raw: OnRaw = ignore_raw,
     ) -> None:
         """Use the link, not yet open; `on_raw` receives every input of the parser."""
-        super().__init__(
-            link,
-            period_s=1.0 / rate_hz,
-            silence_hint="check that it is the skin's converter board and that it has power.",
-            on_raw=on_raw,
-        )
+        super().__init__(link, 1.0 / rate_hz, on_raw)
         self.period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
         self._count = 0

@@ -112,7 +112,7 @@ class UrArm:
     def clear_command(self) -> bool:
         """Clear the register with the last command while no program runs; False: try again later.
 
-        ur-rtde has no call for it, but clears the register before it reports that it cannot send. False means that it
+        ur-rtde has no such call, but clears the register before it reports that it cannot send. False means that it
         does not know yet that no program runs, and would wait for the program.
         """
         if self._control.isProgramRunning():

@@ -4,28 +4,60 @@ A new worker has motion disabled. No command is sent twice, and nothing moves be
 """
 
 import asyncio
+import contextlib
 import importlib.util
 import math
+import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Any, Final, Literal, cast
 
-from shearloop.drivers.errors import DriverError, is_cancelled
+from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError, is_cancelled
 from shearloop.drivers.ur import error_messages
-from shearloop.drivers.ur.messages import Command, CommandReply, Failed, Message, RobotState
+from shearloop.drivers.ur.messages import (
+    RECOVERY_HANG_S,
+    Command,
+    CommandReply,
+    Configure,
+    Disconnect,
+    Failed,
+    FailureKind,
+    Heartbeat,
+    Message,
+    MessageDecoder,
+    RobotState,
+    WorkerPhase,
+    encode,
+)
 from shearloop.drivers.ur.settings import UrSettings
-from shearloop.drivers.ur.worker_connection import Descriptor, LossKind, LostError, WorkerConnection, output_pipe
 
 LinkStatus = Literal["starting", "up", "down"]
+LossKind = FailureKind | Literal["crashed", "hung", "garbled"]
 
 PAUSES_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 # After this time without a loss the pauses start again with the shortest.
 STEADY_S = 30.0
 # A program found this soon after a loss counts as left behind by the lost worker.
 TAKES_OVER_S = 10.0
+# A disconnecting worker stops the arm (1 s) and ends the program; after this time it is killed.
+FAREWELL_S = 3.0
+# The worker's own alarms end it at a known place; the daemon kills it this much later.
+GRACE_S = 1.0
+# The bound on bytes that a stuck worker leaves unread: some hundred commands.
+MOST_UNSENT = 1 << 15
+# The end of the worker's error output that a message quotes.
+LAST_WORDS_BYTES, LAST_WORDS_LINES = 1024, 8
+
+
+class LostError(DeviceLostError):
+    """The worker has to be replaced; `kind` says why."""
+
+    def __init__(self, kind: LossKind, sentence: str) -> None:
+        super().__init__(sentence)
+        self.kind: LossKind = kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,8 +123,8 @@ class UrRobot:
     def send_nowait(self, command: Command, on_reply: Callable[[CommandReply], None]) -> None:
         """Send a command and pass its reply to `on_reply`.
 
-        A command whose worker dies first is refused and not sent again. An exception in `on_reply` ends the connection;
-        where that has ended, it goes to the event loop's handler.
+        When the worker dies first, the command is refused and not sent again. An exception in `on_reply` ends the
+        connection; where that has ended, it goes to the event loop's handler.
         """
         if self._connection is None or self._state is None:
             on_reply(CommandReply(refusal=f"The robot is not connected. {self.link.sentence}"))
@@ -113,8 +145,7 @@ class UrRobot:
         while True:
             started_s = time.monotonic()
             try:
-                with output_pipe() as (stdout, its_stdout):
-                    await self._run_worker(stdout, its_stdout)
+                await self._run_worker()
             except LostError as loss:
                 if loss.kind == "not-installed":
                     raise DriverError(str(loss)) from loss
@@ -123,21 +154,16 @@ class UrRobot:
                 self._notify_link("down", str(loss), loss.kind)
             await asyncio.sleep(PAUSES_S[min(attempts, len(PAUSES_S)) - 1])
 
-    async def _run_worker(self, stdout: int, its_stdout: Descriptor) -> None:
-        process = await asyncio.create_subprocess_exec(
-            sys.executable, "-m", "shearloop.drivers.ur.worker",
-            stdin=asyncio.subprocess.PIPE, stdout=its_stdout.number, stderr=asyncio.subprocess.PIPE,
-        )  # fmt: skip
-        # The worker alone holds it, so that it closes with the worker.
-        its_stdout.close()
-        self.pid = process.pid
-        connection = WorkerConnection(self.settings, process, stdout, self.handle_messages, takes_over=self.takes_over)
-        self._connection = connection
+    async def _run_worker(self) -> None:
+        connection = WorkerConnection(self.settings, self.handle_messages, takes_over=self.takes_over)
+        await asyncio.get_running_loop().subprocess_exec(
+            lambda: connection, sys.executable, "-m", "shearloop.drivers.ur.worker"
+        )
+        self._connection, self.pid = connection, connection.pid
         loss: BaseException | None = None
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(connection.keep_alive())
-                tasks.create_task(connection.collect_stderr())
                 await connection.listen()
         except* LostError as group:
             loss = group.exceptions[0]
@@ -197,7 +223,158 @@ class UrRobot:
         self._on_link(self.link)
 
 
-async def _finish(ending: Coroutine[None, None, None]) -> None:
+class WorkerConnection(asyncio.SubprocessProtocol):
+    """The pipes to one worker process, its end, and the reason for that."""
+
+    def __init__(
+        self,
+        settings: UrSettings,
+        on_messages: Callable[[Sequence[tuple[int, Message]]], None],
+        *,
+        takes_over: bool = False,
+    ) -> None:
+        """Take the worker's configuration. `on_messages` receives all messages of one read, in order."""
+        self._settings = settings
+        self._on_messages = on_messages
+        self._takes_over = takes_over
+        self._decoder = MessageDecoder()
+        self._received_s = self._sent_s = time.monotonic()
+        # Done when the worker has ended and all of its output was read.
+        self._ended = asyncio.get_running_loop().create_future()
+        # Done then too (None), or with an error that ends the connection before. The error is a result, because asyncio
+        # complains about exceptions that are never retrieved.
+        self._closed: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
+        self._stderr_tail = b""
+        self._activity = "starting"
+        self._state: RobotState | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Configure the worker."""
+        self._process = cast(asyncio.SubprocessTransport, transport)
+        self._stdin = cast(asyncio.WriteTransport, self._process.get_pipe_transport(0))
+        self.send(Configure(self._settings, self._takes_over))
+
+    @property
+    def pid(self) -> int | None:
+        """The worker's process id."""
+        return self._process.get_pid()
+
+    def send(self, message: Message, number: int = 0) -> None:
+        """Send a message to the worker."""
+        self._sent_s = time.monotonic()
+        self._stdin.write(encode(message, number))
+
+    def pipe_data_received(self, fd: int, data: bytes) -> None:
+        """Handle output where it is read: waking a task for each of 125 states a second would double the cost."""
+        if fd == 2:
+            # After a crash the end of the error output is the only trace.
+            self._stderr_tail = (self._stderr_tail + data)[-LAST_WORDS_BYTES:]
+            return
+        if self._closed.done():
+            return
+        self._received_s = time.monotonic()
+        try:
+            messages = self._decoder.feed(data)
+            for _, message in messages:
+                if isinstance(message, WorkerPhase):
+                    self._activity = message.activity
+                elif isinstance(message, RobotState):
+                    self._state, self._activity = message, "controlling"
+            self._on_messages(messages)
+        except ProtocolError as error:
+            self._kill()
+            self._closed.set_result(LostError("garbled", str(error)))
+        except Exception as error:  # noqa: BLE001 - raised again by `listen`
+            self._closed.set_result(error)
+
+    def connection_lost(self, _error: Exception | None) -> None:
+        """Note the end of the worker and of its output."""
+        self._ended.set_result(None)
+        if not self._closed.done():
+            self._closed.set_result(None)
+
+    async def listen(self) -> None:
+        """Wait for the end of the connection; kill a worker that is silent for too long.
+
+        Raises:
+            LostError: always, in the end.
+        """
+        while not self._closed.done():
+            timeout_s = self._timeout_s()
+            silent_s = time.monotonic() - self._received_s
+            if silent_s >= timeout_s:
+                self._kill()
+                raise LostError("hung", self._hung_sentence(timeout_s))
+            await asyncio.wait([self._closed], timeout=min(timeout_s - silent_s, self._settings.hang_timeout_s))
+        error = self._closed.result()
+        raise error if error is not None else self._died()
+
+    async def keep_alive(self) -> None:
+        """Send heartbeats four times within the silence timeout, unless commands go out as often."""
+        longest_s = self._settings.silence_timeout_s / 4
+        while True:
+            left_s = longest_s - (time.monotonic() - self._sent_s)
+            if left_s <= 0:
+                self.send(Heartbeat())
+                left_s = longest_s
+            await asyncio.sleep(left_s)
+            if self._stdin.get_write_buffer_size() > MOST_UNSENT:
+                self._kill()
+                raise LostError("hung", self._hung_sentence(self._settings.silence_timeout_s))
+
+    async def end(self) -> None:
+        """Disconnect the worker, and kill it after `FAREWELL_S`."""
+        if self._process.get_returncode() is None:
+            self.send(Disconnect())
+        # The end of its input disconnects the worker too.
+        self._stdin.close()
+        await asyncio.wait([self._ended], timeout=FAREWELL_S)
+        if not self._ended.done():
+            self._kill()
+            await self._ended
+        self._process.close()
+
+    def _kill(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            self._process.kill()
+
+    def _timeout_s(self) -> float:
+        if self._state is None:
+            return self._settings.connect_timeout_s + GRACE_S
+        return (RECOVERY_HANG_S if self._state.recovering else self._settings.hang_timeout_s) + GRACE_S
+
+    def _died(self) -> LostError:
+        status = self._process.get_returncode() or 0
+        if status == -signal.SIGALRM:
+            return LostError("hung", self._hung_sentence(self._settings.hang_timeout_s))
+        end = f"died of {signal.Signals(-status).name}" if status < 0 else f"ended with status {status}"
+        # ur-rtde crashes like this when it loses the controller.
+        cause = ": it lost the controller" if -status in (signal.SIGSEGV, signal.SIGABRT) else ""
+        return LostError(
+            "crashed",
+            f"The robot's process {end} while {self._activity}{cause}. The robot's watchdog ends the motion; the "
+            f"process is started again with motion disabled.{self._last_words()}",
+        )
+
+    def _hung_sentence(self, seconds: float) -> str:
+        if self._state is None:
+            sentence = error_messages.SILENT.format(
+                host=self._settings.host, seconds=self._settings.connect_timeout_s, activity=self._activity
+            )
+        else:
+            sentence = (
+                f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "
+                "motion; the process is started again with motion disabled."
+            )
+        return sentence + self._last_words()
+
+    def _last_words(self) -> str:
+        lines = [line.strip() for line in self._stderr_tail.decode("utf-8", "replace").splitlines()]
+        words = " / ".join([line for line in lines if line][-LAST_WORDS_LINES:])
+        return f" Its last words: {words}." if words else ""
+
+
+async def _finish(ending: Coroutine[Any, Any, None]) -> None:
     """Await to the end, also when cancelled meanwhile."""
     task = asyncio.ensure_future(ending)
     try:

@@ -67,7 +67,7 @@ class Recovery:
         self.refusal = reason
 
     def has_ended(self, now_ns: int) -> bool:
-        """Whether `advance` will refuse, whatever the sample."""
+        """Whether `advance` will refuse every sample."""
         return bool(self.refusal) or now_ns > self._deadline_ns
 
     def advance(self, sample: RtdeSample, now_ns: int) -> Outcome:
@@ -109,7 +109,7 @@ class Recovery:
         return Outcome.UNDER_WAY
 
     def _await_foreign_program(self, now_ns: int) -> Outcome:
-        """Wait for the end of a program that we may not stop; one whose daemon died ends by its watchdog."""
+        """Wait for the end of a program that we may not stop; after its daemon's death its watchdog ends it."""
         since_ns = self._asked_ns.setdefault("end", now_ns)
         return self._refuse("") if now_ns > since_ns + int(ENDS_ITSELF_S * 1e9) else Outcome.UNDER_WAY
 
@@ -182,7 +182,7 @@ class PausedProgramStopper:
 
     def _fail(self, reason: str) -> None:
         self.failed_stops += 1
-        self.failure = error_messages.still_paused(reason)
+        self.failure = error_messages.STILL_PAUSED.format(reason=reason.strip().removesuffix("."))
 
 
 class ForeignProgramDetector:

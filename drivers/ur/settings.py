@@ -22,7 +22,7 @@ _CLIENT_BOUNDS = {
     "linear_acceleration_m_per_s2": 150.0,
 }
 
-# The longest time the robot may go on without commands, whatever the file says.
+# No file may let the robot go on without commands for longer.
 _LONGEST_S = {"command_timeout_s": 1.0, "silence_timeout_s": 1.0, "state_timeout_s": 1.0, "reaction_s": 0.5}
 _LEAST_WATCHDOG_HZ = 1.0
 
@@ -120,7 +120,7 @@ class UrSettings:
     # A cycle that takes longer is a hang, and the worker is ended: calls of ur-rtde block for up to 301 s.
     hang_timeout_s: float = 1.5
     recover_timeout_s: float = 30.0
-    # Delay until a commanded speed takes effect; distances to the joint limits allow for it.
+    # Delay until a commanded speed takes effect; distances to the joint limits include it.
     reaction_s: float = 0.04
 
     def __post_init__(self) -> None:

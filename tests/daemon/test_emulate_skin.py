@@ -13,8 +13,7 @@ from shearloop.daemon.cli.emulate.skin import PushedSkin
 from shearloop.daemon.synthetic_skin import SyntheticSkin
 from shearloop.drivers.connection import Link, SerialLink, TcpLink
 from shearloop.drivers.emulators.rig import EmulatedRig, RigSettings, RigSkin
-from shearloop.drivers.shear_skin.instruments import AdcBoard, Daq, Keithley6430, ScpiScanner
-from shearloop.drivers.shear_skin.skin import ShearSkin, SkinFault, SkinSample
+from shearloop.drivers.shear_skin import AdcBoard, Daq, Keithley6430, ScpiScanner, ShearSkin, SkinFault, SkinSample
 from tests.daemon.conftest import DEADLINE_S, shearloop
 
 SPEED = 20

@@ -100,7 +100,7 @@ def test_causes_that_take_turns_hold_the_wrist_no_longer_than_one_alone_may(coun
     assert stopped_s == pytest.approx(HELD_AT_MOST_S, abs=2 * TICK_S)
     told = gate.report([]).reasons[-1]
     assert "held for too long" in told
-    assert all(f"{event.value} for " in told for event in events[:4])
+    assert all(f"{event.text} for " in told for event in events[:4])
 
 
 def test_one_cause_alone_is_told_alone() -> None:

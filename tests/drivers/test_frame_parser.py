@@ -2,7 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -137,11 +137,6 @@ def test_one_byte_at_a_time_gives_the_same_frames() -> None:
     stream = b"".join(LINES[:2])
     frames = feed_all(FrameParser(ZERO_SLOTS), [stream[n : n + 1] for n in range(len(stream))])
     assert [frame.line + b"\n" for frame in frames] == LINES[:2]
-
-
-def test_a_mask_of_any_layout_serves() -> None:
-    (frame,) = FrameParser(np.repeat(ZERO_SLOTS, 2)[::2]).feed(GOOD, 0)
-    assert frame.line + b"\n" == GOOD
 
 
 def test_carriage_returns_are_taken_as_part_of_the_line_end() -> None:
@@ -303,28 +298,6 @@ def test_a_repeated_line_is_flagged_and_makes_no_channel_dead() -> None:
     frames = flagged([first, first, first, first, second], dead_after=3)
     assert [frame.repeated for frame in frames] == [False, True, True, True, False]
     assert not any(frame.dead.any() for frame in frames)
-
-
-@settings(max_examples=40)
-@given(
-    st.lists(st.tuples(st.sampled_from([0.3, 0.4]), st.sampled_from([0.5, 0.6]), st.booleans()), max_size=30),
-    st.integers(1, 5),
-)
-def test_dead_is_what_counting_equal_frames_says(frames: list[tuple[float, float, bool]], dead_after: int) -> None:
-    line, lines = noisy(1)[0], []
-    for number, (one, other, again) in enumerate(frames):
-        if not (again and lines):
-            line = line.copy()
-            # A third channel moves in each, so that no line repeats by chance.
-            line[LINE_SLOTS[:3]] = one, other, ADC_STEP_V * (1 + number % 300)
-        lines.append(line)
-    run, before, expected = np.zeros(2), np.full(2, np.nan), []
-    for number, line in enumerate(lines):
-        if number == 0 or line is not lines[number - 1]:
-            run = np.where(line[LINE_SLOTS[:2]] == before, run + 1, 1)
-            before = line[LINE_SLOTS[:2]]
-        expected.append((run >= dead_after).tolist())
-    assert [frame.dead[:2].tolist() for frame in flagged(lines, dead_after=dead_after)] == expected
 
 
 def test_the_recorded_frames_pass_and_show_what_the_flags_are_for(shared) -> None:

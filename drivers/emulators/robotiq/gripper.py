@@ -14,7 +14,7 @@ FORCE_N = (10.0, 125.0)
 
 @dataclass(frozen=True, slots=True)
 class GripperMechanics:
-    """The positions at which the fingers stop, and the speeds of activation and release."""
+    """The ends of the fingers' range, and the speeds of activation and release."""
 
     open_counts: float = 3.0
     open_mm: float = 140.0
@@ -65,9 +65,9 @@ class Command:
 class Gripper:
     """One gripper. Servers write `command` and read the status; `step` moves the fingers.
 
-    `between` returns the width in mm at which an object stops closing fingers that press with a force in N, or None
-    without an object; `around` does so for opening fingers. The next step takes up commands: until then the status
-    belongs to the motion before, as on the real gripper.
+    `between` returns the width in mm of an object that stops closing fingers with a given force in N, or None; `around`
+    does so for opening fingers. The next step takes up commands: until then the status belongs to the motion before, as
+    on the real gripper.
     """
 
     def __init__(

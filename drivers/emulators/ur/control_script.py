@@ -1,4 +1,4 @@
-"""ur-rtde's control script, played: what it does with its registers in each cycle, by the table in its source.
+"""ur-rtde's control script, played cycle by cycle after the command table in its source.
 
 Input register 0 carries a command; output register 0 is 1 for ready and 2 for done. `speedJ` runs in every cycle
 without an answer. Other commands run once, report 2, and wait for command 0. While one of them blocks, nothing reads
@@ -27,7 +27,7 @@ _ARMED = re.compile(rb'rtde_set_watchdog\("input_int_register_0", ([0-9.]+), "st
 
 
 def armed_hz(text: bytes | bytearray) -> float:
-    """Return the frequency with which a script arms its watchdog before its loop, or 0."""
+    """Return the watchdog frequency of a script that arms it before its loop, or 0."""
     found = _ARMED.search(text)
     return float(found[1]) if found is not None else 0.0
 

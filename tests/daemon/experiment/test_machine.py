@@ -82,7 +82,7 @@ def test_the_steps_are_carried_out_in_order_to_the_end() -> None:
     bench.run()
     assert bench.machine.phase is ExperimentPhase.DONE
     assert bench.begun == ["MoveTo", "GripTo", "Tare", "GripTo", "MoveTo"]
-    assert bench.machine.progress().share == 1.0
+    assert bench.machine.progress == 1.0
     holds = [wish for wish in bench.seen if wish.activity.startswith("holding 0.200 rad")]
     assert len(holds) * TICK_NS / 1e9 == pytest.approx(2 * 1.0, abs=0.05)
     assert {wish.activity.split(": ")[1].split(",")[1] for wish in holds} == {" repeat 1 of 2", " repeat 2 of 2"}
@@ -118,14 +118,14 @@ def test_while_paused_or_held_the_wrist_stands_and_no_time_passes() -> None:
     bench = Bench(experiment({"do": "twist", "angles_rad": [0.5], "hold_s": 5.0}))
     for _ in range(100):
         bench.tick()
-    left_s, angle_rad = bench.machine.progress().remaining_s, bench.wrist_rad
+    left_s, angle_rad = bench.machine.remaining_s, bench.wrist_rad
     bench.machine.pause()
     for _ in range(1000):
         assert bench.tick().wrist == Hold()
     bench.machine.resume()
     for _ in range(1000):
         assert bench.tick(held=True).wrist == Hold()
-    assert bench.machine.progress().remaining_s == left_s
+    assert bench.machine.remaining_s == left_s
     assert bench.wrist_rad == angle_rad
     bench.run()
     assert bench.machine.phase is ExperimentPhase.DONE
@@ -135,9 +135,9 @@ def test_a_step_that_takes_too_long_is_said_to_be_overdue() -> None:
     machine = experiment({"do": "grip", "timeout_s": 2.0})
     view = StepContext(0.0, None, action=ActionState.RUNNING)
     machine.update(view, 2_000_000_000)
-    assert not machine.progress().overdue
+    assert not machine.overdue
     machine.update(view, 2_100_000_000)
-    assert machine.progress().overdue == "step 1 (grip) has taken 2.1 s of at most 2 s"
+    assert machine.overdue == "step 1 (grip) has taken 2.1 s of at most 2 s"
 
 
 def test_a_steps_limits_only_tighten_the_experiments() -> None:
@@ -191,7 +191,7 @@ def test_any_experiment_ends_whatever_interrupts_it_and_never_moves_after_its_en
             bench.machine.resume()
         wish = bench.tick(held=what == "hold")
         assert what != "hold" or wish.wrist == Hold()
-        assert 0.0 <= bench.machine.progress().share <= 1.0
+        assert 0.0 <= bench.machine.progress <= 1.0
     bench.machine.resume()
     bench.run()
     assert bench.machine.phase is ExperimentPhase.DONE

@@ -1,4 +1,5 @@
-from collections.abc import Callable
+import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -62,3 +63,15 @@ def slices_folder(tmp_path) -> Path:
         path = folder / "diameter_slices" / f"{diameter}mm_Data_{n // 4 + 1}.mat"
         savemat(path, {"data_diff": frame[None], "mean_torque": 0.1})
     return folder
+
+
+@pytest.fixture
+def small_disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
+    """A file system of the size in the test's parameter."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={request.param}", "tmpfs", folder]
+    if subprocess.run(mount, check=False, capture_output=True).returncode:
+        pytest.skip("only root can mount a file system, and not in every container")
+    yield folder
+    subprocess.run(["umount", folder], check=True)

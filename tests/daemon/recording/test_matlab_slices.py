@@ -58,9 +58,9 @@ class Sweep:
             torque = {"t_mono_ns": round(self.t_s * S), "torque_nm": torque_nm, "valid": valid}
             self.recorder("load.torque", torque)
 
-    def hold(self, number: int, torque_nm: float, for_s: float = 5.0, *, valid: bool = True) -> None:
+    def hold(self, number: int, torque_nm: float, for_s: float = 5.0, **frames: bool) -> None:
         self._loop(hold=number)
-        self.frames(torque_nm, for_s, valid=valid)
+        self.frames(torque_nm, for_s, **frames)
         self._loop()
         self.frames(0.0, 1.0)
 
@@ -190,32 +190,23 @@ def test_a_hold_with_a_safety_interruption_is_one_slice(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tared", "for_s", "why"), [(False, 5.0, "no `tare` step"), (True, 0.5, "fewer than 3 frames")]
+    ("tared", "for_s", "frames", "reason"),
+    [
+        (False, 5.0, {}, "no `tare` step"),
+        (True, 0.5, {}, "fewer than 3 frames"),
+        (True, 5.0, {"repeated": True}, "fewer than 3 frames"),
+        (True, 5.0, {"valid": False}, "or no torque"),
+    ],
+    ids=["no tare", "short hold", "repeated frames", "invalid load"],
 )
-def test_a_missed_slice_is_counted_with_its_reason(tmp_path: Path, tared: bool, for_s: float, why: str) -> None:
+def test_a_missed_slice_is_counted_with_its_reason(
+    tmp_path: Path, tared: bool, for_s: float, frames: dict[str, bool], reason: str
+) -> None:
     sweep = Sweep(tmp_path, tared=tared)
-    sweep.hold(1, 0.1, for_s)
+    sweep.hold(1, 0.1, for_s, **frames)
     sweep.done()
     assert not sweep.recorder.written
-    assert why in sweep.recorder.summary
-
-
-def test_an_invalid_load_gives_no_slice(tmp_path: Path) -> None:
-    sweep = Sweep(tmp_path)
-    sweep.hold(1, 0.1, valid=False)
-    sweep.done()
-    assert not sweep.recorder.written
-    assert "or no torque" in sweep.recorder.summary
-
-
-def test_repeated_frames_give_no_slice(tmp_path: Path) -> None:
-    sweep = Sweep(tmp_path)
-    sweep._loop(hold=1)
-    sweep.frames(0.1, 5.0, repeated=True)
-    sweep._loop()
-    sweep.done()
-    assert not sweep.recorder.written
-    assert "fewer than 3 frames" in sweep.recorder.summary
+    assert reason in sweep.recorder.summary
 
 
 def test_slices_need_a_request_of_the_experiment(tmp_path: Path) -> None:

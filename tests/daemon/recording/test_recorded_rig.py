@@ -1,8 +1,6 @@
 """A disk that is full: what runs goes on, nothing new is begun, and with room again nothing is missing."""
 
 import contextlib
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -14,17 +12,6 @@ from tests.daemon.test_closed_loop import experiment, rig_config, running_rig, s
 __all__ = ["rig_config"]
 pytestmark = pytest.mark.real_time
 TWIST = {"do": "twist", "angles_rad": [0.1], "speed_rad_per_s": 0.01, "hold_s": 60.0}
-
-
-@pytest.fixture
-def small_disk(tmp_path: Path) -> Iterator[Path]:
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", folder], check=False)
-    if mounted.returncode:
-        pytest.skip("a small file system can be mounted by root alone, and not in every container")
-    yield folder
-    subprocess.run(["umount", folder], check=True)
 
 
 @pytest.fixture
@@ -55,6 +42,7 @@ def check_recordings(disk: Path, torques: int) -> None:
     assert sum(found) >= torques
 
 
+@pytest.mark.parametrize("small_disk", ["8m"], indirect=True)
 async def test_a_full_disk_refuses_only_the_next_experiment(
     recorded_rig: Path, tiny_bank: Path, tmp_path: Path, small_disk: Path
 ) -> None:

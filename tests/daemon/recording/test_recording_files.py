@@ -10,7 +10,9 @@ from shearloop.daemon.analysis.series import read_series
 from shearloop.daemon.config import RecordingConfig, load_daemon_config
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.recording import identity
+from shearloop.daemon.recording.export import count_messages
 from shearloop.daemon.recording.reader import read_recording
+from shearloop.daemon.recording.replay import RecordedRun
 from shearloop.daemon.recording.writer import RecordingWriter
 
 
@@ -55,26 +57,30 @@ def test_an_unfinished_recording_stays_partial(tmp_path):
     assert read_recording(tmp_path / "a.mcap.partial").torque_nm.tolist() == [1.0]
 
 
-def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch):
+@pytest.mark.parametrize("read", [read_recording, RecordedRun, count_messages])
+def test_foreign_and_outdated_files_are_refused(tmp_path, monkeypatch, read):
     (tmp_path / "text.mcap").write_text("hello")
     with pytest.raises(UserError, match=r"text\.mcap: this is not an MCAP file"):
-        read_recording(tmp_path / "text.mcap")
+        read(tmp_path / "text.mcap")
     with (tmp_path / "other.mcap").open("wb") as file:
         other = Writer(file)
         other.start()
         other.finish()
     with pytest.raises(UserError, match="not a recording of shearloop"):
-        read_recording(tmp_path / "other.mcap")
+        read(tmp_path / "other.mcap")
     with pytest.raises(UserError, match="No such file"):
-        read_recording(tmp_path / "none.mcap")
+        read(tmp_path / "none.mcap")
     monkeypatch.setattr(identity, "CHANNEL_TABLE_HASH", "0" * 64)
     written(tmp_path / "stale.mcap")
     with pytest.raises(UserError, match="channel table 000000000000…"):
-        read_recording(tmp_path / "stale.mcap")
-    monkeypatch.setattr(identity, "FORMAT_VERSION", "99")
-    written(tmp_path / "new.mcap")
-    with pytest.raises(UserError, match="format version 99, expected 2"):
-        read_recording(tmp_path / "new.mcap")
+        read(tmp_path / "stale.mcap")
+    monkeypatch.setattr(identity, "FORMAT_VERSION", "1")
+    written(tmp_path / "old.mcap")
+    with pytest.raises(UserError, match="format version 1, expected 2; record it again, or import it again"):
+        read(tmp_path / "old.mcap")
+
+
+def test_an_unwritable_recording_is_an_error(tmp_path):
     with pytest.raises(UserError, match="choose another --out"):
         RecordingWriter(tmp_path / "no" / "where.mcap", "x")
 

@@ -239,11 +239,11 @@ def test_two_fingertips_and_their_combined_estimate(browsed: Browsed) -> None:
         left={"source": "left", "torque_nm": None, "valid": False, "reason": "no calibration is configured"},
         both={"source": "combined", "torque_nm": 0.0876, "k": None, "sigma": None, "score": None, "runner_up": None},
     )
-    browsed.until("#torque-source", "estimate of both, drives the loop")
+    browsed.until("#torque-source", "estimate of combined, drives the loop")
     browsed.until("#torque-now", "+0.0876 N·m")
-    browsed.until("#torque-legend", "estimate of both, with its 95 % interval")
+    browsed.until("#torque-legend", "estimate of combined, with its 95 % interval")
     panels = page.locator(".fingertip .name").all_inner_texts()
-    assert sorted(panels) == ["left", "right"], "both together are no gel"
+    assert sorted(panels) == ["left", "right"], "the combined estimate has no panel"
     browsed.until(".fingertip[data-source=left] .invalid", "no calibration is configured")
     assert browsed.layout()["spilt"] == []
     browsed.viewer.kill()

@@ -2,20 +2,17 @@
 
 import asyncio
 import gc
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from unittest.mock import Mock
 
 import pytest
 
 from shearloop.drivers.errors import DriverError
-from shearloop.drivers.ur.client import UrRobot
+from shearloop.drivers.ur.client import LAST_WORDS_BYTES, LostError, UrRobot, WorkerConnection
 from shearloop.drivers.ur.messages import CommandReply, Failed, Stop, encode
-from shearloop.drivers.ur.worker_connection import LAST_WORDS_BYTES, LostError, WorkerConnection, output_pipe
 from tests.drivers.ur.flight import SETTINGS, Flight, flying
 from tests.drivers.ur.robots import ROOT, Link, running, settings_for
 
@@ -197,26 +194,19 @@ async def test_of_states_that_are_read_at_once_only_the_last_is_the_newest() -> 
     robot.on_state = lambda _, is_newest: newest.append(is_newest)
     flight = Flight()
     flight.fly(1)
-    with output_pipe() as (stdout, its_stdout):
-        process = Mock(spec=asyncio.subprocess.Process, stdin=Mock(), stderr=Mock())
-        connection = WorkerConnection(SETTINGS, process, stdout, robot.handle_messages)
-        os.write(its_stdout.number, 3 * encode(flight.state) + encode(CommandReply(), 1))
-        connection._read()
-        os.write(its_stdout.number, encode(flight.state))
-        connection._read()
+    connection = WorkerConnection(SETTINGS, robot.handle_messages)
+    connection.pipe_data_received(1, 3 * encode(flight.state) + encode(CommandReply(), 1))
+    connection.pipe_data_received(1, encode(flight.state))
     assert newest == [False, False, True, True]
 
 
-async def test_loss_that_is_told_when_nobody_listens_any_more_is_no_complaint_of_asyncio() -> None:
+async def test_loss_that_nobody_retrieves_is_no_complaint_of_asyncio() -> None:
     complaints: list[dict[str, Any]] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _loop, said: complaints.append(said))
-    with output_pipe() as (stdout, its_stdout):
-        process = Mock(spec=asyncio.subprocess.Process, stdin=Mock(), stderr=Mock())
-        connection = WorkerConnection(SETTINGS, process, stdout, UrRobot(SETTINGS).handle_messages)
-        os.write(its_stdout.number, encode(Failed("lost", "The connection is lost.")))
-        connection._read()
-        del connection
-        gc.collect()
+    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: complaints.append(context))
+    connection = WorkerConnection(SETTINGS, UrRobot(SETTINGS).handle_messages)
+    connection.pipe_data_received(1, encode(Failed("lost", "The connection is lost.")))
+    del connection
+    gc.collect()
     assert complaints == []
 
 

@@ -7,8 +7,9 @@ from typing import Any
 
 import pytest
 
-from shearloop.drivers.ur import worker_connection
-from shearloop.drivers.ur.worker_connection import HEARTBEAT, WorkerConnection
+from shearloop.drivers.ur import client
+from shearloop.drivers.ur.client import WorkerConnection
+from shearloop.drivers.ur.messages import Heartbeat, encode
 from tests.drivers.ur.flight import SETTINGS
 
 LONGEST_S = SETTINGS.silence_timeout_s / 4
@@ -22,11 +23,16 @@ class Played:
         self.connection: Any = None
         self.signs_s: list[float] = []
         self._commands_until_s, self._ends_s = commands_until_s, ends_s
-        self.transport = SimpleNamespace(get_write_buffer_size=lambda: 0)
+
+    def get_pipe_transport(self, _fd: int) -> Any:
+        return self
+
+    def get_write_buffer_size(self) -> int:
+        return 0
 
     def write(self, data: bytes) -> None:
         """Take what the process is told."""
-        if data == HEARTBEAT:
+        if data == encode(Heartbeat()):
             self.signs_s.append(self.now_s)
 
     async def sleep(self, seconds: float) -> None:
@@ -43,9 +49,9 @@ class Played:
 async def signs_s(monkeypatch: pytest.MonkeyPatch, commands_until_s: float, ends_s: float) -> list[float]:
     """Return when signs of life were given."""
     played: Any = Played(commands_until_s, ends_s)
-    monkeypatch.setattr(worker_connection, "time", SimpleNamespace(monotonic=lambda: played.now_s))
-    process: Any = SimpleNamespace(stdin=played, stderr=object())
-    played.connection = WorkerConnection(SETTINGS, process, 0, lambda _: None)
+    monkeypatch.setattr(client, "time", SimpleNamespace(monotonic=lambda: played.now_s))
+    played.connection = WorkerConnection(SETTINGS, lambda _: None)
+    played.connection.connection_made(played)
     with monkeypatch.context() as patched:
         patched.setattr(asyncio, "sleep", played.sleep)
         with pytest.raises(asyncio.CancelledError):

@@ -3,11 +3,10 @@
 import asyncio
 import contextlib
 import signal
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import structlog
 import zmq
@@ -16,7 +15,7 @@ import zmq.asyncio
 from shearloop.bank.eit.channels import ZERO_SLOTS
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.commands import Commands, required_rig
-from shearloop.daemon.config import DaemonConfig, FingertipConfig
+from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.configured_experiment import ConfiguredExperiment
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.health import HealthReporter, TaskFacts
@@ -54,131 +53,146 @@ class Daemon:
         self._clock = Clock()
         self.supervisor = Supervisor()
         self._stop = asyncio.Event()
+        self._tasks: dict[str, Callable[[], Awaitable[None]]] = {}
+        self._tares: dict[str, Callable[[], None]] = {}
         self._rig: Rig | None = None
         self._experiment: ConfiguredExperiment | None = None
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
-        both = open_both(config.combined, config.fingertips) if config.combined is not None else None
-        sources = torque_sources(config, estimators, both)
+        combined = open_both(config.combined, config.fingertips) if config.combined is not None else None
+        sources = torque_sources(config, estimators, combined)
         check_experiment(config, sources)
         with contextlib.ExitStack() as opened:
             keys = load_server_keys(config.curve.server_key) if config.curve is not None else None
-            self._gate: CurveAuthenticator | None = None
+            self._authenticator: CurveAuthenticator | None = None
             if config.curve is not None and config.network_addresses:
-                self._gate = CurveAuthenticator(context, config.curve.clients)
-                opened.callback(self._gate.close)
+                self._authenticator = CurveAuthenticator(context, config.curve.clients)
+                opened.callback(self._authenticator.close)
             self.publisher = Publisher(context, config.publish, self._clock, keys)
             opened.callback(self.publisher.close)
-            self._recorder = _recorder(config, self.publisher, self._clock, self._busy, self._on_recording_error)
+            self.health = HealthReporter(self.publisher, self.supervisor, self._clock)
+            self._recorder = self._open_recorder()
             if self._recorder is not None:
                 opened.callback(self._recorder.close)
-            self._wire(estimators, both, sources)
-            self.health = self._make_health()
-            commands = self._make_commands()
-            self._commands = CommandServer(context, config.commands, commands.handlers(), keys)
+            self._connect(estimators, combined, sources)
+            self.commands = Commands(
+                rig=self._rig,
+                tares=self._tares,
+                fingertips=self._fingertips,
+                experiment=config.experiment,
+                start=self.start_experiment,
+                call_off_experiment=self._call_off_experiment,
+                tasks=self.health.tasks,
+                stop=self.stop,
+            )
+            self._commands = CommandServer(context, config.commands, self.commands.handlers(), keys)
             opened.callback(self._commands.close)
             self._open_stop: CommandServer | None = None
             if "commands" in config.network_addresses:
                 address = local_stop_address(config.commands)
-                self._open_stop = CommandServer(context, address, commands.open_handlers())
+                self._open_stop = CommandServer(context, address, self.commands.open_handlers())
                 opened.callback(self._open_stop.close)
             self._close = opened.pop_all().close
+        self._add_service_tasks()
 
-    def _wire(
-        self, estimators: Mapping[str, AnyEstimator], both: TrackedEstimator | None, sources: Mapping[str, TorqueSource]
+    def _add(
+        self,
+        name: str,
+        run: Callable[[], Awaitable[None]],
+        diagnostics: Callable[[], TaskFacts] | None = None,
+        tare: Callable[[], None] | None = None,
     ) -> None:
-        """Create the tasks of devices and estimators; no device is opened yet."""
-        config = self._config
+        """Add a task with its diagnostics for `health` and its tare for the command."""
+        self._tasks[name] = run
+        if diagnostics is not None:
+            self.health.add(name, diagnostics)
+        if tare is not None:
+            self._tares[name] = tare
+
+    def _connect(
+        self,
+        estimators: Mapping[str, AnyEstimator],
+        combined: TrackedEstimator | None,
+        sources: Mapping[str, TorqueSource],
+    ) -> None:
+        """Create and connect the tasks of devices and estimators; no device is opened yet."""
+        config, publisher, clock = self._config, self.publisher, self._clock
         diameters = FingertipDiameters(COMBINED)
         if config.robot is not None:
-            self._rig = Rig(
-                config,
-                self.publisher,
-                self._clock,
-                sources,
-                self._tare_to_the_end,
-                self.supervisor.deaths,
-                self._tap,
-                diameters.at,
-            )
-            if config.experiment is not None:
-                self._experiment = ConfiguredExperiment(
-                    config.experiment, self.start_experiment, self._rig.runner.experiment_ended
-                )
+            dead_tasks = self.supervisor.deaths
+            self._rig = Rig(config, publisher, clock, sources, self._tare, dead_tasks, self._on_raw, diameters.at)
         on_torque = self._rig.control_loop.on_torque if self._rig is not None else lambda _: None
-        self._load_cell = self._rig.load_cell if self._rig is not None else None
-        if self._rig is None and config.load_cell is not None:
-            # Measured and recorded while another machine twists.
-            self._load_cell = make_load_cell(
-                config.load_cell, self.publisher, self._clock, on_torque, self._on_link(LOAD_CELL), self._tap(LOAD_CELL)
-            )
-        self._skin: SkinTask | None = None
-        if config.skin is not None:
-            self._skin = SkinTask(config.skin, self.publisher, self._clock, on_torque, self._tap)
 
-        def estimation(name: str, estimator: AnyEstimator, period_s: Callable[[], float]) -> EstimatorTask:
-            made = EstimatorTask(
-                name, estimator, self.publisher, self._clock, period_s, on_torque, diameters.hear, self._tap(name)
+        def estimator_task(name: str, estimator: AnyEstimator, period_s: Callable[[], float]) -> EstimatorTask:
+            task = EstimatorTask(
+                name, estimator, publisher, clock, period_s, on_torque, diameters.hear, self._on_raw(name)
             )
             if self._rig is not None and self._rig.gripper is not None:
-                made.held_tool = self._rig.gripper.held_tool
-            return made
+                task.held_tool = self._rig.gripper.held_tool
+            return task
 
-        self._both: CombinedFingertipTask | None = None
-        if both is not None:
-            period_s = config.fingertips[both.sides[0]].frame_period_s
-            self._both = CombinedFingertipTask(estimation(COMBINED, both, lambda: period_s), both.sides, period_s)
+        pair: CombinedFingertipTask | None = None
+        if combined is not None:
+            period_s = config.fingertips[combined.sides[0]].frame_period_s
+            pair = CombinedFingertipTask(estimator_task(COMBINED, combined, lambda: period_s), combined.sides, period_s)
 
-        def fingertip(name: str, estimator: AnyEstimator) -> FingertipTask:
-            board = _board(config.fingertips[name], name, self._on_link(name), self._tap(name), self._both)
+        def fingertip_task(name: str, estimator: AnyEstimator) -> FingertipTask:
+            own = config.fingertips[name]
+            board = EitKit(
+                path=own.device.path,
+                serial_number=own.device.serial_number,
+                zero_slots=ZERO_SLOTS,
+                frame_period_s=own.frame_period_s,
+                on_event=self._on_link(name),
+                on_raw=self._on_raw(name),
+                **({"on_frame": partial(pair.take, name)} if pair is not None else {}),
+            )
             return FingertipTask(
                 board,
-                estimation(name, estimator, lambda: board.period_s),
-                self.publisher,
-                **({"room": self._both.room} if self._both is not None and name in self._both.sides else {}),
-                always_heatmap=config.fingertips[name].heatmap == "always",
+                estimator_task(name, estimator, lambda: board.period_s),
+                publisher,
+                **({"room": pair.room} if pair is not None and name in pair.sides else {}),
+                always_heatmap=own.heatmap == "always",
             )
 
-        self._fingertips = {name: fingertip(name, estimator) for name, estimator in estimators.items()}
+        self._fingertips = {name: fingertip_task(name, estimator) for name, estimator in estimators.items()}
         self._estimations = {name: task.estimation for name, task in self._fingertips.items()}
-        if self._both is not None:
-            self._estimations[COMBINED] = self._both.estimation
-
-    def _make_commands(self) -> Commands:
-        tares: dict[str, Callable[[], None]] = {name: one.tare for name, one in self._estimations.items()}
-        if self._skin is not None:
-            tares[SKIN] = self._skin.tare
-        if self._load_cell is not None:
-            tares[LOAD_CELL] = self._load_cell.tare
-        return Commands(
-            rig=self._rig,
-            tares=tares,
-            fingertips=self._fingertips,
-            experiment=self._config.experiment,
-            start=self.start_experiment,
-            call_off_experiment=self._call_off_experiment,
-            tasks=self.health.tasks,
-            stop=self.stop,
-        )
-
-    def _make_health(self) -> HealthReporter:
-        health = HealthReporter(self.publisher, self.supervisor, self._clock)
         for name, task in self._fingertips.items():
-            health.add(name, task.diagnostics)
-        if self._both is not None:
-            health.add(COMBINED, self._both.diagnostics)
-        if self._skin is not None:
-            health.add(SKIN, self._skin.diagnostics)
-            health.add(SKIN_SOURCE, self._skin.source_diagnostics)
-        if self._load_cell is not None:
-            health.add(LOAD_CELL, self._load_cell.diagnostics)
+            self._add(name, task.read, task.diagnostics, task.estimation.tare)
+            self._add(f"{name}.estimator", task.estimate)
+        if pair is not None:
+            self._estimations[COMBINED] = pair.estimation
+            self._add(COMBINED, pair.estimate, pair.diagnostics, pair.estimation.tare)
+        self._skin: SkinTask | None = None
+        if config.skin is not None:
+            self._skin = SkinTask(config.skin, publisher, clock, on_torque, self._on_raw)
+            self._add(SKIN, self._skin.read, self._skin.diagnostics, self._skin.tare)
+            self._add(SKIN_SOURCE, self._skin.watch_source, self._skin.source_diagnostics)
+        load_cell = self._rig.load_cell if self._rig is not None else None
+        if self._rig is None and config.load_cell is not None:
+            # Measured and recorded while another machine twists.
+            on_link, on_raw = self._on_link(LOAD_CELL), self._on_raw(LOAD_CELL)
+            load_cell = make_load_cell(config.load_cell, publisher, clock, on_torque, on_link, on_raw)
+        if load_cell is not None:
+            self._add(LOAD_CELL, load_cell.read, load_cell.diagnostics, load_cell.tare)
         if self._rig is not None:
-            health.add("robot", self._rig.runner.diagnostics)
             if self._rig.gripper is not None:
-                health.add("gripper", self._rig.gripper.diagnostics)
+                self._add("gripper", self._rig.gripper.read, self._rig.gripper.diagnostics)
+            self._add("robot", self._rig.robot.run, self._rig.runner.diagnostics)
+            self._add("loop", self._rig.runner.run)
+
+    def _add_service_tasks(self) -> None:
+        if self._rig is not None and self._config.experiment is not None:
+            ended = self._rig.runner.experiment_ended
+            self._experiment = ConfiguredExperiment(self._config.experiment, self.start_experiment, ended)
+            self._add("experiment", partial(self._run_experiment, self._experiment))
         if self._recorder is not None:
-            health.add("recording", self._recorder.diagnostics)
-        health.add("commands", self._command_facts)
-        return health
+            self._add("recording", self._recorder.run, self._recorder.diagnostics)
+        self._add("commands", self._commands.run, self._command_diagnostics)
+        if self._authenticator is not None:
+            self._add("keys", self._authenticator.run)
+        if self._open_stop is not None:
+            self._add("open_stop", self._open_stop.run)
+        self._add("health", self.health.run)
 
     async def run(self, on_ready: Callable[[], None] = lambda: None) -> None:
         """Run until `stop`, then end every task and close the sockets; `on_ready` is called once the tasks run."""
@@ -199,7 +213,10 @@ class Daemon:
 
     async def _run_tasks(self, on_ready: Callable[[], None]) -> None:
         async with asyncio.TaskGroup() as group:
-            running = [group.create_task(task, name=name) for name, task in self._tasks()]
+            running = [
+                group.create_task(self.supervisor.keep_running(name, run), name=name)
+                for name, run in self._tasks.items()
+            ]
             structlog.get_logger().info("running", fingertips=list(self._fingertips))
             on_ready()
             notify("READY=1")
@@ -226,34 +243,6 @@ class Daemon:
         """Wait for a call of `stop`."""
         await self._stop.wait()
 
-    def _tasks(self) -> Iterator[tuple[str, Any]]:
-        def supervised(name: str, run: Callable[[], Any]) -> tuple[str, Any]:
-            return name, self.supervisor.keep_running(name, run)
-
-        for name, task in self._fingertips.items():
-            yield supervised(name, task.read)
-            yield supervised(f"{name}.estimator", task.estimate)
-        if self._both is not None:
-            yield supervised(COMBINED, self._both.estimate)
-        if self._skin is not None:
-            yield supervised(SKIN, self._skin.read)
-            yield supervised(SKIN_SOURCE, self._skin.watch_source)
-        if self._load_cell is not None:
-            yield supervised(LOAD_CELL, self._load_cell.read)
-        if self._rig is not None:
-            for name, run in self._rig.tasks():
-                yield supervised(name, run)
-            if self._experiment is not None:
-                yield supervised("experiment", partial(self._run_experiment, self._experiment))
-        if self._recorder is not None:
-            yield supervised("recording", self._recorder.run)
-        yield supervised("commands", self._commands.run)
-        if self._gate is not None:
-            yield supervised("keys", self._gate.run)
-        if self._open_stop is not None:
-            yield supervised("open_stop", self._open_stop.run)
-        yield supervised("health", self.health.run)
-
     async def _run_experiment(self, experiment: ConfiguredExperiment) -> None:
         await experiment.run()
         if self._config.stop_when_done:
@@ -277,11 +266,27 @@ class Daemon:
         """Cancel the automatic start of the configured experiment; return it, or None if it was not awaited."""
         return self._experiment.call_off() if self._experiment is not None else None
 
-    def _tap(self, source: str) -> OnRaw:
+    def _open_recorder(self) -> Recorder | None:
+        """Return the recorder, if one is configured; raises UserError if it cannot write."""
+        if self._config.recording is None:
+            return None
+        recorder = Recorder(
+            self._config.recording.folder,
+            daemon_identity(self._config),
+            self._clock,
+            is_busy=self._experiment_runs,
+            on_failure=self._on_recording_error,
+        )
+        self.publisher.add_listener(recorder.record_message)
+        return recorder
+
+    def _on_raw(self, source: str) -> OnRaw:
         return ignore_raw if self._recorder is None else self._recorder.input_recorder(source)
 
-    def _busy(self) -> bool:
-        """Return whether an experiment is running."""
+    def _on_link(self, device: str) -> Callable[[LinkEvent], None]:
+        return self._rig.on_link(device) if self._rig is not None else partial(log_link, device)
+
+    def _experiment_runs(self) -> bool:
         experiment = self._rig.control_loop.experiment if self._rig is not None else None
         return experiment is not None and experiment.running
 
@@ -295,57 +300,22 @@ class Daemon:
         for path in self._recorder.finished:
             structlog.get_logger().info("recorded", file=str(path))
         if self._recorder.failure:
-            structlog.get_logger().error("the recording could not be finished", why=self._recorder.failure)
+            structlog.get_logger().error("the recording could not be finished", reason=self._recorder.failure)
 
-    def _on_link(self, device: str) -> Callable[[LinkEvent], None]:
-        return self._rig.on_link(device) if self._rig is not None else partial(log_link, device)
-
-    def _command_facts(self) -> TaskFacts:
+    def _command_diagnostics(self) -> TaskFacts:
         """Return the numbers of refused commands and clients, by kind."""
         refused = self._commands.refused.copy()
-        for other in (self._gate, self._open_stop):
+        for other in (self._authenticator, self._open_stop):
             if other is not None:
                 refused.update(other.refused)
         return {"errors": dict(refused)}
 
-    async def _tare_to_the_end(self) -> str:
-        tares = [one.tare_to_the_end() for one in self._estimations.values()]
+    async def _tare(self) -> str:
+        """Zero fingertips and skin; return the errors, or an empty string."""
+        tares = [estimation.tare_to_the_end() for estimation in self._estimations.values()]
         if self._skin is not None:
             tares.append(self._skin.zero())
         return " ".join(filter(None, await asyncio.gather(*tares)))
-
-
-def _recorder(
-    config: DaemonConfig,
-    publisher: Publisher,
-    clock: Clock,
-    busy: Callable[[], bool],
-    on_failure: Callable[[str], None],
-) -> Recorder | None:
-    """Return the recorder, if one is configured; raises UserError if it cannot write."""
-    if config.recording is None:
-        return None
-    recorder = Recorder(config.recording.folder, daemon_identity(config), clock, is_busy=busy, on_failure=on_failure)
-    publisher.add_listener(recorder.record_message)
-    return recorder
-
-
-def _board(
-    config: FingertipConfig,
-    name: str,
-    on_event: Callable[[LinkEvent], None],
-    tap: OnRaw,
-    both: CombinedFingertipTask | None,
-) -> EitKit:
-    return EitKit(
-        path=config.device.path,
-        serial_number=config.device.serial_number,
-        zero_slots=ZERO_SLOTS,
-        frame_period_s=config.frame_period_s,
-        on_event=on_event,
-        on_raw=tap,
-        **({"on_frame": partial(both.take, name)} if both is not None else {}),
-    )
 
 
 async def run_daemon(

@@ -1,7 +1,7 @@
 """The rig: builds load cell, gripper, robot and control loop from the configuration, and checks its experiment."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 
 from shearloop.bank.estimation import Measured
@@ -160,13 +160,6 @@ class Rig:
             self._set_link(device, event.up, event.sentence)
 
         return on_event
-
-    def tasks(self) -> Iterator[tuple[str, Callable[[], Awaitable[None]]]]:
-        """Yield name and coroutine function of every task except the load cell's, which may run without a rig."""
-        if self.gripper is not None:
-            yield "gripper", self.gripper.read
-        yield "robot", self.robot.run
-        yield "loop", self.runner.run
 
     async def tare(self) -> str:
         """Zero every torque sensor; return the errors, or an empty string."""

@@ -100,16 +100,16 @@ class TwistPlayer:
         self._gripper.command = ACTIVATE
         while self._gripper.sta != 3:
             self._step()
-        self._still(IDLE_S)
+        self._hold_still(IDLE_S)
         self._gripper.command = GRIP
-        self._still(SETTLE_S)
+        self._hold_still(SETTLE_S)
         for angle_rad in self._angles():
             self._turn_to(angle_rad, self._random.uniform(*SPEEDS_RAD_PER_S))
-            self._still(self._random.uniform(*HOLDS_S))
+            self._hold_still(self._random.uniform(*HOLDS_S))
         self._turn_to(0.0, 0.2)
-        self._still(SETTLE_S)
+        self._hold_still(SETTLE_S)
         self._gripper.command = _OPEN
-        self._still(IDLE_S)
+        self._hold_still(IDLE_S)
 
     def _angles(self) -> Iterator[float]:
         """Yield angles over the whole range in random order, with a zero after every third."""
@@ -124,7 +124,7 @@ class TwistPlayer:
             self._wrist_rad = angle_rad if abs(angle_rad - self._wrist_rad) <= abs(step) else self._wrist_rad + step
             self._step()
 
-    def _still(self, seconds: float) -> None:
+    def _hold_still(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
             self._step()
 

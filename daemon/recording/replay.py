@@ -340,13 +340,12 @@ class Replay:
         elif event.raw is not None:
             self._clock.set(event.t_mono_ns)
             await self._pipeline.process(event.source, event.raw)
-        elif event.topic in COMPUTED_TOPICS and self._run.has_inputs and self._is_computed(event.source):
+        elif (
+            event.topic in COMPUTED_TOPICS and self._run.has_inputs and event.source in self._pipeline.published_sources
+        ):
             self.comparison.compare(event)
         elif event.topic != EitHeatmap.topic:
             self._publisher.forward(event.topic, restored_wire_map(event.content))
-
-    def _is_computed(self, source: str) -> bool:
-        return source in self._pipeline.published_sources
 
 
 def restored_wire_map(content: Mapping[str, Any]) -> dict[str, Any]:

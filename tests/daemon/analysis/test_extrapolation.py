@@ -1,4 +1,4 @@
-"""Beyond the torques calibrated on: which slices are calibrated on and which judged, and what is drawn of it."""
+"""Torques beyond the calibrated ones: the parts to calibrate on, their results and the picture."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -71,10 +71,10 @@ def test_chosen_slices_keep_their_own_torques(slices: FrameSeries) -> None:
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
     slices: FrameSeries, bank: Bank, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # Of a twentieth no estimator can be made.
+    # A twentieth is too few for an estimator.
     monkeypatch.setattr(slice_stability, "CALIBRATED_SHARES", (0.5, 0.05))
     some = slices.between(0, 40)
-    # A slice whose torque nobody knows is neither.
+    # A slice of unknown torque is in neither part.
     torque_nm = some.torque_nm.copy()
     torque_nm[3] = np.nan
     whole = replace(some, torque_nm=torque_nm)

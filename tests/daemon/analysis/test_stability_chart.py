@@ -91,7 +91,7 @@ def test_an_electrode_touches_its_own_injections_and_pairs() -> None:
     assert 28 * 2 < lost_channels(np.array([3])).sum() < 28 * 5
 
 
-def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts, bank) -> None:
+def test_unreported_lost_electrodes_never_pass_silently(parts, bank) -> None:
     stream = next(one for one in parts if one.past.kind == "raw")
     (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
     scene = scene_for(stream, bank)
@@ -103,7 +103,7 @@ def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts,
 
 
 @pytest.mark.usefixtures("fonts", "few_mixtures")
-def test_the_mean_of_cells_alike_does_not_hop_and_the_rims_are_walked(parts, bank, scratch) -> None:
+def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, bank, scratch) -> None:
     slices = parts[0]
     calibrations = fitted(slices, ("bank", "fused"), Physics(bank, None))
     found = walks(slices, bank, calibrations)
@@ -129,7 +129,7 @@ def drifting(n: int, seed: int) -> FrameSeries:
 
 
 @pytest.mark.usefixtures("fonts")
-def test_the_share_of_a_foreign_frame_that_passes_is_the_one_that_its_size_allows() -> None:
+def test_the_passing_share_of_a_foreign_frame_follows_from_its_size() -> None:
     """Off the slices' directions nothing but the foreign part stands out: its square adds to that of the noise."""
     series = drifting(100, 4)
     found = detect_mixtures(series, origins=(0.6,))

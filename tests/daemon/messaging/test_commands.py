@@ -147,7 +147,7 @@ def test_foreign_messages_are_an_error(tmp_path: Path) -> None:
 async def test_only_heatmap_can_be_set(config: Callable[..., Path]) -> None:
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(config()), context)
-        change = daemon._make_commands().handlers()["set"]
+        change = daemon.commands.handlers()["set"]
         assert not daemon._fingertips["right"].always_heatmap
         assert await change({"heatmap": "always"}) == {"set": ["right"], "heatmap": "always"}
         assert daemon._fingertips["right"].always_heatmap

@@ -63,7 +63,7 @@ def earlier(slices) -> Callable[[Name, int], Calibration]:
 def cylinders(shared, tmp_path_factory) -> dict[int, FrameSeries]:
     folder, out = shared / "recordings/streams/cylinders", tmp_path_factory.mktemp("cylinders")
     for mm in (10, 20, 30, 40):
-        import_mat(sorted(folder.glob(f"{mm}mm_*.mat")), out / f"{mm}.mcap")
+        import_mat(sorted(folder.glob(f"{mm}mm_1_*.mat")), out / f"{mm}.mcap")
     return {mm: series_of(read_recording(out / f"{mm}.mcap")) for mm in (10, 20, 30, 40)}
 
 

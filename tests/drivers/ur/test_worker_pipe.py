@@ -1,6 +1,6 @@
 """The pipe of the robot's own process: what waits for what, what is dropped, and what is bounded."""
 
-from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, WristSpeed
 from tests.drivers.ur.flight import Flight, flying
 from tests.drivers.ur.process import Daemon
@@ -22,7 +22,7 @@ def test_each_command_is_answered_at_once(daemon: Daemon) -> None:
     flight = flying()
     for acceleration, accepted in ((4.0, True), (-4.0, False)):
         daemon.say(WristSpeed(0.1, acceleration))
-        child._handle_commands(daemon.pipe, flight.handler, flight.state)
+        worker._handle_commands(daemon.pipe, flight.handler, flight.state)
         assert [message.accepted for _, message in daemon.hear() if isinstance(message, CommandReply)] == [accepted]
 
 

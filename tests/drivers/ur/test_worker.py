@@ -4,7 +4,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Message, RtdeSample, Unlock, WristSpeed
 from tests.drivers.ur.process import CyclingArm, Daemon, fly
 
@@ -123,7 +123,7 @@ def test_program_of_somebody_else_is_not_stopped_by_a_process_that_leaves(daemon
 
 CRASHING = """
 import threading
-from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import Configure
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
@@ -133,14 +133,14 @@ class Arm(FakeArm):
 
 # As the client's threads may, this one keeps the interpreter from ending.
 threading.Thread(target=threading.Event().wait).start()
-child._receive_configuration = lambda pipe: Configure(SETTINGS)
-child._connect = lambda pipe, settings: Arm()
-child.main()
+worker._receive_configuration = lambda pipe: Configure(SETTINGS)
+worker._connect = lambda pipe, settings: Arm()
+worker.main()
 """
 
 
 def test_exception_ends_the_process_at_once_and_is_told() -> None:
     command = [sys.executable, "-c", CRASHING]
     ended = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, timeout=30, check=False)
-    assert ended.returncode == child.EXIT_FAILED
+    assert ended.returncode == worker.EXIT_FAILED
     assert b"ValueError: what nobody thought of" in ended.stderr

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, RtdeSample, Unlock, WristSpeed
 from tests.drivers.ur.process import Daemon, Timed, TimedArm
@@ -23,7 +23,7 @@ def test_a_late_cycle_begins_at_once_and_is_not_caught_up_with(daemon: Daemon, m
     class Slow(TimedArm):
         def read(self) -> RtdeSample:
             if len(self.read_s) == 10:
-                child.time.sleep(0.0441)
+                worker.time.sleep(0.0441)
             return super().read()
 
     timed = Timed(daemon, monkeypatch, (0.3, Disconnect()), arm=Slow())
@@ -38,7 +38,7 @@ def test_a_command_is_carried_out_when_it_comes_and_again_in_each_cycle(
 
     class Turned(TimedArm):
         def wrist(self, command: WristSpeed) -> bool:
-            sent_s.append(child.time.monotonic() - 1000.0)
+            sent_s.append(worker.time.monotonic() - 1000.0)
             return super().wrist(command)
 
     Timed(daemon, monkeypatch, (0.1, Enable()), (0.203, WristSpeed(0.1, 4.0)), (0.3, Disconnect()), arm=Turned())
@@ -52,11 +52,11 @@ def test_a_stop_that_the_readings_tell_later_than_the_commands_is_told_as_what_i
 ) -> None:
     class Late(TimedArm):
         def wrist(self, command: WristSpeed) -> bool:
-            self.takes = child.time.monotonic() < 1000.0 + stopped_s
+            self.takes = worker.time.monotonic() < 1000.0 + stopped_s
             return super().wrist(command)
 
         def read(self) -> RtdeSample:
-            if child.time.monotonic() > 1000.003 + stopped_s and self.reading.safety_mode == 1:
+            if worker.time.monotonic() > 1000.003 + stopped_s and self.reading.safety_mode == 1:
                 self.protective_stop()
             return super().read()
 
@@ -72,7 +72,7 @@ def test_what_happens_is_told_in_the_cycle_that_sees_it(
 ) -> None:
     class Stopping(TimedArm):
         def read(self) -> RtdeSample:
-            if child.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
+            if worker.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
                 self.protective_stop()
             return super().read()
 

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.sensing.both import COMBINED
+from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S, TRANSFER_NS
 
 MEASUREMENTS = ("commands", "latency", "flood", "rated", "twisting")
@@ -195,7 +195,9 @@ def by_bank(args: argparse.Namespace, matching: str) -> dict[str, Any]:
 def by_default(args: argparse.Namespace, sides: Sequence[str]) -> dict[str, Any]:
     """Return the configuration of fingertips with the default estimator, and of the combined one for several."""
     rig = args.rig.resolve()
-    fingertips = {side: {"calibration": str(rig / f"rig-{side}.cal"), "estimator": "fused"} for side in sides}
+    fingertips = {
+        side: {"calibration": str(rig / f"rig-{side}.cal"), "estimator": "motion_regression"} for side in sides
+    }
     combined = {COMBINED: {"calibration": str(rig / "rig.cal")}} if len(sides) > 1 else {}
     return {"fingertips": fingertips, **combined}
 

@@ -121,8 +121,8 @@ def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Pat
     # The same maximum: the same torques.
     assert fast["rmse_nm"] == paper["rmse_nm"]
     assert fast["latency_ratio"] == fast["latency_ms"] / paper["latency_ms"]
-    assert {"rank 8", "zero lag, float16", "64 channels", "fused"} <= set(by_name)
-    assert {"fused, right", "fused, both"} <= {row["name"] for row in stream}
+    assert {"rank 8", "zero lag, float16", "64 channels", "motion_regression"} <= set(by_name)
+    assert {"motion_regression, right", "motion_regression, both"} <= {row["name"] for row in stream}
     errors = {row["name"]: row["error"] for row in content["forward"]}
     assert errors["direct, 0.4 cm"] > errors["direct, 0.2 cm"] > 0
     assert errors["batch, 0.2 cm"] == pytest.approx(errors["direct, 0.2 cm"], rel=1e-6)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, FrameSeries, fit
-from shearloop.daemon.analysis.evaluation import follow, judge
+from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import series_of
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
@@ -155,8 +155,10 @@ def record(
 
 def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
     """Return the default estimator's calibration for these fingertips."""
-    chosen = [one.of_sides(sides) for one in recordings]
-    return fit("fused", chosen, "the emulated rig, by shearloop.daemon.cli.demo_calibration", timed_by=recordings)
+    chosen = [one.select_sides(sides) for one in recordings]
+    return fit(
+        "motion_regression", chosen, "the emulated rig, by shearloop.daemon.cli.demo_calibration", timed_by=recordings
+    )
 
 
 def main() -> None:
@@ -178,7 +180,7 @@ def main() -> None:
         calibration = calibrate(recordings, sides)
         path = args.out / ("rig.cal" if sides == both else f"rig-{sides[0]}.cal")
         calibration.save(path)
-        figures = judge([follow(calibration, one) for one in apart])
+        figures = figures_of([estimate_series(calibration, one) for one in apart])
         print(
             f"{path}: torque ± {figures['rmse_nm']:.4f} N·m, diameter ± {figures['diameter_rmse_mm']:.1f} mm, "
             f"valid {figures['valid_fraction']:.2f} of the frames, intervals cover {figures['coverage_95']:.2f}"

@@ -20,7 +20,6 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.eit.polynomial import Polynomial
-from shearloop.bank.eit.stored import check_made_with, check_version
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
@@ -190,8 +189,16 @@ class Calibration:
         header, arrays = _read_members(path)
         if header.get("kind") != _FILE_KIND:
             raise CalibrationError(f"{path} is not an estimator's calibration: make one with `shearloop calibrate`")
-        check_version(path, header, FORMAT_VERSION)
-        check_made_with(path, header, {"channel_table": CHANNEL_TABLE_HASH})
+        version, table = header.get("format_version"), str(header.get("channel_table"))
+        if version != FORMAT_VERSION:
+            raise CalibrationError(
+                f"{path}: the calibration has format version {version}, expected {FORMAT_VERSION}; calibrate again"
+            )
+        if table != CHANNEL_TABLE_HASH:
+            raise CalibrationError(
+                f"{path}: the calibration was made with the channel table {table[:12]}…, expected "
+                f"{CHANNEL_TABLE_HASH[:12]}…; calibrate again"
+            )
         try:
             restored: Self = _from_plain(cls, header["content"], "", arrays)
         except (KeyError, TypeError, ValueError, IndexError, StopIteration, CalibrationError) as error:

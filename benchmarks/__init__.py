@@ -1,6 +1,6 @@
-"""Measurements: scripts that write their numbers as JSON and draw their charts; without a `main`, parts of those."""
+"""Benchmarks: scripts that print their figures and write them as JSON."""
 
 import os
 
-# As the command line does, before numpy is loaded: what is compared is compared on one thread each.
+# Before numpy is loaded, as on the command line: all methods run on one thread.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -28,36 +28,23 @@ import yaml
 import zmq
 from numpy.typing import NDArray
 
-from shearloop.daemon.messaging.client import send_command
 from shearloop.daemon.messaging.messages import decode
 from shearloop.daemon.recording.reader import read_recording
-from shearloop.daemon.sensing.both import COMBINED
+from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S, TRANSFER_NS
 
-MEASUREMENTS = ("commands", "latency", "flood", "rated", "twisting")
+MEASUREMENTS = ("commands", "latency", "flood", "rated")
 REPEATS = 5
 READY_S = 30.0
 # Between frames: long enough for the daemon to be idle again.
 PAUSE_S = 0.03
 FLOOD_HZ = 500.0
 USB_PACKET_BYTES = 512
-# Before processor time counts: until everything is connected, and until the experiment has gripped its tool.
-SETTLING_S, GRIPPING_S = 10.0, 15.0
+# Before processor time counts: until everything is connected.
+SETTLING_S = 10.0
 RIG_RECORDING, RIG_BANK = "rig-25mm.mcap", "demo.bank"
 # Idle frames to skip, and the number of frames until the default estimator is valid in the grip.
 FIRST_FRAME, FIRST_VALID_FRAME = 12, 28
-TWISTS = {
-    "name": "twists",
-    "torque_source": "load_cell",
-    "limits": {"torque_nm": 0.3, "angle_rad": 0.5},
-    "steps": [
-        {"do": "release", "timeout_s": 15},
-        {"do": "tare", "timeout_s": 30},
-        {"do": "approach", "along_tool_m": 0.03, "timeout_s": 15},
-        {"do": "grip", "width_mm": 5, "force_n": 60, "timeout_s": 15},
-        {"do": "twist", "angles_rad": [0.15, 0.0], "speed_rad_per_s": 0.2, "hold_s": 2, "repeats": 1000},
-    ],
-}
 _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
@@ -195,7 +182,9 @@ def by_bank(args: argparse.Namespace, matching: str) -> dict[str, Any]:
 def by_default(args: argparse.Namespace, sides: Sequence[str]) -> dict[str, Any]:
     """Return the configuration of fingertips with the default estimator, and of the combined one for several."""
     rig = args.rig.resolve()
-    fingertips = {side: {"calibration": str(rig / f"rig-{side}.cal"), "estimator": "fused"} for side in sides}
+    fingertips = {
+        side: {"calibration": str(rig / f"rig-{side}.cal"), "estimator": "motion_regression"} for side in sides
+    }
     combined = {COMBINED: {"calibration": str(rig / "rig.cal")}} if len(sides) > 1 else {}
     return {"fingertips": fingertips, **combined}
 
@@ -285,11 +274,8 @@ def flood(args: argparse.Namespace, n_frames: int) -> dict[str, Any]:
     }
 
 
-def rated(bank: Path, rig_bank: Path, seconds: float, *, twisting: bool = False) -> dict[str, float]:
-    """Return processor time and memory with the whole emulated rig at its rated speeds, recording.
-
-    No experiment runs, or one that twists a tool to and fro.
-    """
+def rated(bank: Path, rig_bank: Path, seconds: float) -> dict[str, float]:
+    """Return processor time and memory with the whole emulated rig at its rated speeds, recording."""
     with tempfile.TemporaryDirectory() as name, contextlib.ExitStack() as opened:
         folder = Path(name)
         host = f"127.{os.getpid() >> 14 & 63 | 192}.{os.getpid() >> 7 & 127}.{1 + os.getpid() % 128}"
@@ -320,10 +306,6 @@ def rated(bank: Path, rig_bank: Path, seconds: float, *, twisting: bool = False)
         pid, ready_s = opened.enter_context(running_daemon(config))
         health = opened.enter_context(subscription(folder, "health"))
         _listen(health, SETTLING_S)
-        if twisting:
-            (folder / "twists.yaml").write_text(yaml.safe_dump(TWISTS))
-            _start(f"ipc://{folder}/commands", folder / "twists.yaml")
-            _listen(health, GRIPPING_S)
         before, begun = {each: cpu_s(each) for each in process_tree(pid)}, time.monotonic()
         _listen(health, seconds)
         took_s = time.monotonic() - begun
@@ -343,15 +325,6 @@ def _listen(health: "zmq.Socket[bytes]", seconds: float) -> None:
     until = time.monotonic() + seconds
     while time.monotonic() < until:
         receive(health)
-
-
-def _start(commands: str, experiment: Path) -> None:
-    """Start an experiment, unlocking as the operator does."""
-    until = time.monotonic() + SETTLING_S
-    while not (reply := send_command(commands, {"command": "start", "experiment": str(experiment)}, SETTLING_S))["ok"]:
-        if time.monotonic() > until:
-            raise RuntimeError(reply["reason"])
-        send_command(commands, {"command": "unlock"}, SETTLING_S)
 
 
 def command_s(*arguments: str, repeats: int = 1) -> float:
@@ -390,8 +363,6 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         found["flood"] = flood(args, 10 * args.frames)
     if "rated" in args.only:
         found["rated"] = rated(args.bank, args.rig / RIG_BANK, args.rated_s)
-    if "twisting" in args.only:
-        found["twisting"] = rated(args.bank, args.rig / RIG_BANK, args.rated_s, twisting=True)
     return found
 
 

@@ -14,13 +14,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import FrameSeries, Name, Physics, fit
-from shearloop.bank.estimation.ranking import accuracy_over_channels
-from shearloop.daemon.analysis.evaluation import EstimateTrack, follow, judge
-from shearloop.daemon.analysis.figure import draw
+from shearloop.bank.estimation.interval_regressor import STRENGTHS
+from shearloop.bank.estimation.regressors import Ridge, best_strength, later_splits, ranked_channels
+from shearloop.daemon.analysis.evaluate import EstimateTrack, draw_tracks, estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli.demo_calibration import calibrate, record
 from shearloop.daemon.recording.importing import import_mat
@@ -28,7 +31,7 @@ from shearloop.daemon.recording.reader import read_recording
 from shearloop.drivers.emulators.rig import SIDES
 
 Figures = dict[str, float | int | None]
-DEFAULT: Name = "fused"
+DEFAULT: Name = "motion_regression"
 
 # Three and four of five repeats; about half of the cylinders' slices; five of ten twists.
 SLICE_SHARES = (0.592, 0.796)
@@ -100,7 +103,7 @@ def later_frames(
             except BankError as error:
                 print(f"{split.title}, {name}: {error}")
                 continue
-            yield split.title, name, follow(calibration, split.future, physics.bank)
+            yield split.title, name, estimate_series(calibration, split.future, physics.bank)
 
 
 def other_day(recordings: Path, scratch: Path) -> Iterator[tuple[str, Figures | str]]:
@@ -115,11 +118,11 @@ def other_day(recordings: Path, scratch: Path) -> Iterator[tuple[str, Figures | 
         for sides in FINGERTIPS:
             title = f"{name}, {' and '.join(sides)}"
             try:
-                calibration = fit(DEFAULT, [series.of_sides(sides)], name, timed_by=[series])
+                calibration = fit(DEFAULT, [series.select_sides(sides)], name, timed_by=[series])
             except BankError as error:
                 yield title, str(error)
                 continue
-            yield title, judge([follow(calibration, exchanged.of_sides(sides))])
+            yield title, figures_of([estimate_series(calibration, exchanged.select_sides(sides))])
 
 
 def other_tools(bank: Path, seed: int, repeats: int) -> Iterator[tuple[int, tuple[str, ...], Figures]]:
@@ -129,15 +132,28 @@ def other_tools(bank: Path, seed: int, repeats: int) -> Iterator[tuple[int, tupl
         seeds = [seed + 1000 * (1 + number) + 100 * i for i in range(repeats)]
         known = [[one.series(mm) for mm, one in record(bank, each, cylinders_mm)] for each in seeds]
         for sides in (tuple(SIDES), *((side,) for side in SIDES)):
-            tracks = [follow(calibrate(one, sides), tool) for one in known for tool in tools]
-            yield len(cylinders_mm), sides, judge(tracks)
+            tracks = [estimate_series(calibrate(one, sides), tool) for one in known for tool in tools]
+            yield len(cylinders_mm), sides, figures_of(tracks)
 
 
 def over_channels(torque: FrameSeries) -> dict[int, float]:
     """Return r on the later slices by number of channels, ranked on the earlier ones (the paper's figure 3b)."""
     past, future = part_of(torque, 0, SLICE_SHARES[0]), part_of(torque, SLICE_SHARES[0], 1)
-    pair = [(one.channels[:, 0], one.torque_at_frames()) for one in (past, future)]
-    return accuracy_over_channels(pair[0], pair[1], CHANNEL_COUNTS)
+    frames, values = past.channels[:, 0], past.torque_at_frames()
+    order = ranked_channels(frames, values)
+    splits = list(later_splits(len(values)))
+    found = {}
+    for count in CHANNEL_COUNTS:
+        best = frames[:, order[:count]]
+
+        def error(strength: float, rows: IntArray, later: IntArray, best: FloatArray = best) -> float:
+            ridge = Ridge.fit(best[rows], values[rows], strength)
+            return float(((ridge.predict(best[later]) - values[later]) ** 2).mean())
+
+        ridge = Ridge.fit(best, values, best_strength(STRENGTHS, error, splits))
+        predicted = ridge.predict(future.channels[:, 0][:, order[:count]])
+        found[count] = float(np.corrcoef(predicted, future.torque_at_frames())[0, 1])
+    return found
 
 
 def table_row(*cells: str | float | None) -> str:
@@ -163,7 +179,7 @@ def main() -> None:
         "| fitted to | estimator | r | RMSE, N·m or mm | bias, N·m | coverage | valid |\n|---|---|---|---|---|---|---|"
     )
     for title, name, track in later_frames(args.recordings, args.out, names, physics):
-        figures = judge([track])
+        figures = figures_of([track])
         found.setdefault(title, {})[name] = figures
         rmse = figures.get("diameter_rmse_mm", figures["rmse_nm"])
         columns = figures["r"], rmse, figures["bias_nm"], figures["coverage_95"], figures["valid_fraction"]
@@ -189,7 +205,7 @@ def main() -> None:
             print(table_row(count, " and ".join(sides), rmse_mm, coverage), flush=True)
     (args.out / "estimators.json").write_text(json.dumps(found, indent=1) + "\n")
     title = f"{DEFAULT}, on frames later than its fit"
-    draw(list(tracks.values()), [f"fitted to {name}" for name in tracks], title, args.out / "estimators.png")
+    draw_tracks(list(tracks.values()), [f"fitted to {name}" for name in tracks], title, args.out / "estimators.png")
 
 
 if __name__ == "__main__":

@@ -94,7 +94,7 @@ class RunningRig:
             "publish": f"ipc://{self.folder}/publish",
             "commands": f"ipc://{self.folder}/commands",
             "fingertips": {
-                "right": {"device": {"path": "eit-right"}, "estimator": "fused", "calibration": calibration}
+                "right": {"device": {"path": "eit-right"}, "estimator": "motion_regression", "calibration": calibration}
             },
             "load_cell": {"device": {"path": "load-cell"}},
             "robot": "ur.yaml",

@@ -27,15 +27,11 @@ from shearloop.daemon.messaging.publisher import Listener, Publisher
 from shearloop.daemon.recording.identity import AttachedFile, daemon_identity, experiment_notes
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.rig import Rig, check_experiment, make_load_cell
-from shearloop.daemon.sensing.both import COMBINED, CombinedFingertipTask
-from shearloop.daemon.sensing.estimation import EstimatorTask
-from shearloop.daemon.sensing.fingertip import FingertipTask
+from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator, torque_sources
+from shearloop.daemon.sensing.fingertip_task import CombinedFingertipTask, EstimatorTask, FingertipTask
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL
-from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
 from shearloop.daemon.sensing.skin_task import SKIN, SKIN_SOURCE, SkinTask
 from shearloop.daemon.sensing.tool_diameter import FingertipDiameters
-from shearloop.daemon.sensing.torque_sources import torque_sources
-from shearloop.daemon.sensing.tracking import TrackedEstimator
 from shearloop.daemon.service import notify
 from shearloop.daemon.signals import ending_signals
 from shearloop.daemon.supervisor import Supervisor
@@ -58,7 +54,7 @@ class Daemon:
         self._rig: Rig | None = None
         self._experiment: ConfiguredExperiment | None = None
         estimators = {name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()}
-        combined = open_both(config.combined, config.fingertips) if config.combined is not None else None
+        combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
         sources = torque_sources(config, estimators, combined)
         check_experiment(config, sources)
         with contextlib.ExitStack() as opened:
@@ -110,8 +106,8 @@ class Daemon:
 
     def _connect(
         self,
-        estimators: Mapping[str, AnyEstimator],
-        combined: TrackedEstimator | None,
+        estimators: Mapping[str, LiveEstimator],
+        combined: LiveEstimator | None,
         sources: Mapping[str, TorqueSource],
     ) -> None:
         """Create and connect the tasks of devices and estimators; no device is opened yet."""
@@ -119,23 +115,30 @@ class Daemon:
         diameters = FingertipDiameters(COMBINED)
         if config.robot is not None:
             dead_tasks = self.supervisor.deaths
-            self._rig = Rig(config, publisher, clock, sources, self._tare, dead_tasks, self._on_raw, diameters.at)
+            self._rig = Rig(config, publisher, clock, sources, self._tare, dead_tasks, self._on_raw, diameters.latest)
         on_torque = self._rig.control_loop.on_torque if self._rig is not None else lambda _: None
 
-        def estimator_task(name: str, estimator: AnyEstimator, period_s: Callable[[], float]) -> EstimatorTask:
-            task = EstimatorTask(
-                name, estimator, publisher, clock, period_s, on_torque, diameters.hear, self._on_raw(name)
+        gripper = self._rig.gripper if self._rig is not None else None
+
+        def estimator_task(name: str, estimator: LiveEstimator, period_s: Callable[[], float]) -> EstimatorTask:
+            return EstimatorTask(
+                name,
+                estimator,
+                publisher,
+                clock,
+                period_s=period_s,
+                on_torque=on_torque,
+                on_diameter=diameters.update,
+                held_tool=gripper.held_tool if gripper is not None else lambda _: None,
+                on_raw=self._on_raw(name),
             )
-            if self._rig is not None and self._rig.gripper is not None:
-                task.held_tool = self._rig.gripper.held_tool
-            return task
 
         pair: CombinedFingertipTask | None = None
         if combined is not None:
-            period_s = config.fingertips[combined.sides[0]].frame_period_s
-            pair = CombinedFingertipTask(estimator_task(COMBINED, combined, lambda: period_s), combined.sides, period_s)
+            period_s = config.fingertips[combined.calibration.sides[0]].frame_period_s
+            pair = CombinedFingertipTask(estimator_task(COMBINED, combined, lambda: period_s), period_s)
 
-        def fingertip_task(name: str, estimator: AnyEstimator) -> FingertipTask:
+        def fingertip_task(name: str, estimator: LiveEstimator) -> FingertipTask:
             own = config.fingertips[name]
             board = EitKit(
                 path=own.device.path,
@@ -144,24 +147,24 @@ class Daemon:
                 frame_period_s=own.frame_period_s,
                 on_event=self._on_link(name),
                 on_raw=self._on_raw(name),
-                **({"on_frame": partial(pair.take, name)} if pair is not None else {}),
+                **({"on_frame": partial(pair.on_frame, name)} if pair is not None else {}),
             )
             return FingertipTask(
                 board,
                 estimator_task(name, estimator, lambda: board.period_s),
                 publisher,
-                **({"room": pair.room} if pair is not None and name in pair.sides else {}),
+                pair,
                 always_heatmap=own.heatmap == "always",
             )
 
         self._fingertips = {name: fingertip_task(name, estimator) for name, estimator in estimators.items()}
-        self._estimations = {name: task.estimation for name, task in self._fingertips.items()}
+        self._estimators = {name: task.estimator_task for name, task in self._fingertips.items()}
         for name, task in self._fingertips.items():
-            self._add(name, task.read, task.diagnostics, task.estimation.tare)
+            self._add(name, task.read, task.diagnostics, task.estimator_task.tare)
             self._add(f"{name}.estimator", task.estimate)
         if pair is not None:
-            self._estimations[COMBINED] = pair.estimation
-            self._add(COMBINED, pair.estimate, pair.diagnostics, pair.estimation.tare)
+            self._estimators[COMBINED] = pair.estimator_task
+            self._add(COMBINED, pair.estimator_task.run, pair.diagnostics, pair.estimator_task.tare)
         self._skin: SkinTask | None = None
         if config.skin is not None:
             self._skin = SkinTask(config.skin, publisher, clock, on_torque, self._on_raw)
@@ -312,7 +315,7 @@ class Daemon:
 
     async def _tare(self) -> str:
         """Zero fingertips and skin; return the errors, or an empty string."""
-        tares = [estimation.tare_to_the_end() for estimation in self._estimations.values()]
+        tares = [task.tare_and_wait() for task in self._estimators.values()]
         if self._skin is not None:
             tares.append(self._skin.zero())
         return " ".join(filter(None, await asyncio.gather(*tares)))

@@ -8,7 +8,7 @@ from typing import Any
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.command_server import STATUS, STOP, CommandRefusedError, Handler, Reply, Request
 from shearloop.daemon.rig import Rig
-from shearloop.daemon.sensing.fingertip import FingertipTask
+from shearloop.daemon.sensing.fingertip_task import FingertipTask
 
 # The reply to the `stop` that ends the daemon is sent within this time.
 STOP_DELAY_S = 0.05

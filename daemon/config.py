@@ -58,7 +58,7 @@ class SerialDevice(ConfigModel):
         return self
 
 
-EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "fused"]
+EstimatorName = Literal["paper", "bank", "regression", "reconstruction", "motion_regression"]
 
 
 class CreepConfig(ConfigModel):

@@ -25,10 +25,9 @@ from shearloop.daemon.control.runner import WRENCH, ControlLoopRunner, wrench_so
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import log_event, log_link
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.both import COMBINED
+from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, LoadCellTask
 from shearloop.daemon.sensing.skin_task import SKIN
-from shearloop.daemon.sensing.tool_diameter import unknown
 from shearloop.drivers.connection import LinkEvent
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
@@ -102,7 +101,7 @@ class Rig:
         tare_fingertips: Callable[[], Awaitable[str]],
         dead_tasks: Callable[[], Mapping[str, str]],
         tap: Callable[[str], OnRaw] = lambda _: ignore_raw,
-        fingertip_diameter: Callable[[int], Measured | None] = unknown,
+        fingertip_diameter: Callable[[int], Measured | None] = lambda _: None,
     ) -> None:
         """Read the settings of every device; none is opened yet.
 

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.bank_file import Bank, BankDefinition
 from shearloop.bank.eit.build import RowSolver
-from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.channels import LINE_SLOTS, N_ELECTRODES, line_of_channels
 from shearloop.bank.eit.mesh import Mesh
+from shearloop.bank.estimation import Calibration
+from shearloop.bank.estimation.interval_regressor import PolynomialRegressor
 from shearloop.daemon.errors import UserError
 from shearloop.drivers.eit_kit import ADC_STEP_V
 
@@ -202,9 +203,11 @@ def _linear(bank: Bank, rest: float, largest: float) -> tuple[FloatArray, FloatA
 
 def _inverse(bank: Bank, path: Path) -> tuple[FloatArray, FloatArray]:
     """Return ascending torques and their σ: a calibration's curve, while it falls, over the bank's σ."""
-    curve = Calibration.load(path, bank_identity=bank.identity).torque_fit
-    if curve is None:
-        raise UserError(f"{path} was made without torques; calibrate with some, or give --sigma")
+    calibration = Calibration.load(path)
+    calibration.check_bank(bank)
+    if calibration.torque is None or not isinstance(calibration.torque.regressor, PolynomialRegressor):
+        raise UserError(f"{path} has no curve of torque over sigma; give --sigma instead")
+    curve = calibration.torque.regressor.polynomial
     low, high = _sigma_range(bank, (curve.x_low + curve.x_high) / 2)
     sigmas = np.linspace(high, low, N_PLACES)
     torques_nm = np.array([curve(sigma) for sigma in sigmas])

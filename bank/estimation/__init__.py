@@ -1,10 +1,10 @@
-"""Estimators: `fit` makes a calibration from recordings, a `EstimatorSession` turns frames into estimates with it."""
+"""Estimators: `fit` makes a calibration from recordings; an `EstimatorSession` turns frames into estimates with it."""
 
-from shearloop.bank.estimation.calibrated import NAMES, Calibration, Name
+from shearloop.bank.estimation.calibration import NAMES, Calibration, Name
 from shearloop.bank.estimation.fitting import fit
-from shearloop.bank.estimation.fitting_choices import Physics
+from shearloop.bank.estimation.fitting_raw import Physics
 from shearloop.bank.estimation.session import EstimatorSession
-from shearloop.bank.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, fused
+from shearloop.bank.estimation.values import Estimate, FrameSeries, Measured, TactileFrame, combine
 
 __all__ = [
     "NAMES",
@@ -16,6 +16,6 @@ __all__ = [
     "Name",
     "Physics",
     "TactileFrame",
+    "combine",
     "fit",
-    "fused",
 ]

@@ -5,119 +5,177 @@ from dataclasses import replace
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray
+from shearloop.bank.arrays import FloatArray, IntArray
+from shearloop.bank.eit.channels import N_CHANNELS, N_ELECTRODES
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.bank_match import BankMatcher
-from shearloop.bank.estimation.calibrated import Calibration, OutputModel, columns_for, features_of
-from shearloop.bank.estimation.contamination import ContaminationTest
-from shearloop.bank.estimation.fitting_choices import Physics, ks_of, locator_of, ridge_for, strengths_for
-from shearloop.bank.estimation.fitting_regressor import fit_reader
-from shearloop.bank.estimation.interval_regressor import Head
-from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.regressors import InverseCalibration, later_origins
-from shearloop.bank.estimation.soundness import parts_of
+from shearloop.bank.estimation.bank_match import BankMatcher, ElectrodeNumbering
+from shearloop.bank.estimation.calibration import Calibration, OutputModel, Quantity
+from shearloop.bank.estimation.fitting_raw import Physics, k_range, ridge_fit, strengths_for
+from shearloop.bank.estimation.interval_regressor import Mixtures, fit_interval_regressor
+from shearloop.bank.estimation.novelty import NoveltyDetector, fitted_parts
+from shearloop.bank.estimation.regressors import InverseCalibration, Regressor, later_origins
 from shearloop.bank.estimation.values import FrameSeries
 
-# The curve of frames over torque and over diameter: degree, directions of drift, and whether there is a trend. Of the
-# torque's the mean error over six origins (19 to 44 of 49 slices, judged on all that follow) was least for these
-# (docs/decisions/0042).
+# Inverse calibration over torque and over diameter: degree, directions of drift, trend. The torque's have the least
+# mean error over six origins (19 to 44 of 49 slices, evaluated on all later ones; docs/decisions/0042).
 _TORQUE_CURVE, _DIAMETER_CURVE = (3, 3, True), (1, 1, False)
-# With a block left out, as many are left as it takes to know what is familiar, or to determine the torque's curve.
+# With a block left out, enough remain for novelty detection, or for the torque's curve.
 _LEAST_TORQUE_SLICES, _LEAST_FOR_CURVE = 10, 14
+# Foreign frames: every eighth of a turn, plain and mirrored, except the own numbering. Of a few numberings alone the
+# result depends on the choice: single ones give half to twice the median.
+_NUMBERINGS = [(turn, mirrored) for turn in range(0, N_ELECTRODES, N_ELECTRODES // 8) for mirrored in (False, True)][1:]
+# Hardly any mixture with a larger share is accepted.
+_SHARES = (0.1, 0.2, 0.3)
+# Later slices of each origin that are mixed; twice as many give the same result.
+_MOST_LATER = 10
+_ALL = np.ones(N_CHANNELS, dtype=np.bool_)
 
 
 def fit_slices(
-    blank: Calibration, recordings: list[FrameSeries], physics: Physics, *, all_torques: bool = False
+    blank: Calibration, recordings: list[FrameSeries], physics: Physics, *, full_range: bool = False
 ) -> Calibration:
-    """Return a blank calibration with what slices in time order tell of torque and diameter.
+    """Return a blank calibration with torque and diameter fitted to slices in time order.
 
-    With `all_torques` none beyond them will come. Raises CalibrationError for slices of several fingertips, and for
-    too few.
+    With `full_range` no torque beyond theirs will occur. Raises CalibrationError for slices of several fingertips, and
+    for too few.
     """
     if len(blank.sides) > 1:
         raise CalibrationError(
-            f"slices of {len(blank.sides)} fingertips ({', '.join(blank.sides)}) do not go into one calibration; make "
+            f"slices of {len(blank.sides)} fingertips ({', '.join(blank.sides)}) do not fit into one calibration; make "
             "one for each"
         )
+    is_curve = blank.estimator == "motion_regression"
     frames = np.concatenate([one.channels for one in recordings])
     times = _consecutive([one.t_s for one in recordings])
     torque = np.concatenate([one.torque_at_frames() for one in recordings])
     diameter = np.concatenate([one.diameter_mm for one in recordings])
-    registered = locator_of(blank, physics)
-    tasks = {}
-    for name, values in (("torque", torque), ("diameter", diameter)):
-        # Cylinders were twisted too, at one torque each: that does not determine a torque.
-        known = np.isfinite(values) & (np.isfinite(diameter) if name == "diameter" else ~np.isfinite(diameter))
+    matcher = blank.matcher(physics.bank)
+    models: dict[Quantity, OutputModel] = {}
+    for quantity, values in _quantities(torque, diameter):
+        # Cylinders were twisted too, but at one torque each, which determines no torque.
+        known = np.isfinite(values) & (np.isfinite(diameter) if quantity == "diameter" else ~np.isfinite(diameter))
         if not known.any():
             continue
-        least = _LEAST_FOR_CURVE if blank.estimator == "fused" else _LEAST_TORQUE_SLICES
-        if name == "torque" and known.sum() < least:
+        n, least = int(known.sum()), _LEAST_FOR_CURVE if is_curve else _LEAST_TORQUE_SLICES
+        if quantity == "torque" and n < least:
             raise CalibrationError(
-                f"{known.sum()} slices with a torque are too few for the estimator {blank.estimator}; record {least} "
-                "or more"
+                f"{n} slices with a torque are too few for the estimator {blank.estimator}; record {least} or more"
             )
         differences = np.abs(frames[known])
-        # Before anything else is fitted to them: it looks whether they are slices of a board.
-        guard = NoveltyDetector.fit(differences[:, 0])
+        # First, because it checks that a board sent the slices.
+        novelty = NoveltyDetector.fit(differences[:, 0])
         features = np.array(
             [
-                features_of(blank, registered, one, None, t).features
-                for one, t in zip(differences, times[known].tolist(), strict=True)
+                blank.features(matcher, one, None, t_s)[0]
+                for one, t_s in zip(differences, times[known].tolist(), strict=True)
             ]
         )
-        columns = columns_for(blank.estimator, name, features)
-        later = _mixtures(blank, registered, differences[:, 0], times[known]) if name == "torque" else None
-        curve = _TORQUE_CURVE if name == "torque" else _DIAMETER_CURVE
-        if blank.estimator == "fused":
-            _check_distinct(name, values[known], curve[0])
-        reader = fit_reader(
-            columns,
+        test = None
+        if quantity == "torque":
+            test = ContaminationTest(differences[:, 0], _features_of(blank, matcher, times[known]))
+        degree, n_drift, trend = _TORQUE_CURVE if quantity == "torque" else _DIAMETER_CURVE
+        if is_curve:
+            _check_distinct(quantity, values[known], degree)
+        regressor = fit_interval_regressor(
+            blank.columns(quantity, features),
             values[known],
-            _curve(curve) if blank.estimator == "fused" else ridge_for(blank.estimator),
+            _curve_fit(degree, n_drift, trend) if is_curve else ridge_fit(blank.estimator),
             strengths=strengths_for(blank.estimator),
-            left_out=later_origins(int(known.sum())) if name == "torque" else (),
-            difficulty=later.difficulty if later is not None else None,
-            mixed=later.passing if later is not None else None,
-            all_values=all_torques,
+            left_out=later_origins(n) if quantity == "torque" else (),
+            growth=test.growth if test is not None else None,
+            mixtures=test.accepted if test is not None else None,
+            full_range=full_range,
         )
-        tasks[name] = OutputModel(reader, guard, ks_of(blank.estimator, features))
-    if not tasks:
+        models[quantity] = OutputModel(regressor, novelty, k_range(blank.estimator, features))
+    if not models:
         raise CalibrationError("the slices come with neither torque nor diameter")
-    return replace(blank, torque=tasks.get("torque"), diameter=tasks.get("diameter"))
+    return replace(blank, torque=models.get("torque"), diameter=models.get("diameter"))
 
 
-def _mixtures(
-    blank: Calibration, locator: BankMatcher | None, differences: FloatArray, t_s: FloatArray
-) -> ContaminationTest:
-    """Return (n, 896) differences at (n,) times with what may be hidden in them, as the torque is read from it."""
-
-    def features(difference: FloatArray, row: int) -> FloatArray:
-        seen = features_of(blank, locator, difference[None], None, float(t_s[row]))
-        return columns_for(blank.estimator, "torque", seen.features)
-
-    return ContaminationTest(differences, features)
+def _quantities(torque: FloatArray, diameter: FloatArray) -> tuple[tuple[Quantity, FloatArray], ...]:
+    return ("torque", torque), ("diameter", diameter)
 
 
-def _check_distinct(name: str, values: FloatArray, degree: int) -> None:
-    """Raise CalibrationError where a part of (n,) values has too few different ones for a curve, unless all are one."""
-    if np.ptp(values) == 0:
-        return
-    for rows in parts_of(len(values)):
-        distinct = len(np.unique(values[rows]))
-        if distinct <= degree:
-            raise CalibrationError(
-                f"{len(rows)} of the {len(values)} slices have too few different {name}s for the estimator fused, "
-                f"{distinct}; record more of them, in turn"
-            )
+def _features_of(
+    blank: Calibration, matcher: BankMatcher | None, t_s: FloatArray
+) -> Callable[[FloatArray, int], FloatArray]:
+    """Return a function from a (896,) difference and its row to the torque's features."""
+    return lambda difference, row: blank.columns(
+        "torque", blank.features(matcher, difference[None], None, float(t_s[row]))[0]
+    )
 
 
-def _curve(shape: tuple[int, int, bool]) -> Callable[[FloatArray, FloatArray, float], Head]:
-    degree, n_drift, trend = shape
+def _curve_fit(degree: int, n_drift: int, trend: bool) -> Callable[[FloatArray, FloatArray, float], Regressor]:
     return lambda features, values, _: InverseCalibration.fit(features, values, degree, n_drift, trend=trend)
 
 
+class ContaminationTest:
+    """Slices mixed with foreign ones, as detectors of novelty fitted to earlier slices assess them.
+
+    A tenth of a foreign frame moves a slice no further than its own drift, so no detector can refuse it
+    (docs/charts.md), and the interval has to cover it. Stand-ins for foreign frames are the mean slice with the
+    electrodes renumbered.
+    """
+
+    def __init__(self, differences: FloatArray, features_of: Callable[[FloatArray, int], FloatArray]) -> None:
+        """Take (n, 896) differences in time order, and a function from one and its row to (d,) features."""
+        self._differences = differences
+        self._features_of = features_of
+        mean = differences.mean(axis=0)
+        self._foreign = [
+            mean[ElectrodeNumbering(turn, mirrored, score=1.0, runner_up=0.0).model_channels()]
+            for turn, mirrored in _NUMBERINGS
+        ]
+        self._detectors: dict[bytes, NoveltyDetector] = {}
+        self._features: dict[tuple[int, int, float], FloatArray] = {}
+
+    def growth(self, past: IntArray, future: IntArray) -> FloatArray:
+        """Return the growth of the intervals of (q,) later slices, by a detector fitted to the earlier ones."""
+        detector = self._detector(past)
+        return np.array([detector.widening(one, _ALL) for one in self._differences[future]])
+
+    def accepted(self, past: IntArray, future: IntArray) -> Mixtures:
+        """Return the mixtures of later slices that a detector fitted to the earlier ones accepts."""
+        detector = self._detector(past)
+        chosen = future[np.unique(np.linspace(0, len(future) - 1, min(len(future), _MOST_LATER)).astype(int))]
+        rows, features, limit_shares = [], [], []
+        for row in chosen.tolist():
+            for number, foreign in enumerate(self._foreign):
+                for share in _SHARES:
+                    mixed = (1 - share) * self._differences[row] + share * foreign
+                    novelty = detector.assess(mixed, _ALL)
+                    if novelty.reasons:
+                        break
+                    rows.append(row)
+                    limit_shares.append(novelty.limit_share)
+                    key = row, number, share
+                    if key not in self._features:
+                        self._features[key] = self._features_of(mixed, row)
+                    features.append(self._features[key])
+        return Mixtures(np.array(rows, dtype=np.int64), np.array(features), np.array(limit_shares))
+
+    def _detector(self, past: IntArray) -> NoveltyDetector:
+        key = past.tobytes()
+        if key not in self._detectors:
+            self._detectors[key] = NoveltyDetector.fit(self._differences[past])
+        return self._detectors[key]
+
+
+def _check_distinct(quantity: Quantity, values: FloatArray, degree: int) -> None:
+    """Raise CalibrationError where a part of (n,) values has too few distinct ones for a curve."""
+    if np.ptp(values) == 0:
+        return
+    for rows in fitted_parts(len(values)):
+        n_distinct = len(np.unique(values[rows]))
+        if n_distinct <= degree:
+            raise CalibrationError(
+                f"{len(rows)} of the {len(values)} slices have too few different {quantity}s for the estimator "
+                f"motion_regression, {n_distinct}; record more of them, in turn"
+            )
+
+
 def _consecutive(times: list[FloatArray]) -> FloatArray:
-    """Return the times of several series one after another, each beginning one later than the one before has ended."""
+    """Return the times of several series one after another; each starts one after the end of the last, or later."""
     shifted: list[FloatArray] = []
     for one in times:
         begins_early = bool(shifted) and one[0] <= shifted[-1][-1]

@@ -1,40 +1,140 @@
-"""A reader turns the features of a frame into one value with its interval."""
+"""A regressor with 95 % prediction intervals, and its fit.
+
+Intervals come from residuals on frames later than those fitted to: split-conformal in strata of the prediction (Vovk
+2012), namely free of load, about to touch, loaded. In each stratum the half width is the 95 % quantile of the absolute
+residuals with the correction for a finite sample, so that many easy frames do not narrow the intervals of few hard
+ones.
+"""
 
 import math
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import Self, TypeAlias
 
 import numpy as np
+from scipy.special import stdtrit
 
-from shearloop.bank.arrays import FloatArray
-from shearloop.bank.eit.polynomial import TWO_SIDED_95
-from shearloop.bank.estimation.intervals import Intervals
-from shearloop.bank.estimation.regressors import InverseCalibration, Ridge, TobitRidge
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.eit.polynomial import TWO_SIDED_95, Polynomial
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.regressors import (
+    InverseCalibration,
+    Regressor,
+    TobitRidge,
+    best_strength,
+    later_splits,
+    left_out_blocks,
+)
 
-Head: TypeAlias = Ridge | TobitRidge | InverseCalibration
-
-# No interval is narrower than this share of the calibrated range: a load cell has noise too.
+LEVEL = 0.95
+LEAST_IN_STRATUM = 20
+_LEAST_RESIDUALS = 5
+# Narrowest interval as a share of the calibrated range: load cells are noisy too.
 LEAST_HALF_WIDTH = 1e-3
-# Values this far beyond the calibrated range, in spans of it, are extrapolated and not believed.
+# Values further beyond the calibrated range, in spans of it, are refused as extrapolation.
 _LARGEST_BEYOND = 0.35
-# Features this many times larger than any at calibration are of something else.
-_LARGEST_REACH = 1.6
+# Features larger than any at calibration by this factor are refused.
+_LARGEST_DEVIATION = 1.6
+# Penalties to choose from, in units of the features' sum of squares.
+STRENGTHS = tuple(10.0**power for power in range(-6, 1))
+# The future differs from the past more than one part of a recording from the next.
+_INFLATION = 1.05
+_LEAST_FRAMES = 8
+# Share of values left out at either end of the range to test extrapolation. It fails if the prediction covers less
+# than half of the way beyond.
+_AT_END, _LARGEST_SHORTFALL = 0.2, 0.5
+# Left-out values count as at least this far beyond the rest, in spans: noise would dominate a shorter distance.
+_LEAST_DISTANCE = 0.05
+# Values up to this many spans beyond the range can look familiar. Slices of 0.14 N·m do after a calibration below
+# 0.06, 1.6 spans beyond, and no slice lies further (`extrapolation-torque-slices` of docs/charts.md).
+_UNSEEN = 2.0
+# Distance beyond the range that decides from where on a prediction may hide a value beyond: more doubts more good ones.
+_LIKELY_UNSEEN = 0.5
+# Loads are torques above this share of the largest; this share of them must lie within their intervals.
+_LOADED_SHARE, _LEAST_COVERED = 0.1, 0.75
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mixtures:
+    """Accepted mixtures of later frames with foreign ones: their rows, features (q, d) and shares of the limit (q,)."""
+
+    rows: IntArray
+    features: FloatArray
+    limit_shares: FloatArray
+
+
+RegressorFit: TypeAlias = Callable[[FloatArray, FloatArray, float], Regressor]
+# From (earlier, later) rows to the growth of each later row's interval, by a detector fitted to the earlier ones.
+Growth: TypeAlias = Callable[[IntArray, IntArray], FloatArray]
+# From the same rows to accepted mixtures of the later ones.
+MixtureTest: TypeAlias = Callable[[IntArray, IntArray], Mixtures]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Intervals:
+    """Half widths (s,) of the strata that the (s − 1,) edges divide the predictions into."""
+
+    edges: FloatArray
+    half_widths: FloatArray
+
+    @classmethod
+    def fit(
+        cls,
+        predicted: FloatArray,
+        residuals: FloatArray,
+        edges: tuple[float, ...],
+        inflation: float,
+        least_half_width: float = 0.0,
+    ) -> Self:
+        """Fit to (n,) predictions and their residuals on later data; a stratum with few of them joins the next.
+
+        Raises CalibrationError for too few residuals.
+        """
+        if len(residuals) < _LEAST_RESIDUALS:
+            raise CalibrationError(
+                f"{len(residuals)} later frames are too few to determine the error; record more repeats"
+            )
+        kept: list[float] = []
+        for edge in sorted(edges):
+            low = kept[-1] if kept else -np.inf
+            inside = np.count_nonzero((predicted > low) & (predicted <= edge))
+            above = np.count_nonzero(predicted > edge)
+            if inside >= LEAST_IN_STRATUM and above >= LEAST_IN_STRATUM:
+                kept.append(float(edge))
+        stratum = np.searchsorted(kept, predicted)
+        widths = [_conformal_quantile(np.abs(residuals[stratum == i])) for i in range(len(kept) + 1)]
+        return cls(np.array(kept), np.maximum(inflation * np.array(widths), least_half_width))
+
+    def half_width(self, predicted: float) -> float:
+        """Return half of the 95 % interval's width at this prediction."""
+        return float(self.half_widths[self.edges.searchsorted(predicted)])
+
+
+def student_inflation(n: int) -> float:
+    """Return the factor on a 95 % interval's width if n values determine it (Student 1908)."""
+    return float(stdtrit(n - 1, (1 + LEVEL) / 2)) / TWO_SIDED_95
+
+
+def _conformal_quantile(absolute: FloatArray) -> float:
+    """Return the conformal quantile; of few residuals the Gaussian one, because their largest says too little."""
+    n = len(absolute)
+    if n < 2 * LEAST_IN_STRATUM:
+        return TWO_SIDED_95 * float(np.sqrt((absolute**2).mean()))
+    return float(np.quantile(absolute, min(LEVEL * (n + 1) / n, 1.0), method="higher"))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IntervalRegressor:
-    """A head with its intervals, the range of values and the reach of features that it was calibrated on.
+    """A point regressor with intervals, the range of values, and the range of features that it was calibrated on.
 
-    Values at or below low_end may be read of anything lower, those at or above high_end of anything higher (−∞ and ∞
-    where that was not looked at). One that misses_loads did not see too many of those left out: of what it says, an
-    interval reaches over all values that it was calibrated on. hidden_below and hidden_above are how far below and
-    above what is read the truth may lie for what is foreign in a frame unseen, at a nearness of 1 (0 where that was
-    not looked at, as in older calibrations). widened is by how many times the intervals of loads are wider because
-    nobody knows when they were measured. lowest and highest are the furthest values that may be read at the ends
-    (NaN in older calibrations: half a range beyond it).
+    Predictions at or below low_end may hide any lower value, those at or above high_end any higher one (−∞ and ∞ where
+    that was not tested); lowest and highest are the furthest such values. With misses_loads, too many left-out loads
+    lay outside their intervals, so every interval spans the calibrated range. contamination_below and _above are how
+    far the truth may lie below and above a prediction because of foreign signals, at the limit of detection (0 where
+    that was not tested). timing_widening is the factor on the loads' intervals for unknown load timing.
     """
 
-    head: Head
+    point: Regressor
     intervals: Intervals
     low: float
     high: float
@@ -42,72 +142,265 @@ class IntervalRegressor:
     high_end: float
     misses_loads: bool
     mean_feature: FloatArray
-    reach: FloatArray
-    hidden_below: float = 0.0
-    hidden_above: float = 0.0
-    widened: float = 1.0
-    lowest: float = math.nan
-    highest: float = math.nan
+    largest_deviation: FloatArray
+    contamination_below: float
+    contamination_above: float
+    timing_widening: float
+    lowest: float
+    highest: float
 
-    def read(
+    def predict(
         self,
         features: FloatArray,
         usable_share: float = 1.0,
         widening: float = 1.0,
-        nearness: float = 0.0,
-        whole: FloatArray | None = None,
+        limit_share: float = 0.0,
+        complete: FloatArray | None = None,
     ) -> tuple[float, float, float]:
-        """Return the value of (d,) features and how far its 95 % interval reaches below and above it.
+        """Return the value of (d,) features and how far its 95 % interval extends below and above it.
 
-        With a share of the channels unusable the rest have to carry the noise of all: the interval grows by the root.
-        What may be foreign in the frame is the more, the nearer it is to being refused (`nearness`, 1 at the limit).
-        Where part of the own response may be missing, `whole` (d,) is what would be seen with it: the interval reaches
-        to what that says, with an error of its own.
-        Where the lever of the calibration did not touch, the tool may have been twisted the other way as far as the
-        frames say: nothing that was read then denies it.
+        With a share of the channels unusable, the interval grows by the root of it. `limit_share` is how near the frame
+        is to refusal (1 at the limit): foreign signals may be the larger. `complete` (d,) are the features with a
+        response that may be missing: the interval extends to their value. Where the lever does not touch, the tool may
+        be twisted the other way as far as the frames allow.
         """
-        raw, grown = self._raw(features, whole)
+        rows = features[None] if complete is None else np.array([features, complete])
+        raw, *others = self.point.predict(rows).tolist()
         widening /= math.sqrt(max(usable_share, 0.1))
         half = widening * self.intervals.half_width(raw)
-        value = shown(self.head, raw)
-        moved = shown(self.head, grown) - value
-        below = max(half + max(-moved, 0.0), nearness * self.hidden_below)
-        above = max(half + max(moved, 0.0), nearness * self.hidden_above)
+        value = reported_value(self.point, raw)
+        moved = reported_value(self.point, others[0]) - value if others else 0.0
+        below = max(half + max(-moved, 0.0), limit_share * self.contamination_below)
+        above = max(half + max(moved, 0.0), limit_share * self.contamination_above)
         if self.misses_loads:
             below, above = below + max(value - self.low, 0.0), above + max(self.high - value, 0.0)
-        if isinstance(self.head, TobitRidge) and raw < 0:
-            other_way = widening * TWO_SIDED_95 * self.head.sigma - raw
-            below, above = (max(below, other_way), above) if self.head.sign > 0 else (below, max(above, other_way))
+        if isinstance(self.point, TobitRidge) and raw < 0:
+            other_way = widening * TWO_SIDED_95 * self.point.sigma - raw
+            below, above = (max(below, other_way), above) if self.point.sign > 0 else (below, max(above, other_way))
         if value <= self.low_end:
-            below = max(below, value - self._or_half_beyond(self.lowest, self.low, -1))
+            below = max(below, value - self.lowest)
         if value >= self.high_end:
-            above = max(above, self._or_half_beyond(self.highest, self.high, 1) - value)
+            above = max(above, self.highest - value)
         return value, below, above
 
-    def _or_half_beyond(self, furthest: float, end: float, sign: int) -> float:
-        return end + sign * 0.5 * (self.high - self.low) if math.isnan(furthest) else furthest
-
-    def _raw(self, features: FloatArray, whole: FloatArray | None) -> tuple[float, float]:
-        """Return what the head says of (d,) features, and of them with what may be missing: the same where none is."""
-        if whole is None:
-            raw = self.head.value(features)
-            return raw, raw
-        raw, grown = self.head.predict(np.array([features, whole])).tolist()
-        return raw, grown
-
-    def refuse(self, value: float, features: FloatArray, name: str, unit: str) -> tuple[str, ...]:
-        """Return the reasons why a value is beyond what was calibrated."""
+    def range_reasons(self, value: float, features: FloatArray, quantity: str, unit: str) -> tuple[str, ...]:
+        """Return the reason against a value or features beyond the calibration, if there is one."""
         beyond = _LARGEST_BEYOND * (self.high - self.low)
         if not self.low - beyond <= value <= self.high + beyond:
             return (
-                f"the {name} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to "
+                f"the {quantity} would be {value:.3g} {unit}, beyond the calibrated {self.low:.3g} to "
                 f"{self.high:.3g} {unit}",
             )
-        if len(self.reach) and bool((np.abs(features - self.mean_feature) > _LARGEST_REACH * self.reach).any()):
+        limits = _LARGEST_DEVIATION * self.largest_deviation
+        if len(limits) and (np.abs(features - self.mean_feature) > limits).any():
             return ("the frame moves further or faster than any at calibration",)
         return ()
 
 
-def shown(head: Head, raw: float) -> float:
-    """Return the value that a head's prediction means: no torque where the lever would not touch."""
-    return head.sign * max(raw, 0.0) if isinstance(head, TobitRidge) else raw
+@dataclass(frozen=True, slots=True)
+class PolynomialRegressor:
+    """The paper's curve over the first feature, sigma or k in cm, with its prediction interval."""
+
+    symbol: str
+    polynomial: Polynomial
+    misses_loads: bool = False
+
+    def predict(self, features: FloatArray, *_: object) -> tuple[float, float, float]:
+        """Return the value of (d,) features and how far its 95 % interval extends below and above it."""
+        found = self.polynomial.interval(float(features[0]))
+        return found.value, found.value - found.low, found.high - found.value
+
+    def range_reasons(self, _value: float, features: FloatArray, quantity: str, _unit: str) -> tuple[str, ...]:
+        """Return the reason against a feature beyond the calibration, if there is one; the limits are inside."""
+        low, high = self.polynomial.x_low, self.polynomial.x_high
+        if low <= features[0] <= high:
+            return ()
+        return (
+            f"{self.symbol} = {features[0]:.4g} cm is outside of {low:.4g} to {high:.4g} cm, where {quantity} was "
+            "calibrated",
+        )
+
+
+def reported_value(point: Regressor, raw: float) -> float:
+    """Return the value that a raw prediction means: no torque where the lever would not touch."""
+    return point.sign * max(raw, 0.0) if isinstance(point, TobitRidge) else raw
+
+
+def fit_interval_regressor(
+    features: FloatArray,
+    values: FloatArray,
+    fit: RegressorFit,
+    *,
+    strengths: tuple[float, ...] = STRENGTHS,
+    limit_features: bool = False,
+    left_out: Sequence[tuple[IntArray, IntArray]] = (),
+    growth: Growth | None = None,
+    mixtures: MixtureTest | None = None,
+    bounds: tuple[FloatArray, FloatArray] | None = None,
+    full_range: bool = False,
+) -> IntervalRegressor:
+    """Fit to (n, d) features and (n,) values in time order.
+
+    `left_out` are pairs of rows to fit to and rows to validate on; by default blocks of time in turn. With `growth`
+    residuals are in units of it (normalised conformal prediction, Papadopoulos et al. 2002), and extrapolation beyond
+    the range is tested, unless the values cover the `full_range` that will ever occur. With `mixtures` intervals cover
+    the error of accepted mixtures with foreign signals. `bounds` are the least and largest value (n,) that each frame
+    may have: intervals extend to the further one.
+    Raises CalibrationError where the data does not determine the fit.
+    """
+    if len(values) < _LEAST_FRAMES or np.ptp(values) == 0:
+        raise CalibrationError(
+            f"{len(values)} frames with values between {np.min(values, initial=np.inf):.3g} and "
+            f"{np.max(values, initial=-np.inf):.3g} determine no calibration; record more, at different loads"
+        )
+    strength = strengths[0] if len(strengths) == 1 else _best_strength(features, values, fit, strengths)
+    blocks = list(left_out or left_out_blocks(len(values)))
+    validated = [_validate(features, values, fit, strength, past, future) for past, future in blocks]
+    predicted, residuals = (np.concatenate([pair[i] for pair in validated]) for i in (0, 1))
+    rows = np.concatenate([future for _, future in blocks])
+    truth = values[rows]
+    scale = np.ones_like(truth)
+    if growth is not None:
+        scale = np.concatenate([growth(past, future) for past, future in blocks])
+    point = fit(features, values, strength)
+    edges = (-point.sigma, 0.0, 0.4 * float(np.abs(values).max())) if isinstance(point, TobitRidge) else ()
+    inflation = 1.0 if isinstance(point, InverseCalibration) else _INFLATION
+    if left_out:
+        inflation = student_inflation(len(np.unique(rows)))
+    centre = features.mean(axis=0)
+    deviation = np.abs(features - centre).max(axis=0) if limit_features else np.zeros(0)
+    least = LEAST_HALF_WIDTH * float(np.ptp(values))
+    intervals, widening = Intervals.fit(predicted, residuals / scale, edges, inflation, least), 1.0
+    # Before widening for unknown times: a load that is not seen is not seen at any time.
+    half = np.array([intervals.half_width(one) for one in predicted])
+    misses_loads = growth is None and _misses_loads(truth, np.abs(residuals) <= half)
+    if bounds is not None:
+        if not left_out:
+            # Unknown times mean few loads, in a block or two each.
+            inflation = student_inflation(len(blocks))
+        errors = np.max([np.abs(truth + residuals - end[rows]) for end in bounds], axis=0)
+        known = intervals.half_widths[-1]
+        intervals = Intervals.fit(predicted, errors / scale, edges, inflation, least)
+        widening = float(intervals.half_widths[-1] / known)
+    low_end, high_end = -np.inf, np.inf
+    if growth is not None and not full_range:
+        low_end, high_end = (
+            _range_end(point, features, values, lambda rows: fit(features[rows], values[rows], strength), sign)
+            for sign in (1, -1)
+        )
+    contamination = (0.0, 0.0)
+    if mixtures is not None:
+        tested = ((fit(features[past], values[past], strength), mixtures(past, future)) for past, future in blocks)
+        contamination = _contamination(features, values, tested, inflation)
+    low, high, beyond = float(values.min()), float(values.max()), _UNSEEN * float(np.ptp(values))
+    return IntervalRegressor(
+        point, intervals, low, high, low_end, high_end, misses_loads, centre, deviation, *contamination, widening,
+        # No load is always possible, at any distance from the range.
+        min(low - beyond, 0.0), max(high + beyond, 0.0),
+    )  # fmt: skip
+
+
+def _contamination(
+    features: FloatArray, values: FloatArray, tested: Iterable[tuple[Regressor, Mixtures]], inflation: float
+) -> tuple[float, float]:
+    """Return how far the truth lies below and above predictions of mixtures, at 95 % on each side.
+
+    In units of the mixtures' share of the limit: in these, mixtures with a seventh or more of a foreign signal err
+    alike.
+    """
+    errors = [np.zeros(0)]
+    for point, mixed in tested:
+        if not len(mixed.rows):
+            continue
+        own, which = np.unique(mixed.rows, return_inverse=True)
+        pure, contaminated = (
+            np.array([reported_value(point, one) for one in point.predict(rows)])
+            for rows in (features[own], mixed.features)
+        )
+        pure = pure[which]
+        # More slices reduce the error of the slices, not the contamination.
+        errors.append((inflation * (pure - values[mixed.rows]) + contaminated - pure) / mixed.limit_shares)
+    found = np.concatenate(errors)
+    if not len(found):
+        return 0.0, 0.0
+    return max(float(np.quantile(found, LEVEL)), 0.0), max(float(-np.quantile(found, 1 - LEVEL)), 0.0)
+
+
+def _range_end(
+    point: Regressor, features: FloatArray, values: FloatArray, refit: Callable[[IntArray], Regressor], sign: int
+) -> float:
+    """Return the prediction at or below which (sign −1: above which) the truth may lie anywhere further out.
+
+    The outermost values are left out and predicted from the rest. If they are predicted at its end or even within it,
+    values beyond the whole range will be too, the more the further out they are; the end is then moved inwards for
+    values `_LIKELY_UNSEEN` spans beyond. Otherwise it is the end of the range.
+    """
+    outward = sign * values
+    order = np.argsort(outward, kind="stable")
+    # Equal values stay together, else those that remain would reveal the others.
+    n_out = int((outward <= outward[order[round(_AT_END * len(values)) - 1]]).sum())
+    out, kept = order[:n_out], np.sort(order[n_out:])
+
+    def median(by: Regressor, rows: IntArray) -> float:
+        return float(np.median([sign * reported_value(by, one) for one in by.predict(features[rows])]))
+
+    end, outermost = float(outward.min()), median(point, order[: max(n_out // 2, 1)])
+    if len(kept) < _LEAST_FRAMES or np.ptp(values[kept]) == 0:
+        # Untestable: no prediction as far out as the outermost ones now is known to be right.
+        return sign * max(end, outermost)
+    inside = float(outward[kept].min())
+    predicted, true = median(refit(kept), out), float(np.median(outward[out]))
+    if predicted - true > _LARGEST_SHORTFALL * (inside - true) > 0:
+        span = float(np.ptp(values))
+        shortfall = (predicted - inside) / max(inside - true, _LEAST_DISTANCE * span)
+        end = max(end, end + shortfall * _LIKELY_UNSEEN * span, outermost)
+    return sign * end
+
+
+def _misses_loads(truth: FloatArray, inside: BoolArray) -> bool:
+    """Return whether too many loads lie outside their intervals.
+
+    Most frames of a stream are free of load. Their small residuals say nothing of a load that an estimator misses, so
+    loads are a stratum of their own, by their truth (label-conditional, Vovk 2012).
+    """
+    loaded = np.abs(truth) > _LOADED_SHARE * float(np.abs(truth).max())
+    return bool(loaded.any() and not loaded.all() and inside[loaded].mean() < _LEAST_COVERED)
+
+
+def error_on_later(features: FloatArray, values: FloatArray, fit: RegressorFit, strengths: tuple[float, ...]) -> float:
+    """Return the mean squared error on parts later than those fitted to, with the best of the strengths."""
+    return _error(features, values, fit, _best_strength(features, values, fit, strengths))
+
+
+def _error(features: FloatArray, values: FloatArray, fit: RegressorFit, strength: float) -> float:
+    found = [
+        float((_validate(features, values, fit, strength, *split)[1] ** 2).mean()) for split in _time_splits(values)
+    ]
+    return float(np.mean(found))
+
+
+def _time_splits(values: FloatArray) -> list[tuple[IntArray, IntArray]]:
+    return [(past, future) for past, future in later_splits(len(values)) if np.ptp(values[past]) > 0]
+
+
+def _best_strength(features: FloatArray, values: FloatArray, fit: RegressorFit, strengths: tuple[float, ...]) -> float:
+    def error(strength: float, past: IntArray, future: IntArray) -> float:
+        return float((_validate(features, values, fit, strength, past, future)[1] ** 2).mean())
+
+    return best_strength(strengths, error, _time_splits(values))
+
+
+def _validate(
+    features: FloatArray, values: FloatArray, fit: RegressorFit, strength: float, past: IntArray, future: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return the raw predictions of the future by a fit to the past, and their errors."""
+    point = fit(features[past], values[past], strength)
+    raw = point.predict(features[future])
+    return raw, np.array([reported_value(point, one) for one in raw]) - values[future]
+
+
+def is_one_sided(torque_nm: FloatArray) -> bool:
+    """Return whether a load cell was pushed from one side only, and was free of load for much of the time."""
+    largest = float(torque_nm[np.argmax(np.abs(torque_nm))])
+    along = torque_nm * np.sign(largest)
+    return bool(along.min() > -0.05 * abs(largest) and (along < 0.02 * abs(largest)).mean() > 0.2)

@@ -1,70 +1,118 @@
-"""Which differences a calibration of slices can speak of: `NoveltyDetector`.
+"""Novelty detection for calibrations of slices: which differences the calibration covers.
 
-Differences lie about their mean along a few directions. What is off to the side of them is the misfit, how far out
-along them is the reach; both in units of each channel's own spread, since on recorded slices some channels vary ten
-times as much as others and drown the rest in volts. How much of either is still familiar comes from stretches of time
-that were left out in turn (docs/charts.md).
+Differences vary about their mean along a few directions. The mean squared residual off these directions is the Q
+residual, the squared distance along them is Hotelling's T² (principal component analysis for process monitoring). Both
+are in units of each channel's own spread: on recorded slices some channels vary ten times as much as others. The
+limits come from stretches of time that were left out in turn (docs/charts.md).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 
-from shearloop.bank.arrays import BoolArray, FloatArray
-from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
+from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.directions import coordinates
 from shearloop.bank.estimation.fingertip_validator import LARGEST_UNUSABLE_SHARE
-from shearloop.bank.estimation.intervals import LEVEL
-from shearloop.bank.estimation.reciprocity import ReciprocityCheck
-from shearloop.bank.estimation.regressors import left_out_blocks
-from shearloop.bank.estimation.soundness import LEAST_NOISE, check_slices
+from shearloop.bank.estimation.interval_regressor import LEVEL
+from shearloop.bank.estimation.regressors import later_origins, left_out_blocks
 
-# Beyond the largest misfit and reach of blocks left out: on the recorded slices the later ones stay within 1.37 and 1.5
-# times of them after two repeats, and within once after four.
-_MISFIT_MARGIN, _REACH_MARGIN = 1.45, 1.65
+# Margins beyond the largest Q and T² of blocks left out. Later recorded slices stay within 1.37 and 1.5 times of them
+# after two repeats, and within once after four.
+_Q_MARGIN, _T2_MARGIN = 1.45, 1.65
 _LEAST_OUTLYING, _OUTLYING_SPREADS = 0.05, 5.0
 _LEAST_DIFFERENCES = 8
 _MOST_DIRECTIONS = 4
-# Value and main drift. Further directions are so short that single frames of the calibration reach far along them.
-_REACHING = 2
-# A frame that holds less than half of what the own fingertip makes is taken for one that holds half.
+# T² uses value and main drift. Single calibration frames extend far along the shorter directions.
+_T2_DIRECTIONS = 2
+# A frame with less than half of its fingertip's own response counts as one with half.
 _MOST_MISSING = 0.5
-# Intervals grow by this power of the misfit. White noise alone would ask for a half; but what moves many channels
-# together moves the estimate with them. Of 1, 1.5 and 2 this parted later slices best from those with a fifth of a
-# foreign frame, at the same width for the good ones.
+# Intervals grow by this power of Q. White noise alone would need a half, but common motion of many channels moves the
+# estimate too. Of 1, 1.5 and 2 this separates best later slices from those with a fifth of a foreign frame.
 _POWER = 2
+# Directions of slices that the reciprocity check ignores, and its margin beyond the largest residual of blocks left
+# out: later slices stay within 1.39 times of it after two repeats, and within 0.8 times after four.
+_RECIPROCITY_DIRECTIONS, _RECIPROCITY_MARGIN = 12, 1.5
+# Less than this share of a slice is rounding: a board's converter alone makes thousands of times as much.
+_LEAST_NOISE = 1e-6
 _ALL = np.ones(N_CHANNELS, dtype=np.bool_)
+
+# Injection i + 16 drives the current of injection i backwards, so a frame has every voltage twice.
+_FIRST = np.flatnonzero(CHANNELS[:, 0] < N_ELECTRODES // 2)
+_NUMBERS = {(sink, positive): i for i, (sink, _, positive, _) in enumerate(CHANNELS.tolist())}
+_SECOND = np.array([_NUMBERS[sink + N_ELECTRODES // 2, positive] for sink, _, positive, _ in CHANNELS[_FIRST].tolist()])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReciprocityCheck:
+    """Checks the voltages that opposite injections measure twice.
+
+    Their means have half of the noise, so other errors stand out. A gel's drift is large in some channels, a foreign
+    frame differs in all: the median of the channels separates the two better than their mean (docs/charts.md).
+    mean (448,) and spread (448,) of the means are in volts; directions (r, 448) in units of the spread.
+    """
+
+    mean: FloatArray
+    spread: FloatArray
+    directions: FloatArray
+    largest_residual: float
+
+    @classmethod
+    def fit(cls, differences: FloatArray) -> Self:
+        """Fit to (n, 896) differences in time order; the limit comes from blocks of time left out in turn."""
+        residuals = []
+        for rest, block in left_out_blocks(len(differences)):
+            part = cls._model(differences[rest], np.inf)
+            residuals += [part.residual(one, _ALL) for one in differences[block]]
+        return cls._model(differences, _RECIPROCITY_MARGIN * max(residuals))
+
+    @classmethod
+    def _model(cls, differences: FloatArray, largest_residual: float) -> Self:
+        pairs = reciprocal_means(differences)
+        mean, variance = pairs.mean(axis=0), pairs.var(axis=0)
+        # Shrink towards the median: few slices determine a channel's own variance badly.
+        spread = np.sqrt(0.5 * variance + 0.5 * np.median(variance) + np.finfo(np.float64).tiny)
+        directions = np.linalg.svd((pairs - mean) / spread, full_matrices=False)[2]
+        return cls(mean, spread, directions[: min(_RECIPROCITY_DIRECTIONS, len(pairs) // 2)], largest_residual)
+
+    def residual(self, difference: FloatArray, usable: BoolArray) -> float:
+        """Return the median squared residual of a (896,) difference off the directions."""
+        both = usable[_FIRST] & usable[_SECOND]
+        x = (reciprocal_means(difference) - self.mean) / self.spread
+        return float(np.median((x - _coordinates(self.directions, x, both) @ self.directions)[both] ** 2))
+
+
+def reciprocal_means(differences: FloatArray) -> FloatArray:
+    """Return the (…, 448) means of the voltages that (…, 896) differences contain twice."""
+    return np.asarray((differences[..., _FIRST] + differences[..., _SECOND]) / 2)
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
-    """The reasons against a difference, none for a familiar one, and what its interval has to hold.
+class Novelty:
+    """The reasons against a difference, none for a familiar one, and their effect on its interval.
 
-    widening is by how much that grows because the difference is explained less well than is typical. nearness is how
-    near it is to being refused by what it says twice: 1 at the limit, 0 without twins. What is foreign in it moves this
-    by the square of its share; up to the limit most of that may be hidden. missing is what share of the fingertip's own
-    response may have been taken away by it.
+    widening is the interval's growth because the difference is explained less well than is typical. limit_share is the
+    reciprocity residual over its limit: foreign signals raise it by the square of their share. missing_share is the
+    share of the fingertip's own response that foreign signals may have replaced.
     """
 
-    why: tuple[str, ...]
+    reasons: tuple[str, ...]
     widening: float = 1.0
-    nearness: float = 0.0
-    missing: float = 0.0
+    limit_share: float = 0.0
+    missing_share: float = 0.0
 
 
-FAMILIAR = Judgement(())
+FAMILIAR = Novelty(())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoveltyDetector:
-    """The mean (896,) in volts, each channel's spread (896,) in volts, and directions (r, 896) in units of spread.
+    """Mean (896,) and spread (896,) in volts, directions (r, 896) in units of spread with their variances (r,).
 
-    variances (r,) are those along the directions. typical_misfit is the median of what was left out; of an estimate
-    from more, the interval is as much wider. largest_own is as much of the mean as a difference holds, but for one in
-    twenty of those left out. Calibrations that were made before there were twins have none, nor have they a largest_own
-    (0).
+    typical_q is the median Q residual of differences left out. typical_response is the response share at LEVEL of
+    them.
     """
 
     mean: FloatArray
@@ -72,100 +120,92 @@ class NoveltyDetector:
     directions: FloatArray
     variances: FloatArray
     least_norm: float
-    typical_misfit: float
-    largest_misfit: float
+    typical_q: float
+    largest_q: float
     largest_outlying: float
-    largest_reach: float
-    twins: ReciprocityCheck | None = None
-    largest_own: float = 0.0
+    largest_t2: float
+    reciprocity: ReciprocityCheck | None
+    typical_response: float
 
     @classmethod
     def fit(cls, differences: FloatArray) -> Self:
-        """Fit to (n, 896) differences in time order; the limits come from blocks of time that were left out in turn."""
+        """Fit to (n, 896) differences in time order; the limits come from blocks of time left out in turn."""
         n = len(differences)
         if n < _LEAST_DIFFERENCES:
-            raise CalibrationError(f"{n} slices are too few to know what is familiar; record {_LEAST_DIFFERENCES}")
-        check_slices(differences)
-        misfits, reaches, own = [], [], []
+            raise CalibrationError(f"{n} slices are too few to calibrate on; record {_LEAST_DIFFERENCES}")
+        _check_slices(differences)
+        q_and_outlying, t2, responses = [], [], []
         for rest, block in left_out_blocks(n):
-            part = cls._explaining(differences[rest])
-            misfits += [part.misfit(one, _ALL) for one in differences[block]]
-            reaches += [part.reach(one, _ALL) for one in differences[block]]
-            own += [part.own_share(one, _ALL) for one in differences[block]]
-        misfit, outlying = np.array(misfits).max(axis=0)
-        whole = cls._explaining(differences)
-        reach = max(*reaches, *(whole.reach(one, _ALL) for one in differences))
+            part = cls._model(differences[rest])
+            q_and_outlying += [part.q_residual(one, _ALL) for one in differences[block]]
+            t2 += [part.t2(one, _ALL) for one in differences[block]]
+            responses += [part.response_share(one, _ALL) for one in differences[block]]
+        largest_q, outlying = np.array(q_and_outlying).max(axis=0)
+        whole = cls._model(differences)
+        largest_t2 = max(*t2, *(whole.t2(one, _ALL) for one in differences))
         least = 0.5 * float(np.linalg.norm(differences, axis=1).min() / np.sqrt(N_CHANNELS))
         return cls(
             whole.mean, whole.spread, whole.directions, whole.variances, least,
-            float(np.median(misfits, axis=0)[0]), _MISFIT_MARGIN * float(misfit),
-            max(_MISFIT_MARGIN * float(outlying), _LEAST_OUTLYING), _REACH_MARGIN * reach,
-            ReciprocityCheck.fit(differences),
-            float(np.quantile(own, LEVEL)),
+            float(np.median(q_and_outlying, axis=0)[0]), _Q_MARGIN * float(largest_q),
+            max(_Q_MARGIN * float(outlying), _LEAST_OUTLYING), _T2_MARGIN * largest_t2,
+            ReciprocityCheck.fit(differences), float(np.quantile(responses, LEVEL)),
         )  # fmt: skip
 
     @classmethod
-    def _explaining(cls, differences: FloatArray) -> Self:
+    def _model(cls, differences: FloatArray) -> Self:
         mean, rank = differences.mean(axis=0), min(_MOST_DIRECTIONS, len(differences) // 4)
         variance = differences.var(axis=0)
-        # Half is everybody's: of few frames a channel's own variance says little.
+        # Shrink towards the median: few frames determine a channel's own variance badly.
         spread = np.sqrt(0.5 * variance + 0.5 * np.median(variance))
         _, s, vt = np.linalg.svd((differences - mean) / spread, full_matrices=False)
-        if np.sqrt((s[rank:] ** 2).sum()) <= LEAST_NOISE * s[0]:
+        if np.sqrt((s[rank:] ** 2).sum()) <= _LEAST_NOISE * s[0]:
             raise CalibrationError(
                 "the slices have no noise: they are multiples or sums of a few; record slices as they come"
             )
         variances = s[:rank] ** 2 / (len(differences) - 1)
-        return cls(mean, spread, vt[:rank], variances, 0.0, 1.0, np.inf, np.inf, np.inf)
+        return cls(mean, spread, vt[:rank], variances, 0.0, 1.0, np.inf, np.inf, np.inf, None, 0.0)
 
-    def misfit(self, difference: FloatArray, usable: BoolArray) -> tuple[float, float]:
-        """Return the mean squared residual of a (896,) difference, and the share of channels that are far off."""
-        x = self._scaled(difference)
-        residual = (x - coordinates(self.directions, x, usable) @ self.directions)[usable]
+    def q_residual(self, difference: FloatArray, usable: BoolArray) -> tuple[float, float]:
+        """Return the mean squared residual of a (896,) difference, and the share of outlying channels."""
+        x = self._scale(difference)
+        residual = (x - _coordinates(self.directions, x, usable) @ self.directions)[usable]
         return float((residual**2).mean()), float((np.abs(residual) > _OUTLYING_SPREADS).mean())
 
-    def reach(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return how far out a (896,) difference lies along the main directions: a sum of squares of unit variance."""
-        scores = coordinates(self.directions[:_REACHING], self._scaled(difference), usable)
-        return float((scores**2 / self.variances[:_REACHING]).sum())
+    def t2(self, difference: FloatArray, usable: BoolArray) -> float:
+        """Return Hotelling's T² of a (896,) difference along the main directions."""
+        scores = _coordinates(self.directions[:_T2_DIRECTIONS], self._scale(difference), usable)
+        return float((scores**2 / self.variances[:_T2_DIRECTIONS]).sum())
 
-    def own_share(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return how many times a (896,) difference holds the mean, by what the main directions do not explain of it.
+    def response_share(self, difference: FloatArray, usable: BoolArray) -> float:
+        """Return the share of the mean in a (896,) difference, by its part off the main directions.
 
-        A response that is smaller, as where something foreign has taken its place, moves a difference along the main
-        directions as another torque does; but a torque leaves alone what is beside them, which then is smaller too.
+        A smaller response, as where a foreign signal replaces it, moves a difference along the main directions like
+        another torque. A torque leaves the other part alone (partial regression, Frisch–Waugh).
         """
         mean = self.mean / self.spread
-        # Partial regression (Frisch–Waugh): what it leaves of the mean, a torque does not move.
-        beside = (mean - coordinates(self.directions, mean, usable) @ self.directions)[usable]
-        return float((difference / self.spread)[usable] @ beside / (mean[usable] @ beside))
+        rest = (mean - _coordinates(self.directions, mean, usable) @ self.directions)[usable]
+        return float((difference / self.spread)[usable] @ rest / (mean[usable] @ rest))
 
-    def _missing(self, difference: FloatArray, usable: BoolArray) -> float:
-        if self.largest_own <= 0:
-            return 0.0
-        left = self.own_share(difference, usable) / self.largest_own
-        return min(max(1.0 - left, 0.0), _MOST_MISSING)
-
-    def filled(self, difference: FloatArray, usable: BoolArray) -> FloatArray:
-        """Return a (896,) difference with unusable channels where the usable ones say, along the main directions."""
-        scores = coordinates(self.directions, self._scaled(difference), usable)
+    def impute(self, difference: FloatArray, usable: BoolArray) -> FloatArray:
+        """Return a (896,) difference with unusable channels estimated along the main directions."""
+        scores = _coordinates(self.directions, self._scale(difference), usable)
         return np.where(usable, difference, np.maximum(self.mean + self.spread * (scores @ self.directions), 0.0))
 
-    def _scaled(self, difference: FloatArray) -> FloatArray:
+    def _scale(self, difference: FloatArray) -> FloatArray:
         return np.asarray((difference - self.mean) / self.spread)
 
     def widening(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return by how much an interval grows because a difference is explained less well than is typical."""
-        return self._widening(self.misfit(difference, usable)[0])
+        """Return the growth of an interval because a difference is explained less well than is typical."""
+        return self._widening(self.q_residual(difference, usable)[0])
 
-    def _widening(self, misfit: float) -> float:
-        return max(misfit / self.typical_misfit, 1.0) ** _POWER
+    def _widening(self, q: float) -> float:
+        return max(q / self.typical_q, 1.0) ** _POWER
 
-    def judge(self, difference: FloatArray, usable: BoolArray) -> Judgement:
-        """Return what is to be thought of a (896,) difference, by its usable channels."""
+    def assess(self, difference: FloatArray, usable: BoolArray) -> Novelty:
+        """Return the novelty of a (896,) difference, by its usable channels."""
         if 1.0 - usable.mean() > LARGEST_UNUSABLE_SHARE:
             return _refused(
-                f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; look at the ribbon cable"
+                f"{100 * (1 - usable.mean()):.0f} % of the channels are dead or saturated; check the ribbon cable"
             )
         size = float(np.sqrt((difference[usable] ** 2).mean()))
         if size < self.least_norm:
@@ -173,29 +213,68 @@ class NoveltyDetector:
                 f"no grip: the difference to the homogeneous frame is {1e3 * size:.1f} mV a channel, and gripping "
                 f"makes at least {1e3 * self.least_norm:.1f} mV"
             )
-        misfit, outlying = self.misfit(difference, usable)
-        if misfit > self.largest_misfit or outlying > self.largest_outlying:
+        q, outlying = self.q_residual(difference, usable)
+        if q > self.largest_q or outlying > self.largest_outlying:
             return _refused(
-                f"outside of the calibration: the misfit is {misfit:.1f} (at most {self.largest_misfit:.1f}), with "
-                f"{100 * outlying:.0f} % of the channels far off (at most {100 * self.largest_outlying:.0f} %)"
+                f"outside the calibration: the Q residual is {q:.1f} (limit {self.largest_q:.1f}), with "
+                f"{100 * outlying:.0f} % of the channels far off (limit {100 * self.largest_outlying:.0f} %)"
             )
-        nearness = 0.0
-        if self.twins is not None:
-            twins = self.twins.misfit(difference, usable)
-            if twins > self.twins.largest_misfit:
+        limit_share = 0.0
+        if self.reciprocity is not None:
+            residual = self.reciprocity.residual(difference, usable)
+            limit_share = residual / self.reciprocity.largest_residual
+            if limit_share > 1:
                 return _refused(
-                    f"outside of the calibration: what opposite injections say twice is off by {twins:.2f} (at most "
-                    f"{self.twins.largest_misfit:.2f}); part of the frame may be another fingertip's"
+                    f"outside the calibration: opposite injections differ by {residual:.2f} (limit "
+                    f"{self.reciprocity.largest_residual:.2f}); part of the frame may be another fingertip's"
                 )
-            nearness = twins / self.twins.largest_misfit
-        reach = self.reach(difference, usable)
-        if reach > self.largest_reach:
+        t2 = self.t2(difference, usable)
+        if t2 > self.largest_t2:
             return _refused(
-                f"outside of the calibration: the frame lies {np.sqrt(reach):.1f} standard deviations from those "
-                f"calibrated on (at most {np.sqrt(self.largest_reach):.1f})"
+                f"outside the calibration: the frame lies {np.sqrt(t2):.1f} standard deviations from the calibrated "
+                f"ones (limit {np.sqrt(self.largest_t2):.1f})"
             )
-        return Judgement((), self._widening(misfit), nearness, self._missing(difference, usable))
+        return Novelty((), self._widening(q), limit_share, self._missing_share(difference, usable))
+
+    def _missing_share(self, difference: FloatArray, usable: BoolArray) -> float:
+        if self.typical_response <= 0:
+            return 0.0
+        left = self.response_share(difference, usable) / self.typical_response
+        return min(max(1.0 - left, 0.0), _MOST_MISSING)
 
 
-def _refused(why: str) -> Judgement:
-    return Judgement((why,))
+def _refused(reason: str) -> Novelty:
+    return Novelty((reason,))
+
+
+def _coordinates(directions: FloatArray, values: FloatArray, usable: BoolArray) -> FloatArray:
+    """Return the (r,) least-squares coordinates of (n,) values along (r, n) orthonormal directions."""
+    if usable.all():
+        return np.asarray(directions @ values)
+    return np.asarray(np.linalg.lstsq(directions[:, usable].T, values[usable], rcond=None)[0], dtype=np.float64)
+
+
+def _check_slices(differences: FloatArray) -> None:
+    """Raise CalibrationError for (n, 896) differences that are alike, or with too many constant channels."""
+    n = len(differences)
+    with np.errstate(over="ignore"):
+        rounding_v = _LEAST_NOISE * np.sqrt((differences**2).mean())
+    for rows in fitted_parts(n):
+        still = np.ptp(differences[rows], axis=0) <= rounding_v
+        if still.all():
+            raise CalibrationError(f"{len(rows)} of the {n} slices are all alike; record slices as they come")
+        if still.mean() > LARGEST_UNUSABLE_SHARE:
+            raise CalibrationError(
+                f"in {len(rows)} of the {n} slices {100 * still.mean():.0f} % of the channels never change: they are "
+                "dead or saturated; check the ribbon cable and the gel's contact with the electrodes, and record again"
+            )
+
+
+def fitted_parts(n: int) -> Iterator[IntArray]:
+    """Yield the rows of all slices, then of each part that is fitted separately."""
+    yield np.arange(n)
+    for rest, _ in left_out_blocks(n):
+        yield rest
+    # All later origins contain the first.
+    for earlier, _ in later_origins(n)[:1]:
+        yield earlier

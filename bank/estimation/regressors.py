@@ -1,40 +1,41 @@
-"""From features to a value: three regressions, each with its strength chosen on data later than what it was fitted to.
+"""Regressors from features to a value, and an imputer of dead channels.
 
-`Ridge` for features that hold the value linearly. `TobitRidge` for a load cell that a lever pushes from one side only:
-where it reads nothing the twist may be anything below, so those frames bound the value instead of fixing it (Tobin
-1958). `InverseCalibration` the other way round, frames as a smooth curve over the value with correlated drift beside
-it (classical
-calibration by generalised least squares): it does not pull estimates towards the mean as a ridge does.
+`Ridge` is for features that contain the value linearly. `TobitRidge` is for a load cell that a lever pushes from one
+side only: where it reads nothing the twist may be anything below, so these frames bound the value (Tobin 1958).
+`InverseCalibration` models frames as a smooth curve over the value with correlated drift (classical calibration by
+generalised least squares). Unlike a ridge it does not pull estimates towards the mean.
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypeAlias
 
 import numpy as np
 from scipy.special import log_ndtr
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.fingertip_validator import FingertipValidator
 
-# Readings below this share of the largest torque count as "the lever does not touch".
+# Readings below this share of the largest torque mean that the lever does not touch.
 CENSORED_SHARE = 0.02
 _LEAST_SIGMA_SHARE = 0.01
 _EM_ROUNDS = 100
 N_BLOCKS = 5
 FIRST_ORIGIN, N_ORIGINS, LEAST_BEFORE_ORIGIN = 0.6, 20, 12
-# Terms beyond the linear one are held back as by so many frames that do not have them.
-_CURVATURE = 3.0
-# The same for how offset and slope drift with age. From 10 to 100 the error on later slices is nearly the same; without
-# a trend it is a sixth larger (docs/decisions/0042).
-_TREND, N_TREND = 30.0, 2
-# The paper's own number: with so many of the 896 channels its regression was four fifths as good as with all.
+# Penalties of the curve's higher terms and of the trend, as this many frames without them. From 10 to 100 for the trend
+# the error on later slices is nearly the same; without a trend it is a sixth larger (docs/decisions/0042).
+_CURVATURE, _TREND, N_TREND = 3.0, 30.0, 2
+# The paper's number: with this many of the 896 channels its regression was four fifths as good as with all.
 N_RANKED = 272
+# Filled frames of the emulated rig, the recorded stream and formulas give estimates within a tenth of their error for
+# 2 to 16 directions.
+_MOST_DIRECTIONS = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ridge:
-    """value = offset + (features − mean) · weights, clipped to nothing; strength is the penalty that was chosen."""
+    """value = offset + (features − mean) · weights; strength is the chosen penalty."""
 
     mean: FloatArray
     weights: FloatArray
@@ -52,26 +53,22 @@ class Ridge:
 
     @classmethod
     def fit_scaled(cls, features: FloatArray, values: FloatArray, strength: float) -> Self:
-        """Fit as `fit` does, with each feature in units of its own spread: for features of different kinds."""
+        """Fit with each feature in units of its own spread: for features of different kinds."""
         spread = features.std(axis=0)
         spread = np.where(spread > 0, spread, 1.0)
         scaled = cls.fit(features / spread, values, strength)
         return cls(scaled.mean * spread, scaled.weights / spread, scaled.offset, strength)
 
     def predict(self, features: FloatArray) -> FloatArray:
-        """Return the (n,) values of (n, d) features."""
+        """Return the values of (…, d) features."""
         return np.asarray(self.offset + (features - self.mean) @ self.weights)
-
-    def value(self, features: FloatArray) -> float:
-        """Return the value of (d,) features."""
-        return self.offset + float((features - self.mean) @ self.weights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TobitRidge:
-    """As a ridge, fitted with readings of no load as bounds; `sign` is the direction the lever is pushed in.
+    """A ridge with readings of no load as bounds; `sign` is the direction of the lever's push.
 
-    The prediction is the latent value: beyond zero against the sign the lever does not touch, and the torque is zero.
+    It predicts a latent value. Where that is below zero along the sign, the lever does not touch: no torque.
     """
 
     mean: FloatArray
@@ -96,7 +93,7 @@ class TobitRidge:
             offset = float(latent.mean())
             coefficients = gain * (u.T @ (latent - offset))
             predicted = offset + u @ (s * coefficients)
-            expected, variance = _below_zero(predicted[~touching], sigma)
+            expected, variance = _moments_below_zero(predicted[~touching], sigma)
             latent = y.copy()
             latent[~touching] = expected
             sigma = max(
@@ -108,15 +105,11 @@ class TobitRidge:
         return cls(mean, weights, offset, strength, sigma, sign)
 
     def predict(self, features: FloatArray) -> FloatArray:
-        """Return the (n,) latent values of (n, d) features, in the direction of the lever's push."""
+        """Return the latent values of (…, d) features along the lever's direction."""
         return np.asarray(self.offset + (features - self.mean) @ self.weights)
 
-    def value(self, features: FloatArray) -> float:
-        """Return the latent value of (d,) features."""
-        return self.offset + float((features - self.mean) @ self.weights)
 
-
-def _below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
+def _moments_below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]:
     """Return mean and variance of Gaussians of this mean and sigma, given that they are below zero."""
     u = -mean / sigma
     ratio = np.exp(-0.5 * u**2 - 0.5 * np.log(2 * np.pi) - log_ndtr(u))
@@ -127,10 +120,9 @@ def _below_zero(mean: FloatArray, sigma: float) -> tuple[FloatArray, FloatArray]
 class InverseCalibration:
     """Frames as a polynomial of the value, coefficients (degree + 1, q), with drift along `drift` (r, q) and noise.
 
-    Of a frame's d channels only the q `channels` count that go best with the value: the others bring more drift. Each
-    is in units of its own `spread` (q,) about the curve, drawn half towards that of all. What a value makes of a frame
-    changes from repeat to repeat: offset and slope move by `trend` (2, q) as the logarithm of the age does, counted in
-    e-foldings from `last_t` on.
+    It uses the q of a frame's d channels that correlate best with the value; others bring more drift. Each is in units
+    of its own `spread` (q,) about the curve, drawn half towards the spread of all. Offset and slope change by `trend`
+    (2, q) with the logarithm of the age, in e-foldings from `last_t` on.
 
     The value of a frame minimises (x − curve)ᵀ Σ⁻¹ (x − curve), Σ = driftᵀ diag(drift_variance) drift + noise² I.
     """
@@ -153,37 +145,35 @@ class InverseCalibration:
     def fit(cls, frames: FloatArray, values: FloatArray, degree: int, n_drift: int, *, trend: bool = False) -> Self:
         """Fit to (n, d + 1) frames of (n,) values in time order; the last column is each frame's time.
 
-        Any unit of time in which frames come about one apart. The terms beyond the linear one are held back as by three
-        frames without them, the trend as by thirty.
+        Frames should be about one unit of time apart.
         """
         frames, t = frames[:, :-1], frames[:, -1]
         n, n_trend = len(values), N_TREND * trend
         centre, scale = float(values.mean()), float(values.std())
-        distinct = len(np.unique(values))
+        n_distinct = len(np.unique(values))
         least_values, least_frames = degree + 1, degree + n_trend + n_drift + 3
-        if distinct < least_values or n < least_frames or scale == 0:
-            # Of what was recorded these may be the rest, as without the largest fifth of the values.
+        if n_distinct < least_values or n < least_frames or scale == 0:
             raise CalibrationError(
-                f"{n} frames at {distinct} distinct values do not determine a curve of degree {degree} and its noise; "
-                f"record more, at more different values: where some are left out and told by the rest, {least_values} "
-                f"values and {least_frames} frames have to be left"
+                f"{n} frames at {n_distinct} distinct values do not determine a curve of degree {degree} and its "
+                f"noise; record more, at more values: {least_values} values and {least_frames} frames must remain "
+                "where some are left out for validation"
             )
         z = (values - centre) / scale
         spread = _spread_about_parabola(frames, z)
         channels = np.sort(ranked_channels(frames / spread, values)[:N_RANKED])
         frames, spread = (frames / spread)[:, channels], spread[channels]
         first_t, last_t = float(t[0]), float(t[-1])
-        age = _age(t, first_t, last_t)
+        age = _log_age(t, first_t, last_t)
         powers = np.vander(z, degree + 1, increasing=True)
         columns = np.hstack([powers, powers[:, :n_trend] * age[:, None]])
-        # A trend is held back in units of its own spread, as the values are in theirs.
-        held_back = [0.0, 0.0] + [_CURVATURE] * (degree - 1) + [_TREND * float(age.var())] * n_trend
-        coefficients = np.linalg.solve(columns.T @ columns + np.diag(held_back), columns.T @ frames)
+        # The trend's penalty is in units of its own spread.
+        penalties = [0.0, 0.0] + [_CURVATURE] * (degree - 1) + [_TREND * float(age.var())] * n_trend
+        coefficients = np.linalg.solve(columns.T @ columns + np.diag(penalties), columns.T @ frames)
         _, s, vt = np.linalg.svd(frames - columns @ coefficients, full_matrices=False)
         freedom = n - columns.shape[1]
         noise = float(np.sqrt((s[n_drift:freedom] ** 2).sum() / (freedom - n_drift) / frames.shape[1]))
         if noise == 0:
-            raise CalibrationError("the frames have no noise at all: this is no recording of a real board")
+            raise CalibrationError("the frames have no noise: no real board sent them")
         span = float(np.ptp(values))
         return cls(
             channels, spread, coefficients[: degree + 1], coefficients[degree + 1 :], first_t, last_t,
@@ -192,31 +182,27 @@ class InverseCalibration:
         )  # fmt: skip
 
     def predict(self, features: FloatArray) -> FloatArray:
-        """Return the (n,) values of (n, d + 1) frames, the last column being their times; NaN channels are left out.
+        """Return the values of (…, d + 1) frames; the last column is the time, and NaN channels are ignored.
 
-        A time before the last one that was fitted to is taken for that one: somebody counts from the beginning again.
+        A time before the last fitted one counts as that one: the user started counting again.
         """
-        costs: dict[tuple[float, bytes], _Cost] = {}
+        costs: dict[tuple[float, bytes], _CostGrid] = {}
         values = []
-        for frame in features:
+        for frame in features.reshape(-1, features.shape[-1]):
             x, t = frame[self.channels] / self.spread, float(frame[-1])
             keep = np.isfinite(x)
-            # Mixtures are of a few times, with hundreds of frames each.
+            # Hundreds of mixtures share a few times.
             key = t, keep.tobytes()
             if key not in costs:
-                costs[key] = self._cost(keep, t)
-            values.append(costs[key].least(x[keep]))
-        return np.array(values)
+                costs[key] = self._cost_grid(keep, t)
+            values.append(costs[key].minimum(x[keep]))
+        return np.array(values).reshape(features.shape[:-1])
 
-    def value(self, features: FloatArray) -> float:
-        """Return the value of a (d + 1,) frame, its time last; NaN channels are left out."""
-        return float(self.predict(features[None])[0])
-
-    def _cost(self, keep: BoolArray, t: float) -> "_Cost":
-        """Return what a value costs at the time t, by a frame's (q,) channels to keep."""
+    def _cost_grid(self, keep: BoolArray, t: float) -> "_CostGrid":
+        """Return the cost of values at the time t for a frame's (q,) channels to keep."""
         b, v = self.coefficients[:, keep], self.drift[:, keep]
-        later = float(_age(np.array([max(t, self.last_t)]), self.first_t, self.last_t)[0])
-        b[: len(self.trend)] += later * self.trend[:, keep]
+        age = float(_log_age(np.array([max(t, self.last_t)]), self.first_t, self.last_t)[0])
+        b[: len(self.trend)] += age * self.trend[:, keep]
         inner = np.linalg.inv(np.diag(self.noise**2 / self.drift_variance) + v @ v.T)
 
         def whitened(rows: FloatArray) -> FloatArray:
@@ -225,25 +211,36 @@ class InverseCalibration:
         grid = np.linspace(self.low, self.high, 401)
         powers = np.vander((grid - self.centre) / self.scale, len(b), increasing=True)
         weights = whitened(b)
-        return _Cost(grid, powers, weights, np.einsum("ij,jk,ik->i", powers, weights @ b.T, powers))
+        return _CostGrid(grid, powers, weights, np.einsum("ij,jk,ik->i", powers, weights @ b.T, powers))
+
+
+Regressor: TypeAlias = Ridge | TobitRidge | InverseCalibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Cost:
-    """What values on a grid (g,) cost: of themselves (g,), and by powers (g, p) with weights (p, q) of a frame."""
+class _CostGrid:
+    """Cost of values on a grid (g,): a fixed part (g,), and powers (g, p) times weights (p, q) times the frame."""
 
     grid: FloatArray
     powers: FloatArray
     weights: FloatArray
-    of_itself: FloatArray
+    fixed: FloatArray
 
-    def least(self, x: FloatArray) -> float:
-        """Return the value of a scaled frame (q,), which costs least."""
-        return _refined(self.grid, self.of_itself - 2 * self.powers @ (self.weights @ x))
+    def minimum(self, x: FloatArray) -> float:
+        """Return the value of least cost for a scaled frame (q,), refined by a parabola through the least three."""
+        cost = self.fixed - 2 * self.powers @ (self.weights @ x)
+        i = int(np.argmin(cost))
+        if i in (0, len(self.grid) - 1):
+            return float(self.grid[i])
+        before, here, after = cost[i - 1 : i + 2]
+        bend = before - 2 * here + after
+        return float(
+            self.grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (self.grid[1] - self.grid[0])
+        )
 
 
-def _age(t: FloatArray, first_t: float, last_t: float) -> FloatArray:
-    """Return how much older than at last_t frames are, in e-foldings of the time since the first; negative: younger."""
+def _log_age(t: FloatArray, first_t: float, last_t: float) -> FloatArray:
+    """Return the age of frames since last_t in e-foldings of the time since first_t; negative before last_t."""
     return np.asarray(np.log((1.0 + np.maximum(t - first_t, 0.0)) / (1.0 + last_t - first_t)))
 
 
@@ -253,31 +250,65 @@ def _spread_about_parabola(frames: FloatArray, z: FloatArray) -> FloatArray:
     powers = np.vander(z, degree + 1, increasing=True)
     penalty = np.diag([0.0, 0.0] + [_CURVATURE] * (degree - 1))
     squares = ((frames - powers @ np.linalg.solve(powers.T @ powers + penalty, powers.T @ frames)) ** 2).mean(axis=0)
-    # A channel that never changed brings no infinity: half is everybody's.
+    # The median keeps channels that never change finite.
     return np.asarray(np.sqrt(0.5 * squares + 0.5 * np.median(squares) + np.finfo(np.float64).tiny))
 
 
-def _refined(grid: FloatArray, cost: FloatArray) -> float:
-    """Return the minimum of a smooth cost on an even grid, by a parabola through the least three."""
-    i = int(np.argmin(cost))
-    if i in (0, len(grid) - 1):
-        return float(grid[i])
-    before, here, after = cost[i - 1 : i + 2]
-    bend = before - 2 * here + after
-    return float(grid[i] + (0.5 * (before - after) / bend if bend > 0 else 0.0) * (grid[1] - grid[0]))
+@dataclass(frozen=True, slots=True, eq=False)
+class ChannelImputer:
+    """Gaussian model of gripped differences, to impute channels that died after the calibration.
+
+    mean (m, 896) in volts; modes (k, m, 896) in volts, each one standard deviation; precision (m, 896) in V⁻² is one
+    over each channel's remaining variance, 0 for channels that were dead at calibration.
+    """
+
+    mean: FloatArray
+    modes: FloatArray
+    precision: FloatArray
+
+    @classmethod
+    def fit(cls, positions: FloatArray, validators: tuple[FingertipValidator, ...]) -> Self:
+        """Fit to the (n, m·896) differences of gripped frames in units of the validators' noises."""
+        noise = np.array([one.noise for one in validators])
+        alive = np.isfinite(noise)
+        mean = positions.mean(axis=0)
+        moved = positions - mean
+        _, s, vt = np.linalg.svd(moved, full_matrices=False)
+        directions = vt[:_MOST_DIRECTIONS]
+        # No channel is known better than its own noise, the unit here.
+        rest = np.maximum((moved - moved @ directions.T @ directions).std(axis=0), 1.0).reshape(noise.shape)
+        scale = np.where(alive, noise, 0.0)
+        spreads = s[:_MOST_DIRECTIONS] / np.sqrt(len(positions))
+        modes = (spreads[:, None] * directions).reshape(-1, *noise.shape) * scale
+        precision = np.where(alive, (rest * noise) ** -2.0, 0.0)
+        return cls(mean.reshape(noise.shape) * scale, modes, precision)
+
+    def impute(self, difference: FloatArray, usable: BoolArray) -> tuple[FloatArray, FloatArray]:
+        """Return a (m, 896) difference in volts with unusable channels at their conditional mean.
+
+        Also return the (k, m, 896) independent errors of the imputed channels, one standard deviation each.
+        """
+        k = len(self.modes)
+        modes = self.modes.reshape(k, -1)
+        weighted = modes * np.where(usable, self.precision, 0.0).ravel()
+        # Condition the Gaussian in the modes: a (k, k) system instead of one of all channels.
+        covariance = np.linalg.inv(np.eye(k) + weighted @ modes.T)
+        moved = (covariance @ (weighted @ (difference - self.mean).ravel()) @ modes).reshape(difference.shape)
+        errors = (np.linalg.cholesky(covariance).T @ modes).reshape(self.modes.shape)
+        return np.where(usable, difference, self.mean + moved), np.where(usable, 0.0, errors)
 
 
 def left_out_blocks(n: int) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield pairs of (rest, block) for N_BLOCKS blocks of n rows, each of them one stretch of time."""
+    """Yield (rest, block) for N_BLOCKS blocks of n rows, each one stretch of time."""
     block = np.arange(n) * N_BLOCKS // n
     for one in range(N_BLOCKS):
         yield np.flatnonzero(block != one), np.flatnonzero(block == one)
 
 
 def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:
-    """Return pairs of (earlier, all later) parts of n rows, from six tenths of the time on: what is yet to come.
+    """Return (earlier, all later) parts of n rows, from six tenths of the time on: rolling forecasts.
 
-    There are none where the first has fewer rows than tell how good this calibration is.
+    The list is empty where the first part has too few rows to represent this calibration.
     """
     first = round(FIRST_ORIGIN * n)
     if first < LEAST_BEFORE_ORIGIN:
@@ -285,19 +316,19 @@ def later_origins(n: int) -> list[tuple[IntArray, IntArray]]:
     return [(np.arange(cut), np.arange(cut, n)) for cut in range(first, n - 1, max(1, n // N_ORIGINS))]
 
 
+def later_splits(n: int) -> Iterator[tuple[IntArray, IntArray]]:
+    """Yield (earlier, later) parts of n rows in time order: fit on the one, validate on the other."""
+    for share in (0.4, 0.6, 0.8):
+        cut, end = round(n * share), round(n * min(share + 0.2, 1.0))
+        if cut >= 2 and end > cut:
+            yield np.arange(cut), np.arange(cut, end)
+
+
 def ranked_channels(frames: FloatArray, values: FloatArray) -> IntArray:
     """Return the numbers of the (n, d) frames' channels by falling |correlation| with the (n,) values."""
     spread = frames.std(axis=0)
     covariance = np.abs((frames - frames.mean(axis=0)).T @ (values - values.mean()))
     return np.argsort(-covariance / np.where(spread > 0, spread, np.inf), kind="stable")
-
-
-def later_splits(n: int) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield pairs of (earlier, later) parts of n rows in time order: fit on the one, judge on the other."""
-    for share in (0.4, 0.6, 0.8):
-        cut, end = round(n * share), round(n * min(share + 0.2, 1.0))
-        if cut >= 2 and end > cut:
-            yield np.arange(cut), np.arange(cut, end)
 
 
 def best_strength(

@@ -1,401 +1,497 @@
-"""What an estimator of raw frames remembers, and nothing more: the idle frame, and the last few seconds.
+"""State of one session: the idle frame and the last few seconds.
 
-Two kinds of feature are made from it. `difference` is to the idle frame, for what has no memory. `motion` is how far
-the frame has moved, in a few directions per fingertip, since each of the last frames: the gel creeps under a held
-twist for seconds, so how fast it moves tells of the torque what its place does not, and a slow drift of the baseline
-leaves no trace in it. Where the gel holds its place, `placed` adds that place to the motion: what a twist that is held
-for long is told by.
+The state makes two kinds of features. The difference to the idle frame serves estimators without memory. The temporal
+features are how far the frame has moved since each of the last frames, in a few directions per fingertip: the gel
+creeps for seconds under a held twist, so its speed shows torque that its position does not, and slow drift of the
+baseline leaves no trace. Where the gel holds its position, that position is a feature too and shows a long twist.
 """
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from functools import cached_property
+from typing import Self
 
 import numpy as np
 
 from shearloop.bank.arrays import BoolArray, FloatArray
 from shearloop.bank.eit.channels import N_CHANNELS
+from shearloop.bank.eit.matching import signal_above_noise
 from shearloop.bank.estimation.fingertip_validator import (
     LARGEST_JUMPING_SHARE,
+    LEAST_NOISE_V,
     STEP_FRAMES,
+    FingertipSet,
     FingertipValidator,
-    unsaturated,
+    GripDetector,
+    mask_saturated,
 )
-from shearloop.bank.estimation.grip import Grip
-from shearloop.bank.estimation.temporal_features import TemporalFeatures
-from shearloop.bank.estimation.validity import Guards
-from shearloop.bank.estimation.values import TactileFrame, everywhere
+from shearloop.bank.estimation.values import TactileFrame
 
-# Frames that an idle baseline is averaged over at the most recent end.
+# Frames in the mean of the idle baseline.
 BASELINE_FRAMES = 10
-# Frames, half a minute of them, that the mean place of a grip reaches back over: twists come and go within it, and the
-# gel's creep does not add up.
+# Frames (half a minute) in the mean difference of a grip: twists come and go within it.
 _HELD_FRAMES = 60
-# Frames further apart than this have lost the thread, as long as the period is not known: two of 0.54 s are missing.
+# Longest step between frames while the period is unknown: two frames of 0.54 s are missing.
 _LARGEST_GAP_S = 1.4
-# Of so many steps in time the middle one is the period, if that is not known to be shorter; a step longer than the
-# first share of it has one frame missing, and longer than the second more than one.
+# The median of this many steps is the period, if the configured one is not shorter. A step longer than the first share
+# of the period has one frame missing, a step longer than the second has more.
 _STEPS, _MISSING_SHARE, _LARGEST_GAP_SHARE = 9, 1.5, 2.5
-# A session's baseline is made of at least so many frames before a grip is looked for that is not half as strong as the
-# calibration's.
+# A baseline of fewer frames accepts only grips of at least half the calibrated strength.
 _LEAST_IDLE, _OUTRIGHT = 5, 0.5
-# Bridged frames among those remembered: more, and the memory is made up.
+# Most interpolated frames among those remembered.
 _LARGEST_BRIDGED = 3
+# The paper's method refuses frames with more unusable channels than this.
+_PAPER_UNUSABLE_SHARE = 0.10
+# Degrees of freedom of the mean variance of all channels in each channel's own.
+_POOLED_FREEDOM = 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProcessedFrame:
-    """A frame that passed: channels (m, 896) with unusable ones filled in, differences to the idle frame, reasons.
+    """A frame after the session's checks, with the reasons against it.
 
-    usable (m, 896) leaves out what the frame itself shows to be lost or saturated, beside what the board told.
+    channels (m, 896) have unusable ones filled in; difference (m, 896) is to the idle frame. usable (m, 896) excludes
+    channels that the board or the frame itself shows to be lost or saturated. lag_s is the lag of an average.
     """
 
     channels: FloatArray
     difference: FloatArray
-    why: tuple[str, ...]
+    reasons: tuple[str, ...]
     usable: BoolArray
+    lag_s: float = 0.0
 
 
-class _Placed(NamedTuple):
-    """Where a frame lies: the score of each side's grip, and the (m, 896) difference to the idle frame.
+@dataclass(frozen=True, slots=True, eq=False)
+class TemporalFeatures:
+    """Directions (m, p, 896) along which each side's motion is measured, in units of noise, and how far back.
 
-    At the calibration's gain, as are the (m·p,) places of the frame and of its difference along the directions.
+    With uses_position the position relative to the idle frame is a feature too.
     """
 
-    grips: list[float]
-    difference: FloatArray
-    place: FloatArray
-    from_idle: FloatArray
+    directions: FloatArray
+    n_lags: int
+    uses_position: bool = False
+
+    @classmethod
+    def fit(
+        cls, parts: list[FloatArray], validators: tuple[FingertipValidator, ...], n_directions: int, n_lags: int
+    ) -> Self:
+        """Fit the main directions of motion to each recording's (n, m, 896) gripped frames."""
+        directions = []
+        for layer, one in enumerate(validators):
+            moved = np.vstack([(part[n_lags:, layer] - part[:-n_lags, layer]) / one.noise for part in parts])
+            rows = np.linalg.svd(moved, full_matrices=False)[2][:n_directions] / one.noise
+            directions.append(rows * np.sign(rows.sum(axis=1, keepdims=True)))
+        return cls(np.array(directions), n_lags)
+
+    def project(self, channels: FloatArray) -> FloatArray:
+        """Return the (…, m·p) positions of (…, m, 896) frames along the directions."""
+        found = np.einsum("...mc,mpc->...mp", channels, self.directions)
+        return np.asarray(found.reshape(*found.shape[:-2], -1))
+
+    def impute_motion(self, layer: int, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
+        """Return the motion of all (896,) channels of a side along the directions, from the usable channels."""
+        return _fit_along(self._modes(layer, noise), moved, usable, noise)
+
+    def impute_difference(
+        self, layer: int, difference: FloatArray, usable: BoolArray, validator: FingertipValidator
+    ) -> FloatArray:
+        """Return the same for a (896,) difference to idle, with the grip itself as one more direction."""
+        modes = np.vstack([self._modes(layer, validator.noise), validator.gripped - validator.idle])
+        return _fit_along(modes, difference, usable, validator.noise)
+
+    def _modes(self, layer: int, noise: FloatArray) -> FloatArray:
+        return np.asarray(self.directions[layer] * np.where(np.isfinite(noise), noise, 0.0) ** 2)
+
+    def features(self, positions: Sequence[FloatArray], from_idle: FloatArray) -> FloatArray:
+        """Return n_lags · m·p features of motion, nearest lag first, and m·p of position where it is used.
+
+        positions are the last n_lags + 1 (m·p,) positions; from_idle (m·p,) is the newest one relative to idle.
+        """
+        rows = np.array(positions)
+        moved = (rows[-1] - rows[-2::-1]).ravel()
+        return np.concatenate([moved, from_idle]) if self.uses_position else moved
 
 
 class SessionState:
-    """The state of one session; every frame goes through `see` in order."""
+    """State of one session of raw frames; every frame goes through `process` in order."""
 
     def __init__(
         self,
-        guards: tuple[FingertipValidator, ...],
-        motion: TemporalFeatures | None,
+        validators: tuple[FingertipValidator, ...],
+        temporal: TemporalFeatures | None,
         period_s: float = np.inf,
         idle_frames: int = 0,
     ) -> None:
-        """Begin a session; its first `idle_frames` usable frames are, on somebody's word, of untouched fingertips."""
-        self._guards = Guards(guards)
-        # The board's, where it is known beforehand: of one that leaves out half of its frames it cannot be learned.
+        """Begin a session; the operator guarantees that its first `idle_frames` usable frames are untouched."""
+        self._fingertips = FingertipSet(validators)
+        # A board that drops half of its frames does not show its period, so the configured one is a bound.
         self._period_s = period_s
-        self._motion = motion
-        n_lags = motion.n_lags if motion is not None else 0
-        # Where the last frames were along the directions, and the last of these frames.
-        self._recent: deque[FloatArray] = deque(maxlen=n_lags + 1)
+        self._temporal = temporal
+        n_lags = temporal.n_lags if temporal is not None else 0
+        # Positions of the last frames along the directions, and which of them are interpolated.
+        self._positions: deque[FloatArray] = deque(maxlen=n_lags + 1)
         self._bridged: deque[bool] = deque(maxlen=n_lags + 1)
-        # Where the last of them is from idle.
         self._from_idle: FloatArray = np.zeros(0)
-        # How many frames in a row were left out until now.
-        self._left_out = 0
-        self._idle: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in guards]
-        # The calibration's, until the session has its own.
-        self._baselines = self._guards.idle.copy()
-        # (m, 1) of each fingertip's idle frame of this session against the calibration's.
-        self._gains: FloatArray = np.ones((len(guards), 1))
-        # The mean difference to the idle frame since the grip, and of how many frames.
-        self._held: FloatArray = np.zeros_like(self._baselines)
+        self._skipped_in_a_row = 0
+        self._idle: list[deque[FloatArray]] = [deque(maxlen=BASELINE_FRAMES) for _ in validators]
+        # The calibration's idle frame until the session has its own, and (m, 1) gains of the session's over it.
+        self._baselines = self._fingertips.idle.copy()
+        self._gains: FloatArray = np.ones((len(validators), 1))
+        self._mean_difference: FloatArray = np.zeros_like(self._baselines)
         self._n_held = 0
         self._begun = False
         self._before: FloatArray | None = None
-        self._refused: FloatArray | None = None
+        self._disturbed: FloatArray | None = None
         self._t_s = -np.inf
         self._steps_s: deque[float] = deque(maxlen=_STEPS)
-        # Whether a frame is missing between the last two.
-        self._missing = False
+        self._frame_missing = False
         self._passed: deque[FloatArray] = deque(maxlen=STEP_FRAMES + 1)
-        self._let_go = [False for _ in guards]
-        self._grips = [Grip(guard.grip_threshold) for guard in guards]
-        self._lost: BoolArray = np.zeros((len(guards), N_CHANNELS), dtype=np.bool_)
-        # Channels that the session began without: their idle voltages are not known.
+        self._released = [False for _ in validators]
+        self._grips = [GripDetector(one.grip_threshold) for one in validators]
+        self._lost: BoolArray = np.zeros((len(validators), N_CHANNELS), dtype=np.bool_)
+        # Channels that were unusable when the session began: their idle voltages are unknown.
         self._unknown: BoolArray = self._lost
-        self._some_unknown = False
-        # Frames that are to be taken for idle ones, and those taken.
         self._idle_wanted = idle_frames
-        self._idle_taken: list[FloatArray] = []
+        self._tare_frames: list[FloatArray] = []
         self._least_idle = min(_LEAST_IDLE, idle_frames or _LEAST_IDLE)
 
     @property
-    def taking_idle(self) -> bool:
-        """Whether frames are being taken for idle ones."""
-        return len(self._idle_taken) < self._idle_wanted
+    def taring(self) -> bool:
+        """Whether frames are being averaged into the idle frame."""
+        return len(self._tare_frames) < self._idle_wanted
 
     @property
-    def own_baseline(self) -> bool:
-        """Whether every fingertip was seen idle in this session, so that the difference is this session's."""
+    def has_baseline(self) -> bool:
+        """Whether this session has seen every fingertip idle."""
         return all(self._idle)
 
     @property
-    def moved(self) -> FloatArray | None:
-        """The features of the last frames' motion, None while these are not complete, or no motion is read."""
-        if self._motion is None or len(self._recent) < self._motion.n_lags + 1:
+    def temporal_features(self) -> FloatArray | None:
+        """Features of the last frames' motion, None while frames are missing or no motion is used."""
+        if self._temporal is None or len(self._positions) < self._temporal.n_lags + 1:
             return None
-        return self._motion.features(self._recent, self._from_idle)
+        return self._temporal.features(self._positions, self._from_idle)
 
     @property
-    def held(self) -> FloatArray:
-        """The (m, 896) mean difference to the idle frame of this grip's last frames that nothing spoke against.
-
-        It goes on changing, in its place. What does not change while a tool is held is read from it: a single frame
-        has several times the noise.
-        """
-        return self._held
+    def mean_difference(self) -> FloatArray:
+        """Mean (m, 896) difference to the idle frame over this grip's last valid frames, updated in place."""
+        return self._mean_difference
 
     @property
     def held_frames(self) -> int:
-        """Of how many frames `held` is the mean."""
+        """Number of frames in `mean_difference`."""
         return self._n_held
 
-    def see(self, frame: TactileFrame) -> ProcessedFrame:
-        """Take a frame in and return what it looks like with what speaks against it."""
-        self._pass_time(frame.t_s)
-        channels, usable, why, jumping_shares = self._looked_at(frame)
-        disturbed = self._disturbed(jumping_shares)
-        if any(why):
-            # One garbled frame is no other fingertip: it is left out like one that is disturbed.
-            self._refused = None
-            self._leave_out()
-            return ProcessedFrame(channels, np.zeros_like(channels), tuple(filter(None, why)), usable)
-        if disturbed:
-            return self._bridge(channels, disturbed, usable)
-        if self._before is None and not self._begun and not self._idle_taken:
+    def process(self, frame: TactileFrame) -> ProcessedFrame:
+        """Take the next frame and return it with the reasons against it."""
+        self._advance_time(frame.t_s)
+        channels, usable, reasons, jumping_shares = self._check(frame)
+        if any(reasons):
+            # One garbled frame is no other fingertip: skip it like a disturbed one.
+            self._disturbed = None
+            self._skip()
+            return self._refuse(channels, usable, *filter(None, reasons))
+        if jumping_shares and (disturbance := self._fingertips.disturbance(jumping_shares)):
+            return self._bridge(channels, disturbance, usable)
+        if self._before is None and not self._begun and not self._tare_frames:
             self._unknown = ~usable
-            self._some_unknown = not everywhere(usable)
-        if self.taking_idle:
-            return self._taken_for_idle(channels, usable)
+        if self.taring:
+            return self._add_to_tare(channels, usable)
         if self._before is None:
             self._before = channels
-            return ProcessedFrame(
-                channels, np.zeros_like(channels), ("there is no frame before to compare with",), usable
-            )
-        self._refused, self._before, self._left_out = None, channels, 0
-        self._learn_baseline(channels, frame)
-        self._notice_release(channels)
-        return self._judged(channels, usable)
+            return self._refuse(channels, usable, "there is no earlier frame to compare with")
+        self._disturbed, self._before, self._skipped_in_a_row = None, channels, 0
+        self._update_baseline(channels, frame)
+        self._detect_release(channels)
+        return self._finish(channels, usable)
 
-    def _looked_at(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, Sequence[str], Sequence[float]]:
-        """Return the channels, which are usable, why a side says nothing, and which share of each side's jumps.
+    @staticmethod
+    def _refuse(channels: FloatArray, usable: BoolArray, *reasons: str) -> ProcessedFrame:
+        return ProcessedFrame(channels, np.zeros_like(channels), reasons, usable)
 
-        Without a frame before there are no shares.
+    def _check(self, frame: TactileFrame) -> tuple[FloatArray, BoolArray, list[str], list[float]]:
+        """Return the filled channels, the usable ones, each side's reason, and its share of jumping channels.
+
+        There are no shares without an earlier frame.
         """
-        usable = unsaturated(frame.channels, frame.usable)
-        channels = self._filled(frame.channels, usable)
-        why, lost = self._guards.seen(channels, usable)
-        # Channels that are lost for longer are left out; while they are being lost they count as jumping.
+        usable = mask_saturated(frame.channels, frame.usable)
+        channels = self._fill(frame.channels, usable)
+        reasons, lost = self._fingertips.check(channels, usable)
+        # Channels that stay lost are left out; while they are being lost they count as jumping.
         judged = usable & ~((lost & self._lost) | self._unknown)
-        shares = self._guards.jumping_shares(channels, self._before, judged) if self._before is not None else ()
+        shares = self._fingertips.jumping_shares(channels, self._before, judged) if self._before is not None else []
         self._lost = lost
-        if self._some_unknown or np.count_nonzero(lost):
+        if self._unknown.any() or lost.any():
             usable = usable & ~(lost | self._unknown)
-            why = why if any(why) else self._guards.too_few(usable)
-            channels = self._filled(frame.channels, usable)
-        return channels, usable, why, shares
+            reasons = reasons if any(reasons) else self._fingertips.too_few_channels(usable)
+            channels = self._fill(frame.channels, usable)
+        return channels, usable, reasons, shares
 
-    def _pass_time(self, t_s: float) -> None:
-        step_s, self._t_s, self._missing = t_s - self._t_s, t_s, False
+    def _advance_time(self, t_s: float) -> None:
+        step_s, self._t_s, self._frame_missing = t_s - self._t_s, t_s, False
         learned_s = sorted(self._steps_s)[_STEPS // 2] if len(self._steps_s) == _STEPS else np.inf
         period_s = min(learned_s, self._period_s)
         if 0 < step_s <= _LARGEST_GAP_S:
             self._steps_s.append(step_s)
         if not 0 < step_s <= min(_LARGEST_GAP_S, _LARGEST_GAP_SHARE * period_s):
-            # A frame from before the last one says nothing of how the gel has moved since that.
-            self._forget()
-            if self._idle_taken and self.taking_idle:
-                # A tool that was let go or gripped in the gap shows against the zero's last frame.
-                self._before = self._idle_taken[-1]
+            # After a gap the last frames do not show how the gel has moved.
+            self._forget_grip()
+            self._before = self._disturbed = None
+            self._passed.clear()
+            if self._tare_frames and self.taring:
+                # Compare with the tare's last frame: a tool may have been gripped or released in the gap.
+                self._before = self._tare_frames[-1]
             return
-        self._missing = step_s > _MISSING_SHARE * period_s
+        self._frame_missing = step_s > _MISSING_SHARE * period_s
 
-    def _remember(self, place: FloatArray) -> None:
-        """Add a place to the last ones; those that were left out or are missing before it lie on the way to it."""
-        if self._missing and self._recent:
-            self._stand_in()
+    def _remember(self, position: FloatArray) -> None:
+        """Append a position; interpolate the skipped or missing ones before it."""
+        if self._frame_missing and self._positions:
+            self._repeat_position()
         between = 0
         while between < len(self._bridged) and self._bridged[-1 - between]:
             between += 1
-        if 0 < between < len(self._recent):
-            # Left where the gel was, they would say that it has moved in one step as far as in all of these.
-            begin = self._recent[-1 - between]
+        if 0 < between < len(self._positions):
+            begin = self._positions[-1 - between]
             for i in range(1, between + 1):
-                self._recent[i - 1 - between] = begin + i / (between + 1) * (place - begin)
-        self._recent.append(place)
+                self._positions[i - 1 - between] = begin + i / (between + 1) * (position - begin)
+        self._positions.append(position)
         self._bridged.append(False)
 
-    def _stand_in(self) -> None:
-        """Put the last frame in the place of one that is not there, until the next one tells where that was."""
-        self._recent.append(self._recent[-1])
+    def _repeat_position(self) -> None:
+        """Repeat the last position for a missing frame until the next frame allows interpolation."""
+        self._positions.append(self._positions[-1])
         self._bridged.append(True)
 
-    def _leave_out(self) -> None:
-        """Put the last frame that passed in the place of one that did not; after too many in a row it is too old."""
-        self._left_out += 1
-        if self._left_out > _LARGEST_BRIDGED:
+    def _skip(self) -> None:
+        """Leave a frame out; after too many in a row the last position is too old."""
+        self._skipped_in_a_row += 1
+        if self._skipped_in_a_row > _LARGEST_BRIDGED:
             self._forget_grip()
-        elif self._recent:
-            for _ in range(1 + self._missing):
-                self._stand_in()
+        elif self._positions:
+            for _ in range(1 + self._frame_missing):
+                self._repeat_position()
 
-    def _placed(self, channels: FloatArray, usable: BoolArray) -> _Placed:
-        """Return where a frame lies at the calibration's gain, which does not change while it is gripped."""
-        grips, difference = self._guards.grips(channels, self._baselines), self._difference(channels, usable)
-        at_gain = np.array([channels, difference]) / self._gains
-        places = self._motion.places(at_gain) if self._motion is not None else np.zeros((2, 0))
-        return _Placed(grips, at_gain[1], *places)
-
-    def _taken_for_idle(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
-        self._refused, self._before = None, channels
-        self._idle_taken.append(channels)
-        taken, wanted = len(self._idle_taken), self._idle_wanted
-        if taken == wanted:
-            self._baselines, self._begun = np.mean(self._idle_taken, axis=0), True
+    def _add_to_tare(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
+        self._disturbed, self._before = None, channels
+        self._tare_frames.append(channels)
+        n, wanted = len(self._tare_frames), self._idle_wanted
+        if n == wanted:
+            self._baselines, self._begun = np.mean(self._tare_frames, axis=0), True
             for layer, idle in enumerate(self._idle):
-                idle.extend(one[layer] for one in self._idle_taken)
-            self._take_gains()
-        return ProcessedFrame(
-            channels, np.zeros_like(channels), (f"taking the homogeneous frame, {taken} of {wanted}",), usable
-        )
+                idle.extend(one[layer] for one in self._tare_frames)
+            self._update_gains()
+        return self._refuse(channels, usable, f"taking the homogeneous frame, {n} of {wanted}")
 
     def _difference(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
-        """Return the (m, 896) difference to the idle frame; what is not usable goes by what is."""
+        """Return the (m, 896) difference to the idle frame, unusable channels imputed."""
         difference = channels - self._baselines
-        if self._motion is not None and not everywhere(usable):
-            for layer, guard in enumerate(self._guards.sides):
-                said = self._motion.gripped_step(layer, difference[layer], usable[layer], guard)
-                difference[layer] = np.where(usable[layer], difference[layer], said)
+        if self._temporal is not None and not usable.all():
+            for layer, one in enumerate(self._fingertips.sides):
+                imputed = self._temporal.impute_difference(layer, difference[layer], usable[layer], one)
+                difference[layer] = np.where(usable[layer], difference[layer], imputed)
         return difference
 
-    def _judged(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
-        grips, difference, place, from_idle = self._placed(channels, usable)
-        held = [self._holds(layer, score) for layer, score in enumerate(grips)]
-        loose = [one.side for layer, one in enumerate(self._guards.sides) if self._let_go[layer] or not held[layer]]
+    def _finish(self, channels: FloatArray, usable: BoolArray) -> ProcessedFrame:
+        scores = self._fingertips.grip_scores(channels, self._baselines)
+        # At the calibration's gain. It does not change while gripped.
+        difference = self._difference(channels, usable) / self._gains
+        gripped = [self._is_gripped(layer, score) for layer, score in enumerate(scores)]
+        loose = [
+            one.side for layer, one in enumerate(self._fingertips.sides) if self._released[layer] or not gripped[layer]
+        ]
+        reason = ""
         if loose:
             self._forget_grip()
-            return ProcessedFrame(channels, difference, (f"no grip at the {' and '.join(loose)} fingertip",), usable)
-        self._remember(place)
-        self._from_idle = from_idle
-        missing = (self._recent.maxlen or 0) - len(self._recent)
-        if missing:
-            return ProcessedFrame(
-                channels, difference, (f"gripped too lately: {missing} more frames are needed",), usable
-            )
-        if sum(self._bridged) > _LARGEST_BRIDGED:
-            return ProcessedFrame(
-                channels, difference, ("too many of the last frames were disturbed, or are missing",), usable
-            )
-        self._hold(difference)
-        return ProcessedFrame(channels, difference, (), usable)
-
-    def _hold(self, difference: FloatArray) -> None:
+            reason = f"no grip at the {' and '.join(loose)} fingertip"
+        else:
+            position, self._from_idle = np.zeros((2, 0))
+            if self._temporal is not None:
+                position, self._from_idle = self._temporal.project(np.array([channels / self._gains, difference]))
+            self._remember(position)
+            if missing := (self._positions.maxlen or 0) - len(self._positions):
+                reason = f"gripped too recently: {missing} more frames are needed"
+            elif sum(self._bridged) > _LARGEST_BRIDGED:
+                reason = "too many of the last frames were disturbed or are missing"
+        if reason:
+            return ProcessedFrame(channels, difference, (reason,), usable)
         self._n_held = min(self._n_held + 1, _HELD_FRAMES)
         if self._n_held == 1:
-            self._held = difference.copy()
+            self._mean_difference = difference.copy()
         else:
-            self._held += (difference - self._held) / self._n_held
+            self._mean_difference += (difference - self._mean_difference) / self._n_held
+        return ProcessedFrame(channels, difference, (), usable)
 
-    def _holds(self, layer: int, score: float) -> bool:
-        """Return whether a fingertip is gripped; with a baseline of a few frames only an outright grip is one."""
-        guard, grip = self._guards.sides[layer], self._grips[layer]
-        learning = 0 < len(self._idle[layer]) < self._least_idle and not grip.held
-        return grip.see(score) if not learning or score > max(_OUTRIGHT, guard.grip_threshold) else False
+    def _is_gripped(self, layer: int, score: float) -> bool:
+        """Return whether a fingertip is gripped; with a baseline of a few frames only a strong grip counts."""
+        grip = self._grips[layer]
+        learning = 0 < len(self._idle[layer]) < self._least_idle and not grip.gripped
+        strong = max(_OUTRIGHT, self._fingertips.sides[layer].grip_threshold)
+        return grip.update(score) if not learning or score > strong else False
 
-    def _notice_release(self, channels: FloatArray) -> None:
+    def _detect_release(self, channels: FloatArray) -> None:
         self._passed.append(channels)
         if len(self._passed) <= STEP_FRAMES:
             return
-        for layer in self._guards.stepping:
-            now, then, idle = (one[layer] / self._gains[layer] for one in (channels, self._passed[0], self._baselines))
-            released = self._guards.sides[layer].released(now, then, idle)
+        for layer, one in enumerate(self._fingertips.sides):
+            if max(one.step_limit, one.fall_limit) == math.inf:
+                continue
+            now, then, idle = (
+                each[layer] / self._gains[layer] for each in (channels, self._passed[0], self._baselines)
+            )
+            released = one.released(now, then, idle)
             if released is not None:
-                self._let_go[layer] = released
+                self._released[layer] = released
 
-    def _bridge(self, channels: FloatArray, disturbed: str, usable: BoolArray) -> ProcessedFrame:
-        """Leave a disturbed frame out; when the next one agrees with it, the change is real and the past is not."""
-        if self._refused is not None and all(
+    def _bridge(self, channels: FloatArray, disturbance: str, usable: BoolArray) -> ProcessedFrame:
+        """Skip a disturbed frame; if the next one agrees with it, the change is real and the past is void."""
+        confirmed = self._disturbed is not None and all(
             share <= LARGEST_JUMPING_SHARE
-            for share in self._guards.jumping_shares(channels, self._refused, self._guards.alive)
-        ):
+            for share in self._fingertips.jumping_shares(channels, self._disturbed, self._fingertips.alive)
+        )
+        if confirmed:
             self._forget_grip()
-            self._refused, self._before = None, channels
-            if self.taking_idle:
-                # A tool was let go or gripped meanwhile: the mean of before and after is neither.
-                self._idle_taken.clear()
+            self._disturbed, self._before = None, channels
+            if self.taring:
+                # The tool was gripped or released meanwhile: start the tare again.
+                self._tare_frames.clear()
         else:
-            self._refused = channels
-            self._leave_out()
-        return ProcessedFrame(channels, np.zeros_like(channels), (disturbed,), usable)
+            self._disturbed = channels
+            self._skip()
+        return self._refuse(channels, usable, disturbance)
 
-    def _disturbed(self, jumping_shares: Sequence[float]) -> str | None:
-        if not jumping_shares:
-            # There is no frame before to jump from.
-            return None
-        for guard, share in zip(self._guards.sides, jumping_shares, strict=True):
-            if share > LARGEST_JUMPING_SHARE:
-                return (
-                    f"{guard.side} fingertip: {100 * share:.0f} % of the channels jumped since the frame before; "
-                    "the tool was gripped, released or knocked, or the board is disturbed"
-                )
-        return None
-
-    def _filled(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
-        """Return the channels with unusable ones moved on from where they were as the usable ones say."""
-        if everywhere(usable):
+    def _fill(self, channels: FloatArray, usable: BoolArray) -> FloatArray:
+        """Return the channels with unusable ones moved on from the last frame as the usable ones moved."""
+        if usable.all():
             return channels
         if self._before is None:
-            return np.where(usable, channels, self._guards.gripped)
+            return np.where(usable, channels, self._fingertips.gripped)
         assumed = self._before.copy()
-        if self._motion is not None:
-            for layer, guard in enumerate(self._guards.sides):
+        if self._temporal is not None:
+            for layer, one in enumerate(self._fingertips.sides):
                 moved = channels[layer] - self._before[layer]
-                assumed[layer] += self._motion.step(layer, moved, usable[layer], guard.noise)
+                assumed[layer] += self._temporal.impute_motion(layer, moved, usable[layer], one.noise)
         return np.where(usable, channels, assumed)
 
-    def _learn_baseline(self, channels: FloatArray, frame: TactileFrame) -> None:
-        """Follow the idle frame while nothing is gripped; a session that begins gripped has the calibration's.
+    def _update_baseline(self, channels: FloatArray, frame: TactileFrame) -> None:
+        """Follow the idle frame while nothing is gripped; a session that begins gripped keeps the calibration's.
 
-        Channels that were unknown and have come back in an idle frame are taken up into (m, 896) channels with it.
+        Channels that were unknown and work again in an idle frame are restored in `channels` (m, 896).
         """
         first, self._begun = not self._begun, True
-        if self._recent:
+        if self._positions:
             return
-        for layer, guard in enumerate(self._guards.sides):
+        for layer, one in enumerate(self._fingertips.sides):
             idle = self._idle[layer]
-            begun = first and guard.idle_like(channels[layer])
-            # One frame is a poor baseline: the first few are taken unless they look gripped outright.
+            begun = first and one.looks_idle(channels[layer])
+            # One frame is a poor baseline: accept the first few unless they look clearly gripped.
             learned = len(idle) >= self._least_idle
-            limit = 0.5 * guard.grip_threshold if learned else max(_OUTRIGHT, guard.grip_threshold)
-            following = bool(idle) and guard.grip(channels[layer], self._baselines[layer]) < limit
+            limit = 0.5 * one.grip_threshold if learned else max(_OUTRIGHT, one.grip_threshold)
+            following = bool(idle) and one.grip_score(channels[layer], self._baselines[layer]) < limit
             if begun or following:
-                if self._some_unknown:
-                    self._take_up(layer, channels, frame)
+                self._restore_channels(layer, channels, frame)
                 idle.append(channels[layer])
                 self._baselines[layer] = np.mean(idle, axis=0)
-                self._take_gains()
+                self._update_gains()
 
-    def _take_up(self, layer: int, channels: FloatArray, frame: TactileFrame) -> None:
-        alive = unsaturated(frame.channels, frame.usable) & ~self._lost
-        back = self._unknown[layer] & alive[layer]
-        if np.count_nonzero(back):
-            # Idle frames before this one had none of them.
+    def _restore_channels(self, layer: int, channels: FloatArray, frame: TactileFrame) -> None:
+        if not self._unknown[layer].any():
+            return
+        working = mask_saturated(frame.channels, frame.usable) & ~self._lost
+        back = self._unknown[layer] & working[layer]
+        if back.any():
+            # Earlier idle frames lack these channels.
             self._idle[layer].clear()
             channels[layer, back] = frame.channels[layer, back]
             self._unknown[layer] &= ~back
-            self._some_unknown = bool(np.count_nonzero(self._unknown))
 
-    def _take_gains(self) -> None:
-        if self.own_baseline:
-            gains = [guard.gain(idle) for guard, idle in zip(self._guards.sides, self._baselines, strict=True)]
+    def _update_gains(self) -> None:
+        if self.has_baseline:
+            gains = [one.gain(idle) for one, idle in zip(self._fingertips.sides, self._baselines, strict=True)]
             self._gains = np.array(gains)[:, None]
 
     def _forget_grip(self) -> None:
-        self._recent.clear()
+        self._positions.clear()
         self._bridged.clear()
         self._n_held = 0
 
-    def _forget(self) -> None:
-        self._forget_grip()
-        self._before = self._refused = None
-        self._passed.clear()
+
+class PaperState:
+    """State of one session of the paper's method: mean of the latest frames minus the homogeneous frame.
+
+    Trehan et al. 2025, section 2. Without a validator nothing is known of the fingertip but its first frames.
+    """
+
+    has_baseline = True
+    temporal_features = None
+    held_frames = 1
+
+    def __init__(self, baseline_frames: int, average_frames: int, max_gap_s: float) -> None:
+        """Begin a session with `baseline_frames` untouched frames; a longer gap restarts the average."""
+        self._baseline_frames = baseline_frames
+        self._max_gap_s = max_gap_s
+        self._tare_frames: list[FloatArray] = []
+        self._latest: deque[tuple[float, FloatArray]] = deque(maxlen=average_frames)
+        self.mean_difference: FloatArray = np.zeros((1, N_CHANNELS))
+
+    @property
+    def taring(self) -> bool:
+        """Whether frames are being averaged into the homogeneous frame."""
+        return len(self._tare_frames) < self._baseline_frames
+
+    def process(self, frame: TactileFrame) -> ProcessedFrame:
+        """Take the next frame of one side and return it with the reasons against it."""
+        channels = frame.channels
+        unusable = int(np.count_nonzero(~frame.usable))
+        if unusable > _PAPER_UNUSABLE_SHARE * channels.size:
+            return self._refuse(
+                frame,
+                f"{unusable} of {channels.size} channels are saturated or dead; "
+                "check the ribbon cable and the gel's contact with the electrodes",
+            )
+        if self.taring:
+            self._tare_frames.append(channels[0])
+            return self._refuse(
+                frame, f"taking the homogeneous frame, {len(self._tare_frames)} of {self._baseline_frames}"
+            )
+        if self._latest and frame.t_s - self._latest[-1][0] > self._max_gap_s:
+            self._latest.clear()
+        self._latest.append((frame.t_s, channels[0]))
+        mean = np.mean([one for _, one in self._latest], axis=0)
+        difference = mean - self._homogeneous
+        n = len(self._latest)
+        noise = self._noise * math.sqrt(1.0 / n + 1.0 / self._baseline_frames)
+        if (silent := signal_above_noise(difference, noise)) is not None:
+            return self._refuse(frame, silent.why)
+        lag_s = frame.t_s - sum(t_s for t_s, _ in self._latest) / n
+        return ProcessedFrame(channels, difference[None], (), frame.usable, lag_s)
+
+    @staticmethod
+    def _refuse(frame: TactileFrame, reason: str) -> ProcessedFrame:
+        return ProcessedFrame(frame.channels, np.zeros_like(frame.channels), (reason,), frame.usable)
+
+    @cached_property
+    def _homogeneous(self) -> FloatArray:
+        # Deviations from the first frame keep the microvolts that sums of volts would lose.
+        first = self._tare_frames[0]
+        return np.asarray(first + np.mean(np.array(self._tare_frames) - first, axis=0))
+
+    @cached_property
+    def _noise(self) -> FloatArray:
+        """Standard deviation of one frame, (896,) in volts, at least the converter's rounding.
+
+        A few frames know the variance of one channel badly: each is drawn towards the mean of all (Smyth 2004).
+        """
+        freedom = self._baseline_frames - 1
+        own = (np.array(self._tare_frames) - self._homogeneous).var(axis=0, ddof=1)
+        variance = (freedom * own + _POOLED_FREEDOM * own.mean()) / (freedom + _POOLED_FREEDOM)
+        return np.asarray(np.sqrt(np.maximum(variance, LEAST_NOISE_V**2)))
+
+
+def _fit_along(modes: FloatArray, moved: FloatArray, usable: BoolArray, noise: FloatArray) -> FloatArray:
+    weights = np.where(usable & np.isfinite(noise), 1.0 / noise, 0.0)
+    found = np.linalg.lstsq((modes * weights).T, moved * weights, rcond=None)[0]
+    return np.asarray(found @ modes)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank
 from shearloop.bank.estimation.fingertip_validator import channel_noise
-from shearloop.bank.estimation.grip_segmentation import gripped_part
+from shearloop.bank.estimation.grip_segmentation import segment_grip
 from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
 from shearloop.daemon.analysis.series import read_series
@@ -33,7 +33,7 @@ def designed_for(recording: Path, fingertip: Path | None, side: str | None) -> t
     if not series:
         raise UserError(f"{recording} holds no torque; a design needs frames of a tool that is twisted")
     # Peak samples have no side.
-    one = series[0] if sides is None else series[0].of_sides(sides)
+    one = series[0] if sides is None else series[0].select_sides(sides)
     return path, design_bank(scene_of(one), load_yaml_model(path, FingertipGeometryConfig).fingertip())
 
 
@@ -43,7 +43,7 @@ def scene_of(series: FrameSeries) -> MeasuredFrames:
     if series.kind == "difference":
         frames = series.channels[:, 0]
         return MeasuredFrames(frames, residual_noise(frames), torque if np.isfinite(torque).all() else None)
-    idle, gripped, _ = gripped_part(series)
+    idle, gripped, _ = segment_grip(series)
     frames = series.channels[gripped, 0]
     # A recording that begins gripped has no idle frame: use its first one.
     before = series.channels[idle, 0] if idle.stop > 0 else series.channels[:1, 0]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from shearloop.daemon.config import CurveConfig, DaemonConfig, SkinConfig
-    from shearloop.daemon.sensing.opening import AnyEstimator
+    from shearloop.daemon.sensing.estimators import LiveEstimator
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -23,8 +23,7 @@ def run(args: argparse.Namespace) -> int:
     from shearloop.daemon.cli.run import check_emulators
     from shearloop.daemon.config import load_daemon_config
     from shearloop.daemon.rig import check_experiment
-    from shearloop.daemon.sensing.opening import open_both, open_estimator
-    from shearloop.daemon.sensing.torque_sources import torque_sources
+    from shearloop.daemon.sensing.estimators import open_combined, open_estimator, torque_sources
 
     config = load_daemon_config(args.config)
     check_emulators(config.emulators, args.config)
@@ -37,9 +36,9 @@ def run(args: argparse.Namespace) -> int:
         torque = _torque(estimators[name], calibrated=fingertip.calibration is not None)
         bank = "no bank" if grids is None else f"bank {fingertip.bank} of {grids[0].size} × {grids[1].size} cells"
         parts[name] = f"{bank}, {torque}"
-    combined = open_both(config.combined, config.fingertips) if config.combined is not None else None
+    combined = open_combined(config.combined, config.fingertips) if config.combined is not None else None
     if combined is not None:
-        parts["combined"] = f"{' and '.join(combined.sides)} together, {_torque(combined, calibrated=True)}"
+        parts["combined"] = f"{' and '.join(combined.calibration.sides)} together, {_torque(combined, calibrated=True)}"
     if config.skin is not None:
         parts["skin"] = _skin(config.skin)
     parts |= _rig(config)
@@ -57,11 +56,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _torque(estimator: "AnyEstimator", *, calibrated: bool) -> str:
-    from shearloop.daemon.sensing.opening import on_word
-
+def _torque(estimator: "LiveEstimator", *, calibrated: bool) -> str:
     if estimator.measures_torque:
-        return f"with torque{on_word(estimator)}"
+        return f"with torque{estimator.assumptions}"
     reason = "its calibration has diameters only" if calibrated else "no calibration is configured"
     return f"without torque: {reason}"
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import channels_of_line
 from shearloop.bank.estimation import Calibration, FrameSeries, fit
-from shearloop.daemon.analysis.evaluation import follow, judge
+from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import series_of
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.schema import DIAMETER_NOTE
@@ -100,16 +100,16 @@ class TwistPlayer:
         self._gripper.command = ACTIVATE
         while self._gripper.sta != 3:
             self._step()
-        self._still(IDLE_S)
+        self._hold_still(IDLE_S)
         self._gripper.command = GRIP
-        self._still(SETTLE_S)
+        self._hold_still(SETTLE_S)
         for angle_rad in self._angles():
             self._turn_to(angle_rad, self._random.uniform(*SPEEDS_RAD_PER_S))
-            self._still(self._random.uniform(*HOLDS_S))
+            self._hold_still(self._random.uniform(*HOLDS_S))
         self._turn_to(0.0, 0.2)
-        self._still(SETTLE_S)
+        self._hold_still(SETTLE_S)
         self._gripper.command = _OPEN
-        self._still(IDLE_S)
+        self._hold_still(IDLE_S)
 
     def _angles(self) -> Iterator[float]:
         """Yield angles over the whole range in random order, with a zero after every third."""
@@ -124,7 +124,7 @@ class TwistPlayer:
             self._wrist_rad = angle_rad if abs(angle_rad - self._wrist_rad) <= abs(step) else self._wrist_rad + step
             self._step()
 
-    def _still(self, seconds: float) -> None:
+    def _hold_still(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
             self._step()
 
@@ -155,8 +155,10 @@ def record(
 
 def calibrate(recordings: list[FrameSeries], sides: Sides) -> Calibration:
     """Return the default estimator's calibration for these fingertips."""
-    chosen = [one.of_sides(sides) for one in recordings]
-    return fit("fused", chosen, "the emulated rig, by shearloop.daemon.cli.demo_calibration", timed_by=recordings)
+    chosen = [one.select_sides(sides) for one in recordings]
+    return fit(
+        "motion_regression", chosen, "the emulated rig, by shearloop.daemon.cli.demo_calibration", timed_by=recordings
+    )
 
 
 def main() -> None:
@@ -178,7 +180,7 @@ def main() -> None:
         calibration = calibrate(recordings, sides)
         path = args.out / ("rig.cal" if sides == both else f"rig-{sides[0]}.cal")
         calibration.save(path)
-        figures = judge([follow(calibration, one) for one in apart])
+        figures = figures_of([estimate_series(calibration, one) for one in apart])
         print(
             f"{path}: torque ± {figures['rmse_nm']:.4f} N·m, diameter ± {figures['diameter_rmse_mm']:.1f} mm, "
             f"valid {figures['valid_fraction']:.2f} of the frames, intervals cover {figures['coverage_95']:.2f}"

@@ -1,4 +1,4 @@
-"""`shearloop evaluate CAL REC…`: estimates against the truth of recordings, in numbers and as a figure."""
+"""`shearloop evaluate CAL REC…`: compare estimates with the truth of recordings, in numbers and as a figure."""
 
 import argparse
 import json
@@ -16,34 +16,33 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) or folders of slices"
     )
-    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank the calibration was made with, if any")
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank of the calibration, if any")
     parser.add_argument(
-        "--part",
+        "--time-range",
         metavar="FROM:TO",
         default="0:1",
-        help="share of each recording to judge on, e.g. 0.6:1 of one that was calibrated on with 0:0.6 (default: all)",
+        help="share of each recording to use, e.g. 0.6:1 after calibrating on 0:0.6 (default: all)",
     )
     add_cluster(parser)
     parser.add_argument("--json", action="store_true", help="print the figures as JSON, and nothing else, on stdout")
-    parser.add_argument("--plot", action="store_true", help="draw truth against estimate over time into --out")
+    parser.add_argument("--plot", action="store_true", help="draw truth and estimate over time into --out")
     parser.add_argument("--out", type=Path, metavar="FILE", help="figure to draw (default with --plot: CAL.png)")
     parser.epilog = (
-        "Prints, of valid estimates whose truth is known: correlation (r), root mean square error and bias in N·m, "
-        "the share of truths within the 95 % intervals (coverage_95), and how wide the median interval is from end to "
-        "end (interval_nm, of diameters diameter_interval_mm), without which a coverage of 1 says little; of all "
-        "frames: how many are valid, why others are not, and how many milliseconds an estimate takes."
+        "Prints for valid estimates with a known truth: correlation (r), root mean square error and bias in N·m, the "
+        "share of truths within the 95 % intervals (coverage_95), and the median width of the intervals from end to "
+        "end (interval_nm, for diameters diameter_interval_mm). Prints for all frames: the share that is valid, why "
+        "others are not, and the milliseconds of an estimate."
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Evaluate, print, and draw where that is asked for."""
+    """Evaluate, print, and draw on request."""
     from shearloop.bank.eit.bank_file import Bank
     from shearloop.bank.estimation import Calibration
-    from shearloop.bank.estimation.alignment import doubt
-    from shearloop.daemon.analysis.copies import check_no_copies, check_paths_differ
-    from shearloop.daemon.analysis.evaluation import followed, judge, reasons
-    from shearloop.daemon.analysis.series import part_of, read_series
-    from shearloop.daemon.cli.options import check_kind, parse_part
+    from shearloop.bank.estimation.load_delay import load_delay_warning
+    from shearloop.daemon.analysis.evaluate import draw_tracks, estimate_in_worker, figures_of, invalid_reasons
+    from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, part_of, read_series
+    from shearloop.daemon.cli.options import check_kind, parse_time_range
     from shearloop.daemon.errors import UserError
     from shearloop.daemon.workers import in_order, open_executor
 
@@ -52,29 +51,27 @@ def run(args: argparse.Namespace) -> int:
     check_paths_differ(args.recordings)
     calibration = Calibration.load(args.calibration)
     bank = Bank.open(args.bank) if args.bank else None
-    start, stop = parse_part(args.part)
+    start, stop = parse_time_range(args.time_range)
     named = [(path, one) for path in args.recordings for one in read_series(path)]
     check_kind(args.calibration, calibration, [one for _, one in named])
     parts = [part_of(one, start, stop) for _, one in named]
     check_no_copies([(str(path), part) for (path, _), part in zip(named, parts, strict=True)])
     shared = (calibration, None if bank is None else str(args.bank.resolve()))
     with open_executor(args.cluster) as pool:
-        tracks = in_order(pool.map(followed, shared, parts))
-    figures = judge(tracks)
-    if calibration.word:
-        print(f"{args.calibration} was made on somebody's word {calibration.word}.", file=sys.stderr)
+        tracks = in_order(pool.map(estimate_in_worker, shared, parts))
+    figures = figures_of(tracks)
+    if calibration.assumptions:
+        print(f"{args.calibration} assumes that {calibration.assumption_text}.", file=sys.stderr)
     for (path, _), part in zip(named, parts, strict=True):
-        if why := doubt(part):
-            print(f"Doubtful is {path.name}: {why}.", file=sys.stderr)
+        if warning := load_delay_warning(part):
+            print(f"Warning: {path.name}: {warning}.", file=sys.stderr)
     if args.plot or args.out:
         out = args.out or args.calibration.with_suffix(".png")
+        titles = [f"{path.name}, {' and '.join(part.sides)}" for (path, _), part in zip(named, parts, strict=True)]
         try:
-            from shearloop.daemon.analysis.figure import draw
+            draw_tracks(tracks, titles, f"{calibration.estimator}, fitted to {calibration.source}", out)
         except ModuleNotFoundError as error:
             raise UserError(f"the figure needs {error.name}: `pip install 'shearloop[plot]'`") from error
-        try:
-            titles = [f"{path.name}, {' and '.join(part.sides)}" for (path, _), part in zip(named, parts, strict=True)]
-            draw(tracks, titles, f"{calibration.estimator}, fitted to {calibration.source}", out)
         except OSError as error:
             raise UserError(f"{out}: the figure cannot be written: {error.strerror}; choose another --out") from error
         print(f"The figure is in {out}.", file=sys.stderr)
@@ -84,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
     width = max(map(len, figures))
     for name, value in figures.items():
         print(f"{name:<{width}}  {_shown(value)}")
-    for reason in reasons(tracks):
+    for reason in invalid_reasons(tracks):
         print(f"{reason.frames:>6} frames not valid{', e.g.' if reason.differ else ''}: {reason.sentence}")
     return 0
 

@@ -70,14 +70,14 @@ def client_keys(args: argparse.Namespace) -> "ClientKeys | None":
     return ClientKeys(load_key_pair(key), load_public_key(server_key))
 
 
-def parse_part(text: str) -> tuple[float, float]:
+def parse_time_range(text: str) -> tuple[float, float]:
     """Return the shares of FROM:TO; raises UserError unless 0 ≤ FROM < TO ≤ 1."""
     try:
         start, stop = (float(share) for share in text.split(":"))
     except ValueError as error:
-        raise UserError(f"--part must be two shares such as 0.5:1, not {text!r}") from error
+        raise UserError(f"--time-range must be two shares such as 0.5:1, not {text!r}") from error
     if not 0 <= start < stop <= 1:
-        raise UserError(f"--part must rise from 0 or more to 1 or less, not {text!r}")
+        raise UserError(f"--time-range must rise from 0 or more to 1 or less, not {text!r}")
     return start, stop
 
 

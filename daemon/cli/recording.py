@@ -126,13 +126,6 @@ def _export(args: argparse.Namespace) -> int:
         raise UserError(f"{args.recording} has no topic {unknown[0]!r}; it has {', '.join(sorted(counts))}")
     topics = args.topic or sorted(topic for topic, count in counts.items() if count)
     with progress_bar(args.format, sum(counts[topic] for topic in topics), "message") as progress:
-        done = 0
-
-        def count(step: int) -> None:
-            nonlocal done
-            done += step
-            progress(done)
-
-        written = export(args.recording, args.format, out, topics, count)
+        written = export(args.recording, args.format, out, topics, progress)
     print_result({"files": [str(path) for path in written]}, map(str, written), as_json=args.json)
     return 0

@@ -5,13 +5,12 @@ import contextlib
 from collections.abc import Awaitable, Callable, Mapping
 
 from shearloop.bank.eit.polynomial import TWO_SIDED_95
-from shearloop.bank.estimation import Measured, fused
+from shearloop.bank.estimation import Measured, combine
 from shearloop.daemon.control.fault_detection import HAND_STALE_S
 from shearloop.daemon.control.loop_inputs import GripperStatus
 from shearloop.daemon.control.step_runner import GripTo
 from shearloop.daemon.messaging.messages import GripperStateMessage, Scalar
 from shearloop.daemon.messaging.publisher import Publisher
-from shearloop.daemon.sensing.tool_diameter import unknown
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import GripperCommand, GripperState, ObjectStatus
@@ -30,7 +29,7 @@ class GripperTask:
         publisher: Publisher,
         on_state: Callable[[GripperStatus], None],
         *,
-        fingertip_diameter: Callable[[int], Measured | None] = unknown,
+        fingertip_diameter: Callable[[int], Measured | None] = lambda _: None,
         measures_diameters: bool = True,
     ) -> None:
         """`fingertip_diameter` returns the fingertips' diameter at a time in ns.
@@ -140,7 +139,7 @@ def tool_diameter(state: GripperState, fingertips: Measured | None) -> Measured 
     if state.diameter_mm is None:
         return None
     std_mm = state.diameter_std_mm
-    return fused(Measured(state.diameter_mm, TWO_SIDED_95 * std_mm) if std_mm else None, fingertips)
+    return combine(Measured(state.diameter_mm, TWO_SIDED_95 * std_mm) if std_mm else None, fingertips)
 
 
 def _status(state: GripperState) -> GripperStatus:

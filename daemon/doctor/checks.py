@@ -18,8 +18,7 @@ from shearloop.daemon.config import CombinedConfig, CurveConfig, DaemonConfig, F
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.control.experiment_schema import ExperimentFile
 from shearloop.daemon.errors import UserError
-from shearloop.daemon.sensing.opening import on_word, open_both, open_estimator
-from shearloop.daemon.sensing.tracking import TrackedEstimator
+from shearloop.daemon.sensing.estimators import open_combined, open_estimator
 from shearloop.daemon.serial_ports import list_serial_ports
 from shearloop.drivers.errors import DriverError
 from shearloop.drivers.ur.settings import read_settings
@@ -214,19 +213,21 @@ def check_calibration(name: str, fingertip: FingertipConfig) -> Finding:
         estimator = open_estimator(fingertip, name)
     except (UserError, BankError) as error:
         return from_error(subject, error, "there is no torque")
-    if isinstance(estimator, TrackedEstimator):
-        found = f"{fingertip.calibration} is for this fingertip, estimator {estimator.name}"
-        return good(subject, found + on_word(estimator))
-    return good(subject, f"{fingertip.calibration} belongs to this bank")
+    calibration = estimator.calibration
+    if calibration.has_curves_only:
+        return good(subject, f"{fingertip.calibration} belongs to this bank")
+    found = f"{fingertip.calibration} is for this fingertip, estimator {calibration.estimator}"
+    return good(subject, found + estimator.assumptions)
 
 
 def _check_combined(combined: CombinedConfig, fingertips: dict[str, FingertipConfig]) -> Finding:
     try:
-        estimator = open_both(combined, fingertips)
+        estimator = open_combined(combined, fingertips)
     except (UserError, BankError) as error:
         return from_error("combined calibration", error, "there is no combined estimate")
-    found = f"{combined.calibration} is for {' and '.join(estimator.sides)}, estimator {estimator.name}"
-    return good("combined calibration", found + on_word(estimator))
+    found = f"{combined.calibration} is for {' and '.join(estimator.calibration.sides)}"
+    found += f", estimator {estimator.calibration.estimator}{estimator.assumptions}"
+    return good("combined calibration", found)
 
 
 def _check_skin(path: Path) -> Finding:

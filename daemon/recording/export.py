@@ -1,6 +1,7 @@
 """Exports topics of a recording as tables: CSV or Parquet, one file per topic, or one MATLAB file."""
 
 import csv
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -28,13 +29,18 @@ def count_messages(path: Path) -> dict[str, int]:
 def export(path: Path, form: str, out: Path, topics: list[str], progress: Progress = lambda _: None) -> list[Path]:
     """Write topics as `form` (csv, parquet or mat) and return the files.
 
-    For csv and parquet `out` is a folder, for mat a file. `progress` is called for each message. Raises UserError for
-    a recording that cannot be read and for files that cannot be written.
+    For csv and parquet `out` is a folder, for mat a file. `progress` receives the number of messages so far. Raises
+    UserError for a recording that cannot be read and for files that cannot be written.
     """
+    done = itertools.count(1)
+
+    def count() -> None:
+        progress(next(done))
+
     try:
         if form == "mat":
             structs = {
-                topic.replace(".", "_").replace("-", "_"): _matlab_struct(read_rows(path, topic, progress))
+                topic.replace(".", "_").replace("-", "_"): _matlab_struct(read_rows(path, topic, count))
                 for topic in topics
             }
             # savemat changes names and hides the reason if it opens the file itself.
@@ -47,13 +53,13 @@ def export(path: Path, form: str, out: Path, topics: list[str], progress: Progre
         written = []
         for topic in topics:
             written.append(out / f"{topic}.{form}")
-            write(written[-1], read_rows(path, topic, progress))
+            write(written[-1], read_rows(path, topic, count))
     except OSError as error:
         raise UserError(f"{out}: the export cannot be written: {error.strerror or error}") from error
     return written
 
 
-def read_rows(path: Path, topic: str, progress: Progress = lambda _: None) -> Rows:
+def read_rows(path: Path, topic: str, count: Callable[[], None] = lambda: None) -> Rows:
     """Return a topic's messages by time: log_time_ns first, maps as JSON text, None for a missing value."""
     rows = []
     with open_recording(path) as recording:
@@ -62,7 +68,7 @@ def read_rows(path: Path, topic: str, progress: Progress = lambda _: None) -> Ro
             content = with_missing_keys(live, json.loads(message.data))
             row = {key: json.dumps(value) if isinstance(value, dict) else value for key, value in content.items()}
             rows.append({_LOG_TIME: message.log_time, **row})
-            progress(1)
+            count()
     return rows
 
 

@@ -31,7 +31,7 @@ from shearloop.daemon.recording.schema import (
     input_event,
     input_topic,
 )
-from shearloop.daemon.sensing.tool_diameter import from_text
+from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
 from shearloop.drivers.serial_sensor import InputKind
 
 # Metadata of every recording; the other keys are notes of this one.
@@ -174,7 +174,7 @@ def read_recording(path: str | Path) -> Recording:
                     if not rows or rows[-1][2] != line:
                         rows.append((t_ns, int(content["arrival_unix_ns"]), line))
                 elif content["kind"] == InputKind.TOOL.value:
-                    tools.append((t_ns, from_text(input_event(content).data)[1]))
+                    tools.append((t_ns, tool_from_bytes(input_event(content).data)[1]))
             except (KeyError, TypeError, ValueError) as error:
                 raise _unusable(path, f"a message on {topic} does not match its schema ({error!r})") from error
     notes = {key: value for key, value in identity.items() if key not in _IDENTITY_KEYS}

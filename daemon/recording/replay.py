@@ -20,7 +20,6 @@ from pydantic import ValidationError
 
 from shearloop.bank.eit.channels import N_LINE_VALUES, ZERO_SLOTS
 from shearloop.bank.estimation import Measured
-from shearloop.bank.estimation.pairing import Pairing
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.config_file import mistakes
@@ -43,13 +42,11 @@ from shearloop.daemon.recording.schema import (
     with_missing_keys,
 )
 from shearloop.daemon.rig import load_cell_calibration
-from shearloop.daemon.sensing.both import COMBINED
-from shearloop.daemon.sensing.estimation import estimate_message
-from shearloop.daemon.sensing.fingertip import frame_message
+from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator
+from shearloop.daemon.sensing.fingertip_task import FramePairing, estimate_message, frame_message
 from shearloop.daemon.sensing.load_cell_task import LOAD_CELL, load_message
-from shearloop.daemon.sensing.opening import AnyEstimator, open_both, open_estimator
 from shearloop.daemon.sensing.skin_task import SKIN, RecordedSkin
-from shearloop.daemon.sensing.tool_diameter import from_text
+from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
@@ -93,7 +90,7 @@ class ReplayEvents:
         elif event.raw.kind is InputKind.TARE and event.raw.data.isdigit():
             self.tares.setdefault(event.source, set()).add(int(event.raw.data))
         elif event.raw.kind is InputKind.TOOL:
-            frame, tool = from_text(event.raw.data)
+            frame, tool = tool_from_bytes(event.raw.data)
             self.tools.setdefault(event.source, {})[frame] = tool
 
 
@@ -172,13 +169,14 @@ class ReplayPipeline:
         # Per source: the difference between recorded and replayed frame numbers, and the latest frame.
         self._number_offset: dict[str, int] = {}
         self._latest_frame: dict[str, int] = {}
-        self._estimators: dict[str, AnyEstimator] = {
+        self._estimators: dict[str, LiveEstimator] = {
             name: open_estimator(fingertip, name) for name, fingertip in config.fingertips.items()
         }
-        self._pairing: Pairing[Frame] | None = None
+        self._pairing: FramePairing[Frame] | None = None
         if config.combined is not None:
-            self._estimators[COMBINED] = combined = open_both(config.combined, config.fingertips)
-            self._pairing = Pairing(combined.sides, round(config.fingertips[combined.sides[0]].frame_period_s * 1e9))
+            self._estimators[COMBINED] = combined = open_combined(config.combined, config.fingertips)
+            sides = combined.calibration.sides
+            self._pairing = FramePairing(sides, round(config.fingertips[sides[0]].frame_period_s * 1e9))
         self._frame_parsers = {
             name: FrameParser(ZERO_SLOTS, nominal_period_ns=round(fingertip.frame_period_s * 1e9))
             for name, fingertip in config.fingertips.items()
@@ -200,7 +198,7 @@ class ReplayPipeline:
             for frame in self._renumbered(source, self._frame_parsers[source].handle(event)):
                 self._publisher.publish(frame_message(source, frame))
                 await self._estimate(source, frame)
-                pair = self._pairing.take(source, frame.t_mid_ns, frame) if self._pairing is not None else None
+                pair = self._pairing.add(source, frame.t_mid_ns, frame) if self._pairing is not None else None
                 if pair is not None:
                     await self._estimate(COMBINED, *pair[1])
         elif source == LOAD_CELL and self._load_parser is not None:
@@ -226,12 +224,12 @@ class ReplayPipeline:
         tools = self._events.tools.get(source, {})
         due = [first for first in tools if self._latest_frame.get(source, -1) < first <= number]
         if due:
-            estimator.hold(tools[max(due)])
+            estimator.set_tool(tools[max(due)])
         self._latest_frame[source] = number
-        result = await asyncio.to_thread(estimator.update, *frames)  # type: ignore[arg-type]  # one per side
+        estimate = await asyncio.to_thread(estimator.estimate, *frames)
         # The replayed latency is 0; the recording holds the live one.
         arrival_ns = max(frame.t_arrival_ns for frame in frames)
-        self._publisher.publish(estimate_message(source, frames, result, arrival_ns))
+        self._publisher.publish(estimate_message(source, frames, estimate, arrival_ns))
 
 
 class ReplayClock(Clock):
@@ -340,13 +338,12 @@ class Replay:
         elif event.raw is not None:
             self._clock.set(event.t_mono_ns)
             await self._pipeline.process(event.source, event.raw)
-        elif event.topic in COMPUTED_TOPICS and self._run.has_inputs and self._is_computed(event.source):
+        elif (
+            event.topic in COMPUTED_TOPICS and self._run.has_inputs and event.source in self._pipeline.published_sources
+        ):
             self.comparison.compare(event)
         elif event.topic != EitHeatmap.topic:
             self._publisher.forward(event.topic, restored_wire_map(event.content))
-
-    def _is_computed(self, source: str) -> bool:
-        return source in self._pipeline.published_sources
 
 
 def restored_wire_map(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ it as they measure: the load cell as a mean over each conversion, the EIT-kit in
 
 import math
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -171,17 +171,12 @@ class Twin:
                 return limit_nm if torque_nm < 0 else 0.8 * limit_nm
 
 
-@dataclass(frozen=True, slots=True)
-class Truth:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Truth(TwinState):
     """The true state at `time_s` of the scene's own time; without an object diameter_mm is None."""
 
     time_s: float
     wrist_rad: float
-    torque_nm: float
-    shear_torque_nm: float
-    tool_angle_rad: float
-    slipped_rad: float
-    gripped: bool
     grip_force_n: float
     width_mm: float
     diameter_mm: float | None
@@ -197,14 +192,6 @@ class ShearedFrame:
     diameter_mm: float
 
 
-@dataclass(frozen=True, slots=True)
-class _Moment:
-    time_s: float
-    grip: float
-    shear_torque_nm: float
-    torque_nm: float
-
-
 class Scene:
     """Gripper, tool and joint, `speed` times as fast as real time.
 
@@ -218,7 +205,7 @@ class Scene:
         self._speed = speed
         self._wrist_rad = 0.0
         self._slips_to_nm: float | None = None
-        self._moments = deque([_Moment(0.0, 0.0, 0.0, 0.0)])
+        self._states = deque([(0.0, TwinState())])
 
     def step(self, dt_s: float, wrist_rad: float) -> float:
         """Advance by dt_s of real time; return the tool's resisting torque on the flange in N·m."""
@@ -234,9 +221,9 @@ class Scene:
             force_n = min(force_n, max(self._slips_to_nm / self.twin.settings.slip_torque_nm_per_n, MIN_FORCE_N))
         self._slips_to_nm = None
         state = self.twin.step(dt_s, wrist_rad, force_n)
-        self._moments.append(_Moment(self.time_s, float(state.gripped), state.shear_torque_nm, state.torque_nm))
-        while self._moments[0].time_s < self.time_s - HISTORY_S:
-            self._moments.popleft()
+        self._states.append((self.time_s, state))
+        while self._states[0][0] < self.time_s - HISTORY_S:
+            self._states.popleft()
         return -state.torque_nm
 
     def conversion_nm(self, duration_s: float) -> float:
@@ -246,22 +233,17 @@ class Scene:
     def frame(self, duration_s: float) -> ShearedFrame:
         """Return the gel at each injection of a frame over the last `duration_s` of the scene's time."""
         return ShearedFrame(
-            grip=self._history("grip", duration_s, N_INJECTIONS),
+            grip=self._history("gripped", duration_s, N_INJECTIONS),
             shear_torque_nm=self._history("shear_torque_nm", duration_s, N_INJECTIONS),
             diameter_mm=self.gripper.width_mm,
         )
 
     def truth(self) -> Truth:
         """Return the true state now."""
-        state = self.twin.state
         return Truth(
+            **asdict(self.twin.state),
             time_s=self.time_s,
             wrist_rad=self._wrist_rad,
-            torque_nm=state.torque_nm,
-            shear_torque_nm=state.shear_torque_nm,
-            tool_angle_rad=state.tool_angle_rad,
-            slipped_rad=state.slipped_rad,
-            gripped=state.gripped,
             grip_force_n=self.gripper.grip_force_n,
             width_mm=self.gripper.width_mm,
             diameter_mm=self.gripper.between(0.0),
@@ -289,6 +271,6 @@ class Scene:
     def _history(self, name: str, duration_s: float, n: int) -> FloatArray:
         """Return a quantity (n,) in the middles of n equal parts of the last `duration_s`."""
         middles_s = self.time_s - duration_s * (1.0 - (np.arange(n) + 0.5) / n)
-        times_s = [moment.time_s for moment in self._moments]
-        values = [getattr(moment, name) for moment in self._moments]
+        times_s = [time_s for time_s, _ in self._states]
+        values = [float(getattr(state, name)) for _, state in self._states]
         return np.asarray(np.interp(middles_s, times_s, values))

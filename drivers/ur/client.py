@@ -354,7 +354,9 @@ class WorkerConnection(asyncio.SubprocessProtocol):
 
     def _hung_sentence(self, seconds: float) -> str:
         if self._state is None:
-            sentence = error_messages.silent(self._settings.host, self._settings.connect_timeout_s, self._activity)
+            sentence = error_messages.SILENT.format(
+                host=self._settings.host, seconds=self._settings.connect_timeout_s, activity=self._activity
+            )
         else:
             sentence = (
                 f"The robot's process did not answer for {seconds:.1f} s and was ended. The robot's watchdog ends the "

@@ -181,8 +181,6 @@ class CommandHandler:
             failed_program_stops=self._paused_program.failed_stops,
         )
 
-    # ---- commands -------------------------------------------------------------------------------------------------
-
     def _turn(self, number: int, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> CommandReply:
         refusal = self._why_blocked(sample)
         if not refusal and asked.acceleration_rad_per_s2 <= 0:
@@ -256,8 +254,6 @@ class CommandHandler:
         if not refusal and not self._arm.zero_wrench():
             refusal = "The robot did not zero its force-torque sensor."
         return CommandReply(refusal=refusal)
-
-    # ---- conditions -----------------------------------------------------------------------------------------------
 
     def _why_unfit(self, sample: RtdeSample) -> str:
         """Return why nothing can be sent to the robot, or the empty string."""

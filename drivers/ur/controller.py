@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final
 
 from shearloop.drivers.errors import DriverError, ProtocolError
 from shearloop.drivers.ur import error_messages
@@ -89,7 +89,7 @@ def probe_controller(host: str, timeout_s: float) -> str:
         version = ".".join(str(number) for number in struct.unpack(">4I", answer[:16]))
         accepted = _agree_on_protocol(connection)
     if not accepted:
-        raise ProbeError("version", error_messages.version_refused(host, version))
+        raise ProbeError("version", error_messages.VERSION_REFUSED.format(host=host, version=version))
     return version
 
 
@@ -135,10 +135,11 @@ def explain_failure(host: str, timeout_s: float, activity: str) -> Iterator[None
     try:
         yield
     except TimeoutError as error:
-        raise ProbeError("silent", error_messages.silent(host, timeout_s, activity)) from error
+        sentence = error_messages.SILENT.format(host=host, seconds=timeout_s, activity=activity)
+        raise ProbeError("silent", sentence) from error
     except (OSError, struct.error) as error:
         reason = str(error) or type(error).__name__
-        raise ProbeError("unreachable", error_messages.unreachable(host, reason)) from error
+        raise ProbeError("unreachable", error_messages.UNREACHABLE.format(host=host, reason=reason)) from error
 
 
 def _agree_on_protocol(connection: socket.socket) -> bool:
@@ -296,18 +297,6 @@ class SampleAge:
         self._made_ns = stamped_ns + offset_ns
 
 
-class SampleSource(Protocol):
-    """The part of `RtdeReceiver` that `ScriptReadiness` needs."""
-
-    connected: bool
-
-    def latest(self) -> ReceivedSample:
-        """Return the newest sample received."""
-
-    def wait(self, seconds: float) -> bool:
-        """Wait for data, at most this long, and return whether there is any."""
-
-
 class ScriptReadiness:
     """Waits until ur-rtde's control script is ready for the next command (output register 0).
 
@@ -315,7 +304,7 @@ class ScriptReadiness:
     ended. Waiting here first keeps its calls short.
     """
 
-    def __init__(self, samples: SampleSource, timeout_s: float) -> None:
+    def __init__(self, samples: RtdeReceiver, timeout_s: float) -> None:
         """Wait for `timeout_s` at most: the time after which the robot's watchdog ends the program."""
         self._samples, self._timeout_s = samples, timeout_s
         # By the controller's clock; only a later sample shows the script after the command.

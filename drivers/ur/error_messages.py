@@ -1,4 +1,4 @@
-"""Messages for the operator: why motion is not possible, and what to do about it."""
+"""Messages for the operator: why motion is not possible, and what to do about it. Format those with {fields}."""
 
 from shearloop.drivers.ur.messages import (
     ROBOT_MODE_RUNNING,
@@ -24,6 +24,28 @@ PAUSED = (
     "A program on the robot is paused, and goes on with what it did when it is resumed: stop it at the teach pendant, "
     "or unlock, which stops it and starts the control program."
 )
+UNREACHABLE = (
+    "No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its network "
+    "(Settings → System → Network at the teach pendant)."
+)
+SILENT = (
+    "The UR controller at {host} said nothing for {seconds:.1f} s while {activity}: it is starting, hangs, or "
+    "something else listens on its ports. Look at the teach pendant."
+)
+VERSION_REFUSED = (
+    "The UR controller at {host} ({version}) refuses protocol 2 of RTDE: it needs PolyScope 3.10 or 5.4, or newer."
+)
+REGISTERS_IN_USE = (
+    "The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
+    "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus."
+)
+LOCAL_CONTROL = "The robot at {host} is in local control: switch it to remote control, top right on the teach pendant."
+REFUSED_BY_CLIENT = "The connection to the robot at {host} failed: ur-rtde says “{text}”."
+NOT_TAKEN = "The robot did not take the {command}: its control program does not answer."
+LEFT_TO_WATCHDOG = (
+    "{reason} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
+)
+STILL_PAUSED = "The paused program could not be stopped ({reason}): stop it at the teach pendant, do not resume it."
 ASTRAY = "The arm moved without a command: check whether a person or another program moves it."
 
 _SAFETY = {
@@ -32,63 +54,6 @@ _SAFETY = {
     8: "The robot's safety system reports a violation: restart it at the teach pendant.",
     9: "The robot's safety system reports a fault: restart the controller.",
 }
-
-
-def unreachable(host: str, reason: str) -> str:
-    """Return the message for a controller that does not accept connections."""
-    return (
-        f"No UR controller at {host}: {reason}. Check that it is switched on and that this computer is in its network "
-        "(Settings → System → Network at the teach pendant)."
-    )
-
-
-def silent(host: str, seconds: float, activity: str) -> str:
-    """Return the message for a controller that accepts connections and does not answer."""
-    return (
-        f"The UR controller at {host} said nothing for {seconds:.1f} s while {activity}: it is starting, hangs, or "
-        "something else listens on its ports. Look at the teach pendant."
-    )
-
-
-def version_refused(host: str, version: str) -> str:
-    """Return the message for a controller without RTDE protocol 2."""
-    return (
-        f"The UR controller at {host} ({version}) refuses protocol 2 of RTDE: it needs PolyScope 3.10 or 5.4, or newer."
-    )
-
-
-def registers_in_use(host: str) -> str:
-    """Return the message for input registers that another client writes."""
-    return (
-        f"The input registers of the robot at {host} are already in use by another RTDE client, EtherNet/IP or "
-        "PROFINET: end the other program, or disable the adapter under Installation → Fieldbus."
-    )
-
-
-def local_control(host: str) -> str:
-    """Return the message for a robot that takes no commands from the network."""
-    return f"The robot at {host} is in local control: switch it to remote control, top right on the teach pendant."
-
-
-def refused_by_client(host: str, text: str) -> str:
-    """Return the message for an error of ur-rtde, in its own words."""
-    return f"The connection to the robot at {host} failed: ur-rtde says “{text.strip()}”."
-
-
-def not_taken(command: str) -> str:
-    """Return the message for a command that the control program did not take."""
-    return f"The robot did not take the {command}: its control program does not answer."
-
-
-def left_to_watchdog(reason: str) -> str:
-    """Return the message for a control program that receives nothing more; `reason` is a sentence."""
-    return f"{reason} The control program was left to the robot's watchdog, which ends it: unlock to start it again."
-
-
-def still_paused(reason: str) -> str:
-    """Return the message for a paused program of ours that did not stop."""
-    reason = reason.strip().removesuffix(".")
-    return f"The paused program could not be stopped ({reason}): stop it at the teach pendant, do not resume it."
 
 
 def why_unfit(sample: RtdeSample, host: str, state_timeout_s: float) -> str:

@@ -60,8 +60,6 @@ class MotionExecutor:
         self._move_seen = False
         self._move_end: Six = (0.0,) * 6
 
-    # ---- commands -------------------------------------------------------------------------------------------------
-
     def turn(self, motion_id: int, asked: WristSpeed, sample: RtdeSample, now_ns: int) -> bool:
         """Turn the wrist at this speed from now on; return whether the robot took it."""
         self.motion, self.motion_id, self.end_reason = "wrist", motion_id, ""
@@ -112,7 +110,7 @@ class MotionExecutor:
 
     def leave_to_watchdog(self, reason: str) -> None:
         """Send nothing more to this program, so that the robot's watchdog ends it."""
-        self.disable(reason, error_messages.left_to_watchdog(reason))
+        self.disable(reason, error_messages.LEFT_TO_WATCHDOG.format(reason=reason))
 
     def disable(self, end_reason: str, disabled_reason: str) -> None:
         """End the present motion on paper, and send nothing to the program on the robot."""
@@ -121,8 +119,6 @@ class MotionExecutor:
         self.motion = "idle"
         self._speed_thread = False
         self.disabled_reason = disabled_reason
-
-    # ---- cycle by cycle -------------------------------------------------------------------------------------------
 
     def watch(self, sample: RtdeSample, now_ns: int) -> None:
         """Note whether an idle arm rests; call this in every cycle."""
@@ -183,8 +179,6 @@ class MotionExecutor:
                 self.motion = "idle"
             self._arm.send_heartbeat()
 
-    # ---- calls on the arm -----------------------------------------------------------------------------------------
-
     def _send_clipped_speed(self, sample: RtdeSample) -> bool:
         self.sent, self.clipped = clip_wrist(self._asked, sample, self._limits, self._settings.reaction_s)
         return self._send_speed(self.sent)
@@ -199,7 +193,7 @@ class MotionExecutor:
 
     def _reject(self, command: str) -> None:
         self.command_rejected = True
-        self.leave_to_watchdog(error_messages.not_taken(command))
+        self.leave_to_watchdog(error_messages.NOT_TAKEN.format(command=command))
 
     def _end_speed_thread(self) -> None:
         if self._speed_thread:

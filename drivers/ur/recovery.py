@@ -182,7 +182,7 @@ class PausedProgramStopper:
 
     def _fail(self, reason: str) -> None:
         self.failed_stops += 1
-        self.failure = error_messages.still_paused(reason)
+        self.failure = error_messages.STILL_PAUSED.format(reason=reason.strip().removesuffix("."))
 
 
 class ForeignProgramDetector:

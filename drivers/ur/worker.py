@@ -141,10 +141,10 @@ def _connect(pipe: Pipe, settings: UrSettings) -> "UrArm":
     except RuntimeError as error:
         text = str(error)
         if "already in use" in text:
-            _fail(pipe, "registers-in-use", error_messages.registers_in_use(settings.host))
+            _fail(pipe, "registers-in-use", error_messages.REGISTERS_IN_USE.format(host=settings.host))
         if "remote control" in text:
-            _fail(pipe, "local-control", error_messages.local_control(settings.host))
-        _fail(pipe, "unreachable", error_messages.refused_by_client(settings.host, text))
+            _fail(pipe, "local-control", error_messages.LOCAL_CONTROL.format(host=settings.host))
+        _fail(pipe, "unreachable", error_messages.REFUSED_BY_CLIENT.format(host=settings.host, text=text.strip()))
 
 
 def _control(pipe: Pipe, configured: Configure, arm: "UrArm") -> NoReturn:

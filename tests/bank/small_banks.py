@@ -1,4 +1,4 @@
-"""Small banks that differ in what is hard about them, and each fast matcher beside the slow one that it is to equal."""
+"""Small, hard banks, and pairs of a slow reference matcher and the pruned matcher that must equal it."""
 
 import dataclasses
 

@@ -1,4 +1,4 @@
-"""The bank file: what is written is read back, and what cannot be trusted is refused with the cure."""
+"""The bank file: it reads back as written, and damaged files are refused with the cure."""
 
 import hashlib
 import json

@@ -75,7 +75,7 @@ def test_factors_that_are_missing_are_refused():
         elimination.schur_complements(np.ones((1, 3)))
 
 
-# For registers that hold four numbers, whatever this machine's do: prints what is left of some matrices.
+# Prints Schur complements computed with registers of four numbers, on any machine.
 NARROW = """
 from shearloop.bank.eit.vector_kernel import LANES
 from tests.bank.test_batch_forward import what_is_left

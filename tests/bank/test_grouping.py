@@ -33,7 +33,7 @@ def test_beyond_half_a_spacing_the_nearest_rising_levels_are_taken(drift: list[f
     lacks_two = [level for level in range(1, 8) if level != lacking]
     values = LEVELS[[*range(8), *lacks_two]] + drift
     series = place_in_series(values)
-    # So much noise may be in it that nothing rises, or that a level looks like the beginning of another series.
+    # With this much noise nothing rises, or a level looks like the start of another series.
     assume(series is not None and series.repeat.tolist() == 8 * [0] + 6 * [1])
     assert series.level[:8].tolist() == list(range(8))
     found = series.level[8:]

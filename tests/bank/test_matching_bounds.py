@@ -1,4 +1,4 @@
-"""What makes matching fast: bounds below which no score lies, and what is done where they leave much."""
+"""The bounds of the pruned matcher: no score lies above them, and few cells remain."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Meshes: what they are refused for, their files, their digest and their refinement."""
+"""Meshes: refusals, files, digest and refinement."""
 
 import io
 import zipfile

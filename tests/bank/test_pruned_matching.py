@@ -1,4 +1,4 @@
-"""Fast matching: the same cell, score and runner-up as the slow matcher finds, whatever the frame and the bank."""
+"""The pruned matcher returns the reference matcher's cell, score and runner-up for any frame and bank."""
 
 import copy
 from collections.abc import Iterator

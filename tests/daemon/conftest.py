@@ -13,7 +13,7 @@ import yaml
 import zmq
 
 from shearloop.bank.eit.bank_file import Bank, BankDefinition, write_bank
-from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.estimation import Calibration
 
 # Guards against a test that hangs; none waits for so long.
 DEADLINE_S = 60
@@ -40,9 +40,11 @@ def tiny_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny_calibration(tiny_bank: Path) -> Path:
     """A calibration of the whole tiny bank."""
     grid = np.linspace(0.9, 2.1, 30)
-    path = tiny_bank.with_name("tiny.yaml")
+    path = tiny_bank.with_name("tiny.cal")
     identity = Bank.open(tiny_bank).identity
-    Calibration.fit(identity, "synthetic", torque=(grid, 0.3 - 0.1 * grid), diameter=(grid, 20.0 * grid)).save(path)
+    Calibration.from_matches(identity, "synthetic", torque=(grid, 0.3 - 0.1 * grid), diameter=(grid, 20.0 * grid)).save(
+        path
+    )
     return path
 
 

@@ -13,7 +13,7 @@ from shearloop.bank.eit.design import MeasuredFrames, design_bank
 from shearloop.bank.eit.forward import ForwardModel
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation.bank_match import NOT_TURNED, NearestCell
+from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
 from shearloop.bank.estimation.values import FrameSeries
 from shearloop.daemon.analysis.bank_design import design_yaml, designed_for, scene_of
 from shearloop.daemon.analysis.reproduce.banks import OWN_FINGERTIP
@@ -61,7 +61,7 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Pat
     assert plan.definition.model == "step"
     assert len(plan.definition.sigma_grid) == 1
     build_bank(*plan, tmp_path / "step.bank")
-    place = NearestCell(Bank.open(tmp_path / "step.bank"), NOT_TURNED).locate(frames[4])
+    place = RefinedMatcher(Bank.open(tmp_path / "step.bank"), NOT_TURNED).match(frames[4])
     assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.definition.k_grid)[0]
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from shearloop.bank.estimation import Estimate, FrameSeries
-from shearloop.daemon.analysis.evaluation import EstimateTrack
-from shearloop.daemon.analysis.grips import grips_of
+from shearloop.daemon.analysis.evaluate import EstimateTrack, grips_of
 from shearloop.daemon.cli import main
 from shearloop.daemon.config import CreepConfig
 from tests.daemon.control.test_creep import twisted
@@ -52,7 +51,7 @@ def test_it_prints_the_line_of_the_configuration(
     found = track()
     monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
     monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
-    monkeypatch.setattr("shearloop.daemon.analysis.evaluation.follow", lambda *_: found)
+    monkeypatch.setattr("shearloop.daemon.analysis.evaluate.estimate_series", lambda *_: found)
     arguments = ["calibrate", "creep", str(tmp_path / "held.mcap"), "--calibration", "right.cal"]
     assert main([*arguments, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -61,8 +60,8 @@ def test_it_prints_the_line_of_the_configuration(
     assert told["error_after_nm"] < told["error_before_nm"]
     assert main(arguments) == 0
     line, followed, beside = capsys.readouterr().out.splitlines()
-    assert f"estimates, times {told['scale']:.3f} and {1e3 * told['offset_nm']:+.1f} mN·m, follow" in followed
-    assert "no creep" in beside
+    assert f"scaled by {told['scale']:.3f} and shifted by {1e3 * told['offset_nm']:+.1f} mN·m, follow" in followed
+    assert "does not correct scale and zero" in beside
     assert line == f"creep: {{share: {told['share']:g}, time_s: {told['time_s']:g}}}"
     CreepConfig(share=told["share"], time_s=told["time_s"])
 
@@ -73,7 +72,7 @@ def test_a_recording_without_held_twists_is_refused(
     found = track(np.arange(1109) < 10)
     monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
     monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [found.series])
-    monkeypatch.setattr("shearloop.daemon.analysis.evaluation.follow", lambda *_: found)
+    monkeypatch.setattr("shearloop.daemon.analysis.evaluate.estimate_series", lambda *_: found)
     assert main(["calibrate", "creep", "held.mcap", "--calibration", "right.cal"]) == 2
     assert "10 readings are too few for a fit; hold a twist for a minute" in capsys.readouterr().err
 
@@ -83,7 +82,7 @@ def test_twists_that_are_given_twice_are_refused(
 ) -> None:
     monkeypatch.setattr("shearloop.bank.estimation.Calibration.load", lambda _: Loaded())
     monkeypatch.setattr("shearloop.daemon.analysis.series.read_series", lambda *_: [track().series])
-    told_of = {"held.mcap": "is given twice; name it once", "copy.mcap": "holds exactly what held.mcap does"}
+    told_of = {"held.mcap": "is given twice; name it once", "copy.mcap": "equals held.mcap"}
     for copy, told in told_of.items():
         assert main(["calibrate", "creep", "held.mcap", copy, "--calibration", "right.cal"]) == 2
         assert f"{copy} {told}" in capsys.readouterr().err

@@ -18,8 +18,8 @@ import yaml
 import zmq.asyncio
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.models import MODELS
+from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.cli import COMMANDS, main
 from shearloop.daemon.cli.bank.build import MODELS as MODELS_IN_HELP
@@ -28,7 +28,7 @@ from shearloop.daemon.cli.output import message_json, message_line
 from shearloop.daemon.config import TAKEN_NAMES, load_daemon_config
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.messaging.messages import decode, encode
-from shearloop.daemon.sensing.both import COMBINED
+from shearloop.daemon.sensing.estimators import COMBINED
 from shearloop.daemon.sensing.skin_task import SKIN
 
 Write = Callable[..., Path]
@@ -53,7 +53,7 @@ def test_a_calibration_without_torques_cannot_drive_the_loop(
     command: str, config: Write, tiny_bank: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     grid, path = np.linspace(0.9, 2.1, 30), tmp_path / "diameters.yaml"
-    Calibration.fit(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
+    Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", diameter=(grid, 20.0 * grid)).save(path)
     section = {"right": {"device": {"path": "eit"}, "bank": str(tiny_bank), "calibration": str(path)}}
     assert main(["check", str(config(fingertips=section))]) == 0
     assert "without torque: its calibration has diameters only" in capsys.readouterr().out
@@ -135,11 +135,11 @@ def test_a_calibration_of_another_bank_is_refused(
 ) -> None:
     import numpy as np
 
-    from shearloop.bank.eit.calibration import Calibration
+    from shearloop.bank.estimation import Calibration
 
     foreign = tmp_path / "foreign.yaml"
     grid = np.linspace(1, 2, 9)
-    Calibration.fit("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
+    Calibration.from_matches("cd" * 32, "synthetic", torque=(grid, grid)).save(foreign)
     section = fingertip(bank=str(tiny_bank), calibration=str(foreign))
     said = mistake(capsys, "check", str(config(fingertips=section)))
     for part in (str(foreign), "made with the bank cdcdcd", "calibrate again"):

@@ -1,4 +1,4 @@
-"""`shearloop bank`: what it writes and prints, and that every mistake is one sentence and status 2."""
+"""`shearloop bank`: files, output, and mistakes as one sentence with status 2."""
 
 import json
 import signal
@@ -67,7 +67,7 @@ def test_a_build_that_is_interrupted_says_so_and_the_same_command_goes_on(
     def interrupted(*_):
         yield lambda done: signal.raise_signal(signal.SIGINT) if done == rows_done else None
 
-    # A test process may have been told to ignore it.
+    # The test process may ignore SIGINT.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         with monkeypatch.context() as patched:

@@ -14,7 +14,7 @@ import zmq.asyncio
 from aiohttp import web
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.estimation import Calibration
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.messaging.client import send_command
@@ -41,8 +41,10 @@ def torque_of(sigma: np.ndarray) -> np.ndarray:
 def rig_config(config: Write, tiny_bank: Path, tmp_path: Path) -> Path:
     """Write the configuration of a whole rig whose boards are SPEED times as fast."""
     sigma = np.linspace(0.95, 2.05, 40)
-    calibration = tmp_path / "rig.yaml"
-    Calibration.fit(Bank.open(tiny_bank).identity, "synthetic", torque=(sigma, torque_of(sigma))).save(calibration)
+    calibration = tmp_path / "rig.cal"
+    Calibration.from_matches(Bank.open(tiny_bank).identity, "synthetic", torque=(sigma, torque_of(sigma))).save(
+        calibration
+    )
     robot = yaml.safe_load(Path("config/ur.yaml").read_text())
     (tmp_path / "ur.yaml").write_text(yaml.safe_dump({**robot, "host": HOST}))
     return config(

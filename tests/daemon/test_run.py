@@ -215,17 +215,17 @@ async def test_a_lost_board_reconnects_and_health_counts_refused_lines(config: W
 async def test_a_crashed_estimator_restarts_and_is_reported(
     config: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from shearloop.daemon.sensing.estimator import Estimator
+    from shearloop.daemon.sensing.estimators import LiveEstimator
 
-    quickly = Estimator.quickly
+    estimate = LiveEstimator.estimate
     deaths = iter([True])
 
-    def fragile(self: Estimator, frame: Any) -> Any:
+    def fragile(self: LiveEstimator, frame: Any) -> Any:
         if frame.seq == 3 and next(deaths, False):
             raise RuntimeError("a bug")
-        return quickly(self, frame)
+        return estimate(self, frame)
 
-    monkeypatch.setattr(Estimator, "quickly", fragile)
+    monkeypatch.setattr(LiveEstimator, "estimate", fragile)
     link = str(tmp_path / "eit-right")
     async with running(config()) as daemon:
         estimates = collector(daemon, "eit.estimate")

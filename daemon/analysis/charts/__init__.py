@@ -1,1 +1,1 @@
-"""Charts of speed against accuracy, of stability where methods fail, and of how much model a scene needs."""
+"""Charts of speed against accuracy, stability under faults, and the model that a scene needs."""

@@ -1,4 +1,4 @@
-"""What all charts have in common: figures without a window, marks that can be told apart in grey, one way to save."""
+"""Common parts of all charts: figures without a window, marks that differ in grey too, names of points, and files."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,19 +20,19 @@ from shearloop.daemon.errors import UserError
 
 MARKS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "p", "h")
 LINES = ("-", "--", "-.", ":", (0, (6, 1, 1, 1, 1, 1)), (0, (1, 1)), (0, (8, 2)), (0, (3, 1, 1, 1)))
-# Far apart in lightness as well as in hue, so that a print in grey keeps them apart.
+# They differ in lightness as well as in hue, for prints in grey.
 SHADES = ("#111111", "#1f5f99", "#c2571a", "#4b9560", "#8e6bb5", "#9c8b1f", "#7a7a7a", "#d08fa8")
 
 
 def figure(width: float, height: float) -> Figure:
-    """Return an empty figure in inches, drawn without any window or global state."""
+    """Return an empty figure in inches, without a window or global state."""
     made = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(made)
     return made
 
 
 def look(number: int) -> dict[str, Any]:
-    """Return mark, line and shade of the curve of this number: no two of them differ by the shade alone."""
+    """Return mark, line and shade of a curve by its number."""
     return {
         "marker": MARKS[number % len(MARKS)],
         "linestyle": LINES[number % len(LINES)],
@@ -41,7 +41,7 @@ def look(number: int) -> dict[str, Any]:
 
 
 def frontier(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
-    """Return the numbers of the points that no other beats in both cost and error, by rising cost."""
+    """Return the indices of the points that no other beats in both cost and error, by rising cost."""
     order = sorted(range(len(costs)), key=lambda i: (costs[i], errors[i]))
     found: list[int] = []
     for i in order:
@@ -51,7 +51,7 @@ def frontier(costs: Sequence[float], errors: Sequence[float]) -> list[int]:
 
 
 def draw_frontier(axes: Axes, costs: Sequence[float], errors: Sequence[float], reach: float) -> list[int]:
-    """Mark the frontier of points by a broad pale step, up to the cost `reach`: something beats what lies above it."""
+    """Draw the frontier of points as a broad pale step up to the cost `reach`; return its points' indices."""
     best = frontier(costs, errors)
     x, y = [costs[i] for i in best], [errors[i] for i in best]
     axes.plot(
@@ -62,28 +62,28 @@ def draw_frontier(axes: Axes, costs: Sequence[float], errors: Sequence[float], r
 
 
 def lay_out(made: Figure) -> None:
-    """Give everything in a figure its place for good: it takes a second, and would be done for each file anew."""
+    """Compute a figure's layout once for all files: it takes a second."""
     made.draw_without_rendering()
     made.set_layout_engine("none")
 
 
-# Where a name may stand beside its point, in points, the first ones liked best.
+# Offsets of a name from its point, in points, best first.
 _NEAR, *_FURTHER = (7, 16, 26, 38)
 _SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1))
 _CORNERS = ((1, 1), (1, -1), (-1, 1), (-1, -1))
 _BESIDE = [(_NEAR, 4), (_NEAR, -4), (-_NEAR, 4), (-_NEAR, -4), (0, _NEAR), (0, -_NEAR)]
 _BESIDE += [(far * dx, far * dy) for far in _FURTHER for dx, dy in (*_CORNERS, *_SIDES)]
-# From a name that does not stand next to its point, lest it be taken for its neighbour's.
+# A line from a name that is not next to its point.
 _LEADER = {"arrowstyle": "-", "color": "0.5", "linewidth": 0.6, "shrinkA": 0, "shrinkB": 3}
 _MARK_PX = 7.0
-# Between two names, so that they do not read as one.
+# The gap between two names.
 _GAP_PX = 4.0
 
 
 def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize: float = 7) -> None:
-    """Write a name beside each point (x, y, name), where it covers neither other names nor marks nor the legend.
+    """Write a name next to each point (x, y, name), without covering other names, marks or the legend.
 
-    To be done when limits, marks and legend are final, and `lay_out` has been.
+    Call it after `lay_out`, when limits, marks and legend are final.
     """
     centres = [axes.transData.transform((x, y)) for x, y, _ in points]
     taken = [Bbox([centre - _MARK_PX, centre + _MARK_PX]) for centre in centres]
@@ -108,7 +108,7 @@ def write_names(axes: Axes, points: Sequence[tuple[float, float, str]], fontsize
             if note is not chosen:
                 note.remove()
         if max(map(abs, chosen.get_position())) > _NEAR:
-            # Only now: the room that a name takes is asked for without its line.
+            # A name's extent is measured without its line, so add the line last.
             chosen.remove()
             _note(axes, (x, y, name), chosen.get_position(), fontsize, _LEADER)
 
@@ -135,7 +135,7 @@ def _area(box: Bbox) -> float:
 
 
 def plain_log(axes: Axes) -> None:
-    """Make both axes logarithmic, with 1, 2 and 5 of each decade written out."""
+    """Make both axes logarithmic, with ticks at 1, 2 and 5 of each decade."""
     axes.set(xscale="log", yscale="log")
     for axis in (axes.xaxis, axes.yaxis):
         _plain_ticks(axis)
@@ -153,10 +153,7 @@ def slug(title: str) -> str:
 
 
 def check_takes_pictures(directory: Path) -> None:
-    """Raise UserError, before anything is measured, where no chart can be written into a directory.
-
-    One that has to be made for that is removed again: a recording that cannot be read leaves nothing behind.
-    """
+    """Raise UserError where no chart can be written into a directory; leave no new directory behind."""
     with remove_empty_folders(directory):
         try:
             directory.mkdir(parents=True, exist_ok=True)
@@ -168,19 +165,19 @@ def check_takes_pictures(directory: Path) -> None:
 
 @contextmanager
 def remove_empty_folders(directory: Path) -> Iterator[None]:
-    """Remove a directory, and those above it, where they were made in here and hold nothing at the end."""
+    """Remove a directory and its parents at the end, where they are new and empty."""
     absent = [one for one in (directory, *directory.parents) if not one.exists()]
     try:
         yield
     finally:
         for one in absent:
-            # What somebody else has put into it meanwhile is theirs.
+            # Another program may have used the folder meanwhile.
             with suppress(OSError):
                 one.rmdir()
 
 
 def save(made: Figure, content: Mapping[str, Any], directory: Path, name: str) -> list[Path]:
-    """Write NAME.json, .svg and .png into a directory, and return the paths; UserError where that fails."""
+    """Write NAME.json, .svg and .png into a directory and return the paths; raises UserError where that fails."""
     paths = [directory / f"{name}.{suffix}" for suffix in ("json", "svg", "png")]
     try:
         directory.mkdir(parents=True, exist_ok=True)

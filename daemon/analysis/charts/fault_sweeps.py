@@ -20,7 +20,7 @@ from shearloop.bank.estimation import (
     TactileFrame,
     fit,
 )
-from shearloop.bank.estimation.bank_match import Registration
+from shearloop.bank.estimation.bank_match import ElectrodeNumbering
 from shearloop.bank.estimation.fingertip_validator import channel_noise
 from shearloop.daemon.analysis.bank_design import residual_noise
 from shearloop.daemon.analysis.charts.sources import Split
@@ -123,7 +123,7 @@ def _gain(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFram
 
 
 def _turned(scene: FaultScene, level: float, _: np.random.Generator) -> FaultyFrames:
-    order = Registration(int(level), reflected=False, score=1.0, runner_up=0.0).model_channels()
+    order = ElectrodeNumbering(int(level), reflected=False, score=1.0, runner_up=0.0).model_channels()
     return FaultyFrames(_with_channels(scene, scene.series.channels[:, :, order]))
 
 

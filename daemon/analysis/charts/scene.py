@@ -1,4 +1,4 @@
-"""`shearloop chart scene`: how much model a scene needs, by the recording's own noise."""
+"""`shearloop chart scene`: how much model a recording needs, by its own noise."""
 
 import sys
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from shearloop.bank.eit.design import ALLOWED, Design, DesignChoice, MeasuredFrames, design_bank
 from shearloop.bank.eit.fingertip import Fingertip
 from shearloop.daemon.analysis.bank_design import choices_of, doubts, scene_of
-from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save
+from shearloop.daemon.analysis.charts.drawing import SHADES, figure, save, slug
 from shearloop.daemon.analysis.charts.sources import Split, own_fingertip
 from shearloop.daemon.workers import Executor, in_order
 
@@ -20,10 +20,7 @@ _LEAST_SHOWN, _MOST_TICKS = 1e-3, 12
 
 
 def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
-    """Design for the whole of each recording, draw and write; each recording is a task of its own.
-
-    Why a design may not be worth building is told on stderr, as `bank design` tells it.
-    """
+    """Design for each recording, draw and write; print doubts about a design on stderr, as `bank design` does."""
     scenes = [scene_of(split.whole) for split in parts]
     found = in_order(executor.map(designed_on, own_fingertip(_MESH_SIZE_CM), scenes))
     written = []
@@ -36,12 +33,12 @@ def chart(parts: Sequence[Split], out: Path, executor: Executor) -> list[Path]:
 
 
 def designed_on(fingertip: Fingertip, scene: MeasuredFrames) -> Design:
-    """Return `designed` with its arguments as a task has them."""
+    """Return a design; a task for the workers."""
     return design_bank(scene, fingertip)
 
 
 def write(title: str, design: Design, out: Path) -> list[Path]:
-    """Draw a design and write it."""
+    """Draw and write a design."""
     made = figure(15, 13)
     grid = made.add_gridspec(3, 3, height_ratios=[1, 1, 0.95])
     choices = choices_of(design)
@@ -57,13 +54,12 @@ def write(title: str, design: Design, out: Path) -> list[Path]:
     content = asdict(design) | {
         "allowed": ALLOWED, "chosen": {one.name: asdict(one.chosen) | {"enough": one.enough} for one in choices},
     }  # fmt: skip
-    slug = "-".join(title.replace(".", " ").replace("_", " ").split()).lower()
-    return save(made, content, out, f"scene-{slug}")
+    return save(made, content, out, f"scene-{slug(title)}")
 
 
 def _draw_choice(axes: Axes, choice: DesignChoice) -> None:
     settings, added = ([getattr(step, name) for step in choice.steps] for name in ("setting", "added"))
-    # What is exact adds nothing, which a logarithmic axis cannot show.
+    # A logarithmic axis cannot show the zero of an exact choice.
     shown = np.maximum(added, _LEAST_SHOWN)
     axes.plot(settings, shown, "-o", color=SHADES[1], markersize=5)
     scale = "linear" if len(settings) > _MOST_TICKS else "log"
@@ -88,7 +84,7 @@ def _draw_choice(axes: Axes, choice: DesignChoice) -> None:
 
 
 def _spaced(settings: Sequence[float]) -> list[float]:
-    """Return settings, from the last one back, that stand far enough apart on a linear axis to be read."""
+    """Return settings, from the last one back, far enough apart for readable ticks on a linear axis."""
     apart = (max(settings) - min(settings)) / (1.3 * _MOST_TICKS)
     kept = [settings[-1]]
     for one in reversed(settings):
@@ -107,8 +103,8 @@ def _draw_models(axes: Axes, design: Design) -> None:
     axes.set_yticks(range(len(ranked)), [f"{one.model}\n({one.parameters} parameters)" for one in ranked], fontsize=8.5)
     axes.invert_yaxis()
     axes.set(
-        xlabel="unexplained on injections left out, share of a frame\n(bar: penalised; tick: not; dotted: the noise)",
-        title="which model the data supports (hatched)",
+        xlabel="unexplained on other injections, share of a frame\n(bar: penalised; tick: not; dotted: the noise)",
+        title="model that the data supports (hatched)",
     )  # fmt: skip
 
 
@@ -123,10 +119,10 @@ def _draw_table(axes: Axes, choices: Sequence[DesignChoice]) -> None:
         ])  # fmt: skip
     axes.set_axis_off()
     table = axes.table(
-        rows, colLabels=["", "chosen", "adds (noise = 1)", "next step", "which buys", "and costs"],
+        rows, colLabels=["", "chosen", "adds (noise = 1)", "next step", "benefit", "cost"],
         loc="center", cellLoc="left", colWidths=[0.17, 0.09, 0.14, 0.1, 0.16, 0.36],
     )  # fmt: skip
     table.auto_set_font_size(False)
     table.set_fontsize(9)
     table.scale(1, 1.9)
-    axes.set_title("What each further step would buy")
+    axes.set_title("Benefit of each further step")

@@ -16,10 +16,15 @@ from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.models import conductivity
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, Name, Physics, TactileFrame, fit
-from shearloop.bank.estimation.bank_match import NOT_TURNED, BankMatcher, BestCell, NearestCell, Registration
-from shearloop.bank.estimation.fitting_regressor import fit_reader
-from shearloop.bank.estimation.novelty import NoveltyDetector
-from shearloop.bank.estimation.reciprocity import ReciprocityCheck
+from shearloop.bank.estimation.bank_match import (
+    NOT_TURNED,
+    BankMatcher,
+    ElectrodeNumbering,
+    PaperMatcher,
+    RefinedMatcher,
+)
+from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
 from shearloop.bank.estimation.regressors import Ridge
 from shearloop.daemon.analysis.charts.fault_sweeps import (
     FaultCurve,
@@ -78,13 +83,13 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
     """Return the torques of each estimator along the path; the first three differ only in the cell they choose."""
     path, share = path_through(split)
     locators: dict[str, BankMatcher] = {
-        "paper: the maximum of all lags": BestCell(bank),
-        "zero lag: the maximum, refined": NearestCell(bank, NOT_TURNED, mean_of_alike=False),
-        "zero lag: mean of the cells alike (the fix)": NearestCell(bank, NOT_TURNED),
+        "paper: the maximum of all lags": PaperMatcher(bank),
+        "zero lag: the maximum, refined": RefinedMatcher(bank, NOT_TURNED, mean_of_alike=False),
+        "zero lag: mean of the cells alike (the fix)": RefinedMatcher(bank, NOT_TURNED),
     }
     found = [ContinuityWalk(name, _read(split, locator, path), share) for name, locator in locators.items()]
     for calibration in calibrations:
-        if calibration.estimator in ("regression", "fused"):
+        if calibration.estimator in ("regression", "motion_regression"):
             tracker = EstimatorSession(calibration, bank)
             torque = [tracker.estimate(TactileFrame.of(0.0, one[None])).torque_nm for one in path]
             found.append(
@@ -95,12 +100,12 @@ def walks(split: Split, bank: Bank, calibrations: list[Calibration]) -> list[Con
 
 def _read(split: Split, locator: BankMatcher, path: FloatArray) -> FloatArray:
     def features(frames: FloatArray) -> FloatArray:
-        sigma = np.array([locator.locate(one).sigma for one in frames])
+        sigma = np.array([locator.match(one).sigma for one in frames])
         return np.column_stack([sigma, sigma**2])
 
     past = features(np.abs(split.past.channels[:, 0]))
-    reader = fit_reader(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=(1e-9,))
-    read: Callable[[FloatArray], float] = lambda one: reader.read(one)[0]  # noqa: E731
+    reader = fit_interval_regressor(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=(1e-9,))
+    read: Callable[[FloatArray], float] = lambda one: reader.predict(one)[0]  # noqa: E731
     return np.array([read(one) for one in features(path)])
 
 
@@ -257,7 +262,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
     """
     frames = np.abs(series.channels[:, 0])
     usable = np.ones(N_CHANNELS, dtype=np.bool_)
-    turned = Registration(_TURNED_ELECTRODES, reflected=False, score=1.0, runner_up=0.0).model_channels()
+    turned = ElectrodeNumbering(_TURNED_ELECTRODES, reflected=False, score=1.0, runner_up=0.0).model_channels()
     found = []
     for origin in origins:
         n = round(origin * len(frames))
@@ -276,7 +281,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
                 found.append(
                     ForeignMixture(
                         origin, kind, share, tuple(misfits),
-                        float(np.mean([not guard.judge(frame, usable).why for frame in mixed])),
+                        float(np.mean([not guard.assess(frame, usable).reasons for frame in mixed])),
                         float((misfits <= good.max()).mean()),
                         float((misfits[:, None] > good).mean() + 0.5 * (misfits[:, None] == good).mean()),
                     )
@@ -286,7 +291,7 @@ def detect_mixtures(series: FrameSeries, origins: Sequence[float] = ORIGINS, see
 
 def _misfits(twins: ReciprocityCheck, frames: FloatArray) -> FloatArray:
     usable = np.ones(N_CHANNELS, dtype=np.bool_)
-    return np.array([twins.misfit(one, usable) for one in frames]) / twins.largest_misfit
+    return np.array([twins.residual(one, usable) for one in frames]) / twins.largest_residual
 
 
 MODEL = "gaussian_derivative"

@@ -1,4 +1,4 @@
-"""What charts are measured on: recordings of the user, split in time, or synthetic ones where none is given."""
+"""The data of charts: the user's recordings split in time, or synthetic ones."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.synthetic import Synthesiser, TwistProgramme
 from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
-# Frames before the judged part of a stream that fill the memory of an estimator that has one.
+# Frames before the judged part of a stream that fill an estimator's memory.
 WARM_UP_FRAMES = 15
-# The bank of a chart where none is named: config/banks/demo.yaml's.
+# The default bank: that of config/banks/demo.yaml.
 GRID = Grid(np.linspace(2.9, 4.1, 50), np.linspace(0.9, 2.3, 50))
 MESH_SIZE_CM = 0.2
 # Synthetic frames come from a finer mesh than the bank they are matched with, from cells between that bank's.
@@ -34,7 +34,7 @@ _REST_S = 8.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Split:
-    """What is fitted and what is judged: earlier and later frames of one recording."""
+    """The earlier frames of a recording, for the fit, and the later ones, for the judgement."""
 
     title: str
     past: FrameSeries
@@ -43,7 +43,7 @@ class Split:
 
 
 def own_fingertip(mesh_size_cm: float) -> Fingertip:
-    """Return the paper's fingertip as its measures describe it, with another mesh size."""
+    """Return the paper's fingertip by its dimensions, with another mesh size."""
     config = load_yaml_model(OWN_FINGERTIP, FingertipGeometryConfig)
     return config.model_copy(update={"mesh_size_cm": mesh_size_cm}).fingertip()
 
@@ -54,12 +54,12 @@ def mesh_of(path: Path | None) -> Mesh:
 
 
 def bank_of(path: Path | None, mesh: Mesh, scratch: Path, grid: Grid = GRID) -> Bank:
-    """Return the bank of a file, or a small one of this mesh, which is kept in the scratch folder."""
+    """Return the bank of a file, or a small one of this mesh, kept in the scratch folder."""
     return Bank.open(path) if path is not None else cached_bank("chart", grid, mesh, scratch, 1, lambda *_: None)
 
 
 def splits(paths: Sequence[Path], share: float, scratch: Path) -> list[Split]:
-    """Return each recording's earlier and later part; `share` of it is the earlier one. Synthetic without paths."""
+    """Return each recording's earlier part, a `share` of it, and later part; synthetic recordings without paths."""
     named = [(path.name or str(path), series) for path in paths for series in read_series(path)]
     if not named:
         named = [("synthetic slices", synthetic_slices(scratch)), ("synthetic stream", synthetic_stream(scratch))]
@@ -79,40 +79,40 @@ def _parted(series: FrameSeries, share: float) -> tuple[FrameSeries, FrameSeries
 
 
 def sigma_of(torque_nm: float) -> float:
-    """Return the σ in cm that a torque makes in synthetic frames: it falls as the torque rises, as measured."""
+    """Return the σ in cm of a torque in synthetic frames: it falls with rising torque, as measured."""
     return 1.9 - 0.7 * torque_nm / _LARGEST_NM
 
 
 def torque_of(sigma: float) -> float:
-    """Return the torque in N·m that belongs to a σ in cm in synthetic frames, also beyond those that occur."""
+    """Return the torque in N·m of a σ in cm in synthetic frames."""
     return _LARGEST_NM * (1.9 - sigma) / 0.7
 
 
 def played_bank(scratch: Path) -> Bank:
-    """Return the bank that synthetic frames are made from."""
+    """Return the bank of the synthetic frames."""
     mesh = own_fingertip(PLAYED_MESH_SIZE_CM).mesh()
     return cached_bank("played", _PLAYED_GRID, mesh, scratch, 1, lambda *_: None)
 
 
 def mean_frame(synthesiser: Synthesiser, k: float, sigma: float, grip: float) -> FloatArray:
-    """Return the mean of nine frames, (896,) in volts, as the paper's slices are smoothed over time."""
+    """Return the mean of nine frames (896,) in volts, like the paper's smoothed slices."""
     lines = [synthesiser.line(k, sigma, grip) for _ in range(_AVERAGED_FRAMES)]
     return np.asarray(np.mean([channels_of_line(line) for line in lines], axis=0))
 
 
 def homogeneous_of(synthesiser: Synthesiser) -> FloatArray:
-    """Return the homogeneous frame that synthetic slices of this seed are differences to, if asked for first."""
+    """Return the homogeneous frame of synthetic slices; call it first after seeding."""
     return mean_frame(synthesiser, 3.2, 1.5, 0.0)
 
 
 def synthetic_slices(scratch: Path, seed: int = 0) -> FrameSeries:
-    """Return 49 differences as the paper's slices are: five repeats of ten torques, means of nine frames."""
+    """Return 49 differences like the paper's slices: five repeats of ten torques, means of nine frames."""
     synthesiser, rng = Synthesiser(played_bank(scratch), seed=seed), np.random.default_rng((seed, 1))
 
     homogeneous = homogeneous_of(synthesiser)
     levels = np.tile(np.linspace(0.01, _LARGEST_NM, 10), 5)[1:]
     torque = np.clip(levels + rng.normal(0.0, 0.003, len(levels)), 0.0, _LARGEST_NM)
-    # Every repeat the tool sits a little elsewhere in the grip, a little more firmly.
+    # In every repeat the tool sits a little elsewhere in the grip, a little more firmly.
     repeat = np.arange(1, 50) // 10
     frames = [
         np.abs(mean_frame(synthesiser, 3.2 + 0.03 * r, sigma_of(nm), 1.0 + 0.03 * r) - homogeneous)
@@ -123,7 +123,7 @@ def synthetic_slices(scratch: Path, seed: int = 0) -> FrameSeries:
 
 
 def synthetic_stream(scratch: Path, seed: int = 0, cycles: int = 8) -> FrameSeries:
-    """Return the frames of two fingertips that hold a tool through eight twists, idle before."""
+    """Return the frames of two fingertips, idle and then holding a tool through eight twists."""
     programme = TwistProgramme(torque_nm=0.12, grip_s=1.0, cycles=cycles)
     gripped_s = programme.idle_s + programme.grip_s
     end_s = gripped_s + _REST_S + cycles * 2 * (programme.turn_s + programme.hold_s)

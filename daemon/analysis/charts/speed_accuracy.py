@@ -19,9 +19,8 @@ from shearloop.bank.eit.mesh import Mesh
 from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import Calibration, FrameSeries, Name, Physics, fit
-from shearloop.bank.estimation.bank_match import NOT_TURNED, NearestCell
-from shearloop.bank.estimation.fitting_regressor import fit_reader
-from shearloop.bank.estimation.interval_regressor import IntervalRegressor
+from shearloop.bank.estimation.bank_match import NOT_TURNED, RefinedMatcher
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, fit_interval_regressor
 from shearloop.bank.estimation.regressors import Ridge, ranked_channels
 from shearloop.daemon.analysis.charts.drawing import (
     LINES,
@@ -37,7 +36,7 @@ from shearloop.daemon.analysis.charts.drawing import (
 from shearloop.daemon.analysis.charts.forward_methods import CELLS, SolvedForward, forward_methods
 from shearloop.daemon.analysis.charts.simulated_loop import GAIN, LOOPS, TrackingError, tracking_errors
 from shearloop.daemon.analysis.charts.sources import Split
-from shearloop.daemon.analysis.evaluation import follow
+from shearloop.daemon.analysis.evaluate import estimate_series
 
 Single = NDArray[np.float32]
 RANKS = (4, 8, 16, 32, 64, 128)
@@ -103,7 +102,7 @@ def estimators(
     split: Split, physics: Physics, names: tuple[Name, ...], sides: tuple[str, ...]
 ) -> Iterator[TorqueMethod]:
     """Yield the package's estimators on these sides as they run live; print why one cannot be fitted."""
-    past, future = split.past.of_sides(sides), split.future.of_sides(sides)
+    past, future = split.past.select_sides(sides), split.future.select_sides(sides)
     count = f", {sides[0] if len(sides) == 1 else 'both'}" if past.kind == "raw" else ""
     for name in names:
         try:
@@ -117,7 +116,7 @@ def estimators(
 
 
 def _run_estimator(calibration: Calibration, future: FrameSeries, bank: Bank | None) -> tuple[FloatArray, FloatArray]:
-    track = follow(calibration, future, bank)
+    track = estimate_series(calibration, future, bank)
     torque = [np.nan if one.torque_nm is None else one.torque_nm for one in track.estimates]
     return np.array(torque), track.latency_ms
 
@@ -132,8 +131,8 @@ def matchers(split: Split, bank: Bank) -> Iterator[TorqueMethod]:
         ("zero lag, fast and exact", "zero lag", PrunedZeroLagMatcher),
     ):
         yield _read_by(split, name, family, _sigma_by(kind.from_bank(bank)))
-    nearest = NearestCell(bank, NOT_TURNED)
-    yield _read_by(split, "zero lag, smoothed, sub-grid", "zero lag", lambda x: nearest.locate(x).sigma)
+    nearest = RefinedMatcher(bank, NOT_TURNED)
+    yield _read_by(split, "zero lag, smoothed, sub-grid", "zero lag", lambda x: nearest.match(x).sigma)
     cells = np.flatnonzero(bank.valid)
     shapes = np.abs(bank.signals.reshape(-1, bank.signals.shape[-1])[cells])
     shapes /= np.linalg.norm(shapes, axis=1, keepdims=True)
@@ -173,7 +172,7 @@ def fewer_channels(split: Split) -> Iterator[TorqueMethod]:
     order = ranked_channels(differences, torque)
     for count in CHANNEL_COUNTS:
         best = order[:count]
-        reader = fit_reader(differences[:, best], torque, Ridge.fit)
+        reader = fit_interval_regressor(differences[:, best], torque, Ridge.fit)
         yield TorqueMethod(
             f"{count} channels",
             "regression on the best n channels",
@@ -182,7 +181,7 @@ def fewer_channels(split: Split) -> Iterator[TorqueMethod]:
 
 
 def _read_some(reader: IntervalRegressor, channels: NDArray[np.int64], difference: FloatArray) -> float:
-    return reader.read(difference[channels])[0]
+    return reader.predict(difference[channels])[0]
 
 
 def _read_by(split: Split, name: str, family: str, locate: Callable[[FloatArray], float]) -> TorqueMethod:
@@ -191,8 +190,8 @@ def _read_by(split: Split, name: str, family: str, locate: Callable[[FloatArray]
         return np.array([sigma, sigma**2])
 
     past = np.array([features(frame) for frame in np.abs(split.past.channels[:, 0])])
-    reader = fit_reader(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=_POLYNOMIAL)
-    return TorqueMethod(name, family, _timed(split, lambda x: reader.read(features(x))[0]))
+    reader = fit_interval_regressor(past, split.past.torque_at_frames(), Ridge.fit_scaled, strengths=_POLYNOMIAL)
+    return TorqueMethod(name, family, _timed(split, lambda x: reader.predict(features(x))[0]))
 
 
 def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tuple[FloatArray, FloatArray]]:
@@ -212,7 +211,7 @@ def _timed(split: Split, read: Callable[[FloatArray], float]) -> Callable[[], tu
 Fill = Literal["none", "left", "full"]
 # The largest noise that the loop's identification tolerates.
 _LARGEST_LOOP_NOISE_NM = 0.02
-_SLICE_ESTIMATORS: tuple[Name, ...] = ("bank", "regression", "reconstruction", "fused")
+_SLICE_ESTIMATORS: tuple[Name, ...] = ("bank", "regression", "reconstruction", "motion_regression")
 # Errors count valid frames only. A method below this share of the most valid one stays off the frontier.
 _OFTEN_VALID = 0.9
 # Fill of a single window's mark, from the smallest noise to the largest.

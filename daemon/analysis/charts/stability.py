@@ -30,8 +30,8 @@ from shearloop.daemon.analysis.charts.sources import Split, splits
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.workers import Executor
 
-SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "fused")
-STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "fused")
+SLICE_NAMES: tuple[Name, ...] = ("paper", "bank", "regression", "reconstruction", "motion_regression")
+STREAM_NAMES: tuple[Name, ...] = ("bank", "regression", "motion_regression")
 SHIFTS_S = (-0.54, -0.27, -0.13, 0.0, 0.13, 0.27, 0.54, 1.08)
 
 
@@ -59,7 +59,7 @@ def chart(parts: Sequence[Split], bank: Bank, mesh: Mesh, scratch: Path, out: Pa
 def _of_slices(split: Split, bank: Bank, mesh: Mesh, out: Path, executor: Executor) -> list[Path]:
     """Write the charts of slices: continuity, torques beyond the calibrated ones, foreign frames."""
     name, physics = slug(split.title), Physics(bank, mesh)
-    found = walks(split, bank, fitted(split, ("regression", "fused"), physics))
+    found = walks(split, bank, fitted(split, ("regression", "motion_regression"), physics))
     rows = [asdict(one) | {"largest_hop_nm": one.largest_hop_nm, "hops": one.hops} for one in found]
     written = save(continuity_figure(split.title, found), {"steps": STEPS, "walks": rows}, out, f"continuity-{name}")
     beyond = extrapolate(split, SLICE_NAMES, bank, mesh, executor)

@@ -13,12 +13,12 @@ from matplotlib.gridspec import SubplotSpec
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import Calibration
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.matching import Match
 from shearloop.bank.eit.models import MODELS
 from shearloop.bank.eit.polynomial import Polynomial
 from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import Calibration
 from shearloop.daemon.analysis.reproduce.analysis import DiameterResult, ModelScores, TorqueResult, all_notes
 from shearloop.daemon.analysis.reproduce.banks import Grid
 
@@ -165,10 +165,10 @@ def save_calibrations(found: Reproduction, banks: dict[str, Bank], recordings: P
     for name, (bank, points) in fits.items():
         source = f"{name.split('_')[0]} slices of {recordings.name}, on the {bank} bank"
         try:
-            calibration = Calibration.fit(banks[bank].identity, source, **points)
+            calibration = Calibration.from_matches(banks[bank].identity, source, **points)
         except CalibrationError:  # already in the notes
             continue
-        written.append(folder / f"calibration_{name}.yaml")
+        written.append(folder / f"calibration_{name}.cal")
         calibration.save(written[-1])
     return written
 

@@ -8,7 +8,6 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from shearloop.drivers.emulators.ports import Outage, PtyServer, SocketServer
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
@@ -258,19 +257,7 @@ class ModbusServer(PtyServer):
         return reply
 
 
-class GripperServer(Protocol):
-    """The part of a server that `GripperPlayer` needs."""
-
-    silent: bool
-
-    async def run(self) -> None:
-        """Serve until cancelled."""
-
-    async def disconnect(self) -> None:
-        """Break the connection."""
-
-    async def restore(self) -> None:
-        """Accept connections again."""
+GripperServer = UrcapServer | ModbusServer
 
 
 class GripperPlayer:

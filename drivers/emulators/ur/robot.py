@@ -88,7 +88,10 @@ class Robot:
         self._wrench = np.zeros(6)
         self._wrench_zero = np.zeros(6)
 
-    # ---- time -----------------------------------------------------------------------------------------------------
+    @property
+    def clock_s(self) -> float:
+        """The controller's clock, which never stands still."""
+        return self.time_s + self.stood_still_s
 
     def step(self, dt_s: float) -> None:
         """Run one control cycle."""
@@ -121,8 +124,6 @@ class Robot:
         self._frames = link_frames(self.q_rad, self.spec.tool_length_m)
         if moving != bool(self.qd_rad_per_s.any()):
             self._note("motion-stopped" if moving else "motion-started")
-
-    # ---- program --------------------------------------------------------------------------------------------------
 
     def upload(self, watchdog_hz: float = 0.0) -> None:
         """Run a control script that arms its watchdog at `watchdog_hz` by itself; 0 for one that does not."""
@@ -161,8 +162,6 @@ class Robot:
         """Whether a program is loaded and has not ended; a paused one counts."""
         return self._script is not None
 
-    # ---- faults and recovery --------------------------------------------------------------------------------------
-
     def protective_stop(self, cause: str) -> None:
         """Stop for safety and pause the program."""
         if self.safety_mode == SAFETY_NORMAL:
@@ -189,7 +188,7 @@ class Robot:
         """End a protective stop; False within `unlock_wait_s` of its beginning."""
         if self.safety_mode != SAFETY_PROTECTIVE_STOP:
             return True
-        if self.time_s - self._safety_since_s < self.spec.unlock_wait_s:
+        if self.clock_s - self._safety_since_s < self.spec.unlock_wait_s:
             return False
         self.safety_mode = SAFETY_NORMAL
         self._note("protective-stop-unlocked")
@@ -213,8 +212,6 @@ class Robot:
         self._power_step_s = math.inf
         self.remote_control, self.registers_taken = self.spec.remote_control, False
         self._note("faults-cleared")
-
-    # ---- registers and variables ----------------------------------------------------------------------------------
 
     def write(self, name: str, value: float) -> None:
         """Set an input register, as a client does over RTDE; registers outlive their client."""
@@ -255,11 +252,9 @@ class Robot:
         self._wrench_zero = self._wrench.copy()
         self._note("wrench-zeroed")
 
-    # ---- inside ---------------------------------------------------------------------------------------------------
-
     def _stop_for_safety(self, mode: int, name: str, cause: str) -> None:
         self.safety_mode = mode
-        self._safety_since_s = self.time_s
+        self._safety_since_s = self.clock_s
         self._halt(SAFETY_DECELERATION)
         self._note(name, cause)
 
@@ -276,7 +271,7 @@ class Robot:
 
 
 _VARIABLES: dict[str, Callable[[Robot], Value]] = {
-    "timestamp": lambda r: r.time_s + r.stood_still_s,
+    "timestamp": lambda r: r.clock_s,
     "actual_q": lambda r: [*r.q_rad],
     "target_q": lambda r: [*r.q_rad],
     "actual_qd": lambda r: [*r.qd_rad_per_s],

@@ -1,4 +1,4 @@
-"""Every estimator on data whose answer is known."""
+"""Every estimator on data with a known answer."""
 
 import math
 
@@ -80,7 +80,7 @@ def test_what_is_put_into_a_synthetic_skin_is_found_again(put_in: SkinFigures) -
     for name, spread in {
         "noise_floor_n": 0.01,
         "prediction_half_width_n": 0.04,
-        # 36 readings tell a standard deviation within 12 % each.
+        # 36 readings give a standard deviation within 12 %.
         "drift_std": 0.06,
         "crosstalk": noise / math.sqrt(600) / put_in.crosstalk,
         "sensitivity_per_k": 0.1,

@@ -1,4 +1,4 @@
-"""Beyond the torques calibrated on: which slices are calibrated on and which judged, and what is drawn of it."""
+"""Torques beyond the calibrated ones: the parts to calibrate on, their results and the picture."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from shearloop.daemon.analysis.charts.slice_stability import (
 )
 from shearloop.daemon.analysis.charts.sources import Split, bank_of, own_fingertip, splits
 from shearloop.daemon.analysis.charts.stability import extrapolation_figure
-from shearloop.daemon.analysis.evaluation import follow, judge
+from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.reproduce.banks import Grid
 from shearloop.daemon.workers import SerialExecutor
 
@@ -71,10 +71,10 @@ def test_chosen_slices_keep_their_own_torques(slices: FrameSeries) -> None:
 def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
     slices: FrameSeries, bank: Bank, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # Of a twentieth no estimator can be made.
+    # A twentieth is too few for an estimator.
     monkeypatch.setattr(slice_stability, "CALIBRATED_SHARES", (0.5, 0.05))
     some = slices.between(0, 40)
-    # A slice whose torque nobody knows is neither.
+    # A slice of unknown torque is in neither part.
     torque_nm = some.torque_nm.copy()
     torque_nm[3] = np.nan
     whole = replace(some, torque_nm=torque_nm)
@@ -93,8 +93,10 @@ def test_an_estimator_is_calibrated_on_some_torques_and_judged_on_the_others(
             (one.curve.levels[0], one.width_nm[0], known[:29], known[29:]),
             (one.curve.levels[1], one.width_nm[1], known[inside], known[~inside]),
         ):
-            track = follow(fit("regression", [select_rows(slices, past)], "", Physics()), select_rows(slices, future))
-            figures = judge([track])
+            track = estimate_series(
+                fit("regression", [select_rows(slices, past)], "", Physics()), select_rows(slices, future)
+            )
+            figures = figures_of([track])
             assert level.valid == figures["valid_fraction"]
             assert level.bias_nm == pytest.approx(figures["bias_nm"])
             assert level.false_valid == pytest.approx(level.valid * (1 - figures["coverage_95"]))
@@ -111,7 +113,7 @@ def test_the_picture_marks_what_breaks_and_writes_how_many_slices_were_calibrate
     found = [
         Extrapolation(fault_curve(which, "N·m", name, levels), (29, 24, 14), (0.08, 0.04, None))
         for which in (SMALLER, LARGER)
-        for name in ("fused", "bank")
+        for name in ("motion_regression", "bank")
     ]
     made = extrapolation_figure("slices", found)
     assert len(made.axes) == 8

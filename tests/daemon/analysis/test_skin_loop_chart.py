@@ -40,8 +40,8 @@ def test_a_force_is_held_without_a_limit_cycle_wider_than_friction_s_band(
     assert held.offset_n <= 0.02
 
 
-def test_the_band_is_what_does_it(calibration: SkinCalibration) -> None:
-    held, _ = judge(SkinLoopCase(name="not told the band", band=False, seed=5, kp=0.15, hold_s=12.0), calibration)
+def test_without_the_band_the_limit_cycle_is_wide(calibration: SkinCalibration) -> None:
+    held, _ = judge(SkinLoopCase(name="without the band", band=False, seed=5, kp=0.15, hold_s=12.0), calibration)
     assert held.width_n > held.bound_n
 
 
@@ -68,15 +68,15 @@ def test_a_gauge_that_drifts_while_a_force_is_held_ends_in_a_hold_and_not_in_a_p
 
 @pytest.mark.usefixtures("fonts")
 def test_the_stability_chart_shows_the_limit_cycle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    case = SkinLoopCase(name="told the band", hold_s=4.0)
+    case = SkinLoopCase(name="with the band", hold_s=4.0)
     monkeypatch.setattr(skin_loop, "over_gains", lambda: [case])
-    monkeypatch.setattr(skin_loop, "over_delays", lambda: [replace(case, name="not told", band=False)])
+    monkeypatch.setattr(skin_loop, "over_delays", lambda: [replace(case, name="without the band", band=False)])
     monkeypatch.setattr(skin_loop, "SEEDS", 1)
     paths = skin_loop.chart(tmp_path, SerialExecutor())
     assert [path.name for path in paths] == ["stability-skin.json", "stability-skin.svg", "stability-skin.png"]
-    told, not_told = json.loads(paths[0].read_text())["held"]
-    assert told["width_n"] <= told["bound_n"] == pytest.approx(0.08)
-    assert not_told["case"]["band"] is False
+    with_band, without_band = json.loads(paths[0].read_text())["held"]
+    assert with_band["width_n"] <= with_band["bound_n"] == pytest.approx(0.08)
+    assert without_band["case"]["band"] is False
     assert paths[2].stat().st_size > 20_000
 
 

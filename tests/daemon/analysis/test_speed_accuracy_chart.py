@@ -1,4 +1,4 @@
-"""The charts on small synthetic recordings: what they are drawn from, and that a user's mistakes are sentences."""
+"""The charts on small synthetic recordings, and the errors of their command."""
 
 import json
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def test_of_equally_fast_points_the_more_accurate_is_on_the_frontier() -> None:
     assert frontier([1.0, 1.0], [2.0, 1.0]) == [1]
 
 
-def test_what_calls_few_frames_valid_is_not_on_the_frontier_however_fast_and_exact(scratch: Path) -> None:
+def test_a_method_with_few_valid_frames_is_not_on_the_frontier(scratch: Path) -> None:
     split = splits([], 0.6, scratch)[0]
     methods = [
         MeasuredMethod(name, name, cost, cost, cost, error, None, valid)
@@ -76,7 +76,7 @@ def test_what_calls_few_frames_valid_is_not_on_the_frontier_however_fast_and_exa
     ]
 
 
-def test_loops_at_one_window_tell_their_noises_apart_by_their_marks() -> None:
+def test_marks_distinguish_the_noises_of_loops_at_one_window() -> None:
     axes = figure(5, 5).add_subplot()
     runs = [(loop, noise, n) for loop in LOOPS[:2] for noise in (0.002, 0.01, 0.02) for n in (1, 2)]
     runs += [(LOOPS[2], noise, 1) for noise in (0.002, 0.01, 0.02)]
@@ -98,7 +98,7 @@ def test_synthetic_frames_are_split_in_time_and_the_same_each_time(scratch: Path
     np.testing.assert_array_equal(again.channels[: len(stream.past.t_s)], stream.past.channels)
 
 
-def test_errors_fall_in_proportion_to_the_mesh_size_towards_what_two_meshes_foretell() -> None:
+def test_errors_fall_with_the_mesh_size_towards_the_extrapolated_signals() -> None:
     meshes = [own_fingertip(size).mesh() for size in (0.2, 0.1, 0.05)]
     truth = converged(meshes[1], meshes[2], 2.0)
     errors = [error_of(direct(mesh)(), truth) for mesh in meshes]
@@ -121,8 +121,8 @@ def test_the_speed_accuracy_chart_holds_every_method_with_its_ratio(scratch: Pat
     # The same maximum: the same torques.
     assert fast["rmse_nm"] == paper["rmse_nm"]
     assert fast["latency_ratio"] == fast["latency_ms"] / paper["latency_ms"]
-    assert {"rank 8", "zero lag, float16", "64 channels", "fused"} <= set(by_name)
-    assert {"fused, right", "fused, both"} <= {row["name"] for row in stream}
+    assert {"rank 8", "zero lag, float16", "64 channels", "motion_regression"} <= set(by_name)
+    assert {"motion_regression, right", "motion_regression, both"} <= {row["name"] for row in stream}
     errors = {row["name"]: row["error"] for row in content["forward"]}
     assert errors["direct, 0.4 cm"] > errors["direct, 0.2 cm"] > 0
     assert errors["batch, 0.2 cm"] == pytest.approx(errors["direct, 0.2 cm"], rel=1e-6)
@@ -172,7 +172,7 @@ def test_a_folder_that_was_there_is_left_as_it_was(tmp_path: Path) -> None:
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_a_place_that_takes_no_chart_is_told_before_anything_is_measured(
+def test_an_unwritable_folder_is_reported_before_anything_is_measured(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # Were anything read, it would be what fails.
@@ -183,13 +183,13 @@ def test_a_place_that_takes_no_chart_is_told_before_anything_is_measured(
         assert said == "shearloop chart: /dev/null: the chart cannot be written: File exists; choose another --out\n"
 
 
-def test_why_a_design_may_not_be_worth_building_is_told_with_the_chart_of_it(
+def test_doubts_about_a_design_are_printed_with_its_chart(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     t_s, frames = np.arange(12.0), np.random.default_rng(1).normal(0.0, 0.01, (12, 1, N_CHANNELS))
     series = FrameSeries("difference", ("right",), t_s, frames, t_s, t_s, np.full(12, np.nan))
     parts = [Split(f"{name}, slices, first 60%", series, series, series) for name in ("good", "bad")]
-    # Each recording is designed for in turn; of a design its doubts ask no more.
+    # One design per recording, with the attributes that the doubts need.
     found = iter([(0.6, 0.16), (0.9, 0.5)])
 
     def designed_on(*_: object) -> SimpleNamespace:
@@ -232,7 +232,7 @@ def test_pyeit_is_measured_where_it_is_installed_and_cited_where_it_is_not(
 
 
 CROWD = [(1.0, 1.0, "one"), (1.05, 1.0, "another"), (1.0, 1.04, "a third"), (1.1, 1.0, "a fourth")]
-# Side by side, as methods of the same error are.
+# Side by side, like methods with the same error.
 ROW = [(each, 1.0, f"some method,\n{number} triangles") for number, each in enumerate((0.75, 0.79, 0.9, 1.34, 1.4))]
 
 
@@ -247,7 +247,7 @@ def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark(points: 
     lay_out(made)
     write_names(axes, points)
     made.draw_without_rendering()
-    # Two that stand closer together read as one. Of a text alone, without the line that leads to it.
+    # Names closer together read as one. The extent is of the text, without its line.
     boxes = [Text.get_window_extent(note).padded(1.9) for note in axes.texts]
     assert sorted(note.get_text() for note in axes.texts) == sorted(name for *_, name in points)
     for i, box in enumerate(boxes):
@@ -255,7 +255,7 @@ def test_names_of_points_that_crowd_cover_neither_each_other_nor_a_mark(points: 
         assert not any(box.contains(*axes.transData.transform(point[:2])) for point in points)
         assert axes.get_window_extent().containsx(box.x0)
         assert axes.get_window_extent().containsx(box.x1)
-    # One that does not stand next to its own is led to it.
+    # A name away from its point has a line to it.
     led = [isinstance(note, Annotation) and note.arrow_patch is not None for note in axes.texts]
     assert led == [max(map(abs, note.get_position())) > 7 for note in axes.texts]
     assert any(led) == (points is ROW)

@@ -10,7 +10,7 @@ from scipy.stats import mannwhitneyu
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNELS
 from shearloop.bank.estimation import Estimate, EstimatorSession, FrameSeries, Physics
-from shearloop.bank.estimation.reciprocity import ReciprocityCheck
+from shearloop.bank.estimation.novelty import ReciprocityCheck
 from shearloop.daemon.analysis.charts.fault_sweeps import (
     FAULTS,
     FaultLevel,
@@ -58,7 +58,12 @@ def test_figures_count_what_is_valid_and_wrong() -> None:
     assert found.valid == 0.75
     assert found.false_valid == 0.25
     assert found.bias_nm == pytest.approx(0.05 / 3)
-    assert fault_curve("fault", "unit", "fused", [judge_level([estimate(0.1)], truth[:1], 0.0), found]).breaks_at == 2.0
+    assert (
+        fault_curve(
+            "fault", "unit", "motion_regression", [judge_level([estimate(0.1)], truth[:1], 0.0), found]
+        ).breaks_at
+        == 2.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -66,7 +71,7 @@ def test_figures_count_what_is_valid_and_wrong() -> None:
 )
 def test_an_estimator_breaks_at_the_mildest_level_in_either_direction(levels, expected) -> None:
     wrong = [FaultLevel(level, 0.0, 0.0, 1.0, 0.5 if level else 0.0) for level in levels]
-    assert fault_curve("fault", "unit", "fused", wrong).breaks_at == expected
+    assert fault_curve("fault", "unit", "motion_regression", wrong).breaks_at == expected
 
 
 def test_a_stream_is_judged_by_as_many_loaded_frames_as_free_ones() -> None:
@@ -91,7 +96,7 @@ def test_an_electrode_touches_its_own_injections_and_pairs() -> None:
     assert 28 * 2 < lost_channels(np.array([3])).sum() < 28 * 5
 
 
-def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts, bank) -> None:
+def test_unreported_lost_electrodes_never_pass_silently(parts, bank) -> None:
     stream = next(one for one in parts if one.past.kind == "raw")
     (calibration,) = fitted(stream, ("regression",), Physics(bank, None))
     scene = scene_for(stream, bank)
@@ -103,14 +108,14 @@ def test_lost_electrodes_are_told_or_done_without_and_never_pass_silently(parts,
 
 
 @pytest.mark.usefixtures("fonts", "few_mixtures")
-def test_the_mean_of_cells_alike_does_not_hop_and_the_rims_are_walked(parts, bank, scratch) -> None:
+def test_the_mean_of_similar_cells_does_not_hop_and_the_rims_are_swept(parts, bank, scratch) -> None:
     slices = parts[0]
-    calibrations = fitted(slices, ("bank", "fused"), Physics(bank, None))
+    calibrations = fitted(slices, ("bank", "motion_regression"), Physics(bank, None))
     found = walks(slices, bank, calibrations)
     paper, alone, mean = (one.largest_hop_nm for one in found[:3])
     assert mean < 0.5 * min(paper, alone)
     rims = list(sweep_rims(calibrations, bank, scratch))
-    assert {one.estimator for one in rims} == {"bank", "fused"}
+    assert {one.estimator for one in rims} == {"bank", "motion_regression"}
     assert all(one.levels[0].valid > 0.5 for one in rims)
     for figure in (sweeps_figure("rims", rims), continuity_figure("slices", found)):
         assert len(figure.axes) >= 2
@@ -129,7 +134,7 @@ def drifting(n: int, seed: int) -> FrameSeries:
 
 
 @pytest.mark.usefixtures("fonts")
-def test_the_share_of_a_foreign_frame_that_passes_is_the_one_that_its_size_allows() -> None:
+def test_the_passing_share_of_a_foreign_frame_follows_from_its_size() -> None:
     """Off the slices' directions nothing but the foreign part stands out: its square adds to that of the noise."""
     series = drifting(100, 4)
     found = detect_mixtures(series, origins=(0.6,))
@@ -153,9 +158,9 @@ def test_the_share_of_a_foreign_frame_that_passes_is_the_one_that_its_size_allow
     for one, misfits in zip(own, expected, strict=True):
         np.testing.assert_allclose(one.misfits, misfits, rtol=1e-6)
         assert one.auc == pytest.approx(mannwhitneyu(misfits, expected[0]).statistic / len(later) ** 2)
-        assert one.passing <= (misfits <= 1.0).mean()
-    assert own[0].passing == 1.0
-    assert {one.passing for one in own if one.share >= 0.2} == {0.0}
+        assert one.accepted <= (misfits <= 1.0).mean()
+    assert own[0].accepted == 1.0
+    assert {one.accepted for one in own if one.share >= 0.2} == {0.0}
     assert {one.passing_best for one in own if one.share >= 0.2} == {0.0}
     assert len(detectability_figure("slices", found).axes) == 2
 

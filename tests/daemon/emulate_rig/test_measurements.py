@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.estimation import Calibration
 from shearloop.drivers.load_cell import LoadCalibration, LoadCell
 from shearloop.drivers.robotiq.gripper import RobotiqGripper
 from shearloop.drivers.robotiq.messages import ObjectStatus
@@ -84,8 +84,8 @@ async def test_the_modbus_gripper_the_papers_sketch_a_calibration_and_the_truth_
     from shearloop.bank.eit.bank_file import Bank
 
     sigma = np.linspace(1.0, 2.0, 20)
-    calibration = tmp_path / "calibration.yaml"
-    Calibration.fit(Bank.open(bank).identity, "synthetic", torque=(sigma, 0.4 - 0.2 * sigma)).save(calibration)
+    calibration = tmp_path / "calibration.cal"
+    Calibration.from_matches(Bank.open(bank).identity, "synthetic", torque=(sigma, 0.4 - 0.2 * sigma)).save(calibration)
     run_dir, truth = tmp_path / "run", tmp_path / "truth.jsonl"
     arguments = ("--bank", str(bank), "--run-dir", str(run_dir), *PACE, "--gripper", "modbus", "--paper-sketch")
     files = ("--truth", str(truth), "--calibration", str(calibration))

@@ -2,16 +2,18 @@ import json
 import re
 from dataclasses import replace
 from shutil import copytree
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from shearloop.bank.estimation import Estimate, FrameSeries, fit
-from shearloop.bank.estimation.alignment import Alignment
-from shearloop.daemon.analysis.evaluation import EstimateTrack, Reason, judge, reasons
+from shearloop.bank.estimation import Calibration, Estimate, FrameSeries, fit
+from shearloop.bank.estimation.calibration import OutputModel
+from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.load_delay import LoadDelay
+from shearloop.bank.estimation.regressors import Ridge
+from shearloop.daemon.analysis.calibrate import CalibrationReport, _report_timing
+from shearloop.daemon.analysis.evaluate import EstimateTrack, InvalidReason, figures_of, invalid_reasons
 from shearloop.daemon.cli import main
-from shearloop.daemon.cli.calibrated.recording import _of_times
 
 KEYS = {"r", "rmse_nm", "bias_nm", "coverage_95", "interval_nm", "valid_fraction", "frames"}
 KEYS |= {"latency_ms_p50", "latency_ms_p99"}
@@ -22,11 +24,12 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
     first, second = tmp_path / "a.cal", tmp_path / "b.cal"
     for out, form in ((first, []), (second, ["--json"])):
         capsys.readouterr()
-        assert main(["calibrate", str(slices_folder), "--part", "0:0.6", "--out", str(out), *form]) == 0
+        assert main(["calibrate", str(slices_folder), "--time-range", "0:0.6", "--out", str(out), *form]) == 0
     assert first.read_bytes() == second.read_bytes()
     told = json.loads(capsys.readouterr().out)
-    assert (told["path"], told["estimator"], told["quantities"]) == (str(second), "fused", ["torque", "diameter"])
-    assert main(["evaluate", str(first), str(slices_folder), "--part", "0.6:1", "--json", "--plot"]) == 0
+    assert (told["path"], told["estimator"]) == (str(second), "motion_regression")
+    assert told["quantities"] == ["torque", "diameter"]
+    assert main(["evaluate", str(first), str(slices_folder), "--time-range", "0.6:1", "--json", "--plot"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert set(figures) == KEYS | {"diameter_rmse_mm", "diameter_coverage_95", "diameter_interval_mm"}
     assert 0 < figures["interval_nm"] < 0.1
@@ -51,17 +54,19 @@ def test_calibrate_twice_is_one_file_and_evaluate_judges_it(slices_folder, tmp_p
 def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tmp_path, capsys, monkeypatch):
     def blind(*arguments, **options):
         found = fit(*arguments, **options)
-        reader = replace(found.torque.reader, misses_loads=misses_loads)
-        return replace(found, torque=replace(found.torque, reader=reader))
+        reader = replace(found.torque.regressor, misses_loads=misses_loads)
+        return replace(found, torque=replace(found.torque, regressor=reader))
 
-    monkeypatch.setattr("shearloop.bank.estimation.fit", blind)
+    monkeypatch.setattr("shearloop.daemon.analysis.calibrate.fit", blind)
     calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--estimator", "regression"]
     calibrate += ["--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
     told = capsys.readouterr().out
     assert ("It does not see the load: " in told) == misses_loads
-    assert ("every interval spans all calibrated torques, 0.01 to 0.14 N·m, and no torque" in told) == misses_loads
-    cure = "Calibrate with --estimator fused or on both fingertips, or record a grip in which the tool twists the gel"
+    assert (
+        "every interval spans all calibrated torques, 0.01 to 0.14 N·m, and the torque is useless" in told
+    ) == misses_loads
+    cure = "Calibrate with --estimator motion_regression or on both fingertips, or record a grip in which the tool"
     assert (cure in told) == misses_loads
     assert main([*calibrate, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["sees_loads"] is not misses_loads
@@ -71,25 +76,25 @@ def test_calibrate_says_where_loads_are_not_seen(misses_loads, slices_folder, tm
 def test_calibrate_says_which_torques_may_be_of_something_beyond(slices_folder, tmp_path, capsys, monkeypatch):
     fitted = []
     monkeypatch.setattr(
-        "shearloop.bank.estimation.fit", lambda *a, **options: fitted.append(fit(*a, **options)) or fitted[-1]
+        "shearloop.daemon.analysis.calibrate.fit", lambda *a, **options: fitted.append(fit(*a, **options)) or fitted[-1]
     )
     calibrate = ["calibrate", str(slices_folder / "torque_slices"), "--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
-    reader = fitted[-1].torque.reader
+    reader = fitted[-1].torque.regressor
     low_end, lowest = (round(limit, 3) for limit in (reader.low_end, reader.lowest))
-    ends = f"of what is read below {low_end:g} N·m reach to {lowest:g} at least, of what is read above "
+    ends = f"of estimates below {low_end:g} N·m reach to {lowest:g} at least, of estimates above "
     assert ends in capsys.readouterr().out
     assert main([*calibrate, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["reads_beyond"] is False
     assert main(["evaluate", str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")]) == 0
-    assert "somebody's word" not in capsys.readouterr().err
-    assert main([*calibrate, "--all-torques"]) == 0
+    assert "assumes that" not in capsys.readouterr().err
+    assert main([*calibrate, "--assume-full-range"]) == 0
     assert "beyond" not in capsys.readouterr().out
-    assert np.isinf(fitted[-1].torque.reader.high_end)
+    assert np.isinf(fitted[-1].torque.regressor.high_end)
     assert main(["evaluate", str(tmp_path / "a.cal"), str(slices_folder / "torque_slices")]) == 0
-    assert "a.cal was made on somebody's word that no torque will come beyond those of" in capsys.readouterr().err
-    assert main([*calibrate, "--all-torques", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["vouched"] == ["all torques"]
+    assert "a.cal assumes that no torque exceeds" in capsys.readouterr().err
+    assert main([*calibrate, "--assume-full-range", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["assumptions"] == ["full range"]
 
 
 @pytest.mark.usefixtures("few_mixtures")
@@ -100,8 +105,8 @@ def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_
     assert main(["calibrate", str(slices_folder / "torque_slices"), "--out", str(calibration)]) == 0
     assert main(["evaluate", str(calibration), str(recording)]) == 2
     assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
-    assert main(["calibrate", str(recording), "--all-torques", "--out", str(calibration)]) == 2
-    assert "--all-torques is for slices" in capsys.readouterr().err
+    assert main(["calibrate", str(recording), "--assume-full-range", "--out", str(calibration)]) == 2
+    assert "--assume-full-range is for slices" in capsys.readouterr().err
     assert main(["calibrate", "creep", str(recording), "--calibration", str(calibration)]) == 2
     assert "made from slices, and cannot judge raw frames" in capsys.readouterr().err
 
@@ -109,20 +114,20 @@ def test_a_stream_is_imported_and_cannot_be_judged_by_slices(mat_folder, slices_
 def test_reasons_are_told_by_a_true_example_with_all_that_differ_in_numbers_alone():
     """The numbers stood as #, and what follows from them was left out."""
     said = [
-        "outside of the calibration: the misfit is 2.1 (at most 1.5)",
-        "right fingertip: 7 % of the channels jumped since the frame before; it was touched",
-        *("right fingertip: 17.5 % of the channels jumped since the frame before; it was touched",) * 2,
-        "right fingertip: 31.5 % of the channels are dead or saturated; look at the ribbon cable",
+        "outside the calibration: the Q residual is 2.1 (at most 1.5)",
+        "right fingertip: 7 % of the channels jumped since the last frame; it was touched",
+        *("right fingertip: 17.5 % of the channels jumped since the last frame; it was touched",) * 2,
+        "right fingertip: 31.5 % of the channels are dead or saturated; check the ribbon cable",
         *("the torque would be -0.2 N·m", "the torque would be 0.2 N·m"),
-        "outside of the calibration: the frame lies 3.0 standard deviations from those calibrated on",
+        "outside the calibration: the frame lies 3.0 standard deviations from the calibrated ones",
     ]
     nothing = np.full(8, np.nan)
     series = FrameSeries("raw", ("right",), np.arange(8.0), np.zeros((8, 1, 896)), nothing[:0], nothing[:0], nothing)
-    track = EstimateTrack(series, tuple(Estimate(valid=False, why=(why,)) for why in said), np.zeros(8))
-    assert reasons([track]) == [
-        Reason(3, said[2], differ=True),
-        Reason(2, said[5], differ=True),
-        *(Reason(1, said[row], differ=False) for row in (0, 4, 7)),
+    track = EstimateTrack(series, tuple(Estimate(valid=False, reasons=(why,)) for why in said), np.zeros(8))
+    assert invalid_reasons([track]) == [
+        InvalidReason(3, said[2], differ=True),
+        InvalidReason(2, said[5], differ=True),
+        *(InvalidReason(1, said[row], differ=False) for row in (0, 4, 7)),
     ]
 
 
@@ -130,33 +135,33 @@ def test_evaluate_says_of_an_example_that_it_is_one(monkeypatch, slices_folder, 
     calibration, slices = tmp_path / "a.cal", str(slices_folder / "torque_slices")
     assert main(["calibrate", slices, "--out", str(calibration)]) == 0
     told = [
-        Reason(12, "gripped too lately: 12 more frames are needed", differ=True),
-        Reason(1, "no grip", differ=False),
+        InvalidReason(12, "gripped too recently: 12 more frames are needed", differ=True),
+        InvalidReason(1, "no grip", differ=False),
     ]
-    monkeypatch.setattr("shearloop.daemon.analysis.evaluation.reasons", lambda _: told)
+    monkeypatch.setattr("shearloop.daemon.analysis.evaluate.invalid_reasons", lambda _: told)
     assert main(["evaluate", str(calibration), slices]) == 0
     said = capsys.readouterr().out
-    assert "12 frames not valid, e.g.: gripped too lately: 12 more frames are needed" in said
+    assert "12 frames not valid, e.g.: gripped too recently: 12 more frames are needed" in said
     assert "1 frames not valid: no grip" in said
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["calibrate", "{slices}", "--part", "0.5", "--out", "x"], "--part must be two shares"),
-        (["calibrate", "{slices}", "--part", "0.9:0.5", "--out", "x"], "--part must rise"),
+        (["calibrate", "{slices}", "--time-range", "0.5", "--out", "x"], "--time-range must be two shares"),
+        (["calibrate", "{slices}", "--time-range", "0.9:0.5", "--out", "x"], "--time-range must rise"),
         (["calibrate", "{slices}", "--sides", "middle", "--out", "x"], "--sides must be right or left"),
         (["calibrate", "{slices}", "--estimator", "bank", "--out", "x"], "needs a bank"),
         (
             ["calibrate", "{slices}", "--tool-mm", "0", "--out", "x"],
             "--tool-mm must be above 0 and below 140 mm, not 0",
         ),
-        (["calibrate", "{slices}", "--load-late", "0", "--out", "x"], "--load-late is for recordings: each slice"),
+        (["calibrate", "{slices}", "--load-cell-delay-s", "0", "--out", "x"], "--load-cell-delay-s is for recordings"),
         (["calibrate", "{slices}", "--tool-mm", "20", "--out", "x"], "--tool-mm is for recordings: a calibration of"),
-        (["calibrate", "{slices}", "--sides", "left", "--out", "x"], "--sides is for recordings: slices do not tell"),
+        (["calibrate", "{slices}", "--sides", "left", "--out", "x"], "--sides is for recordings: slices do not name"),
         (
-            ["calibrate", "{slices}/diameter_slices", "--all-torques", "--out", "x"],
-            "--all-torques vouches for torques, and these slices tell diameters alone; leave it out",
+            ["calibrate", "{slices}/diameter_slices", "--assume-full-range", "--out", "x"],
+            "--assume-full-range is about torques, and these slices have diameters only; leave it out",
         ),
         (["calibrate", "nowhere.mcap", "--out", "x"], "nowhere.mcap: the recording cannot be read"),
         (["evaluate", "nowhere.cal", "{slices}"], "nowhere.cal: the calibration cannot be read"),
@@ -184,16 +189,16 @@ def test_what_is_given_twice_is_refused_by_its_name(slices_folder, mat_folder, t
     copy.mkdir()
     (copy / "Data_Slice_3.mat").write_bytes((torque / "Data_Slice_7.mat").read_bytes())
     told = refused(torque, copy)
-    assert f"{copy}: Data_Slice_3.mat holds exactly what {torque}: Data_Slice_7.mat does; leave copies out" in told
+    assert f"{copy}: Data_Slice_3.mat equals {torque}: Data_Slice_7.mat; leave copies out" in told
     for number in (5, 6):
         (cylinders / f"20mm_Data_{number}.mat").write_bytes((cylinders / "20mm_Data_2.mat").read_bytes())
     told = refused(cylinders)
-    assert "slice 5 of 20 mm holds exactly what" in told
-    assert "slice 2 of 20 mm does, and 1 more are such copies; leave copies out" in told
+    assert "slice 5 of 20 mm equals" in told
+    assert "slice 2 of 20 mm, and 1 more are such copies; leave copies out" in told
     first, second = tmp_path / "first.mcap", tmp_path / "second.mcap"
     assert main(["import", "mat", str(mat_folder()), "--out", str(first)]) == 0
     second.write_bytes(first.read_bytes())
-    assert f"{second} holds exactly what {first} does; leave copies out" in refused(first, second)
+    assert f"{second} equals {first}; leave copies out" in refused(first, second)
 
 
 @pytest.mark.usefixtures("few_mixtures")
@@ -205,12 +210,12 @@ def test_what_is_judged_twice_is_refused_as_what_is_fitted_twice_is(slices_folde
     assert main(["evaluate", str(calibration), str(slices), str(slices)]) == 2
     assert capsys.readouterr() == (
         "",
-        f"shearloop evaluate: {slices} is given twice; name it once: a copy tells nothing new\n",
+        f"shearloop evaluate: {slices} is given twice; name it once: a copy adds nothing\n",
     )
-    assert main(["evaluate", str(calibration), str(slices), str(copy), "--part", "0.6:1"]) == 2
+    assert main(["evaluate", str(calibration), str(slices), str(copy), "--time-range", "0.6:1"]) == 2
     out, told = capsys.readouterr()
     assert out == ""
-    assert f"{copy}: Data_Slice_30.mat holds exactly what {slices}: Data_Slice_30.mat does, and 19 more are" in told
+    assert f"{copy}: Data_Slice_30.mat equals {slices}: Data_Slice_30.mat, and 19 more are" in told
 
 
 def test_the_load_cell_is_still_calibrated_by_its_name(capsys):
@@ -227,7 +232,7 @@ def test_figures_are_what_their_names_say():
     ] + [Estimate(False, ("no grip",))]
     t = np.arange(4.0)
     series = FrameSeries("difference", ("right",), t, np.zeros((4, 1, 896)), t, truth, np.full(4, np.nan))
-    figures = judge([EstimateTrack(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
+    figures = figures_of([EstimateTrack(series, tuple(estimates), np.array([1.0, 2.0, 3.0, 4.0]))])
     error = np.array([0.02, 0.0, 0.07])
     assert figures["rmse_nm"] == pytest.approx(np.sqrt((error**2).mean()))
     assert figures["bias_nm"] == pytest.approx(error.mean())
@@ -251,11 +256,11 @@ def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
         EstimateTrack(told, (*torques, *refused), np.ones(4)),
         EstimateTrack(of_cylinders, tuple(cylinders), np.ones(4)),
     ]
-    figures = judge(tracks)
+    figures = figures_of(tracks)
     assert figures["coverage_95"] == 1.0
     assert figures["interval_nm"] == pytest.approx(0.04)
     assert figures["diameter_interval_mm"] == pytest.approx(11.5)
-    nothing = judge([EstimateTrack(replace(told, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))])
+    nothing = figures_of([EstimateTrack(replace(told, diameter_mm=np.full(4, 20.0)), tuple(4 * refused), np.ones(4))])
     assert nothing["interval_nm"] is nothing["diameter_interval_mm"] is None
 
 
@@ -263,9 +268,14 @@ def test_a_coverage_is_told_with_the_median_width_of_its_intervals():
 def test_a_time_that_could_not_be_checked_is_told_as_probable(error_s, unsure):
     t = np.arange(4.0)
     series = FrameSeries("raw", ("right",), t, np.zeros((4, 1, 896)), t, np.zeros(4), np.full(4, np.nan))
-    found = Alignment(late_s=0.16, error_s=error_s, explained=0.5)
-    calibration = SimpleNamespace(torque=SimpleNamespace(reader=SimpleNamespace(widened=1.9)))
-    told, (late, *sentences) = _of_times(calibration, [], [series], lambda _: found)
+    found = LoadDelay(delay_s=0.16, error_s=error_s, explained=0.5)
+    ramp = np.linspace(0.0, 1.0, 20)
+    regressor = replace(fit_interval_regressor(ramp[:, None], ramp, Ridge.fit), timing_widening=1.9)
+    model = OutputModel(regressor, None, np.zeros(0))
+    calibration = Calibration("regression", "raw", ("right",), "ramp", "", np.ones((1, 896)), torque=model)
+    report = CalibrationReport(calibration, {}, [])
+    _report_timing(report, [], [series], lambda _: found)
+    late, *sentences = report.sentences
     assert late == f"The load is {'probably ' if unsure else ''}stamped 0.16 s after the frames move."
-    assert ("widened" in told) == unsure == bool(sentences)
-    assert all("so the intervals are wider, those of loads 1.9 times. Record more" in one for one in sentences)
+    assert ("widening" in report.result) == unsure == bool(sentences)
+    assert all("so the intervals are wider, for loads 1.9 times. Record more" in one for one in sentences)

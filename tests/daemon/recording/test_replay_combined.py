@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import AsyncExitStack
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,8 +17,6 @@ from shearloop.bank.eit.channels import channels_of_line, line_of_channels
 from shearloop.bank.estimation import FrameSeries, Measured, fit
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
-from shearloop.daemon.sensing.both import LARGEST_BACKLOG, CombinedFingertipTask
-from shearloop.daemon.sensing.estimation import Taken
 from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import measured, replayed
@@ -64,35 +61,8 @@ def twists(tmp_path_factory: pytest.TempPathFactory) -> Twists:
     calibrations = {}
     for name, sides in (("both", tuple(SIDES)), ("right", ("right",))):
         calibrations[name] = folder / f"{name}.cal"
-        fit("fused", [series.of_sides(sides)], "a test").save(calibrations[name])
+        fit("motion_regression", [series.select_sides(sides)], "a test").save(calibrations[name])
     return Twists(boards, calibrations)
-
-
-async def test_pairs_follow_the_order_of_arrival() -> None:
-    """What the estimator has not caught up with changes no pair: so a replay, which never waits, finds the same."""
-    go_on, all_estimated, estimated, number = asyncio.Event(), asyncio.Event(), [], 0
-
-    async def finish(taken: Taken) -> None:
-        await go_on.wait()
-        estimated.append(tuple(frame.t_mid_ns for frame in taken.frames))
-        if len(estimated) == number:
-            all_estimated.set()
-
-    both = CombinedFingertipTask(SimpleNamespace(finish=finish, count=0), ("right", "left"), 1.0)
-    estimating = asyncio.create_task(both.estimate())
-    while both._room.is_set():
-        both.take("right", SimpleNamespace(t_mid_ns=number * 10**9))
-        both.take("left", SimpleNamespace(t_mid_ns=number * 10**9 + 1))
-        number += 1
-    assert both.diagnostics()["backlog"] == LARGEST_BACKLOG
-    reading_on = asyncio.create_task(both.room())
-    go_on.set()
-    async with asyncio.timeout(DEADLINE_S):
-        await reading_on
-        await all_estimated.wait()
-    assert estimated == [(n * 10**9, n * 10**9 + 1) for n in range(number)]
-    estimating.cancel()
-    await asyncio.gather(estimating, return_exceptions=True)
 
 
 async def record(config: Path, boards: dict[str, Path]) -> Messages:
@@ -120,8 +90,8 @@ async def record(config: Path, boards: dict[str, Path]) -> Messages:
         with zmq.asyncio.Context() as context:
             daemon = Daemon(load_daemon_config(config), context)
             daemon.publisher.add_listener(listen)
-            right = daemon._estimations["right"]
-            right.held_tool = lambda _: Measured(OTHER_MM, 0.5) if right.count in OTHER_TOOL else None
+            right = daemon._estimators["right"]
+            right._held_tool = lambda _: Measured(OTHER_MM, 0.5) if right.count in OTHER_TOOL else None
             running = asyncio.create_task(daemon.run())
             try:
                 await enough.wait()
@@ -139,7 +109,7 @@ def test_combined_fingertips_are_replayed_at_any_speed(
         side: {"device": {"path": f"eit-{side}"}, "bank": str(tiny_bank), "frame_period_s": PERIOD_S / PLAYED}
         for side in SIDES
     }
-    fingertips["right"] |= {"calibration": str(twists.calibrations["right"]), "estimator": "fused"}
+    fingertips["right"] |= {"calibration": str(twists.calibrations["right"]), "estimator": "motion_regression"}
     path = config(
         fingertips=fingertips,
         combined={"calibration": str(twists.calibrations["both"])},
@@ -161,10 +131,10 @@ def test_combined_fingertips_are_replayed_at_any_speed(
     torques = [one["torque_nm"] for _, one in replays[math.inf] if one["source"] == "right" and one["valid"]]
     assert len(torques) > 30
     assert np.ptp(torques) > 0.05
-    says = [(one["source"], "the tool is of 14 mm" in one["reason"]) for _, one in replays[math.inf]]
+    says = [(one["source"], "the tool has 14 mm" in one["reason"]) for _, one in replays[math.inf]]
     assert not any(refused for source, refused in says if source != "right")
     right = [one for _, one in replays[math.inf] if one["source"] == "right"]
-    refused = [number for number, one in enumerate(right) if "the tool is of 14 mm" in one["reason"]]
+    refused = [number for number, one in enumerate(right) if "the tool has 14 mm" in one["reason"]]
     # On a busy computer frames come so unevenly that a few are refused as coming after lost ones.
     assert refused
     assert set(refused) <= set(OTHER_TOOL)

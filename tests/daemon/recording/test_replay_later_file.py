@@ -13,7 +13,7 @@ from shearloop.bank.estimation import Measured
 from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.daemon.recording.replay import RecordedRun
-from shearloop.daemon.sensing.estimator import Estimator
+from shearloop.daemon.sensing.estimators import LiveEstimator
 from tests.daemon.conftest import DEADLINE_S, shearloop
 from tests.daemon.recording.test_replay import replayed
 from tests.daemon.test_run import recording
@@ -40,9 +40,9 @@ async def record(config: Path, stream: Path) -> list[dict[str, Any]]:
 
     with zmq.asyncio.Context() as context:
         daemon = Daemon(load_daemon_config(config), context)
-        recorder, right = daemon._recorder, daemon._estimations["right"]
+        recorder, right = daemon._recorder, daemon._estimators["right"]
         assert recorder is not None
-        right.held_tool = lambda _: OTHER_TOOL if right.count >= HELD else None
+        right._held_tool = lambda _: OTHER_TOOL if right.count >= HELD else None
         daemon.publisher.add_listener(listen)
         async with asyncio.timeout(DEADLINE_S), asyncio.TaskGroup() as group:
             group.create_task(daemon.run())
@@ -66,7 +66,7 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(
     ((zeroed,),) = RecordedRun(later).replay_events().tares.values()
     assert zeroed >= ZEROED
     held: list[object] = []
-    monkeypatch.setattr(Estimator, "hold", lambda _self, tool: held.append(tool))
+    monkeypatch.setattr(LiveEstimator, "set_tool", lambda _self, tool: held.append(tool))
     again, _ = asyncio.run(replayed(later, math.inf, f"ipc://{tmp_path}/replay"))
     assert held == [OTHER_TOOL], "which was told before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}

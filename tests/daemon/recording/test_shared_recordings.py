@@ -16,13 +16,12 @@ import numpy as np
 import pytest
 
 from shearloop.bank.errors import CalibrationError
-from shearloop.bank.estimation import Calibration, FrameSeries, Name, fit
-from shearloop.bank.estimation import alignment as alignments
-from shearloop.bank.estimation.alignment import alignment, doubt, is_filtered
-from shearloop.bank.estimation.bank_match import Registration
+from shearloop.bank.estimation import Calibration, FrameSeries, Name, fit, load_delay
+from shearloop.bank.estimation.bank_match import ElectrodeNumbering
+from shearloop.bank.estimation.load_delay import find_load_delay, is_filtered, load_delay_warning
 from shearloop.bank.estimation.novelty import NoveltyDetector
 from shearloop.daemon.analysis.charts.fault_sweeps import balanced
-from shearloop.daemon.analysis.evaluation import follow, judge
+from shearloop.daemon.analysis.evaluate import estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli import main
 from shearloop.daemon.recording.importing import import_mat
@@ -63,18 +62,18 @@ def earlier(slices) -> Callable[[Name, int], Calibration]:
 def cylinders(shared, tmp_path_factory) -> dict[int, FrameSeries]:
     folder, out = shared / "recordings/streams/cylinders", tmp_path_factory.mktemp("cylinders")
     for mm in (10, 20, 30, 40):
-        import_mat(sorted(folder.glob(f"{mm}mm_*.mat")), out / f"{mm}.mcap")
+        import_mat(sorted(folder.glob(f"{mm}mm_1_*.mat")), out / f"{mm}.mcap")
     return {mm: series_of(read_recording(out / f"{mm}.mcap")) for mm in (10, 20, 30, 40)}
 
 
 @pytest.fixture(scope="module")
 def of_one_cylinder(cylinders) -> dict[int, Calibration]:
-    return {mm: fit("fused", [series], "one cylinder") for mm, series in cylinders.items()}
+    return {mm: fit("motion_regression", [series], "one cylinder") for mm, series in cylinders.items()}
 
 
 @pytest.fixture(scope="module")
 def of_all_twists(twists) -> Calibration:
-    return fit("fused", [twists], "all")
+    return fit("motion_regression", [twists], "all")
 
 
 def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders, of_one_cylinder):
@@ -83,34 +82,34 @@ def test_a_grip_is_told_on_a_recording_of_another_tool(cylinders, of_one_cylinde
     for calibration in of_one_cylinder.values():
         for cylinder in cylinders.values():
             other = replace(cylinder, diameter_mm=np.full(len(cylinder.t_s), np.nan))
-            estimates = follow(calibration, other).estimates
+            estimates = estimate_series(calibration, other).estimates
             held = (other.t_s > held_s[0]) & (other.t_s < held_s[1])
-            assert not any("no grip" in why for one in np.array(estimates)[held] for why in one.why)
+            assert not any("no grip" in why for one in np.array(estimates)[held] for why in one.reasons)
             assert not any(one.valid for one in np.array(estimates)[(other.t_s < idle_s) | (other.t_s > 97.5)])
 
 
 def test_the_torque_of_one_tool_is_not_read_as_that_of_another(cylinders, of_one_cylinder):
     calibration = of_one_cylinder[20]
-    estimates = follow(calibration, cylinders[10]).estimates
+    estimates = estimate_series(calibration, cylinders[10]).estimates
     assert not any(one.valid for one in estimates)
-    assert "the tool is of 10 mm and the calibration of one of 20 mm" in estimates[80].why[0]
-    assert np.mean([one.valid for one in follow(calibration, cylinders[20]).estimates]) > 0.6
+    assert "the tool has 10 mm, and the calibration was made with a tool of 20 mm" in estimates[80].reasons[0]
+    assert np.mean([one.valid for one in estimate_series(calibration, cylinders[20]).estimates]) > 0.6
 
 
 def test_cylinders_that_turn_differently_give_a_diameter_and_no_torque(cylinders):
-    calibration = fit("fused", list(cylinders.values()), "all four")
+    calibration = fit("motion_regression", list(cylinders.values()), "all four")
     assert calibration.torque is None
     for mm, series in cylinders.items():
-        found = [one.diameter_mm for one in follow(calibration, series).estimates if one.valid]
+        found = [one.diameter_mm for one in estimate_series(calibration, series).estimates if one.valid]
         assert len(found) > 100
         assert abs(np.mean(found) - mm) < 2
     # Each was gripped once only: how far the diameter of a tool is off that was not among them is what it says.
     assert calibration.diameter is not None
-    assert 8 < calibration.diameter.reader.intervals.half_widths[0] < 25
+    assert 8 < calibration.diameter.regressor.intervals.half_widths[0] < 25
     # A session that begins gripped does not know where the gel stood before.
-    later = follow(calibration, part_of(cylinders[10], 0.5, 0.8)).estimates
+    later = estimate_series(calibration, part_of(cylinders[10], 0.5, 0.8)).estimates
     assert not any(one.valid for one in later)
-    assert "its idle frame is not known" in later[-1].why[0]
+    assert "its idle frame is not known" in later[-1].reasons[0]
 
 
 @pytest.mark.parametrize(
@@ -118,9 +117,9 @@ def test_cylinders_that_turn_differently_give_a_diameter_and_no_torque(cylinders
     [(("right",), 0.85, 0.008), (("left",), 0.85, 0.008), (("right", "left"), 0.93, 0.0055)],
 )
 def test_later_twists(twists, sides, r, rmse_nm):
-    series = twists.of_sides(sides)
-    calibration = fit("fused", [part_of(series, 0, HALF)], "earlier", timed_by=[part_of(twists, 0, HALF)])
-    figures = judge([follow(calibration, part_of(series, HALF - 0.015, 1))])
+    series = twists.select_sides(sides)
+    calibration = fit("motion_regression", [part_of(series, 0, HALF)], "earlier", timed_by=[part_of(twists, 0, HALF)])
+    figures = figures_of([estimate_series(calibration, part_of(series, HALF - 0.015, 1))])
     assert figures["r"] >= r
     assert figures["rmse_nm"] <= rmse_nm
     assert 0.90 <= figures["coverage_95"] <= 0.98
@@ -128,7 +127,7 @@ def test_later_twists(twists, sides, r, rmse_nm):
 
 
 def test_idle_disturbed_and_foreign_frames_are_never_valid(twists, of_all_twists):
-    whole = follow(of_all_twists, twists)
+    whole = estimate_series(of_all_twists, twists)
     idle = (twists.t_s < 22) | (twists.t_s > 380)
     assert not any(one.valid for one, free in zip(whole.estimates, idle, strict=True) if free)
     assert np.mean([one.valid for one in whole.estimates]) > 0.7
@@ -140,22 +139,22 @@ def test_idle_disturbed_and_foreign_frames_are_never_valid(twists, of_all_twists
             layer[rng.choice(896, 224, replace=False)] = np.abs(rng.normal(0, 0.05, 224))
     for channels in (noisy, some.channels[:, ::-1]):
         strange = FrameSeries("raw", some.sides, some.t_s, channels, some.torque_t_s, some.torque_nm, some.diameter_mm)
-        assert not any(one.valid for one in follow(of_all_twists, strange).estimates)
+        assert not any(one.valid for one in estimate_series(of_all_twists, strange).estimates)
 
 
 def test_another_day_with_a_looser_grip_and_the_fingertips_exchanged_is_refused(of_all_twists, shared, tmp_path):
     imported = import_mat([shared / "recordings/streams/20241202_153632"], tmp_path / "other.mcap")
     assert "46 s in all" in imported.remarks[0]
     other = series_of(read_recording(tmp_path / "other.mcap"))
-    assert judge([follow(of_all_twists, other)])["valid_fraction"] == 0
+    assert figures_of([estimate_series(of_all_twists, other)])["valid_fraction"] == 0
 
 
 def test_later_torque_slices(slices, earlier):
     """Fitted to the first 19 to 44 of 49 slices, judged on all that follow."""
     errors, covered, widths_nm = [], [], []
     for n in (19, 24, 29, 34, 39, 44):
-        followed = follow(earlier("fused", n), slices.between(n, 49))
-        figures = judge([followed])
+        followed = estimate_series(earlier("motion_regression", n), slices.between(n, 49))
+        figures = figures_of([followed])
         r, rmse_nm, coverage = LATER_SLICES.get(n, (0.96, 0.018, 0.0))
         assert figures["r"] >= r
         assert figures["rmse_nm"] <= rmse_nm
@@ -170,28 +169,35 @@ def test_later_torque_slices(slices, earlier):
     # Which they would in any that are wide enough: the slices span 0.131 N·m.
     assert np.median(widths_nm) <= 0.12
     # Intervals of torques near the ends reach beyond them, unless somebody vouches for the range: 0.091 N·m after 29.
-    vouched = fit("fused", [slices.between(0, 29)], "earlier", all_torques=True)
-    found = follow(vouched, slices.between(29, 49)).estimates
+    vouched = fit("motion_regression", [slices.between(0, 29)], "earlier", full_range=True)
+    found = estimate_series(vouched, slices.between(29, 49)).estimates
     assert np.median([one.torque_high_nm - one.torque_low_nm for one in found]) <= 0.085
-    without_ends = replace(earlier("fused", 29).torque.reader, low_end=-np.inf, high_end=np.inf)
-    assert pickle.dumps(vouched.torque.reader) == pickle.dumps(without_ends), "nothing else is another"
+    without_ends = replace(earlier("motion_regression", 29).torque.regressor, low_end=-np.inf, high_end=np.inf)
+    assert pickle.dumps(vouched.torque.regressor) == pickle.dumps(without_ends), "nothing else is another"
 
 
 @pytest.mark.parametrize(
     ("name", "low_nm", "high_nm"),
-    [("fused", 0.0, 0.08), ("fused", 0.07, 1.0), ("regression", 0.05, 1.0), ("regression", 0.0, 0.06)],
+    [
+        ("motion_regression", 0.0, 0.08),
+        ("motion_regression", 0.07, 1.0),
+        ("regression", 0.05, 1.0),
+        ("regression", 0.0, 0.06),
+    ],
 )
 def test_torques_beyond_those_calibrated_on_lie_within_the_intervals(name, low_nm, high_nm, slices):
     """They are read within the range, and up to nine tenths of them false-valid; they lie up to 1.6 of it beyond."""
     inside = (low_nm <= slices.torque_nm) & (slices.torque_nm < high_nm)
     calibration = fit(name, [_some(slices, inside)], "a part of the torques")
-    figures = judge([follow(calibration, _some(slices, ~inside))])
+    figures = figures_of([estimate_series(calibration, _some(slices, ~inside))])
     assert figures["valid_fraction"] > 0.9, "or nothing would be tested"
     assert figures["coverage_95"] >= 0.9
     # As where somebody has vouched that no other will come, which changes nothing else (test_later_torque_slices).
-    reader = replace(calibration.torque.reader, low_end=-np.inf, high_end=np.inf)
-    vouched = replace(calibration, torque=replace(calibration.torque, reader=reader))
-    assert judge([follow(vouched, _some(slices, ~inside))])["coverage_95"] < 0.8, "or there was nothing to hold"
+    reader = replace(calibration.torque.regressor, low_end=-np.inf, high_end=np.inf)
+    vouched = replace(calibration, torque=replace(calibration.torque, regressor=reader))
+    assert figures_of([estimate_series(vouched, _some(slices, ~inside))])["coverage_95"] < 0.8, (
+        "or there was nothing to hold"
+    )
 
 
 def _some(series: FrameSeries, chosen) -> FrameSeries:
@@ -201,18 +207,18 @@ def _some(series: FrameSeries, chosen) -> FrameSeries:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["fused", "regression"])
+@pytest.mark.parametrize("name", ["motion_regression", "regression"])
 def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(name, slices, earlier):
-    """No guard can see it; with `fused` a quarter of the slices, and a fifth with `regression`, were false-valid."""
+    """No check detects it. A quarter of the slices, a fifth with `regression`, would be false-valid."""
     calibration, later = earlier(name, 29), slices.between(29, 49)
     foreign = later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
     spoilt = replace(later, channels=0.9 * later.channels + 0.1 * foreign)
-    figures = judge([follow(calibration, spoilt)])
+    figures = figures_of([estimate_series(calibration, spoilt)])
     assert figures["valid_fraction"] == 1
     assert figures["coverage_95"] >= 0.95
     # It costs half as much again at most.
     width_nm, was_nm = (
-        np.median([one.torque_high_nm - one.torque_low_nm for one in follow(each, later).estimates])
+        np.median([one.torque_high_nm - one.torque_low_nm for one in estimate_series(each, later).estimates])
         for each in (calibration, _believing(calibration))
     )
     assert width_nm <= 1.5 * was_nm
@@ -220,30 +226,34 @@ def test_a_tenth_of_a_foreign_frame_in_later_slices_lies_within_the_intervals(na
 
 def test_where_slices_tell_little_intervals_reach_to_what_may_be_hidden_in_them(slices, earlier):
     """Of ten slices after the narrowest calibration, with a tenth of the own ones mirrored, four were false-valid."""
-    calibration, later = earlier("fused", 39), slices.between(39, 49)
-    mirrored = Registration(5, True, score=1.0, runner_up=0.0).model_channels()
+    calibration, later = earlier("motion_regression", 39), slices.between(39, 49)
+    mirrored = ElectrodeNumbering(5, True, score=1.0, runner_up=0.0).model_channels()
     foreign = later.channels.mean(axis=0)[:, mirrored]
     spoilt = replace(later, channels=0.9 * later.channels + 0.1 * foreign)
-    assert judge([follow(calibration, spoilt)])["coverage_95"] >= 0.9
-    assert judge([follow(_believing(calibration), spoilt)])["coverage_95"] <= 0.7, "or there was nothing to hold"
+    assert figures_of([estimate_series(calibration, spoilt)])["coverage_95"] >= 0.9
+    assert figures_of([estimate_series(_believing(calibration), spoilt)])["coverage_95"] <= 0.7, (
+        "or there was nothing to hold"
+    )
 
 
 def _believing(calibration: Calibration) -> Calibration:
     """Return a calibration of slices that takes them for what they seem to be."""
-    reader = replace(calibration.torque.reader, hidden_below=0.0, hidden_above=0.0)
-    return replace(calibration, torque=replace(calibration.torque, reader=reader))
+    reader = replace(calibration.torque.regressor, contamination_below=0.0, contamination_above=0.0)
+    return replace(calibration, torque=replace(calibration.torque, regressor=reader))
 
 
-@pytest.mark.parametrize("name", ["fused", "regression"])
+@pytest.mark.parametrize("name", ["motion_regression", "regression"])
 def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_intervals(name, slices, earlier, shared):
-    """A cylinder responds weakly: 21 of 100 of these were false-valid with `fused`, 16 with `regression`."""
+    """A cylinder responds weakly: 21 of 100 of these were false-valid with the default, 16 with `regression`."""
     (cylinders,) = read_series(shared / "recordings/diameter_slices")
     missed = []
     for n in (19, 29, 39):
         calibration, later = earlier(name, n), slices.between(n, 49)
         for diameter_mm in (10, 20, 30, 40):
             foreign = cylinders.channels[cylinders.diameter_mm == diameter_mm].mean(axis=0)
-            figures = judge([follow(calibration, replace(later, channels=0.8 * later.channels + 0.2 * foreign))])
+            figures = figures_of(
+                [estimate_series(calibration, replace(later, channels=0.8 * later.channels + 0.2 * foreign))]
+            )
             assert figures["valid_fraction"] == 1
             missed.append(1 - figures["coverage_95"])
     assert max(missed) <= 0.2, "else it breaks silently"
@@ -252,7 +262,9 @@ def test_a_fifth_of_a_recorded_cylinder_in_later_slices_lies_within_the_interval
 
 def test_later_slices_of_the_cylinders(shared):
     (series,) = read_series(shared / "recordings/diameter_slices")
-    figures = judge([follow(fit("fused", [part_of(series, 0, 0.62)], "earlier"), part_of(series, 0.62, 1))])
+    figures = figures_of(
+        [estimate_series(fit("motion_regression", [part_of(series, 0, 0.62)], "earlier"), part_of(series, 0.62, 1))]
+    )
     assert figures["diameter_rmse_mm"] <= 5
     assert figures["coverage_95"] >= 0.9
 
@@ -260,22 +272,22 @@ def test_later_slices_of_the_cylinders(shared):
 @pytest.mark.parametrize("stop", [0.5, 0.6, 1.0])
 def test_the_load_goes_with_the_frames_and_a_quarter_of_a_second_beside_is_refused(twists, stop):
     part = part_of(twists, 0, stop)
-    found = alignment(part)
+    found = find_load_delay(part)
     assert found is not None
-    assert found.late_s == pytest.approx(0.26, abs=0.03)
+    assert found.delay_s == pytest.approx(0.26, abs=0.03)
     assert found.error_s < 0.08
     assert is_filtered(part.torque_nm)
     for late_s in (0.27, -0.4):
         with pytest.raises(CalibrationError, match="that moves them is stamped"):
-            fit("fused", [replace(part, torque_t_s=part.torque_t_s + late_s)], "shifted")
+            fit("motion_regression", [replace(part, torque_t_s=part.torque_t_s + late_s)], "shifted")
 
 
 def test_calibrate_says_how_late_the_load_is_unless_somebody_vouches_for_it(twists_file, tmp_path, capsys):
-    calibrate = ["calibrate", str(twists_file), "--part", "0:0.5", "--out", str(tmp_path / "a.cal")]
+    calibrate = ["calibrate", str(twists_file), "--time-range", "0:0.5", "--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
     assert "The load is stamped 0.27 s after the frames move." in capsys.readouterr().out
-    assert main([*calibrate, "--load-late", "0.1", "--json"]) == 0
-    assert "load_late_s" not in json.loads(capsys.readouterr().out)
+    assert main([*calibrate, "--load-cell-delay-s", "0.1", "--json"]) == 0
+    assert "load_cell_delay_s" not in json.loads(capsys.readouterr().out)
 
 
 # A third holds three twists: no shift stands out on either fingertip.
@@ -286,12 +298,12 @@ THIRD = 1 / 3
 @pytest.mark.parametrize("late_s", [-0.54, 0.54])
 def test_a_load_half_a_second_off_in_a_short_recording_lies_within_the_intervals(twists, sides, late_s):
     """Of as many loaded as free frames up to 41 % were false-valid; of the loaded ones, up to 77 %."""
-    past = part_of(twists.of_sides(sides), 0, THIRD)
+    past = part_of(twists.select_sides(sides), 0, THIRD)
     late = replace(past, torque_t_s=past.torque_t_s + late_s)
-    future = part_of(twists.of_sides(sides), THIRD - 0.02, 1)
-    calibration = fit("fused", [late], "shifted")
-    assert calibration.torque.reader.widened > 1.1
-    estimates = follow(calibration, future).estimates
+    future = part_of(twists.select_sides(sides), THIRD - 0.02, 1)
+    calibration = fit("motion_regression", [late], "shifted")
+    assert calibration.torque.regressor.timing_widening > 1.1
+    estimates = estimate_series(calibration, future).estimates
     truth_nm = balanced(future.torque_at_frames())
     missed = [
         one.valid and not one.torque_low_nm <= truth <= one.torque_high_nm
@@ -302,35 +314,36 @@ def test_a_load_half_a_second_off_in_a_short_recording_lies_within_the_intervals
 
 
 def test_a_fingertip_that_the_lever_hardly_moves_has_its_times_from_the_other_one(twists):
-    left = twists.of_sides(("left",))
-    assert fit("fused", [left], "alone").torque.reader.widened > 1.1
-    assert fit("fused", [left], "beside the right one", timed_by=[twists]).torque.reader.widened == 1.0
+    left = twists.select_sides(("left",))
+    assert fit("motion_regression", [left], "alone").torque.regressor.timing_widening > 1.1
+    timed = fit("motion_regression", [left], "with the right one", timed_by=[twists])
+    assert timed.torque.regressor.timing_widening == 1.0
     late = replace(twists, torque_t_s=twists.torque_t_s + 0.54)
     with pytest.raises(CalibrationError, match="that moves them is stamped"):
-        fit("fused", [late.of_sides(("left",))], "beside the right one", timed_by=[late])
+        fit("motion_regression", [late.select_sides(("left",))], "beside the right one", timed_by=[late])
 
 
 def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twists_file, tmp_path, capsys, monkeypatch):
-    calibrate = ["calibrate", str(twists_file), "--part", f"0:{THIRD}", "--out", str(tmp_path / "a.cal")]
+    calibrate = ["calibrate", str(twists_file), "--time-range", f"0:{THIRD}", "--out", str(tmp_path / "a.cal")]
     assert main(calibrate) == 0
     told = capsys.readouterr().out
-    assert "When the load is stamped could not be checked, for it changes too seldom: it may be 0.75 s off" in told
-    assert re.search(r"intervals are wider, those of loads \d\.\d times\. Record more changes of load", told)
-    assert main([*calibrate, "--load-late", "0"]) == 0
-    assert "could not be checked" not in capsys.readouterr().out
-    looked, of_side = [], alignments._of_side
-    monkeypatch.setattr(alignments, "_of_side", lambda *a: (looked.append(a[0]), of_side(*a))[1])
+    assert "Could not verify the load cell's timestamps: the load changed too few times. They may be 0.75 s off" in told
+    assert re.search(r"intervals are wider, for loads \d\.\d times\. Record more changes of load", told)
+    assert main([*calibrate, "--load-cell-delay-s", "0"]) == 0
+    assert "Could not verify" not in capsys.readouterr().out
+    looked, of_side = [], load_delay._delay_of_side
+    monkeypatch.setattr(load_delay, "_delay_of_side", lambda *a: (looked.append(a[0]), of_side(*a))[1])
     assert main(["calibrate", str(twists_file), "--sides", "left", "--out", str(tmp_path / "a.cal"), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    assert told["load_unchecked_s"] == 0
-    assert told["load_late_s"] == [pytest.approx(0.25, abs=0.03)]
+    assert told["timing_uncertainty_s"] == 0
+    assert told["load_cell_delay_s"] == [pytest.approx(0.25, abs=0.03)]
     assert len(looked) == len(set(looked)), "each recording once"
 
 
 @pytest.mark.parametrize("name", ["20241202_153632", "glitch_20241202_173837"])
 def test_nothing_is_said_of_the_times_of_a_recording_that_does_not_show_them(shared, tmp_path, name):
     import_mat([shared / "recordings/streams" / name], tmp_path / "other.mcap")
-    assert alignment(series_of(read_recording(tmp_path / "other.mcap"))) is None
+    assert find_load_delay(series_of(read_recording(tmp_path / "other.mcap"))) is None
 
 
 def test_a_load_that_seems_stamped_early_is_told_and_not_refused(shared, twists_file, tmp_path, capsys):
@@ -339,12 +352,10 @@ def test_a_load_that_seems_stamped_early_is_told_and_not_refused(shared, twists_
     import_mat([shared / "recordings/streams/20241202_153632"], other)
     assert main(["calibrate", str(other), "--estimator", "regression", "--out", calibration]) == 0
     told = capsys.readouterr().out
-    assert re.search(
-        r"Doubtful is other\.mcap: the frames move 2\.67 ± 0\.\d+ s after the load that moves them is", told
-    )
+    assert re.search(r"Warning: other\.mcap: the frames move 2\.67 ± 0\.\d+ s after the load that moves them is", told)
     assert "though 57 gripped frames are too few to be sure" in told
     assert main(["evaluate", calibration, str(other), str(twists_file)]) == 0
-    assert re.findall(r"Doubtful is (\S+):", capsys.readouterr().err) == ["other.mcap"]
+    assert re.findall(r"Warning: (\S+):", capsys.readouterr().err) == ["other.mcap"]
 
 
 def test_no_good_recording_is_doubted(shared, twists_file, tmp_path):
@@ -354,7 +365,7 @@ def test_no_good_recording_is_doubted(shared, twists_file, tmp_path):
     for n, sources in enumerate([[streams / "glitch_20241202_173837"], *cylinders]):
         paths.append(tmp_path / f"{n}.mcap")
         import_mat(sources, paths[-1])
-    assert [doubt(series_of(read_recording(path))) for path in paths] == [""] * 6
+    assert [load_delay_warning(series_of(read_recording(path))) for path in paths] == [""] * 6
 
 
 @pytest.mark.parametrize("n", [19, 24, 29, 34, 39, 44])
@@ -363,5 +374,5 @@ def test_no_later_slice_is_strange_and_a_third_of_a_foreign_one_is(slices, n):
     guard = NoveltyDetector.fit(frames[:n])
     later = frames[n:]
     foreign = later.mean(axis=0)[np.random.default_rng(7).permutation(896)]
-    assert not any(guard.judge(one, usable).why for one in later)
-    assert all(guard.judge(0.65 * one + 0.35 * foreign, usable).why for one in later)
+    assert not any(guard.assess(one, usable).reasons for one in later)
+    assert all(guard.assess(0.65 * one + 0.35 * foreign, usable).reasons for one in later)

@@ -16,7 +16,7 @@ from shearloop.daemon.recording.identity import Identity, basic_identity, experi
 from shearloop.daemon.recording.reader import read_recording
 from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import summarise
-from shearloop.daemon.sensing.tool_diameter import as_text
+from shearloop.daemon.sensing.tool_diameter import tool_as_bytes
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 PERIOD_NS = 540_000_000
@@ -43,7 +43,7 @@ def recorded(folder: Path, *held: tuple[int, Measured | None], named_mm: float |
         recorder.input_recorder("right")(RawEvent(InputKind.DATA, clock.t_ns, b'"kind":"tool", said the board'))
         if number in told:
             recorder.input_recorder("right")(
-                RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, as_text(number, told[number]))
+                RawEvent(InputKind.TOOL, clock.t_ns - PERIOD_NS // 2, tool_as_bytes(number, told[number]))
             )
         line = np.random.default_rng(number).uniform(0.01, 0.5, 1024)
         message = EitFrame(
@@ -66,7 +66,7 @@ def test_the_experiment_names_its_tool(tmp_path: Path, capsys: pytest.CaptureFix
     path = recorded(tmp_path, (5, Measured(20.4, 1.2)), (35, None), named_mm=20.0)
     (series,) = read_series(path)
     assert series.tool_mm == Measured(20.0, 0.0), "and the gripper, which is not as exact, agrees"
-    assert series.gripped_mm is None
+    assert series.gripper_mm is None
     assert read_series(path, tool_mm=30.0)[0].tool_mm == Measured(20.0, 0.0), "a recording that names it knows better"
     assert summarise(path).tool_mm == "20"
     assert main(["recording", "info", str(path)]) == 0
@@ -79,7 +79,7 @@ def test_the_gripper_says_which_tool_it_held(tmp_path: Path) -> None:
     (series,) = read_series(path)
     assert series.tool_mm == TWENTY
     assert np.isnan(series.diameter_mm).all(), "which is no truth to fit a diameter to"
-    assert series.between(10, 20).of_sides(("right",)).tool_mm == TWENTY
+    assert series.between(10, 20).select_sides(("right",)).tool_mm == TWENTY
     assert read_series(path, tool_mm=20.0)[0].tool_mm == Measured(20.0, 0.0)
 
 

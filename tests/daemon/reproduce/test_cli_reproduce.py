@@ -3,11 +3,12 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scipy.io import savemat
 
 from shearloop.bank.eit.bank_file import Bank
-from shearloop.bank.eit.calibration import Calibration
+from shearloop.bank.estimation import Calibration
 from shearloop.daemon.analysis.reproduce import banks
 from shearloop.daemon.analysis.reproduce.report import PAPER_MODEL_SCORES
 from shearloop.daemon.cli import main
@@ -54,8 +55,11 @@ def test_numbers_figures_and_calibrations_are_made(
         assert "</svg>" in (out / f"{name}.svg").read_text()
     (focused,) = (out / "banks").glob("focused-*.bank")
     identity = Bank.open(focused).identity
-    calibration = Calibration.load(out / "calibration_torque_focused.yaml", bank_identity=identity)
-    assert calibration.torque(1.9).value < calibration.torque(1.2).value
+    calibration = Calibration.load(out / "calibration_torque_focused.cal")
+    assert calibration.bank_identity == identity
+    assert calibration.torque is not None
+    thick, thin = (calibration.torque.regressor.predict(np.array([sigma]))[0] for sigma in (1.9, 1.2))
+    assert thick < thin
 
     # A second run finds the banks and says the same as a table; a damaged bank is built anew.
     before = focused.stat().st_mtime_ns

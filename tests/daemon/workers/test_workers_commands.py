@@ -81,11 +81,11 @@ def test_evaluate_gives_the_same_figures_on_a_cluster_with_a_killed_worker(
 ) -> None:
     slices, cylinders = (str(shared / "recordings" / name) for name in ("torque_slices", "diameter_slices"))
     calibration = str(tmp_path / "slices.cal")
-    assert main(["calibrate", slices, "--estimator", "regression", "--part", "0:0.6", "--out", calibration]) == 0
+    assert main(["calibrate", slices, "--estimator", "regression", "--time-range", "0:0.6", "--out", calibration]) == 0
     figures = []
     for options in ([], ["--cluster", scheduler]):
         capsys.readouterr()
-        assert main(["evaluate", calibration, slices, cylinders, "--part", "0.6:1", "--json", *options]) == 0
+        assert main(["evaluate", calibration, slices, cylinders, "--time-range", "0.6:1", "--json", *options]) == 0
         found = json.loads(capsys.readouterr().out)
         figures.append({name: value for name, value in found.items() if not name.startswith("latency")})
     assert killed

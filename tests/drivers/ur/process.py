@@ -5,7 +5,7 @@ from typing import NoReturn
 
 import pytest
 
-from shearloop.drivers.ur import worker as child
+from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import Configure, Message, MessageDecoder, RobotState, RtdeSample, encode
 from tests.drivers.ur.flight import SETTINGS, FakeArm
 
@@ -22,9 +22,9 @@ class Daemon:
         self._stdout, its_stdout = os.pipe()
         os.set_blocking(self._stdout, False)
         self._all = [its_stdin, self._stdin, self._stdout, its_stdout]
-        self.pipe = child.Pipe(its_stdin, its_stdout)
-        monkeypatch.setattr(child, "_set_alarm", lambda _seconds: None)
-        monkeypatch.setattr(child, "_exit", self._left)
+        self.pipe = worker.Pipe(its_stdin, its_stdout)
+        monkeypatch.setattr(worker, "_set_alarm", lambda _seconds: None)
+        monkeypatch.setattr(worker, "_exit", self._left)
 
     @staticmethod
     def _left(_status: int) -> NoReturn:
@@ -56,7 +56,7 @@ class CyclingArm(FakeArm):
 
 def fly(daemon: Daemon, arm: CyclingArm) -> None:
     with pytest.raises(LeftError):
-        child._control(daemon.pipe, Configure(SETTINGS), arm)  # type: ignore[arg-type]  # an arm in all that counts
+        worker._control(daemon.pipe, Configure(SETTINGS), arm)  # type: ignore[arg-type]  # an arm in all that counts
 
 
 class Time:
@@ -84,8 +84,8 @@ class TimedArm(CyclingArm):
 
     def read(self) -> RtdeSample:
         super().read()
-        self.read_s.append(child.time.monotonic() - 1000.0)
-        self.be(t_mono_ns=child.time.monotonic_ns())
+        self.read_s.append(worker.time.monotonic() - 1000.0)
+        self.be(t_mono_ns=worker.time.monotonic_ns())
         return self.reading
 
 
@@ -103,7 +103,7 @@ class Timed:
         self.arm = arm or TimedArm()
         self._daemon = daemon
         self._script = [(1000.0 + at_s, message) for at_s, message in script]
-        monkeypatch.setattr(child, "time", self.time)
+        monkeypatch.setattr(worker, "time", self.time)
         monkeypatch.setattr(daemon.pipe, "wait", self._wait)
         fly(daemon, self.arm)
         self.states = [message for _, message in daemon.hear() if isinstance(message, RobotState)]

@@ -294,18 +294,18 @@ async def test_daemon_killed_in_the_middle_of_a_twist_leaves_a_robot_at_rest_and
         sys.executable, "-c", DAEMON, controller.host, stdout=asyncio.subprocess.PIPE, cwd=ROOT
     )
     assert daemon.stdout is not None
-    child = os.pidfd_open(int(await daemon.stdout.readline()))
+    worker = os.pidfd_open(int(await daemon.stdout.readline()))
     killed_ns = time.monotonic_ns()
     daemon.kill()
     try:
         stopped = await controller.event("motion-stopped", killed_ns)
         assert stopped_after_s(stopped, killed_ns) <= STOPPED_WITHIN_S
         ended = asyncio.Event()
-        asyncio.get_running_loop().add_reader(child, ended.set)
+        asyncio.get_running_loop().add_reader(worker, ended.set)
         async with asyncio.timeout(5):
             await ended.wait()
     finally:
-        asyncio.get_running_loop().remove_reader(child)
-        os.close(child)
+        asyncio.get_running_loop().remove_reader(worker)
+        os.close(worker)
     assert (await controller.event("program-ended", killed_ns))["detail"] == "the client ended it"
     await daemon.communicate()

@@ -1,0 +1,347 @@
+"""Calibration of one estimator: its fingertips, its features of a frame, and its file.
+
+The file is a zip of a YAML header and NumPy arrays with checksums. It keeps any tree of frozen dataclasses of numbers,
+texts, tuples and arrays. Equal calibrations are equal bytes: fixed dates, fixed order, no compression.
+"""
+
+import hashlib
+import io
+import types
+import zipfile
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from pathlib import Path
+from typing import Any, Literal, Self, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
+from shearloop.bank.eit.polynomial import Polynomial
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.bank_match import (
+    NOT_TURNED,
+    BankMatch,
+    BankMatcher,
+    ElectrodeNumbering,
+    PaperMatcher,
+    RefinedMatcher,
+)
+from shearloop.bank.estimation.fingertip_validator import FingertipValidator
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, PolynomialRegressor
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.regressors import ChannelImputer
+from shearloop.bank.estimation.session_state import TemporalFeatures
+from shearloop.bank.estimation.values import Kind
+from shearloop.files import replace_file
+
+FORMAT_VERSION = 4
+# First bytes of a zip that is not empty.
+ARCHIVE_MAGIC = b"PK\x03\x04"
+_FILE_KIND = "shearloop estimator calibration"
+_HEADER = "calibration.yaml"
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+Name = Literal["paper", "bank", "regression", "reconstruction", "motion_regression"]
+NAMES: tuple[Name, ...] = get_args(Name)
+NEEDS_BANK: tuple[Name, ...] = ("paper", "bank")
+Quantity = Literal["torque", "diameter"]
+# What the user guarantees, with the end of a sentence that says so.
+Assumption = Literal["full range", "load timing"]
+_ASSUMPTION_TEXTS: dict[Assumption, str] = {
+    "full range": "no torque exceeds its slices (--assume-full-range)",
+    "load timing": "the load cell's delay is as given (--load-cell-delay-s)",
+}
+# Columns of the paper's features (k, sigma, sigma²).
+PAPER_COLUMNS: dict[Quantity, slice] = {"torque": slice(1, 3), "diameter": slice(0, 1)}
+TORQUE_DEGREE, DIAMETER_DEGREE = 2, 1
+# Two cells of the paper's bank.
+_LEAST_MARGIN_K_CM = 0.05
+# Tools differ if their diameters differ by a larger share.
+LARGEST_TOOL_SHARE = 0.15
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OutputModel:
+    """How one quantity is predicted: its regressor, and for differences the detector of novel ones.
+
+    k_range holds the least and largest matched k in cm, or nothing without a bank.
+    """
+
+    regressor: IntervalRegressor | PolynomialRegressor
+    novelty: NoveltyDetector | None
+    k_range: FloatArray
+
+    def match_reasons(self, match: BankMatch | None) -> tuple[str, ...]:
+        """Return the reason against a bank match far from the calibrated ones, if there is one."""
+        if match is None or not len(self.k_range):
+            return ()
+        low, high = self.k_range.tolist()
+        margin = max(high - low, _LEAST_MARGIN_K_CM)
+        if low - margin <= match.k <= high + margin:
+            return ()
+        return (
+            f"the bank fits best at k = {match.k:.2f} cm, outside the calibrated {low:.2f} to {high:.2f} cm; "
+            "the match is on another ridge of the bank",
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """All that an estimator knows of its fingertips; `source` describes the data in words.
+
+    validators and temporal are for raw frames. scale (m, 896) divides differences per channel and is infinite for dead
+    ones; image (p, 896) maps them to pixels. bank_identity is empty for an estimator without a bank. tool_mm is the
+    diameter of the only tool in the recordings, else NaN. imputer serves raw frames that are read without memory.
+    """
+
+    estimator: Name
+    kind: Kind
+    sides: tuple[str, ...]
+    source: str
+    bank_identity: str
+    scale: FloatArray
+    tool_mm: float = np.nan
+    numbering: ElectrodeNumbering = NOT_TURNED
+    validators: tuple[FingertipValidator, ...] = ()
+    temporal: TemporalFeatures | None = None
+    image: FloatArray | None = None
+    torque: OutputModel | None = None
+    diameter: OutputModel | None = None
+    imputer: ChannelImputer | None = None
+    assumptions: tuple[Assumption, ...] = ()
+
+    @classmethod
+    def uncalibrated(cls, bank_identity: str) -> Self:
+        """Return the paper's estimator on a bank without any fit: it gives k and sigma alone."""
+        return cls("paper", "raw", (), "", bank_identity, np.ones((1, N_CHANNELS)))
+
+    @classmethod
+    def from_matches(
+        cls,
+        bank_identity: str,
+        source: str,
+        *,
+        torque: tuple[FloatArray, FloatArray] | None = None,
+        diameter: tuple[FloatArray, FloatArray] | None = None,
+    ) -> Self:
+        """Fit the paper's curves: torque = (σ (n,) in cm, torque_nm (n,)), diameter = (k (n,) in cm, diameter_mm (n,)).
+
+        Torque is a parabola over sigma and diameter a line over k (Trehan et al. 2025, figures 8 and 9). Raises
+        CalibrationError where both are missing or do not determine their curves.
+        """
+        if torque is None and diameter is None:
+            raise CalibrationError("a calibration needs measurements of torque, of diameter, or of both")
+
+        def model(symbol: str, degree: int, points: tuple[FloatArray, FloatArray] | None) -> OutputModel | None:
+            if points is None:
+                return None
+            return OutputModel(PolynomialRegressor(symbol, Polynomial.fit(*points, degree)), None, np.zeros(0))
+
+        return cls(
+            "paper", "raw", (), source, bank_identity, np.ones((1, N_CHANNELS)),
+            torque=model("sigma", TORQUE_DEGREE, torque), diameter=model("k", DIAMETER_DEGREE, diameter),
+        )  # fmt: skip
+
+    @property
+    def has_curves_only(self) -> bool:
+        """Whether nothing is known of the fingertip but curves over k and sigma: no validators, no side."""
+        return self.kind == "raw" and not self.validators
+
+    @property
+    def assumption_text(self) -> str:
+        """The user's guarantees as part of a sentence, empty without any."""
+        return " and ".join(_ASSUMPTION_TEXTS[one] for one in self.assumptions)
+
+    def save(self, path: str | Path) -> None:
+        """Write the file, the same bytes for the same calibration; CalibrationError where that fails."""
+        path = Path(path)
+        arrays: dict[str, NDArray[Any]] = {}
+        content = _to_plain(self, "", arrays)
+        members = {f"{name}.npy": _npy_bytes(array) for name, array in sorted(arrays.items())}
+        header = {
+            "kind": _FILE_KIND,
+            "format_version": FORMAT_VERSION,
+            "channel_table": CHANNEL_TABLE_HASH,
+            "content": content,
+            "sha256": {name: hashlib.sha256(data).hexdigest() for name, data in members.items()},
+        }
+        text = yaml.safe_dump(header, sort_keys=False, allow_unicode=True, width=120).encode()
+        try:
+            with replace_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+                for name, data in {_HEADER: text, **members}.items():
+                    archive.writestr(zipfile.ZipInfo(name, _DATE), data)
+        except OSError as error:
+            raise CalibrationError(
+                f"{path}: the calibration cannot be written: {error.strerror}; choose another --out"
+            ) from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a calibration.
+
+        Raises CalibrationError, naming the file, where it is missing, truncated, damaged, foreign, of another format
+        version, or made with another channel table.
+        """
+        path = Path(path)
+        header, arrays = _read_members(path)
+        if header.get("kind") != _FILE_KIND:
+            raise CalibrationError(f"{path} is not an estimator's calibration: make one with `shearloop calibrate`")
+        version, table = header.get("format_version"), str(header.get("channel_table"))
+        if version != FORMAT_VERSION:
+            raise CalibrationError(
+                f"{path}: the calibration has format version {version}, expected {FORMAT_VERSION}; calibrate again"
+            )
+        if table != CHANNEL_TABLE_HASH:
+            raise CalibrationError(
+                f"{path}: the calibration was made with the channel table {table[:12]}…, expected "
+                f"{CHANNEL_TABLE_HASH[:12]}…; calibrate again"
+            )
+        try:
+            restored: Self = _from_plain(cls, header["content"], "", arrays)
+        except (KeyError, TypeError, ValueError, IndexError, StopIteration, CalibrationError) as error:
+            raise CalibrationError(
+                f"{path}: the file does not describe a calibration of this version ({error}); use the version that "
+                "wrote it, or calibrate again"
+            ) from error
+        return restored
+
+    def check_bank(self, bank: Bank | None) -> Bank:
+        """Return the bank; raises CalibrationError where it is missing or not the calibration's."""
+        if bank is None:
+            raise CalibrationError(f"the estimator {self.estimator} needs its bank; name it with --bank")
+        if bank.identity != self.bank_identity:
+            raise CalibrationError(
+                f"the calibration was made with the bank {self.bank_identity[:12]}…, and {bank.path} is "
+                f"{bank.identity[:12]}…; name the bank it was made with, or calibrate again"
+            )
+        return bank
+
+    def matcher(self, bank: Bank | None) -> BankMatcher | None:
+        """Return the matcher of an estimator that needs a bank, None for others; raises as `check_bank` does."""
+        if self.estimator not in NEEDS_BANK:
+            return None
+        bank = self.check_bank(bank)
+        return PaperMatcher(bank) if self.estimator == "paper" else RefinedMatcher(bank, self.numbering)
+
+    def features(
+        self, matcher: BankMatcher | None, difference: FloatArray, temporal: FloatArray | None, t_s: float
+    ) -> tuple[FloatArray, BankMatch | None]:
+        """Return the features of (m, 896) differences at t_s, and the bank match if there is one.
+
+        With temporal features these are the features. A slice has its time as a feature, because the gel drifts.
+        """
+        if self.temporal is not None:
+            if temporal is None:
+                raise ValueError("an estimator of motion needs the last frames")
+            return temporal, None
+        if matcher is not None:
+            matches = [matcher.match(layer) for layer in difference]
+            if self.estimator == "paper":
+                # The paper reads one fingertip: torque from sigma, diameter from k.
+                return np.array([matches[0].k, matches[0].sigma, matches[0].sigma ** 2]), matches[0]
+            return np.concatenate([one.features for one in matches]), matches[0]
+        if self.image is not None:
+            return (difference @ self.image.T).ravel(), None
+        features = (difference / self.scale).ravel()
+        return (np.append(features, t_s) if self.estimator == "motion_regression" else features), None
+
+    def columns(self, quantity: Quantity, features: FloatArray) -> FloatArray:
+        """Return those (…, d) features that a quantity is predicted from."""
+        return features[..., PAPER_COLUMNS[quantity]] if self.estimator == "paper" else features
+
+    def inputs(self, quantity: Quantity, features: FloatArray, mean_difference: FloatArray) -> FloatArray:
+        """Return the (d,) inputs of a quantity's regressor from a frame's features and its grip's mean difference.
+
+        An estimator of motion reads the diameter from the gel's mean position in this grip.
+        """
+        if self.temporal is not None and quantity == "diameter":
+            return np.asarray((mean_difference / self.scale).ravel())
+        return self.columns(quantity, features)
+
+
+def _read_members(path: Path) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """Return header and arrays after checking each array's checksum."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            found = {name: archive.read(name) for name in archive.namelist()}
+    except OSError as error:
+        raise CalibrationError(f"{path}: the calibration cannot be read: {error.strerror or error}") from error
+    except (zipfile.BadZipFile, EOFError, ValueError, NotImplementedError) as error:
+        raise CalibrationError(
+            f"{path}: this is not a calibration, or it is truncated or damaged ({error}); calibrate again"
+        ) from error
+    try:
+        header = yaml.safe_load(found.pop(_HEADER, b""))
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise CalibrationError(f"{path}: the header is not YAML; calibrate again") from error
+    if not isinstance(header, dict):
+        raise CalibrationError(f"{path} is not a calibration: it has no header; make one with `shearloop calibrate`")
+    checksums = header.get("sha256")
+    if not isinstance(checksums, dict) or set(checksums) != set(found):
+        raise CalibrationError(f"{path}: the calibration lacks some of its arrays; calibrate again")
+    for name, data in found.items():
+        if hashlib.sha256(data).hexdigest() != checksums[name]:
+            raise CalibrationError(f"{path}: the calibration is damaged: {name} has changed; calibrate again")
+    return header, {
+        name.removesuffix(".npy"): np.load(io.BytesIO(data), allow_pickle=False) for name, data in found.items()
+    }
+
+
+def _npy_bytes(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, np.ascontiguousarray(array), allow_pickle=False)
+    return buffer.getvalue()
+
+
+def _to_plain(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
+    """Return YAML's view of a value; its arrays go into `arrays` by their path."""
+    if is_dataclass(value):
+        return {one.name: _to_plain(getattr(value, one.name), f"{path}/{one.name}", arrays) for one in fields(value)}
+    if isinstance(value, np.ndarray):
+        name = path.strip("/").replace("/", ".")
+        arrays[name] = value
+        return {"array": name}
+    if isinstance(value, tuple):
+        return [_to_plain(item, f"{path}/{i}", arrays) for i, item in enumerate(value)]
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise TypeError(f"{path}: a {type(value).__name__} cannot be kept in a calibration")
+
+
+def _from_plain(kind: Any, plain: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
+    """Return the value of type `kind` that `_to_plain` made plain."""
+    origin, name = get_origin(kind), path.strip("/")
+    if origin in (Union, types.UnionType):
+        choices = [choice for choice in get_args(kind) if choice is not type(None)]
+        if plain is None:
+            return None
+        if len(choices) > 1:  # several dataclasses: the one with these fields
+            choices = [choice for choice in choices if {one.name for one in fields(choice)} == set(plain)]
+        return _from_plain(choices[0], plain, path, arrays)
+    if origin is Literal and plain not in get_args(kind):
+        raise ValueError(f"{name} is {plain!r}, which this version does not know")
+    if origin is tuple:
+        if not isinstance(plain, list):
+            raise TypeError(f"{name} is not a list")
+        return tuple(_from_plain(get_args(kind)[0], item, f"{path}/{i}", arrays) for i, item in enumerate(plain))
+    if isinstance(plain, dict) and set(plain) == {"array"}:
+        array = arrays[plain["array"]]
+        array.setflags(write=False)
+        return array
+    if is_dataclass(kind):
+        hints = get_type_hints(kind)
+        return kind(  # type: ignore[operator]  # a dataclass is its own constructor
+            **{
+                one.name: _from_plain(hints[one.name], plain[one.name], f"{path}/{one.name}", arrays)
+                for one in fields(kind)
+                if one.name in plain or one.default is MISSING
+            }
+        )
+    if kind is float:
+        return float(plain)
+    if not isinstance(plain, str | bool | int | float | list) and plain is not None:
+        raise TypeError(f"{name} is a {type(plain).__name__}")
+    return plain

@@ -1,0 +1,61 @@
+"""`shearloop calibrate creep REC… --calibration CAL`: fit the gel's creep under a held twist."""
+
+import argparse
+from pathlib import Path
+
+from shearloop.daemon.cli.options import add_json
+from shearloop.daemon.cli.output import print_result
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument(
+        "recordings", nargs="+", type=Path, metavar="REC", help="recordings (.mcap) of held twists, best ten"
+    )
+    parser.add_argument(
+        "--calibration", type=Path, required=True, metavar="CAL", help="calibration of the estimator for the loop"
+    )
+    parser.add_argument("--bank", type=Path, metavar="FILE", help="the bank of the calibration, if any")
+    add_json(parser)
+    parser.epilog = "Prints the line `creep:` for the fingertip, or for `combined`, in the configuration."
+
+
+def run(args: argparse.Namespace) -> int:
+    """Estimate every frame, fit, and print the line for the configuration."""
+    from shearloop.bank.eit.bank_file import Bank
+    from shearloop.bank.estimation import Calibration
+    from shearloop.daemon.analysis.evaluate import estimate_series, grips_of
+    from shearloop.daemon.analysis.series import check_no_copies, check_paths_differ, read_series
+    from shearloop.daemon.cli.options import check_kind
+    from shearloop.daemon.control.creep import fit_creep
+
+    check_paths_differ(args.recordings)
+    calibration = Calibration.load(args.calibration)
+    bank = Bank.open(args.bank) if args.bank else None
+    named = [(str(path), one) for path in args.recordings for one in read_series(path, calibration.sides)]
+    series = [one for _, one in named]
+    check_kind(args.calibration, calibration, series)
+    check_no_copies(named)
+    grips = [grip for one in series for grip in grips_of(estimate_series(calibration, one, bank))]
+    found = fit_creep(grips)
+    share, time_s = round(found.creep.share, 3), round(found.creep.time_s, 1)
+    result = {
+        "share": share,
+        "time_s": time_s,
+        "grips": len(grips),
+        "frames": sum(grip.t_s.size for grip in grips),
+        "error_before_nm": found.before_nm,
+        "error_after_nm": found.after_nm,
+        "scale": found.scale,
+        "offset_nm": found.offset_nm,
+    }
+    sentences = [
+        f"creep: {{share: {share:g}, time_s: {time_s:g}}}",
+        f"From {result['frames']} frames of {len(grips)} grips: the estimates, scaled by {found.scale:.3f} and shifted "
+        f"by {1e3 * found.offset_nm:+.1f} mN·m, follow the load cell within {1e3 * found.after_nm:.1f} mN·m instead of "
+        f"{1e3 * found.before_nm:.1f} (standard deviation).",
+        "The line above does not correct scale and zero. If the scale is far from 1, calibrate the estimator again; if "
+        "the shift is far from 0, tare untouched.",
+    ]
+    print_result(result, sentences, as_json=args.json)
+    return 0

@@ -1,1 +1,0 @@
-"""`shearloop calibrate`, one module per thing that is calibrated."""

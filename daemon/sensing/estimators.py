@@ -1,0 +1,202 @@
+"""Estimators of the daemon: opened from the configuration, and run on the boards' frames. No I/O but the files."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from weakref import WeakValueDictionary
+
+import numpy as np
+
+from shearloop.bank.arrays import FloatArray
+from shearloop.bank.eit.bank_file import Bank
+from shearloop.bank.eit.pruned_matching import PrunedMatcher, PrunedZeroLagMatcher
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import Calibration, Estimate, EstimatorSession, Measured, TactileFrame
+from shearloop.bank.estimation.bank_match import PaperMatcher
+from shearloop.bank.estimation.session import REPEATED_FRAME
+from shearloop.daemon.config import CombinedConfig, DaemonConfig, FingertipConfig
+from shearloop.daemon.control.loop_inputs import TorqueSource
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.messaging.messages import STALE_AFTER_PERIODS
+from shearloop.daemon.sensing.skin_task import skin_source
+from shearloop.drivers.eit_kit import Frame
+
+# Source of the estimate from several fingertips together.
+COMBINED = "combined"
+_MATCHERS: Mapping[str, type[PrunedMatcher | PrunedZeroLagMatcher]] = {
+    "all_lags": PrunedMatcher,
+    "zero_lag": PrunedZeroLagMatcher,
+}
+# Matchers in use have no state, so fingertips with the same bank share one.
+_in_use: WeakValueDictionary[tuple[str, str], PrunedMatcher | PrunedZeroLagMatcher] = WeakValueDictionary()
+# A longer gap restarts the average of frames.
+_MAX_GAP_S = 3.0
+
+
+class LiveEstimator:
+    """Estimates from the frames of one fingertip, or of several together, in order.
+
+    Around a session it adds the board's flags, and the bank match where a bank is configured.
+    """
+
+    def __init__(self, calibration: Calibration, config: FingertipConfig) -> None:
+        """Begin a session; raises CalibrationError for a bank that is missing or another one."""
+        bank = Bank.open(config.bank) if config.bank is not None else None
+        self.calibration = calibration
+        self.model = bank.model if bank is not None else ""
+        self._matcher = _shared_matcher(bank, config.matching) if bank is not None else None
+        matcher = None
+        if calibration.has_curves_only and self._matcher is not None:
+            calibration.check_bank(bank)
+            matcher = PaperMatcher(self._matcher)
+        self._session = EstimatorSession(
+            calibration,
+            bank,
+            matcher=matcher,
+            period_s=config.frame_period_s,
+            baseline_frames=config.baseline_frames,
+            average_frames=config.average_frames,
+            max_gap_s=max(_MAX_GAP_S, STALE_AFTER_PERIODS * config.frame_period_s),
+        )
+
+    @property
+    def measures_torque(self) -> bool:
+        """Whether it gives torques, and not only diameters or the bank match."""
+        return self.calibration.torque is not None
+
+    @property
+    def assumptions(self) -> str:
+        """The user's guarantees behind the calibration as the end of a sentence, empty without any."""
+        text = self.calibration.assumption_text
+        return f", assuming that {text}" if text else ""
+
+    @property
+    def grids(self) -> tuple[FloatArray, FloatArray] | None:
+        """The k and the sigma of the bank's cells, None without a bank."""
+        return (self._matcher.k_grid, self._matcher.sigma_grid) if self._matcher is not None else None
+
+    @property
+    def taring(self) -> bool:
+        """Whether frames are being averaged into the homogeneous frame."""
+        return self._session.taring
+
+    def tare(self) -> None:
+        """Average the next frames, of an untouched fingertip, into a new homogeneous frame."""
+        self._session.tare()
+
+    def set_tool(self, tool: Measured | None) -> None:
+        """Set the diameter of the held tool: on another one than the calibration's there is no torque."""
+        self._session.set_tool(tool)
+
+    def estimate(self, *frames: Frame) -> Estimate:
+        """Return the estimate of frames of one time, one for each side. It may take many milliseconds."""
+        if any(frame.repeated for frame in frames):
+            return Estimate(valid=False, reasons=REPEATED_FRAME)
+        usable = np.array([~(frame.saturated | frame.dead) for frame in frames])
+        t_s = sum(frame.t_mid_ns for frame in frames) / len(frames) / 1e9
+        channels = np.array([frame.channels for frame in frames])
+        estimate = self._session.estimate(TactileFrame.of(t_s, channels, usable))
+        difference = self._first_difference()
+        if not estimate.valid or estimate.k is not None or self._matcher is None or difference is None:
+            return estimate
+        match = self._matcher.match(difference)
+        return replace(estimate, k=match.k, sigma=match.sigma, score=match.score, runner_up=match.runner_up)
+
+    def heatmap(self) -> FloatArray | None:
+        """Return the (K, S) scores of the first side's last difference, None without a bank or a difference."""
+        difference = self._first_difference()
+        return None if self._matcher is None or difference is None else self._matcher.heatmap(difference)
+
+    def _first_difference(self) -> FloatArray | None:
+        difference = self._session.difference
+        return difference[0] if difference is not None and difference[0].any() else None
+
+
+def open_estimator(config: FingertipConfig, name: str) -> LiveEstimator:
+    """Return the estimator of one fingertip.
+
+    Raises BankError for a file that is missing, damaged or does not fit, and UserError for a calibration of another
+    estimator or side.
+    """
+    if config.calibration is not None and config.calibration.exists():
+        calibration = _load(config.calibration, config.estimator)
+        if not calibration.has_curves_only and calibration.sides != (name,):
+            raise UserError(
+                f"{config.calibration} is of the {' and '.join(calibration.sides)} fingertip, not of {name}; "
+                f"calibrate with `--sides {name}`, or name a calibration of both under `combined`"
+            )
+        if calibration.has_curves_only and config.bank is None:
+            raise UserError(f"the paper's estimator of {name} needs its bank; add `bank:` to the fingertip")
+        return _live(config.calibration, calibration, config)
+    if config.estimator not in (None, "paper"):
+        found = "none is configured" if config.calibration is None else f"{config.calibration} does not exist"
+        raise UserError(
+            f"the estimator {config.estimator} of {name} needs a calibration on recordings, and {found}; make one with "
+            f"`shearloop calibrate REC… --estimator {config.estimator} --out CAL`"
+        )
+    if config.bank is None:
+        raise UserError(f"the paper's estimator of {name} needs its bank; add `bank:` to the fingertip")
+    if config.calibration is not None:
+        return LiveEstimator(Calibration.load(config.calibration), config)
+    return LiveEstimator(Calibration.uncalibrated(Bank.open(config.bank).identity), config)
+
+
+def open_combined(config: CombinedConfig, fingertips: Mapping[str, FingertipConfig]) -> LiveEstimator:
+    """Return the estimator of several fingertips together; raises as `open_estimator` does."""
+    calibration = _load(config.calibration, config.estimator)
+    missing = [side for side in calibration.sides if side not in fingertips]
+    if missing or len(calibration.sides) < 2:
+        raise UserError(
+            f"{config.calibration} is of {' and '.join(calibration.sides)}, and the fingertips are "
+            f"{', '.join(fingertips)}; calibrate on a recording of both, and name the fingertips as its sides"
+        )
+    return _live(config.calibration, calibration, fingertips[calibration.sides[0]])
+
+
+def torque_sources(
+    config: DaemonConfig, estimators: Mapping[str, LiveEstimator], combined: LiveEstimator | None
+) -> dict[str, TorqueSource]:
+    """Return the period of each sensor's torque, and the time that it averages over."""
+    sources = {
+        name: TorqueSource(
+            name=name,
+            period_s=own.frame_period_s,
+            window_s=own.frame_period_s * own.average_frames,
+            measures_torque=estimators[name].measures_torque,
+        )
+        for name, own in config.fingertips.items()
+    }
+    if combined is not None:
+        period_s = max(own.frame_period_s for own in config.fingertips.values())
+        sources[COMBINED] = TorqueSource(
+            name=COMBINED, period_s=period_s, window_s=period_s, measures_torque=combined.measures_torque
+        )
+    skin = skin_source(config.skin) if config.skin is not None else None
+    return sources if skin is None else {**sources, skin.name: skin}
+
+
+def _shared_matcher(bank: Bank, matching: str) -> PrunedMatcher | PrunedZeroLagMatcher:
+    key = (f"{bank.identity} {bank.signals_sha256}", matching)
+    shared = _in_use.get(key)
+    if shared is None:
+        shared = _in_use[key] = _MATCHERS[matching].from_bank(bank)
+    return shared
+
+
+def _live(path: Path, calibration: Calibration, config: FingertipConfig) -> LiveEstimator:
+    try:
+        return LiveEstimator(calibration, config)
+    except CalibrationError as error:
+        raise CalibrationError(f"{path}: {error}") from error
+
+
+def _load(path: Path, wanted: str | None) -> Calibration:
+    calibration = Calibration.load(path)
+    if calibration.kind != "raw":
+        raise UserError(f"{path} was made from slices; the daemon has raw frames: calibrate on a recording of them")
+    if wanted not in (None, calibration.estimator):
+        raise UserError(
+            f"{path} is a calibration of the estimator {calibration.estimator}, and {wanted} is configured; "
+            f"name the other, or calibrate with `--estimator {wanted}`"
+        )
+    return calibration

@@ -1,0 +1,117 @@
+import zipfile
+from dataclasses import replace
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shearloop.bank.errors import BankError, CalibrationError
+from shearloop.bank.estimation import Calibration, EstimatorSession, TactileFrame, fit
+
+
+@pytest.fixture(scope="module")
+def saved(motion_calibration, tmp_path_factory):
+    path = tmp_path_factory.mktemp("calibration") / "fused.cal"
+    motion_calibration.save(path)
+    return path
+
+
+def test_the_same_calibration_is_the_same_bytes(saved, tmp_path):
+    again = tmp_path / "again.cal"
+    Calibration.load(saved).save(again)
+    assert again.read_bytes() == saved.read_bytes()
+
+
+def test_a_loaded_calibration_estimates_alike(motion_calibration, saved, recorded):
+    trackers = [EstimatorSession(motion_calibration), EstimatorSession(Calibration.load(saved))]
+    for t, x in zip(recorded.t_s[:120], recorded.channels, strict=False):
+        one, other = (tracker.estimate(TactileFrame.of(float(t), x)) for tracker in trackers)
+        assert one == other
+
+
+@settings(max_examples=40, deadline=None)
+@given(where=st.floats(0, 1), length=st.integers(1, 40), cut=st.booleans())
+def test_damage_is_refused_by_name_or_does_no_harm(saved, tmp_path_factory, where, length, cut):
+    content = saved.read_bytes()
+    at = int(where * (len(content) - 1))
+    spoilt = bytes(255 - byte for byte in content[at : at + length])
+    path = tmp_path_factory.mktemp("damaged") / "x.cal"
+    path.write_bytes(content[:at] if cut else content[:at] + spoilt + content[at + length :])
+    try:
+        loaded = Calibration.load(path)
+    except BankError as error:
+        told = str(error)
+    else:
+        # Bytes that nothing reads, such as a date in the directory of the zip.
+        loaded.save(path)
+        assert path.read_bytes() == content
+        return
+    assert str(path) in told
+
+
+def test_foreign_and_stale_files_are_refused(tmp_path, motion_calibration):
+    foreign = tmp_path / "foreign.cal"
+    with zipfile.ZipFile(foreign, "w") as archive:
+        archive.writestr("notes.txt", "hello")
+    with pytest.raises(CalibrationError, match="no header"):
+        Calibration.load(foreign)
+    (tmp_path / "text.cal").write_text("not a zip")
+    with pytest.raises(CalibrationError, match="not a calibration, or it is truncated"):
+        Calibration.load(tmp_path / "text.cal")
+    with pytest.raises(CalibrationError, match="cannot be read"):
+        Calibration.load(tmp_path / "none.cal")
+    stale = tmp_path / "stale.cal"
+    _with_header(motion_calibration, stale, channel_table="0" * 64)
+    with pytest.raises(CalibrationError, match="channel table 000000000000…, expected"):
+        Calibration.load(stale)
+    _with_header(motion_calibration, stale, format_version=3)
+    with pytest.raises(CalibrationError, match="format version 3, expected 4; calibrate again"):
+        Calibration.load(stale)
+
+
+def _with_header(calibration, path, content=None, **changes):
+    """Write a calibration with other entries in its header and in the header's content."""
+    whole = path.with_suffix(".whole")
+    calibration.save(whole)
+    with zipfile.ZipFile(whole) as read, zipfile.ZipFile(path, "w") as written:
+        header = yaml.safe_load(read.read("calibration.yaml")) | changes
+        header["content"] |= content or {}
+        written.writestr("calibration.yaml", yaml.safe_dump(header))
+        for member in header["sha256"]:
+            written.writestr(member, read.read(member))
+
+
+def test_values_that_cannot_be_kept_and_files_that_cannot_be_written_are_errors(tmp_path, motion_calibration):
+    with pytest.raises(TypeError, match="cannot be kept"):
+        replace(motion_calibration, source={"a": 1}).save(tmp_path / "x.cal")
+    with pytest.raises(CalibrationError, match="choose another --out"):
+        motion_calibration.save(tmp_path / "none" / "x.cal")
+
+
+def test_assumptions_are_kept(motion_calibration, recorded, sliced, tmp_path):
+    assert motion_calibration.assumptions == ()
+    assert motion_calibration.assumption_text == ""
+    timed = fit("motion_regression", [recorded], "an emulated rig", trust_times=True)
+    assert timed.assumption_text == "the load cell's delay is as given (--load-cell-delay-s)"
+    path = tmp_path / "new.cal"
+    fit("regression", [sliced()], "slices", full_range=True).save(path)
+    assert Calibration.load(path).assumption_text == "no torque exceeds its slices (--assume-full-range)"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("assumptions", ["the moon"]),
+        ("assumptions", [["load timing"]]),
+        ("assumptions", "load timing"),
+        ("kind", "volts"),
+        ("sides", "r"),
+    ],
+)
+def test_an_unknown_value_is_refused_by_name(motion_calibration, tmp_path, name, value):
+    """One of a newer version ended `run` in a KeyError, and raw frames were taken for slices of another kind."""
+    other = tmp_path / "other.cal"
+    _with_header(motion_calibration, other, {name: value})
+    with pytest.raises(CalibrationError, match=name):
+        Calibration.load(other)

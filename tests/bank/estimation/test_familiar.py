@@ -1,0 +1,245 @@
+"""What a calibration of slices can speak of, and what it says of a frame at the rim of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame
+from shearloop.bank.estimation.bank_match import BankMatch
+from shearloop.bank.estimation.interval_regressor import IntervalRegressor, fit_interval_regressor
+from shearloop.bank.estimation.novelty import NoveltyDetector, ReciprocityCheck
+from shearloop.bank.estimation.regressors import Ridge
+
+ALL = np.ones(896, dtype=np.bool_)
+
+
+def follow(calibration, frames):
+    tracker = EstimatorSession(calibration)
+    return [tracker.estimate(TactileFrame.of(100.0 + i, frame)) for i, frame in enumerate(frames)]
+
+
+def beyond(series: FrameSeries, below_nm: float) -> np.ndarray:
+    """Return what the slices' frames become at a torque so far below the least of them, along their own slope."""
+    frames, torque = series.channels, series.torque_at_frames()
+    slope = np.polyfit(torque, frames.reshape(len(torque), -1), 1)[0].reshape(frames.shape[1:])
+    return frames[np.argmin(torque)] - below_nm * slope
+
+
+def test_a_frame_far_out_along_the_calibrations_own_directions_is_refused(sliced):
+    series = sliced()
+    guard = NoveltyDetector.fit(series.channels[:, 0])
+    near, far = (beyond(series, nm)[0] for nm in (0.01, 0.15))
+    assert guard.assess(near, ALL).reasons == ()
+    # Its misfit is as small as any: only how far it lies out tells of it.
+    assert guard.q_residual(far, ALL)[0] < guard.largest_q
+    assert "standard deviations from the calibrated ones" in guard.assess(far, ALL).reasons[0]
+
+
+@pytest.mark.parametrize("share", [0.35, 0.5, 1.0])
+def test_a_foreign_frame_mixed_in_is_refused(sliced, sliced_calibration, share):
+    calibration, later = sliced_calibration, sliced(seed=3)
+    foreign = later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
+    assert not any(one.valid for one in follow(calibration, (1 - share) * later.channels + share * foreign))
+    assert all(one.valid for one in follow(calibration, later.channels))
+
+
+def test_channels_that_vary_much_do_not_drown_the_others():
+    rng = np.random.default_rng(0)
+    scale = np.where(np.arange(896) < 90, 1e-2, 1e-4)
+    frames = 5e-2 + scale * rng.normal(size=(30, 896))
+    guard = NoveltyDetector.fit(frames)
+    # Ten times its own spread on every quiet channel is nothing beside one spread of the loud ones, in volts.
+    odd = frames[3] + np.where(np.arange(896) < 90, 0.0, 1e-3) * np.where(np.arange(896) % 2, 1, -1)
+    assert guard.assess(odd, ALL).reasons
+    assert not guard.assess(frames[3], ALL).reasons
+
+
+def saturating(value):
+    """Return features of values that cannot tell how far below a third a value is."""
+    return np.column_stack([np.maximum(value, 0.3), np.maximum(value, 0.3) ** 2])
+
+
+def reader_of(features, values) -> IntervalRegressor:
+    return fit_interval_regressor(
+        features, values, Ridge.fit, strengths=(1e-9,), growth=lambda _, later: np.ones(len(later))
+    )
+
+
+def test_a_reading_at_the_end_of_what_is_told_apart_may_mean_anything_beyond_it():
+    rng = np.random.default_rng(1)
+    values = rng.uniform(0.0, 1.0, 200)
+    reader = reader_of(saturating(values) + rng.normal(0, 1e-3, (200, 2)), values)
+    low_value, below, above = reader.predict(saturating(np.array([-0.3]))[0])
+    assert low_value == pytest.approx(0.15, abs=0.1)
+    assert low_value - below < -0.3
+    assert above < 0.3
+    _, below, above = reader.predict(saturating(np.array([0.6]))[0])
+    assert max(below, above) < 0.3
+
+
+def test_what_is_read_the_further_inside_the_further_it_lies_beyond_may_be_read_anywhere_above_that():
+    """Left out, a tenth of the range beyond is read a tenth inside: so half a range beyond, half of it inside."""
+    values = np.random.default_rng(5).uniform(0.0, 1.0, 200)
+
+    def folded(value):
+        return np.minimum(value, 1.6 - value)[:, None]
+
+    features = folded(values) + np.random.default_rng(6).normal(0, 1e-3, (200, 1))
+    reader = reader_of(features, values)
+    assert reader.low_end == values.min(), "below nothing is folded"
+    assert reader.high_end == pytest.approx(0.5, abs=0.05)
+    _, below, above = reader.predict(np.array([0.3]))
+    assert max(below, above) < 0.5
+    value, _, above = reader.predict(np.array([0.6]))
+    assert value + above == pytest.approx(values.max() + 2 * np.ptp(values)), "as far beyond as is known to pass"
+    vouched = fit_interval_regressor(
+        features, values, Ridge.fit, strengths=(1e-9,), growth=lambda _, later: np.ones(len(later)), full_range=True
+    )
+    assert vouched.predict(np.array([0.6]))[2] < 0.5
+    assert vouched.predict(np.array([0.6]))[0] == value
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_is_read_at_the_end_towards_zero_may_be_no_load_at_all(sign):
+    rng = np.random.default_rng(1)
+    values = rng.uniform(0.0, 1.0, 200)
+    reader = reader_of(saturating(values) + rng.normal(0, 1e-3, (200, 2)), sign * (values + 3.0))
+    value, *reach = reader.predict(saturating(np.array([-3.0]))[0])
+    assert value - sign * reach[0 if sign > 0 else 1] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_equal_values_do_not_tell_where_the_outermost_of_them_are(steps):
+    """As torques that were commanded, not measured: more than a fifth are the largest, and some of these were kept.
+
+    Of one step nothing is left to tell the others by, and as far as the largest are read now nothing is known.
+    """
+    values = np.round(np.random.default_rng(5).uniform(0.0, 1.0, 200) ** 0.5 * steps) / steps
+    features = np.minimum(values, 1.4 - values)[:, None] + np.random.default_rng(6).normal(0, 0.1, (200, 1))
+    reader = reader_of(features, values)
+    assert (values == 1.0).mean() > 0.2
+    assert reader.high_end < 0.95
+
+
+def test_values_that_are_nearly_equal_say_nothing_of_how_it_goes_on_beyond_them():
+    """Where the cut parts a level, what is left out lies a hair's breadth beyond, and is read with an error."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        values = np.resize([0.0, 0.3, 0.7, 1.0], 200) + 1e-6 * rng.normal(size=200)
+        reader = reader_of(values[:, None] + rng.normal(0, 0.03, (200, 1)), values)
+        assert reader.low_end < 0.2
+        assert reader.high_end > 0.8
+
+
+def test_where_values_beyond_are_read_as_such_intervals_reach_no_further_than_the_range():
+    rng = np.random.default_rng(2)
+    values = rng.uniform(0.0, 1.0, 200)
+    reader = reader_of(values[:, None] + rng.normal(0, 1e-3, (200, 1)), values)
+    assert (reader.low_end, reader.high_end) == (values.min(), values.max())
+    assert reader.predict(np.array([0.02]))[1] < 0.01
+
+
+def test_a_load_that_an_estimator_does_not_see_lies_in_its_interval():
+    """Of a stream most is free of load: its small residuals must not stand for a load that leaves no trace."""
+    rng = np.random.default_rng(3)
+    torque = np.where(np.arange(600) % 40 < 3, rng.uniform(0.02, 0.06, 600), 0.0)
+    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
+    reader = fit_interval_regressor(blind, torque, Ridge.fit)
+    loaded = np.flatnonzero(torque > 0.01)
+    read = np.array([reader.predict(blind[i]) for i in loaded])
+    assert (torque[loaded] - read[:, 0] <= read[:, 2]).mean() > 0.9
+    assert reader.misses_loads
+    # One that sees it pays nothing.
+    seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
+    assert not fit_interval_regressor(seeing, torque, Ridge.fit).misses_loads
+
+
+def test_a_load_that_is_not_seen_is_not_seen_at_any_other_time_either():
+    """Intervals that hold what is measured beside a frame cover more loads, by which a blind reader passed for none."""
+    rng = np.random.default_rng(3)
+    torque = np.where(np.arange(600) % 40 < 5, rng.uniform(0.02, 0.06, 600), 0.0)
+    blind = rng.normal(0, 1, (600, 2)) + torque[:, None]
+    beside = np.array([np.roll(torque, shift) for shift in range(-6, 7)])
+    reader = fit_interval_regressor(blind, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
+    assert reader.timing_widening > 1.2
+    loaded = torque > 0.01
+    read = np.array([reader.predict(one) for one in blind[loaded]])
+    half = np.array([reader.intervals.half_width(one) for one in read[:, 0]])
+    assert (np.abs(torque[loaded] - read[:, 0]) <= half).mean() > 0.75, "as wide as that they would hold these loads"
+    assert reader.misses_loads
+    seeing = np.column_stack([torque, rng.normal(0, 1, 600)]) + rng.normal(0, 1e-3, (600, 2))
+    sighted = fit_interval_regressor(seeing, torque, Ridge.fit, bounds=(beside.min(axis=0), beside.max(axis=0)))
+    assert not sighted.misses_loads, "one that sees loads pays no more than the times cost"
+
+
+def test_a_slice_is_measured_against_the_calibration_once(sliced, sliced_calibration, monkeypatch):
+    """What lets it pass and its interval go by the same misfits: looked for twice they were a third of the time."""
+    series, looked = sliced(), []
+    for kind, name in ((NoveltyDetector, "q_residual"), (ReciprocityCheck, "residual")):
+        found = getattr(kind, name)
+        monkeypatch.setattr(kind, name, lambda *args, found=found: (looked.append(type(args[0])), found(*args))[1])
+    assert all(one.valid for one in follow(sliced_calibration, series.channels[20:23]))
+    assert looked == [NoveltyDetector, ReciprocityCheck] * 3
+
+
+def test_a_judgement_holds_what_intervals_go_by(sliced):
+    frames = sliced().channels[:, 0]
+    guard = NoveltyDetector.fit(frames[:30])
+    for frame in frames[30:]:
+        judged = guard.assess(frame, ALL)
+        assert judged.reasons == ()
+        assert judged.widening == guard.widening(frame, ALL) >= 1.0
+        assert judged.limit_share == guard.reciprocity.residual(frame, ALL) / guard.reciprocity.largest_residual <= 1.0
+
+
+def test_how_much_is_the_own_response_is_told_whatever_the_torque_does(sliced):
+    frames = sliced().channels[:, 0]
+    guard = NoveltyDetector.fit(frames)
+    own = guard.response_share(frames[35], ALL)
+    assert own == pytest.approx(1.0, abs=0.1)
+    assert guard.response_share(0.8 * frames[35], ALL) == pytest.approx(0.8 * own)
+    along = guard.spread * guard.directions[0] * np.sqrt(guard.variances[0])
+    assert guard.response_share(frames[35] + 2 * along, ALL) == pytest.approx(own), "so another torque moves it"
+    some = ALL & (np.arange(896) % 4 > 0)
+    assert guard.response_share(np.where(some, 0.8 * frames[35], 9.0), some) == pytest.approx(0.8 * own, abs=0.03)
+
+
+def test_a_judgement_says_how_much_of_the_own_response_may_be_missing(sliced):
+    frames = sliced().channels[:, 0]
+    guard = NoveltyDetector.fit(frames)
+    less = 0.8 * frames[35]
+    assert guard.assess(less, ALL).missing_share == pytest.approx(
+        1 - guard.response_share(less, ALL) / guard.typical_response
+    )
+    assert guard.assess(less, ALL).missing_share > 0.15 > guard.assess(frames[35], ALL).missing_share
+    assert replace(guard, typical_response=1e-3).assess(frames[35], ALL).missing_share == 0.0, (
+        "more than ever is nothing missing"
+    )
+    assert replace(guard, typical_response=9.0).assess(frames[35], ALL).missing_share == 0.5, (
+        "no frame is made larger than twice"
+    )
+    # But for one in twenty of those left out none is larger; so of good ones hardly any is.
+    assert np.mean([guard.response_share(one, ALL) <= guard.typical_response for one in frames]) >= 0.9
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_may_be_missing_widens_to_the_side_where_it_would_be_read(sign):
+    rng = np.random.default_rng(5)
+    values = rng.uniform(0.0, 1.0, 100)
+    reader = reader_of(sign * values[:, None] + rng.normal(0, 1e-3, (100, 1)), values)
+    features = np.array([sign * 0.5])
+    _, *plain = reader.predict(features)
+    assert reader.predict(features, complete=features)[1:] == pytest.approx(plain)
+    low, high = reader.predict(features, complete=features - sign * 0.2)[1:]
+    assert (low, high) == (pytest.approx(plain[0] + 0.2, abs=0.01), pytest.approx(plain[1]))
+    low, high = reader.predict(features, complete=features + sign * 0.2)[1:]
+    assert (low, high) == (pytest.approx(plain[0]), pytest.approx(plain[1] + 0.2, abs=0.01))
+
+
+def test_a_match_on_another_ridge_of_the_bank_is_refused(sliced_calibration):
+    task = replace(sliced_calibration.torque, k_range=np.array([3.12, 3.17]))
+    place = BankMatch(3.19, 1.5, 0.0, 0.99, None, ambiguous=False)
+    assert task.match_reasons(place) == ()
+    assert task.match_reasons(None) == ()
+    assert "another ridge" in task.match_reasons(replace(place, k=3.41))[0]

@@ -1,0 +1,44 @@
+"""What cannot be calibrated on is said in a sentence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import fit
+
+
+def with_a_nan(values):
+    spoilt = values.copy()
+    spoilt.flat[len(spoilt) // 2] = np.nan
+    return spoilt
+
+
+@pytest.mark.parametrize("name", ["t_s", "channels", "torque_nm"])
+def test_values_that_are_no_numbers_are_told(recorded, name):
+    """They made the whole recording look gripped from the first frame on, or stamped at another time."""
+    spoilt = replace(recorded, **{name: with_a_nan(getattr(recorded, name))})
+    with pytest.raises(CalibrationError, match="recording 2 of 2 holds 1 values that are not finite numbers"):
+        fit("motion_regression", [recorded, spoilt], "rig", trust_times=True)
+
+
+def test_a_slice_with_a_value_that_is_no_number_is_told(sliced):
+    slices = sliced()
+    with pytest.raises(CalibrationError, match="holds 1 values that are not finite"):
+        fit("motion_regression", [replace(slices, channels=with_a_nan(slices.channels))], "slices")
+
+
+def test_a_recording_without_frames_is_told(recorded, sliced):
+    with pytest.raises(CalibrationError, match="recording 1 of 1 has no frames"):
+        fit("motion_regression", [recorded.between(0, 0)], "nothing")
+    slices = sliced()
+    with pytest.raises(CalibrationError, match="recording 2 of 2 has no frames"):
+        fit("motion_regression", [slices, slices.between(0, 0)], "slices")
+
+
+def test_a_torque_of_a_single_frame_is_too_little_to_calibrate_on(recorded):
+    torque = recorded.torque_nm.copy()
+    torque[900] = 1000.0
+    with pytest.raises(CalibrationError, match="from the first torque to the last there are 1 frames"):
+        fit("motion_regression", [replace(recorded, torque_nm=torque)], "rig", trust_times=True)

@@ -1,0 +1,184 @@
+import numpy as np
+import pytest
+from scipy.stats import truncnorm
+
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.regressors import (
+    InverseCalibration,
+    Ridge,
+    TobitRidge,
+    _moments_below_zero,
+    best_strength,
+    later_origins,
+    later_splits,
+    left_out_blocks,
+)
+
+
+def test_a_ridge_without_strength_is_least_squares():
+    rng = np.random.default_rng(0)
+    x, weights = rng.normal(size=(60, 5)), np.arange(5.0)
+    y = 2 + x @ weights + 0.01 * rng.normal(size=60)
+    ridge = Ridge.fit(x, y, 1e-12)
+    expected = np.linalg.lstsq(np.column_stack([np.ones(60), x]), y, rcond=None)[0]
+    np.testing.assert_allclose(ridge.weights, expected[1:], rtol=1e-7)
+    np.testing.assert_allclose(ridge.predict(np.zeros((1, 5))), expected[:1], rtol=1e-7)
+
+
+def test_a_scaled_ridge_does_not_care_for_units():
+    rng = np.random.default_rng(1)
+    x, y = rng.normal(size=(40, 3)), rng.normal(size=40)
+    units = np.array([1.0, 1e3, 1e-4])
+    metric = Ridge.fit_scaled(x, y, 0.1).predict(x)
+    np.testing.assert_allclose(Ridge.fit_scaled(x * units, y, 0.1).predict(x * units), metric, rtol=1e-9)
+
+
+def test_what_a_free_lever_hides_is_not_taken_for_zero():
+    """y = max(0, z): least squares through the zeros finds half the slope, the censored fit all of it."""
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(800, 2))
+    latent = x @ [0.05, 0.02] - 0.03
+    y = np.maximum(latent + 0.002 * rng.normal(size=800), 0.0)
+    censored = TobitRidge.fit(x, y, 1e-9)
+    np.testing.assert_allclose(censored.weights, [0.05, 0.02], rtol=0.05)
+    assert censored.offset - censored.weights @ censored.mean == pytest.approx(-0.03, rel=0.05)
+    assert Ridge.fit(x, y, 1e-9).weights[0] < 0.03
+
+
+def test_a_lever_may_be_pushed_either_way():
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(300, 1))
+    y = -np.maximum(0.05 * x[:, 0], 0.0)
+    pushed = TobitRidge.fit(x, y, 1e-9)
+    assert pushed.sign == -1.0
+    assert pushed.sign * pushed.predict(np.array([[1.0]]))[0] == pytest.approx(-0.05, rel=0.1)
+
+
+@pytest.mark.parametrize(("mean", "sigma"), [(-0.5, 1.0), (0.0, 0.2), (0.7, 0.3), (3.0, 0.5)])
+def test_the_moments_of_a_gaussian_moments_below_zero(mean, sigma):
+    found = _moments_below_zero(np.array([mean]), sigma)
+    expected = truncnorm.stats(-np.inf, -mean / sigma, loc=mean, scale=sigma, moments="mv")
+    np.testing.assert_allclose(np.ravel(found), expected, rtol=1e-6)
+
+
+def frames_on_a_curve(values, rng, noise=0.05, drift=1.0, begins_at=0.0, shrinking=0.0):
+    """Return (n, 201) frames, one a second; the response to a value shrinks by a share with each e-folding of age."""
+    shapes = np.random.default_rng(9).normal(size=(4, 200))
+    times = begins_at + np.arange(len(values))
+    value = np.asarray(values)[:, None]
+    z = value * (1 - shrinking * np.log1p(times))[:, None]
+    frames = (
+        shapes[0]
+        + z * shapes[1]
+        + 0.2 * z**2 * shapes[2]
+        + drift * rng.normal(size=z.shape) * shapes[3]
+        + noise * (rng.normal(size=(len(z), 200)))
+    )
+    return np.column_stack([frames, times])
+
+
+def test_a_curve_finds_the_value_through_drift_ten_times_the_noise():
+    rng = np.random.default_rng(4)
+    values = rng.uniform(-1, 2, 60)
+    curve = InverseCalibration.fit(frames_on_a_curve(values, rng), values, 2, 1)
+    later = rng.uniform(-1, 2, 40)
+    errors = curve.predict(frames_on_a_curve(later, rng)) - later
+    assert np.sqrt((errors**2).mean()) < 0.03
+
+
+def test_a_curve_does_not_pull_towards_the_mean():
+    """With few frames of many noisy channels a ridge shrinks what it predicts; a curve does not."""
+    rng = np.random.default_rng(5)
+    values = rng.uniform(-1, 2, 25)
+    noisy = frames_on_a_curve(values, rng, noise=1.5, drift=0.1)
+    later = np.linspace(-1, 2, 60)
+    future = frames_on_a_curve(later, rng, noise=1.5, drift=0.1)
+
+    def slope(predicted):
+        return np.polyfit(later, predicted, 1)[0]
+
+    assert slope(Ridge.fit(noisy, values, 0.1).predict(future)) < 0.8
+    assert 0.85 < slope(InverseCalibration.fit(noisy, values, 1, 0).predict(future)) < 1.15
+
+
+def test_a_curve_works_on_with_the_channels_that_are_left():
+    rng = np.random.default_rng(6)
+    values = rng.uniform(-1, 2, 60)
+    curve = InverseCalibration.fit(frames_on_a_curve(values, rng), values, 2, 1)
+    frame = frames_on_a_curve([1.3], rng)[0]
+    usable = rng.random(200) > 0.4
+    frame[:-1][~usable] = np.nan
+    assert curve.predict(frame[None])[0] == pytest.approx(1.3, abs=0.05)
+
+
+def test_frames_together_are_read_as_each_alone():
+    rng = np.random.default_rng(9)
+    values = rng.uniform(-1, 2, 60)
+    curve = InverseCalibration.fit(frames_on_a_curve(values, rng, shrinking=0.08), values, 2, 1, trend=True)
+    frames = frames_on_a_curve(rng.uniform(-1, 2, 12), rng, begins_at=60.0, shrinking=0.08)
+    frames[1::3, -1] = 64.0
+    frames[:4, 10:60] = np.nan
+    frames[4:6, 100:130] = np.nan
+    alone = [curve.predict(frame[None])[0] for frame in frames]
+    np.testing.assert_array_equal(curve.predict(frames), alone)
+
+
+def test_a_response_that_shrinks_with_age_is_followed_beyond_what_was_fitted():
+    rng = np.random.default_rng(8)
+    values, later = rng.uniform(-1, 2, 60), rng.uniform(-1, 2, 60)
+    past = frames_on_a_curve(values, rng, drift=0.0, shrinking=0.08)
+    future = frames_on_a_curve(later, rng, drift=0.0, begins_at=60.0, shrinking=0.08)
+    still, followed = (
+        np.sqrt(np.mean((InverseCalibration.fit(past, values, 2, 1, trend=trend).predict(future) - later) ** 2))
+        for trend in (False, True)
+    )
+    assert followed < 0.6 * still
+    # Frames that are numbered from the beginning again are read as at the end of what was fitted.
+    curve, anew = InverseCalibration.fit(past, values, 2, 1, trend=True), future.copy()
+    anew[:, -1] -= 60.0
+    at_the_end = future.copy()
+    at_the_end[:, -1] = 59.0
+    np.testing.assert_array_equal(curve.predict(anew), curve.predict(at_the_end))
+
+
+def test_a_curve_needs_enough_frames():
+    rng = np.random.default_rng(7)
+    with pytest.raises(CalibrationError, match="4 frames at 2 distinct values do not determine"):
+        InverseCalibration.fit(rng.normal(size=(4, 9)), np.array([1.0, 1.0, 2.0, 2.0]), 2, 1)
+
+
+@pytest.mark.parametrize("n", [8, 13, 19, 20, 49, 500])
+def test_what_is_judged_comes_later_or_is_left_out(n):
+    for past, future in [*later_splits(n), *later_origins(n)]:
+        assert past.max() < future.min()
+    assert all(future.max() == n - 1 for _, future in later_origins(n))
+    assert len(later_origins(n)) <= 11
+    assert bool(later_origins(n)) == (n >= 20)
+    blocks = [block for _, block in left_out_blocks(n)]
+    np.testing.assert_array_equal(np.concatenate(blocks), np.arange(n))
+    assert all(not set(rest) & set(block) for rest, block in left_out_blocks(n))
+
+
+def test_of_equal_strengths_the_strongest():
+    assert best_strength((0.1, 1.0, 10.0), lambda s, *_: 5.0 if s == 10.0 else 1.0, list(later_splits(20))) == 1.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_twist_the_other_way_than_the_lever_pushed_is_no_sure_zero(sign: float) -> None:
+    """The load cell read 0 whenever the tool was twisted the other way: a 0 that may be anything on that side."""
+    rng = np.random.default_rng(9)
+    twist = np.sin(np.arange(400) / 9.0)
+    frames = twist[:, None] * rng.normal(size=(1, 12)) + rng.normal(0.0, 0.05, (400, 12))
+    reader = fit_interval_regressor(frames, sign * np.maximum(twist, 0.0) * 0.1, TobitRidge.fit, strengths=(1e-5,))
+    other_way = np.flatnonzero(twist < -0.1)
+    read = [reader.predict(frames[i]) for i in other_way.tolist()]
+    truth = (sign * 0.1 * twist[other_way]).tolist()
+    inside = [value - below <= true <= value + above for (value, below, above), true in zip(read, truth, strict=True)]
+    assert np.mean(inside) > 0.95
+    for _, below, above in read:
+        # Towards the side that the lever pushes to, it is as sure as it was.
+        assert (above if sign > 0 else below) < 0.02
+    far, below, above = reader.predict(frames[np.argmin(twist)])
+    assert far == 0.0
+    assert (below if sign > 0 else above) > 0.1

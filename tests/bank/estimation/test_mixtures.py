@@ -1,0 +1,129 @@
+"""What of something foreign a slice may hold unseen: intervals include it, and cost nothing where it is seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shearloop.bank.estimation import Calibration, EstimatorSession, FrameSeries, TactileFrame, fit
+from shearloop.bank.estimation.fitting_slices import ContaminationTest, Mixtures
+from shearloop.bank.estimation.interval_regressor import fit_interval_regressor
+from shearloop.bank.estimation.novelty import NoveltyDetector
+from shearloop.bank.estimation.regressors import Ridge
+
+
+def shrinking(seed: int) -> FrameSeries:
+    """Return slices whose response shrinks as the torque rises, and that differ from each other by a fifth of it.
+
+    So much drift hides a tenth of a foreign frame; and that shrinks what is left of the own one.
+    """
+    rng, shape = np.random.default_rng(seed), np.random.default_rng(78)
+    base = np.abs(shape.normal(0, 6e-3, 896))
+    slope = 0.1 * base * shape.normal(1, 0.5, 896)
+    torque = np.tile(np.linspace(0.01, 0.14, 10), 5) + rng.normal(0, 0.002, 50)
+    drift = rng.normal(0, 0.2, (50, 896)) * base
+    frames = base - ((torque - 0.075) / 0.04)[:, None] * slope + drift + rng.normal(0, 3e-4, (50, 896))
+    t = np.arange(50.0)
+    return FrameSeries("difference", ("right",), t, np.abs(frames)[:, None], t, torque, np.full(50, np.nan))
+
+
+def mixed_with_a_foreign_frame(series: FrameSeries, share: float) -> FrameSeries:
+    foreign = series.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
+    return replace(series, channels=(1 - share) * series.channels + share * foreign)
+
+
+def judged(calibration: Calibration, series: FrameSeries) -> tuple[float, float, float]:
+    """Return the share of valid and of false-valid estimates, and the median width of the intervals in N·m."""
+    tracker = EstimatorSession(calibration)
+    pairs = zip(series.t_s, series.channels, strict=True)
+    estimates = [tracker.estimate(TactileFrame.of(float(t), channels)) for t, channels in pairs]
+    valid = [
+        (one.torque_low_nm, truth, one.torque_high_nm)
+        for one, truth in zip(estimates, series.torque_at_frames(), strict=True)
+        if one.valid
+    ]
+    missed = [not low <= truth <= high for low, truth, high in valid]
+    n = len(estimates)
+    widths = [high - low for low, _, high in valid] or [np.nan]
+    return len(valid) / n, sum(missed) / n, float(np.median(widths))
+
+
+def test_what_a_guard_cannot_see_lies_within_the_interval():
+    found, pure = [], []
+    for seed in range(3):
+        whole = shrinking(seed)
+        calibration = fit("regression", [whole.between(0, 30)], "earlier")
+        later = whole.between(30, 50)
+        found.append(judged(calibration, mixed_with_a_foreign_frame(later, 0.1)))
+        pure.append(judged(calibration, later))
+    valid, false_valid, _ = np.mean(found, axis=0)
+    assert valid > 0.9  # or nothing would be tested
+    assert false_valid <= 0.1
+    assert np.mean(pure, axis=0)[1] <= 0.1
+
+
+def test_where_it_is_seen_intervals_are_as_wide_as_without(sliced, sliced_calibration):
+    calibration = sliced_calibration
+    reader = calibration.torque.regressor
+    without = replace(
+        calibration, torque=replace(calibration.torque, regressor=replace(reader, contamination_below=0.0))
+    )
+    later = sliced(seed=3)
+    assert judged(calibration, mixed_with_a_foreign_frame(later, 0.2))[0] < 0.1
+    assert judged(calibration, later)[2] < 1.15 * judged(without, later)[2]
+
+
+@pytest.mark.parametrize("name", ["motion_regression", "regression"])
+def test_a_fifth_of_something_that_hardly_responds_lies_within_the_interval(name, sliced, sliced_calibration):
+    """It only makes the own response smaller, which is what another torque does: no misfit tells of it."""
+    calibration = sliced_calibration if name == "motion_regression" else fit(name, [sliced()], "all")
+    later = sliced(seed=3)
+    guard = calibration.torque.novelty
+    blind = replace(calibration, torque=replace(calibration.torque, novelty=replace(guard, typical_response=0.0)))
+    foreign = 0.2 * later.channels.mean(axis=0)[:, np.random.default_rng(7).permutation(896)]
+    spoilt = replace(later, channels=0.8 * later.channels + 0.2 * foreign)
+    valid, false_valid, _ = judged(calibration, spoilt)
+    assert valid > 0.9  # or nothing would be tested
+    assert false_valid <= 0.05
+    assert judged(blind, spoilt)[1] > 0.2  # or there was nothing to hold
+    assert judged(calibration, later)[2] < 1.2 * judged(blind, later)[2]
+
+
+def test_a_streams_intervals_know_nothing_of_mixtures(motion_calibration):
+    reader = motion_calibration.torque.regressor
+    assert (reader.contamination_below, reader.contamination_above) == (0.0, 0.0)
+
+
+def test_mixtures_are_those_that_the_guard_of_the_earlier_slices_lets_pass():
+    differences = shrinking(0).channels[:, 0]
+    past, future = np.arange(30), np.arange(30, 50)
+    guard = NoveltyDetector.fit(differences[past])
+    usable = np.ones(896, dtype=bool)
+    mixtures = ContaminationTest(differences, np.append)
+    passing = mixtures.accepted(past, future)
+    assert 0 < len(passing.rows) < 20 * 15 * 3
+    for row, features, nearness in zip(passing.rows, passing.features, passing.limit_shares, strict=True):
+        assert features[-1] == row
+        assert not guard.assess(features[:-1], usable).reasons
+        assert nearness == guard.assess(features[:-1], usable).limit_share <= 1.0
+    np.testing.assert_array_equal(
+        mixtures.growth(past, future), [guard.widening(one, usable) for one in differences[future]]
+    )
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_the_interval_reaches_to_the_side_on_which_the_truth_is_hidden(sign):
+    """Mixtures that read 0.3 too much at a nearness of ½ hide the truth 0.6 below at the limit."""
+    rng = np.random.default_rng(4)
+    values = rng.uniform(0.0, 1.0, 100)
+    features = values[:, None] + rng.normal(0, 1e-3, (100, 1))
+
+    def moved(_, later) -> Mixtures:
+        return Mixtures(later, features[later] + sign * 0.3, np.full(len(later), 0.5))
+
+    reader = fit_interval_regressor(features, values, Ridge.fit, strengths=(1e-9,), mixtures=moved)
+    _, *plain = reader.predict(np.array([0.5]))
+    _, *at_limit = reader.predict(np.array([0.5]), limit_share=1.0)
+    hidden, other = (0, 1) if sign > 0 else (1, 0)
+    assert at_limit[hidden] == pytest.approx(0.6, abs=0.01)
+    assert at_limit[other] == plain[other] < 0.01

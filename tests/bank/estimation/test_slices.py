@@ -1,0 +1,176 @@
+"""Slices: frames by themselves, with a torque or a diameter each."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import EstimatorSession, FrameSeries, TactileFrame, fit
+
+
+def follow(calibration, series, usable=None):
+    tracker = EstimatorSession(calibration)
+    return [
+        tracker.estimate(TactileFrame.of(float(t), x, usable)) for t, x in zip(series.t_s, series.channels, strict=True)
+    ]
+
+
+def errors(estimates, series):
+    return np.array([one.torque_nm - y for one, y in zip(estimates, series.torque_at_frames(), strict=True)])
+
+
+@pytest.mark.parametrize("name", ["motion_regression", "regression"])
+def test_later_slices_are_read_through_the_drift(sliced, name):
+    whole = sliced()
+    later = whole.between(30, 50)
+    estimates = follow(fit(name, [whole.between(0, 30)], "earlier"), later)
+    assert np.sqrt((errors(estimates, later) ** 2).mean()) < 0.008
+    inside = [
+        one.torque_low_nm <= y <= one.torque_high_nm for one, y in zip(estimates, later.torque_at_frames(), strict=True)
+    ]
+    assert np.mean(inside) >= 0.85
+
+
+def test_what_is_not_familiar_is_not_valid(sliced, sliced_calibration):
+    calibration = sliced_calibration
+    later = sliced(seed=3)
+    assert np.mean([one.valid for one in follow(calibration, later)]) > 0.95
+    rng = np.random.default_rng(0)
+    noisy = later.channels.copy()
+    for frame in noisy[:, 0]:
+        frame[rng.choice(896, 224, replace=False)] = np.abs(rng.normal(0, 0.02, 224))
+    idle = np.abs(rng.normal(0, 0.0008, later.channels.shape))
+    foreign = later.channels[..., ::-1]
+    for frames, why in ((noisy, "outside the calibration"), (idle, "no grip"), (foreign, "outside the")):
+        strange = FrameSeries(
+            later.kind, later.sides, later.t_s, frames, later.torque_t_s, later.torque_nm, later.diameter_mm
+        )
+        estimates = follow(calibration, strange)
+        assert not any(one.valid for one in estimates)
+        assert all(why in one.reasons[0] and one.torque_nm is None for one in estimates)
+
+
+@pytest.mark.parametrize("name", ["motion_regression", "regression"])
+def test_with_a_fifth_of_the_channels_dead_the_rest_say_nearly_as_much(sliced, sliced_calibration, name):
+    """A dead channel that was given the calibration's mean would pull the torque towards its mean."""
+    later = sliced(seed=4)
+    calibration = sliced_calibration if name == "motion_regression" else fit(name, [sliced()], "all")
+    usable = np.random.default_rng(1).random((1, 896)) > 0.2
+    dead = replace(later, channels=np.where(usable, later.channels, 1.0))
+    whole, left = (errors(follow(calibration, *one), later) for one in ((later,), (dead, usable)))
+    assert np.sqrt((left**2).mean()) < 1.25 * np.sqrt((whole**2).mean())
+
+
+def test_slices_of_two_fingertips_are_not_judged_by_one_of_them(sliced):
+    one = sliced()
+    both = replace(one, sides=("right", "left"), channels=np.repeat(one.channels, 2, axis=1))
+    with pytest.raises(CalibrationError, match=r"slices of 2 fingertips \(right, left\) do not fit into one"):
+        fit("motion_regression", [both], "both")
+
+
+def test_cylinders_give_a_diameter_and_no_torque(sliced):
+    torque = sliced()
+    rng = np.random.default_rng(2)
+    shape = np.abs(np.random.default_rng(55).normal(0, 4e-3, (2, 896)))
+    diameter = np.tile([10.0, 20.0, 30.0, 40.0], 4)
+    frames = shape[0] + (diameter / 25 - 1)[:, None] * 0.5 * shape[1] + rng.normal(0, 3e-4, (16, 896))
+    t = np.arange(16.0)
+    cylinders = FrameSeries("difference", ("right",), t, np.abs(frames)[:, None], t, np.full(16, 0.1), diameter)
+    calibration = fit("motion_regression", [torque, cylinders.between(0, 12)], "both")
+    for one, truth in zip(follow(calibration, cylinders.between(12, 16)), diameter[12:], strict=True):
+        assert one.valid
+        assert one.diameter_mm == pytest.approx(truth, abs=4)
+        assert one.torque_nm is None
+    assert all(one.diameter_mm is None for one in follow(calibration, torque))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("paper", {}, "needs a bank"),
+        ("reconstruction", {}, "needs a mesh"),
+        ("motion_regression", {"torque_nm": np.full(50, 0.1)}, "determine no calibration"),
+        ("motion_regression", {"torque_nm": np.full(50, np.nan)}, "neither torque nor diameter"),
+    ],
+)
+def test_what_cannot_be_calibrated_says_why(sliced, name, change, message):
+    whole = sliced()
+    content = {key: getattr(whole, key) for key in FrameSeries.__slots__} | change
+    with pytest.raises(CalibrationError, match=message):
+        fit(name, [FrameSeries(**content)], "x")
+
+
+@pytest.mark.parametrize(("name", "least"), [("motion_regression", 14), ("regression", 10)])
+def test_as_many_slices_as_an_estimator_asks_for_are_enough(sliced, name, least):
+    whole = sliced()
+    for n in (5, least - 1):
+        with pytest.raises(CalibrationError, match=f"^{n} slices with a torque .* {name}; record {least} or more$"):
+            fit(name, [whole.between(0, n)], "too few")
+    assert fit(name, [whole.between(0, least)], "enough").torque is not None
+
+
+@pytest.mark.parametrize(
+    ("torque", "message"),
+    [
+        (np.tile([0.01, 0.05, 0.1], 17)[:50], "50 of the 50 slices have too few different torques .*, 3; record more"),
+        (np.repeat([0.01, 0.03, 0.05, 0.07, 0.1], 10), "30 of the 50 slices have too few different torques .*, 3;"),
+    ],
+)
+def test_too_few_different_torques_are_not_called_too_few_slices(sliced, torque, message):
+    with pytest.raises(CalibrationError, match=message):
+        fit("motion_regression", [replace(sliced(), torque_nm=torque)], "x")
+
+
+def test_where_few_torques_are_left_without_the_outermost_it_is_they_that_are_asked_for(sliced):
+    few = sliced().between(0, 14)
+    few = replace(few, torque_t_s=few.t_s, torque_nm=np.resize([0.01, 0.05, 0.1, 0.14], 14))
+    message = "10 frames at 3 distinct values .* at more values: 4 values and 11 frames must remain"
+    with pytest.raises(CalibrationError, match=message):
+        fit("motion_regression", [few], "four torques")
+
+
+def alike(frames):
+    return np.repeat(frames[:1], len(frames), axis=0)
+
+
+def multiples(frames):
+    return np.linspace(1.0, 2.0, len(frames))[:, None, None] * frames[:1]
+
+
+def loose(frames):
+    """Return frames of which the first forty come through a ribbon cable that carries three quarters of the wires."""
+    frames = frames.copy()
+    frames[:40, :, 600:] = 0.0
+    return frames
+
+
+def loose_at_half(frames):
+    return np.where(np.arange(896) < 448, 0.0, frames)
+
+
+@pytest.mark.parametrize("name", ["motion_regression", "regression"])
+@pytest.mark.parametrize(
+    ("spoilt", "message"),
+    [
+        (alike, "50 of the 50 slices are all alike; record slices as they come"),
+        (multiples, "the slices have no noise: they are multiples or sums of a few"),
+        (loose_at_half, "in 50 of the 50 slices 50 % of the channels never change: .* check the ribbon cable"),
+        (loose, "in 40 of the 50 slices 33 % of the channels never change: .* check the ribbon cable"),
+    ],
+)
+def test_slices_that_no_sound_board_sends_are_refused(sliced, name, spoilt, message):
+    whole = sliced()
+    with pytest.raises(CalibrationError, match=message):
+        fit(name, [replace(whole, channels=spoilt(whole.channels))], "spoilt")
+
+
+def test_up_to_a_quarter_of_the_channels_may_be_dead_as_in_a_live_frame(sliced):
+    whole = sliced()
+    quarter = replace(whole, channels=np.where(np.arange(896) < 224, 0.0, whole.channels))
+    assert fit("motion_regression", [quarter], "a quarter is dead").torque is not None
+
+
+def test_raw_frames_and_slices_do_not_mix(sliced, recorded):
+    with pytest.raises(CalibrationError, match="do not fit into one calibration"):
+        fit("motion_regression", [sliced(), recorded], "x")

@@ -1,0 +1,138 @@
+"""Curves through measurements, and the paper's calibration made from them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shearloop.bank.eit.polynomial import Polynomial
+from shearloop.bank.errors import CalibrationError
+from shearloop.bank.estimation import Calibration
+
+BANK = "ab" * 32
+SIGMA, K = np.linspace(1.2, 1.9, 30), np.linspace(3.4, 3.8, 12)
+NOISE = np.random.default_rng(1)
+TORQUE = 0.4 - 0.1 * SIGMA - 0.05 * SIGMA**2 + NOISE.normal(0, 0.003, 30)
+DIAMETER = 250 - 60 * K + NOISE.normal(0, 1.0, 12)
+CALIBRATION = Calibration.from_matches(BANK, "made up", torque=(SIGMA, TORQUE), diameter=(K, DIAMETER))
+
+
+def test_a_curve_without_noise_is_found_exactly() -> None:
+    fit = Polynomial.fit(SIGMA, 0.4 - 0.1 * SIGMA - 0.05 * SIGMA**2, 2)
+    assert fit.residual_std < 1e-15
+    for sigma in (1.2, 1.55, 2.5):
+        value, low, high = fit.interval(sigma)
+        assert value == pytest.approx(0.4 - 0.1 * sigma - 0.05 * sigma**2, abs=1e-13)
+        assert (low, high) == pytest.approx((value, value), abs=1e-13)
+
+
+def test_the_interval_of_a_mean_is_the_textbook_one() -> None:
+    # A polynomial of degree 0: mean ± t s √(1 + 1/n), t of 4 degrees of freedom being 2.7764.
+    fit = Polynomial.fit(np.arange(5.0), np.array([1.0, 2.0, 3.0, 4.0, 5.0]), 0)
+    half = 2.776445105 * np.sqrt(2.5) * np.sqrt(1.2)
+    assert fit.interval(100.0) == pytest.approx((3.0, 3.0 - half, 3.0 + half))
+
+
+def test_the_interval_of_a_line_is_the_textbook_one() -> None:
+    x, y = np.array([1.0, 2.0, 4.0, 7.0]), np.array([2.0, 3.0, 3.0, 9.0])
+    slope = ((x - 3.5) * (y - 4.25)).sum() / ((x - 3.5) ** 2).sum()
+    std = np.sqrt(((y - 4.25 - slope * (x - 3.5)) ** 2).sum() / 2)
+    half = 4.302652730 * std * np.sqrt(1 + 1 / 4 + (6.0 - 3.5) ** 2 / ((x - 3.5) ** 2).sum())
+    value = 4.25 + slope * 2.5
+    assert Polynomial.fit(x, y, 1).interval(6.0) == pytest.approx((value, value - half, value + half))
+
+
+def test_95_of_100_new_measurements_fall_into_the_interval() -> None:
+    generator = np.random.default_rng(7)
+    inside = 0
+    for _ in range(2000):
+        x = generator.uniform(1, 2, 13)
+        y = 3 * x**2 + generator.normal(0, 0.2, 13)
+        *known, new = zip(x, y, strict=True)
+        _, low, high = Polynomial.fit(*map(np.array, zip(*known, strict=True)), 2).interval(new[0])
+        inside += bool(low <= new[1] <= high)
+    # The binomial standard deviation is 0.5 %.
+    assert inside / 2000 == pytest.approx(0.95, abs=0.015)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "says"),
+    [
+        ([1.0, 2.0, 3.0], [1.0, 2.0, 3.0], "3 measurements at 3 distinct places do not determine .* degree 2"),
+        ([1.0, 1.0, 2.0, 2.0], [1.0, 2.0, 3.0, 4.0], "4 measurements at 2 distinct places"),
+        ([1.0, 2.0, 3.0, np.nan], [1.0, 2.0, 3.0, 4.0], "as many finite x as y"),
+        ([1.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0], "as many finite x as y"),
+    ],
+)
+def test_points_that_do_not_determine_a_curve_are_refused(x: list[float], y: list[float], says: str) -> None:
+    with pytest.raises(CalibrationError, match=says):
+        Polynomial.fit(np.array(x), np.array(y), 2)
+
+
+def test_torque_and_diameter_come_with_intervals() -> None:
+    assert CALIBRATION.torque is not None
+    assert CALIBRATION.diameter is not None
+    value, below, above = CALIBRATION.torque.regressor.predict(np.array([1.5, 2.25]))
+    assert value == pytest.approx(0.4 - 0.15 - 0.1125, abs=0.003)
+    assert below > 0
+    assert below == pytest.approx(above)
+    assert CALIBRATION.diameter.regressor.predict(np.array([3.6]))[0] == pytest.approx(34, abs=1.5)
+
+
+def test_outside_of_the_calibrated_range_a_reason_is_given() -> None:
+    def reasons(k: float, sigma: float) -> tuple[str, ...]:
+        return tuple(
+            reason
+            for model, feature, name, unit in (
+                (CALIBRATION.torque, sigma, "torque", "N·m"),
+                (CALIBRATION.diameter, k, "diameter", "mm"),
+            )
+            if model is not None
+            for reason in model.regressor.range_reasons(0.0, np.array([feature]), name, unit)
+        )
+
+    assert reasons(3.6, 1.5) == reasons(K[0], SIGMA[-1]) == ()
+    assert reasons(3.2, 2.0) == (
+        "sigma = 2 cm is outside of 1.2 to 1.9 cm, where torque was calibrated",
+        "k = 3.2 cm is outside of 3.4 to 3.8 cm, where diameter was calibrated",
+    )
+    assert len(reasons(np.nan, np.nan)) == 2
+
+
+def test_one_of_the_fits_may_be_missing_and_not_both() -> None:
+    assert Calibration.from_matches(BANK, "torque only", torque=(SIGMA, TORQUE)).diameter is None
+    assert Calibration.from_matches(BANK, "diameter only", diameter=(K, DIAMETER)).torque is None
+    with pytest.raises(CalibrationError, match="of torque, of diameter, or of both"):
+        Calibration.from_matches(BANK, "nothing")
+
+
+def test_a_saved_calibration_is_loaded_as_it_was_and_has_the_same_bytes_each_time(tmp_path: Path) -> None:
+    paths = [tmp_path / "a.cal", tmp_path / "b.cal"]
+    for path in paths:
+        CALIBRATION.save(path)
+    assert paths[0].read_bytes() == paths[1].read_bytes()
+    loaded = Calibration.load(paths[0])
+    assert loaded.torque is not None
+    assert CALIBRATION.torque is not None
+    assert loaded.torque.regressor == CALIBRATION.torque.regressor
+    assert loaded.has_curves_only
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.cal", "b.cal"]
+
+
+def test_an_older_file_is_refused_with_the_cure(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.yaml"
+    path.write_text("kind: shearloop calibration\nformat_version: 1\n")
+    with pytest.raises(CalibrationError, match=r"calibration\.yaml.*calibrate again"):
+        Calibration.load(path)
+    with pytest.raises(CalibrationError, match="cannot be read: No such file"):
+        Calibration.load(tmp_path / "absent.cal")
+
+
+def test_a_calibration_that_cannot_be_written_leaves_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "own.cal"
+    CALIBRATION.save(path)
+    content = path.read_bytes()
+    (tmp_path / "own.cal.tmp").mkdir()
+    with pytest.raises(CalibrationError, match="cannot be written: Is a directory"):
+        Calibration.uncalibrated(BANK).save(path)
+    assert path.read_bytes() == content

@@ -1,0 +1,158 @@
+"""Estimators as the configuration opens them, on frames of boards."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from shearloop.bank.errors import BankError
+from shearloop.bank.estimation import Calibration, FrameSeries, fit
+from shearloop.daemon.cli.check import _torque
+from shearloop.daemon.config import CombinedConfig, FingertipConfig
+from shearloop.daemon.doctor.checks import _check_combined, check_calibration
+from shearloop.daemon.errors import UserError
+from shearloop.daemon.sensing.estimators import LiveEstimator, open_combined, open_estimator
+from shearloop.drivers.eit_kit import Frame
+from tests.bank.estimation.conftest import IDLE_S, PERIOD_S, series
+
+NO_CHANNEL = np.zeros(896, bool)
+NAME = "motion_regression"
+
+
+@pytest.fixture(scope="module")
+def recorded() -> FrameSeries:
+    return series()
+
+
+@pytest.fixture(scope="module")
+def calibration(recorded: FrameSeries) -> Calibration:
+    return fit(NAME, [recorded], "rig")
+
+
+@pytest.fixture(scope="module")
+def files(recorded: FrameSeries, calibration: Calibration, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Save a calibration of both sides and one of the right alone."""
+    folder = tmp_path_factory.mktemp("calibrations")
+    calibration.save(folder / "combined.cal")
+    fit(NAME, [recorded.select_sides(("right",))], "rig").save(folder / "right.cal")
+    return {"combined": folder / "combined.cal", "right": folder / "right.cal"}
+
+
+def fingertip(**changes: object) -> FingertipConfig:
+    return FingertipConfig.model_validate({"device": {"path": "eit"}, **changes})
+
+
+def frame(
+    number: int, channels: NDArray[np.float64], *, dead: NDArray[np.bool_] = NO_CHANNEL, repeated: bool = False
+) -> Frame:
+    t_ns = round(number * PERIOD_S * 1e9)
+    return Frame(
+        channels=channels, raw=np.zeros(1024), line=b"", t_mid_ns=t_ns, t_arrival_ns=t_ns + 270_000_000, seq=number,
+        saturated=NO_CHANNEL, dead=dead, unusable=int(dead.sum()), repeated=repeated,
+    )  # fmt: skip
+
+
+def torques(estimator: LiveEstimator, played: FrameSeries, **flags: NDArray[np.bool_]) -> list[float | None]:
+    """Return the torque of every pair, None where there is none."""
+    found = []
+    for number, pair in enumerate(played.channels):
+        estimate = estimator.estimate(*(frame(number, channels, **flags) for channels in pair))
+        assert estimate.valid == (estimate.torque_nm is not None)
+        found.append(estimate.torque_nm)
+    return found
+
+
+def test_both_fingertips_together_follow_another_session(calibration: Calibration) -> None:
+    played = series(seed=3)
+    found = torques(LiveEstimator(calibration, fingertip()), played)
+    truth = played.torque_at_frames()
+    errors = [value - true for value, true in zip(found, truth, strict=True) if value is not None]
+    assert len(errors) > 0.6 * len(found)
+    assert np.sqrt(np.mean(np.square(errors))) < 0.005
+    assert np.nanmax(truth) > 0.05
+
+
+def test_a_tare_averages_the_frames_that_follow(calibration: Calibration) -> None:
+    played = series(seed=3)
+    estimator = LiveEstimator(calibration, fingertip(baseline_frames=5))
+    estimator.tare()
+    for number in range(5):
+        assert estimator.taring
+        estimate = estimator.estimate(*(frame(number, channels) for channels in played.channels[number]))
+        assert estimate.reasons == (f"taking the homogeneous frame, {number + 1} of 5",)
+    assert not estimator.taring
+    assert any(value is not None for value in torques(estimator, played.between(5, len(played.t_s))))
+
+
+def test_dead_channels_leave_the_rest_at_work_and_a_repeated_frame_is_refused(calibration: Calibration) -> None:
+    played = series(seed=4)
+    dead = np.random.default_rng(0).uniform(size=896) < 0.1
+    found = torques(LiveEstimator(calibration, fingertip()), played, dead=dead)
+    assert np.count_nonzero([value is not None for value in found]) > 0.6 * len(found)
+    elsewhere = replace(played, channels=np.where(dead, 0.3, played.channels))
+    again = torques(LiveEstimator(calibration, fingertip()), elsewhere, dead=dead)
+    assert again == found, "the values of dead channels do not matter"
+    pair = [frame(0, channels, repeated=True) for channels in played.channels[0]]
+    estimate = LiveEstimator(calibration, fingertip()).estimate(*pair)
+    assert estimate.reasons == ("the board sent the same frame again",)
+
+
+def test_a_bank_adds_k_sigma_and_heatmaps(calibration: Calibration, tiny_bank: Path) -> None:
+    estimator = LiveEstimator(calibration, fingertip(bank=str(tiny_bank), matching="zero_lag"))
+    played = series(seed=3)
+    gripped = int((IDLE_S + 12.0) / PERIOD_S)
+    for number in range(gripped):
+        estimate = estimator.estimate(*(frame(number, channels) for channels in played.channels[number]))
+    assert estimate.valid
+    heatmap = estimator.heatmap()
+    assert heatmap is not None
+    assert estimate.score == pytest.approx(np.nanmax(heatmap), abs=1e-6)
+
+
+def test_the_calibration_decides_the_estimator(files: dict[str, Path]) -> None:
+    assert open_estimator(fingertip(calibration=files["right"]), "right").calibration.estimator == NAME
+    tips = {"right": fingertip(), "left": fingertip()}
+    combined = open_combined(CombinedConfig(calibration=files["combined"]), tips)
+    assert combined.calibration.sides == ("right", "left")
+    assert combined.grids is None
+
+
+def test_doctor_and_check_show_the_assumptions(
+    calibration: Calibration, files: dict[str, Path], tmp_path: Path
+) -> None:
+    path, tips = tmp_path / "combined.cal", {"right": fingertip(), "left": fingertip()}
+    replace(calibration, assumptions=("load timing",)).save(path)
+    assumed = _check_combined(CombinedConfig(calibration=path), tips)
+    assert assumed.state == "good"
+    ends = ", assuming that the load cell's delay is as given (--load-cell-delay-s)"
+    assert assumed.found.endswith(ends)
+    assert _torque(open_combined(CombinedConfig(calibration=path), tips), calibrated=True) == f"with torque{ends}"
+    for finding in (
+        _check_combined(CombinedConfig(calibration=files["combined"]), tips),
+        check_calibration("right", fingertip(calibration=files["right"])),
+    ):
+        assert finding.state == "good"
+        assert "assuming" not in finding.found
+
+
+@pytest.mark.parametrize(
+    ("open_it", "sentence"),
+    [
+        (lambda f: open_estimator(fingertip(calibration=f["right"]), "left"), "fingertip, not of left"),
+        (lambda f: open_estimator(fingertip(calibration=f["combined"]), "right"), "of both under `combined`"),
+        (lambda f: open_estimator(fingertip(calibration=f["right"], estimator="bank"), "right"), f"estimator {NAME}"),
+        (lambda _: open_estimator(fingertip(estimator=NAME), "right"), "none is configured"),
+        (lambda _: open_estimator(fingertip(estimator=NAME, calibration="no.cal"), "right"), "no.cal does not"),
+        (lambda _: open_estimator(fingertip(calibration=__file__), "right"), "calibrate again"),
+        (lambda _: open_estimator(fingertip(), "right"), "needs its bank; add `bank:`"),
+        (lambda f: open_combined(CombinedConfig(calibration=f["combined"]), {"right": fingertip()}), "of both, and"),
+    ],
+)  # fmt: skip
+def test_a_configuration_that_does_not_fit_is_refused(
+    open_it: Callable[[dict[str, Path]], object], sentence: str, files: dict[str, Path]
+) -> None:
+    with pytest.raises((UserError, BankError), match=sentence):
+        open_it(files)

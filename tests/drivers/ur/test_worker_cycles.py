@@ -1,0 +1,102 @@
+"""What the robot's own process does and sends in each cycle, in a time of its own."""
+
+from itertools import pairwise
+
+import pytest
+
+from shearloop.drivers.ur import worker
+from shearloop.drivers.ur.command_handler import CommandHandler
+from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, RtdeSample, Unlock, WristSpeed
+from tests.drivers.ur.process import Daemon, Timed, TimedArm
+
+
+def test_each_state_is_sent_and_the_robot_kept_awake_in_each_cycle(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    timed = Timed(daemon, monkeypatch, (0.405, Disconnect()))
+    assert [state.cycle for state in timed.states] == [0, 0, 1, 1, 2, 2, *range(3, 52)]
+    assert timed.arm.read_s[:51] == pytest.approx([0.008 * cycle for cycle in range(51)])
+    assert timed.arm.calls.count("send_heartbeat") == 49
+
+
+def test_a_late_cycle_begins_at_once_and_is_not_caught_up_with(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Slow(TimedArm):
+        def read(self) -> RtdeSample:
+            if len(self.read_s) == 10:
+                worker.time.sleep(0.0441)
+            return super().read()
+
+    timed = Timed(daemon, monkeypatch, (0.3, Disconnect()), arm=Slow())
+    assert timed.arm.read_s[9:13] == pytest.approx([0.072, 0.1241, 0.1241, 0.1321])
+    assert [state.cycle for state in timed.states[12:16]] == [9, 10, 11, 12]
+
+
+def test_a_command_is_carried_out_when_it_comes_and_again_in_each_cycle(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent_s: list[float] = []
+
+    class Turned(TimedArm):
+        def wrist(self, command: WristSpeed) -> bool:
+            sent_s.append(worker.time.monotonic() - 1000.0)
+            return super().wrist(command)
+
+    Timed(daemon, monkeypatch, (0.1, Enable()), (0.203, WristSpeed(0.1, 4.0)), (0.3, Disconnect()), arm=Turned())
+    assert sent_s[:4] == pytest.approx([0.203, 0.208, 0.216, 0.224])
+    assert max(later - earlier for earlier, later in pairwise(sent_s)) < 0.0081
+
+
+@pytest.mark.parametrize("stopped_s", [0.2001, 0.2005, 0.2079])
+def test_a_stop_that_the_readings_tell_later_than_the_commands_is_told_as_what_it_is(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, stopped_s: float
+) -> None:
+    class Late(TimedArm):
+        def wrist(self, command: WristSpeed) -> bool:
+            self.takes = worker.time.monotonic() < 1000.0 + stopped_s
+            return super().wrist(command)
+
+        def read(self) -> RtdeSample:
+            if worker.time.monotonic() > 1000.003 + stopped_s and self.reading.safety_mode == 1:
+                self.protective_stop()
+            return super().read()
+
+    speeds = [(0.1005 + 0.008 * number, WristSpeed(0.1, 4.0)) for number in range(20)]
+    timed = Timed(daemon, monkeypatch, (0.1, Enable()), *speeds, (0.3, Disconnect()), arm=Late())
+    assert {state.blocked[:15] for state in timed.states if state.cycle > 15} == {"", "Protective stop"}
+    assert {state.motion for state in timed.states if state.blocked} == {"idle"}
+
+
+@pytest.mark.parametrize("cycle", [31, 32, 34])
+def test_what_happens_is_told_in_the_cycle_that_sees_it(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch, cycle: int
+) -> None:
+    class Stopping(TimedArm):
+        def read(self) -> RtdeSample:
+            if worker.time.monotonic() > 1000.0 + 0.008 * cycle - 1e-6 and self.reading.safety_mode == 1:
+                self.protective_stop()
+            return super().read()
+
+    said = (0.1, Enable()), (0.2, WristSpeed(0.01, 4.0)), (0.3, Disconnect())
+    timed = Timed(daemon, monkeypatch, *said, arm=Stopping())
+    assert next(state.cycle for state in timed.states if state.protective_stop) == cycle
+
+
+def test_robot_that_is_made_ready_no_more_is_told_at_once_however_soon(
+    daemon: Daemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Announced as being made ready, and given up in the same cycle: all is as before the announcement."""
+    arm = TimedArm()
+    arm.be(robot_mode=3)
+    given_up = CommandHandler.tick
+
+    def tick(handler: CommandHandler, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
+        if now_ns > 1000.1e9 and handler._recovery is not None:
+            handler._recovery.give_up("Nobody waits for it.")
+        return given_up(handler, reading, now_ns)
+
+    monkeypatch.setattr("shearloop.drivers.ur.command_handler.CommandHandler.tick", tick)
+    timed = Timed(daemon, monkeypatch, (0.201, Unlock()), (0.4, Disconnect()), arm=arm)
+    ready = [state for state in timed.states if 1000.195 < state.t_mono_ns / 1e9 < 1000.3]
+    announced = next(number for number, state in enumerate(ready) if state.recovering)
+    assert not ready[announced + 1].recovering
+    assert ready[announced + 1].cycle == ready[announced].cycle

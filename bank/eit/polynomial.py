@@ -87,8 +87,8 @@ class Polynomial:
         """Return y at x with the 95 % prediction interval of a single new measurement.
 
         y ± t s √(1 + pᵀ S p), with p the powers of x − centre, S the spread, s the residual_std, and t Student's
-        quantile at 97.5 % with n − len(coefficients) degrees of freedom. Assumes
-        independent Gaussian residuals of one size.
+        quantile at 97.5 % with n − len(coefficients) degrees of freedom. It assumes independent Gaussian residuals of
+        one size.
         """
         powers = (x - self.centre) ** np.arange(len(self.coefficients))
         t = float(stdtrit(self.n - len(powers), (1 + CONFIDENCE) / 2))

@@ -1,4 +1,4 @@
-"""Calibration of one estimator: what it knows of its fingertips, its features of a frame, and its file.
+"""Calibration of one estimator: its fingertips, its features of a frame, and its file.
 
 The file is a zip of a YAML header and NumPy arrays with checksums. It keeps any tree of frozen dataclasses of numbers,
 texts, tuples and arrays. Equal calibrations are equal bytes: fixed dates, fixed order, no compression.
@@ -51,7 +51,7 @@ Quantity = Literal["torque", "diameter"]
 # What the user guarantees, with the end of a sentence that says so.
 Assumption = Literal["full range", "load timing"]
 _ASSUMPTION_TEXTS: dict[Assumption, str] = {
-    "full range": "no torque is beyond those of its slices (--assume-full-range)",
+    "full range": "no torque exceeds its slices (--assume-full-range)",
     "load timing": "the load cell's delay is as given (--load-cell-delay-s)",
 }
 # Columns of the paper's features (k, sigma, sigma²).
@@ -59,7 +59,7 @@ PAPER_COLUMNS: dict[Quantity, slice] = {"torque": slice(1, 3), "diameter": slice
 TORQUE_DEGREE, DIAMETER_DEGREE = 2, 1
 # Two cells of the paper's bank.
 _LEAST_MARGIN_K_CM = 0.05
-# A tool whose diameter differs by a larger share is another tool.
+# Tools differ if their diameters differ by a larger share.
 LARGEST_TOOL_SHARE = 0.15
 
 
@@ -67,7 +67,7 @@ LARGEST_TOOL_SHARE = 0.15
 class OutputModel:
     """How one quantity is predicted: its regressor, and for differences the detector of novel ones.
 
-    k_range holds the least and largest k in cm at which the bank matched, or nothing without a bank.
+    k_range holds the least and largest matched k in cm, or nothing without a bank.
     """
 
     regressor: IntervalRegressor | PolynomialRegressor

@@ -60,7 +60,7 @@ def list_serial_ports() -> list[SerialPortInfo]:
 
 
 def access_error(path: str) -> str:
-    """Return why this user may not open a port, and the cure; empty if the user may."""
+    """Return why this user may not open a port, and the cure; empty if allowed."""
     if os.access(path, os.R_OK | os.W_OK):
         return ""
     try:
@@ -71,7 +71,7 @@ def access_error(path: str) -> str:
 
 
 def _stable_name(device: str, serial_number: str | None) -> str:
-    """Return a link that survives swapped cables: ours by serial number, or udev's; empty if there is none."""
+    """Return a link that survives swapped cables: ours by serial number, or udev's; empty without one."""
     folders = (Path("/dev/serial/by-id"), Path("/dev/serial/by-path"))
     links = [link for folder in folders if folder.is_dir() for link in sorted(folder.iterdir())]
     for link in (BY_SERIAL / (serial_number or "-"), *links):

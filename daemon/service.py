@@ -43,7 +43,7 @@ def notify(*states: str) -> bool:
 
 
 class Step(NamedTuple):
-    """One step: a sentence that says what `run` does. `run` is None when nothing needs to be done."""
+    """One step: a sentence that says what `run` does. Without `run`, nothing needs to be done."""
 
     sentence: str
     run: Callable[[], object] | None = None

@@ -87,7 +87,7 @@ def _ignore_terminal() -> None:
 
 
 def _unblock_queue(pool: ProcessPoolExecutor) -> None:
-    """Let a large task that is being sent fail: Python before 3.11.5 waits for it forever (CPython issue 94777)."""
+    """Let a large task that is being sent fail: Python before 3.11.5 waits forever (CPython issue 94777)."""
     if sys.version_info < (3, 11, 5):
         reader: Connection = vars(vars(pool)["_call_queue"])["_reader"]
         reader.close()

@@ -50,7 +50,7 @@ def default_token_path() -> Path:
 
 
 def load_token(path: Path, *, new: bool = False) -> str:
-    """Return the token in a file; create it if there is none, or always with `new`.
+    """Return the token in a file; create a missing one, and replace it with `new`.
 
     Raises UserError for a file that others may read, that holds no token, or that cannot be written.
     """

@@ -42,7 +42,7 @@ class StoredMessage(NamedTuple):
 
 
 class LatestMessages:
-    """Stores messages and returns what is new to a page."""
+    """Stores messages and returns the new ones for a page."""
 
     def __init__(self, height_cm: float) -> None:
         """Take the fingertip's height, for the conductivity profiles."""

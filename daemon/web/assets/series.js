@@ -58,7 +58,7 @@ export class Series {
     for (const column of this.columns.values()) column.splice(0, drop);
   }
 
-  // Rows for uPlot, computed anew only after something came.
+  // Rows for uPlot, computed again only after new samples.
   data(names) {
     const key = names.join("\n");
     if (this.drawn?.key !== key || this.drawn.version !== this.version) {

@@ -199,7 +199,7 @@ def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree: Tree)
     same = re.findall(r"(\S+): (\d+) of (\d+) equal the recorded ones, bit for bit", comparison)
     assert [topic for topic, *_ in same] == ["eit.estimate", "eit.frame", "load.torque"]
     assert all(made == recorded and int(made) > 100 for _, made, recorded in same)
-    assert "estimator motion_regression, torque from" in tree.shell(calibrate).stdout
+    assert "Estimator motion_regression, torque from" in tree.shell(calibrate).stdout
     figures = dict(
         line.split(maxsplit=1) for line in tree.shell(evaluate).stdout.splitlines() if re.match(r"\w+ +\S+$", line)
     )

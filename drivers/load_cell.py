@@ -9,8 +9,7 @@ import os
 import re
 import time
 from collections import Counter
-from collections.abc import AsyncGenerator, Callable
-from contextlib import aclosing
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, Self
 
@@ -272,14 +271,6 @@ class LoadCell(SerialSensor[LoadSample]):
         """Make a raw value the zero of the samples to come."""
         self._dispatch(InputKind.TARE, time.monotonic_ns(), repr(raw_at_rest).encode())
 
-    async def samples(self) -> AsyncGenerator[LoadSample]:
-        """Yield every sample that arrives; see `values`."""
-        async with aclosing(self.values()) as samples:
-            async for sample in samples:
-                self._samples += 1
-                self._flagged += not sample.trusted
-                yield sample
-
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""
         errors = self._parser.errors
@@ -292,4 +283,7 @@ class LoadCell(SerialSensor[LoadSample]):
         }
 
     def _parse(self, event: RawEvent) -> list[LoadSample]:
-        return self._parser.handle(event)
+        samples = self._parser.handle(event)
+        self._samples += len(samples)
+        self._flagged += sum(not sample.trusted for sample in samples)
+        return samples

@@ -115,7 +115,7 @@ class SerialSensor(ABC, Generic[ValueT]):
         self._has_sent = False
         self._timeouts = 0
 
-    async def values(self) -> AsyncGenerator[ValueT]:
+    async def readings(self) -> AsyncGenerator[ValueT]:
         """Yield the values of every line, in order and without end; reconnects when the board disappears.
 
         Nothing is lost while the receiver is busy: the bytes wait in the kernel, then on the board. Iterate within

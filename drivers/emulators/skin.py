@@ -17,6 +17,7 @@ from shearloop.drivers.emulators.scpi import (
     ScpiError,
     ScpiInterpreter,
     accept_number,
+    accept_word,
     parse_boolean,
     parse_number,
 )
@@ -155,23 +156,23 @@ def _parse_between(text: str, low: float, high: float, what: str) -> float:
     return value
 
 
-class EmulatedKeithley6430:
+class EmulatedKeithley6430(ScpiInterpreter):
     """The current source; replies as its manual (6430-901-01, sections 13 and 17) gives them."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
-        """Switch the instrument on, with the output off."""
         self.circuit = circuit
         self._random = Random(seed)
         self._reset("")
-        self.interpreter = ScpiInterpreter(
+        super().__init__(
             SOURCE_IDENTITY,
             {
                 "*RST": self._reset,
-                "SOURce:FUNCtion[:MODE]": self._set_function,
-                "SOURce:CURRent:MODE": self._set_mode,
+                # Sourcing a voltage is not emulated.
+                "SOURce:FUNCtion[:MODE]": accept_word("CURR", "CURRENT"),
+                "SOURce:CURRent:MODE": accept_word("FIX", "FIXED"),
                 "SOURce:CURRent:RANGe": accept_number(-MAX_A, MAX_A),
                 "SOURce:CURRent[:LEVel][:IMMediate][:AMPLitude]": self._set_level,
-                "SENSe:FUNCtion:CONCurrent": self._set_concurrent,
+                "SENSe:FUNCtion:CONCurrent": accept_word("ON", "1", "OFF", "0"),
                 "SENSe:FUNCtion[:ON]": self._set_measured,
                 "SENSe:VOLTage[:DC]:PROTection[:LEVel]": self._set_compliance,
                 "SENSe:VOLTage[:DC]:RANGe[:UPPer]": accept_number(-MAX_V, MAX_V),
@@ -184,28 +185,12 @@ class EmulatedKeithley6430:
             SOURCE_NO_ERROR,
         )
 
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to received bytes."""
-        return self.interpreter.feed(data)
-
     def _reset(self, _: str) -> None:
         self._measured = {"CURR"}
         self._elements = set(ELEMENTS)
         self.circuit.output_on = False
         self.circuit.level_a = 0.0
         self.circuit.compliance_v = 21.0
-
-    def _set_function(self, text: str) -> None:
-        if text.upper() not in ("CURR", "CURRENT"):
-            # Sourcing a voltage is not emulated.
-            raise ScpiError(ILLEGAL_VALUE)
-
-    def _set_mode(self, text: str) -> None:
-        if text.upper() not in ("FIX", "FIXED"):
-            raise ScpiError(ILLEGAL_VALUE)
-
-    def _set_concurrent(self, text: str) -> None:
-        parse_boolean(text)
 
     def _set_level(self, text: str) -> None:
         self.circuit.level_a = parse_number(text, -MAX_A, MAX_A)
@@ -214,16 +199,10 @@ class EmulatedKeithley6430:
         self.circuit.compliance_v = parse_number(text, 2e-4, MAX_V)
 
     def _set_measured(self, text: str) -> None:
-        names = {part.strip().strip("'\"").upper().removesuffix(":DC")[:4] for part in text.split(",")}
-        if not names <= {"VOLT", "CURR", "RES"}:
-            raise ScpiError(ILLEGAL_VALUE)
-        self._measured = names
+        self._measured = _parse_names(text, {"VOLT", "CURR", "RES"})
 
     def _set_elements(self, text: str) -> None:
-        names = {part.strip().upper()[:4] for part in text.split(",")}
-        if not names <= {*ELEMENTS}:
-            raise ScpiError(ILLEGAL_VALUE)
-        self._elements = names
+        self._elements = _parse_names(text, {*ELEMENTS})
 
     def _switch(self, text: str) -> None:
         self.circuit.output_on = parse_boolean(text)
@@ -241,22 +220,25 @@ class EmulatedKeithley6430:
             "TIME": now_s % 1e5,
             "STAT": float(_STATUS | (_COMPLIANCE if state.compliance else 0)),
         }
-        return ",".join(_scientific(values[name]) for name in ELEMENTS if name in self._elements)
+        return ",".join(f"{values[name]:+.6E}" for name in ELEMENTS if name in self._elements)
 
 
-def _scientific(value: float) -> str:
-    return f"{value:+.6E}"
+def _parse_names(text: str, allowed: set[str]) -> set[str]:
+    """Return the short forms of comma-separated names, quoted or not; ScpiError for an unknown one."""
+    names = {part.strip().strip("'\"").upper().removesuffix(":DC")[:4] for part in text.split(",")}
+    if not names <= allowed:
+        raise ScpiError(ILLEGAL_VALUE)
+    return names
 
 
-class EmulatedScanner:
+class EmulatedScanner(ScpiInterpreter):
     """A scanning multimeter; the first two channels of a scan are the gauges."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
-        """Switch the instrument on, with an empty scan list."""
         self._circuit = circuit
         self._random = Random(seed)
         self._reset("")
-        self._interpreter = ScpiInterpreter(
+        super().__init__(
             SCANNER_IDENTITY,
             {
                 "*RST": self._reset,
@@ -267,10 +249,6 @@ class EmulatedScanner:
             },
             SCANNER_NO_ERROR,
         )
-
-    def feed(self, data: bytes) -> bytes:
-        """Return the replies to received bytes."""
-        return self._interpreter.feed(data)
 
     def _reset(self, _: str) -> None:
         self._range_v = 300.0

@@ -2,7 +2,6 @@
 
 import re
 from collections import Counter
-from collections.abc import AsyncGenerator
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -326,10 +325,6 @@ class AdcBoard(SerialSensor[Voltages]):
         self.period_s = 1.0 / rate_hz
         self._parser = PairParser(rate_hz, full_scale_v)
         self._count = 0
-
-    def readings(self) -> AsyncGenerator[Voltages]:
-        """Yield the voltages of every line; see `values`."""
-        return self.values()
 
     def diagnostics(self) -> Diagnostics:
         """Return the board's values for `health`; counts are since the process began."""

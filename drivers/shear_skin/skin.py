@@ -81,11 +81,6 @@ class SkinSample:
         """Whether there are no faults."""
         return not self.faults
 
-    @property
-    def reason(self) -> str:
-        """The faults, in sentences."""
-        return "; ".join(self.faults)
-
 
 class SampleValidator:
     """Turns readings of voltages and current into samples, one by one. No I/O; times are passed in."""

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shearloop.bank.eit.channels import LINE_SLOTS, ZERO_SLOTS, channels_of_line, line_of_channels
+from shearloop.drivers import eit_kit
 from shearloop.drivers.eit_kit import (
     ADC_STEP_V,
     FULL_SCALE_SINE_RMS_V,
@@ -21,6 +22,7 @@ from shearloop.drivers.eit_kit import (
     read_line,
 )
 from shearloop.drivers.emulators.boards import format_line
+from shearloop.drivers.serial_sensor import InputKind, RawEvent
 
 PERIOD_NS = NOMINAL_PERIOD_NS
 
@@ -133,12 +135,6 @@ def test_any_slicing_gives_the_same_frames(cuts: list[int]) -> None:
     assert parser.partial_lines == 0
 
 
-def test_one_byte_at_a_time_gives_the_same_frames() -> None:
-    stream = b"".join(LINES[:2])
-    frames = feed_all(FrameParser(ZERO_SLOTS), [stream[n : n + 1] for n in range(len(stream))])
-    assert [frame.line + b"\n" for frame in frames] == LINES[:2]
-
-
 def test_carriage_returns_are_taken_as_part_of_the_line_end() -> None:
     frames = FrameParser(ZERO_SLOTS).feed(GOOD.replace(b"\n", b"\r\n") * 2, 0)
     assert [frame.line + b"\n" for frame in frames] == [GOOD, GOOD]
@@ -225,7 +221,7 @@ def test_a_whole_line_that_is_broken_is_refused_even_as_the_first() -> None:
 def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> None:
     parser = FrameParser(ZERO_SLOTS)
     parser.feed(GOOD + LINES[1][:3000], 0)
-    parser.port_opened()
+    parser.handle(RawEvent(InputKind.OPENED, 0))
     frames = parser.feed(LINES[2], 0)
     assert [(frame.line + b"\n", frame.seq) for frame in frames] == [(LINES[2], 1)]
     assert parser.unfinished == 1
@@ -236,7 +232,7 @@ def test_another_port_drops_the_line_that_was_cut_off_and_counts_it_apart() -> N
 def test_a_board_that_is_started_again_may_go_on_or_begin_anew(begun: int, anew: bool) -> None:
     parser = FrameParser(ZERO_SLOTS)
     parser.feed(GOOD + LINES[1][:begun], 0)
-    parser.board_started()
+    parser.handle(RawEvent(InputKind.STARTED, 0))
     frames = parser.feed((LINES[2] if anew else LINES[1][begun:]) + LINES[3], 0)
     assert [frame.line + b"\n" for frame in frames] == [LINES[2] if anew else LINES[1], LINES[3]]
     assert parser.unfinished == (anew and begun > 0)
@@ -265,8 +261,8 @@ def test_the_middles_of_frames_are_in_order_and_before_their_arrival(bursts: lis
     assert all(a < b for a, b in pairwise(middles))
 
 
-def flagged(lines: list[NDArray[np.float64]], **settings: int) -> list[Frame]:
-    parser = FrameParser(ZERO_SLOTS, **settings)
+def flagged(lines: list[NDArray[np.float64]]) -> list[Frame]:
+    parser = FrameParser(ZERO_SLOTS)
     return [frame for n, line in enumerate(lines) for frame in parser.feed(format_line(line), n * PERIOD_NS)]
 
 
@@ -283,19 +279,21 @@ def test_a_channel_above_the_largest_sine_the_adc_follows_is_saturated() -> None
     assert frame.unusable == 1
 
 
-def test_a_channel_that_has_not_changed_for_n_frames_is_dead_until_it_changes() -> None:
+def test_a_channel_that_has_not_changed_for_n_frames_is_dead_until_it_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(eit_kit, "DEAD_AFTER_FRAMES", 4)
     lines = noisy(8)
     for line in lines[:6]:
         line[LINE_SLOTS[10]] = 0.5
-    frames = flagged(lines, dead_after=4)
+    frames = flagged(lines)
     dead = [frame.dead[10] for frame in frames]
     assert [frame.unusable for frame in frames] == dead
     assert dead == [False, False, False, True, True, True, False, False]
 
 
-def test_a_repeated_line_is_flagged_and_makes_no_channel_dead() -> None:
+def test_a_repeated_line_is_flagged_and_makes_no_channel_dead(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(eit_kit, "DEAD_AFTER_FRAMES", 3)
     first, second = noisy(2)
-    frames = flagged([first, first, first, first, second], dead_after=3)
+    frames = flagged([first, first, first, first, second])
     assert [frame.repeated for frame in frames] == [False, True, True, True, False]
     assert not any(frame.dead.any() for frame in frames)
 

@@ -52,12 +52,12 @@ def transfer_ns(n_bytes: int, baud: int) -> int:
 class LineSplitter:
     """Splits a byte stream into lines, however it is sliced. A line that is too long is counted once and dropped whole.
 
-    `too_long` and `unfinished` count since the beginning: lines beyond `max_bytes`, and lines cut off by a reopening.
+    `too_long` and `unfinished` count since the beginning: lines of more than `max_bytes`, without the newline, and
+    lines cut off by a reopening.
     `too_long_start` is the beginning of the last line that was too long.
     """
 
     def __init__(self, max_bytes: int) -> None:
-        """Wait for the first line; `max_bytes` excludes the newline."""
         self._max_bytes = max_bytes
         self._dropping = False
         self.partial = b""

@@ -8,19 +8,9 @@ from pathlib import Path
 from random import Random
 from typing import TypeAlias
 
+from shearloop.drivers.emulators import scpi
 from shearloop.drivers.emulators.boards import EmulatedAdcBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
-from shearloop.drivers.emulators.scpi import (
-    ILLEGAL_VALUE,
-    SETTINGS_CONFLICT,
-    FaultyServer,
-    ScpiError,
-    ScpiInterpreter,
-    accept_number,
-    accept_word,
-    parse_boolean,
-    parse_number,
-)
 
 # The conductance of an open circuit's insulation.
 OPEN_OHM = 1e9
@@ -156,7 +146,7 @@ def _parse_between(text: str, low: float, high: float, what: str) -> float:
     return value
 
 
-class EmulatedKeithley6430(ScpiInterpreter):
+class EmulatedKeithley6430(scpi.ScpiInterpreter):
     """The current source; replies as its manual (6430-901-01, sections 13 and 17) gives them."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
@@ -168,15 +158,15 @@ class EmulatedKeithley6430(ScpiInterpreter):
             {
                 "*RST": self._reset,
                 # Sourcing a voltage is not emulated.
-                "SOURce:FUNCtion[:MODE]": accept_word("CURR", "CURRENT"),
-                "SOURce:CURRent:MODE": accept_word("FIX", "FIXED"),
-                "SOURce:CURRent:RANGe": accept_number(-MAX_A, MAX_A),
+                "SOURce:FUNCtion[:MODE]": scpi.accept_word("CURR", "CURRENT"),
+                "SOURce:CURRent:MODE": scpi.accept_word("FIX", "FIXED"),
+                "SOURce:CURRent:RANGe": scpi.accept_number(-MAX_A, MAX_A),
                 "SOURce:CURRent[:LEVel][:IMMediate][:AMPLitude]": self._set_level,
-                "SENSe:FUNCtion:CONCurrent": accept_word("ON", "1", "OFF", "0"),
+                "SENSe:FUNCtion:CONCurrent": scpi.accept_word("ON", "1", "OFF", "0"),
                 "SENSe:FUNCtion[:ON]": self._set_measured,
                 "SENSe:VOLTage[:DC]:PROTection[:LEVel]": self._set_compliance,
-                "SENSe:VOLTage[:DC]:RANGe[:UPPer]": accept_number(-MAX_V, MAX_V),
-                "SENSe:VOLTage[:DC]:NPLCycles": accept_number(0.01, 10.0),
+                "SENSe:VOLTage[:DC]:RANGe[:UPPer]": scpi.accept_number(-MAX_V, MAX_V),
+                "SENSe:VOLTage[:DC]:NPLCycles": scpi.accept_number(0.01, 10.0),
                 "FORMat:ELEMents[:SENSe]": self._set_elements,
                 "OUTPut[:STATe]": self._switch,
                 "OUTPut[:STATe]?": lambda _: str(int(circuit.output_on)),
@@ -193,10 +183,10 @@ class EmulatedKeithley6430(ScpiInterpreter):
         self.circuit.compliance_v = 21.0
 
     def _set_level(self, text: str) -> None:
-        self.circuit.level_a = parse_number(text, -MAX_A, MAX_A)
+        self.circuit.level_a = scpi.parse_number(text, -MAX_A, MAX_A)
 
     def _set_compliance(self, text: str) -> None:
-        self.circuit.compliance_v = parse_number(text, 2e-4, MAX_V)
+        self.circuit.compliance_v = scpi.parse_number(text, 2e-4, MAX_V)
 
     def _set_measured(self, text: str) -> None:
         self._measured = _parse_names(text, {"VOLT", "CURR", "RES"})
@@ -205,11 +195,11 @@ class EmulatedKeithley6430(ScpiInterpreter):
         self._elements = _parse_names(text, {*ELEMENTS})
 
     def _switch(self, text: str) -> None:
-        self.circuit.output_on = parse_boolean(text)
+        self.circuit.output_on = scpi.parse_boolean(text)
 
     def _read(self, _: str) -> str:
         if not self.circuit.output_on:
-            raise ScpiError(OUTPUT_IS_OFF)
+            raise scpi.ScpiError(OUTPUT_IS_OFF)
         now_s = time.monotonic()
         state = self.circuit.state(now_s)
         volts = state.source_v + self._random.gauss(0.0, SOURCE_NOISE_V)
@@ -227,11 +217,11 @@ def _parse_names(text: str, allowed: set[str]) -> set[str]:
     """Return the short forms of comma-separated names, quoted or not; ScpiError for an unknown one."""
     names = {part.strip().strip("'\"").upper().removesuffix(":DC")[:4] for part in text.split(",")}
     if not names <= allowed:
-        raise ScpiError(ILLEGAL_VALUE)
+        raise scpi.ScpiError(scpi.ILLEGAL_VALUE)
     return names
 
 
-class EmulatedScanner(ScpiInterpreter):
+class EmulatedScanner(scpi.ScpiInterpreter):
     """A scanning multimeter; the first two channels of a scan are the gauges."""
 
     def __init__(self, circuit: Circuit, seed: int = 0) -> None:
@@ -243,7 +233,7 @@ class EmulatedScanner(ScpiInterpreter):
             {
                 "*RST": self._reset,
                 "CONFigure:VOLTage:DC": self._configure,
-                "[SENSe:]VOLTage:DC:NPLCycles": accept_number(0.02, 200.0),
+                "[SENSe:]VOLTage:DC:NPLCycles": scpi.accept_number(0.02, 200.0),
                 "ROUTe:SCAN": self._set_scan,
                 "READ?": self._read,
             },
@@ -255,16 +245,16 @@ class EmulatedScanner(ScpiInterpreter):
         self._channels = 0
 
     def _configure(self, text: str) -> None:
-        self._range_v = parse_number(text.split(",", 1)[0], 0.0, 300.0)
+        self._range_v = scpi.parse_number(text.split(",", 1)[0], 0.0, 300.0)
 
     def _set_scan(self, text: str) -> None:
         if not (text.startswith("(@") and text.endswith(")")):
-            raise ScpiError(ILLEGAL_VALUE)
+            raise scpi.ScpiError(scpi.ILLEGAL_VALUE)
         self._channels = text.count(",") + 1
 
     def _read(self, _: str) -> str:
         if not self._channels:
-            raise ScpiError(SETTINGS_CONFLICT)
+            raise scpi.ScpiError(scpi.SETTINGS_CONFLICT)
         return ",".join(self._digits(volts) for volts in self._circuit.voltages()[: self._channels])
 
     def _digits(self, volts: float) -> str:
@@ -276,21 +266,21 @@ class EmulatedScanner(ScpiInterpreter):
 
 def play_source(
     circuit: Circuit, address: Address | None, on_port: Callable[[str], None], *, speed: float = 1.0, seed: int = 0
-) -> FaultyServer:
+) -> scpi.FaultyServer:
     """Return the current source at an address; None for a new pseudo-terminal."""
     feed = EmulatedKeithley6430(circuit, seed).feed
     if isinstance(address, tuple):
-        return FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
-    return FaultyServer(PtyServer(feed, address, on_port, answer_s=ANSWER_S / speed))
+        return scpi.FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
+    return scpi.FaultyServer(PtyServer(feed, address, on_port, answer_s=ANSWER_S / speed))
 
 
 def play_daq(
     circuit: Circuit, address: Address | None, on_port: Callable[[str], None], *, speed: float = 1.0, seed: int = 0
-) -> FaultyServer | EmulatedAdcBoard:
+) -> scpi.FaultyServer | EmulatedAdcBoard:
     """Return a scanner on a socket, or a converter board on a pseudo-terminal."""
     if isinstance(address, tuple):
         feed = EmulatedScanner(circuit, seed).feed
-        return FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
+        return scpi.FaultyServer(SocketServer(lambda: feed, *address, on_port=on_port, answer_s=ANSWER_S / speed))
     period_s = DAQ_PERIOD_S / speed
     return EmulatedAdcBoard(
         circuit.voltages, period_s=period_s, noise_v=NOISE_V, link=address, on_port=on_port, seed=seed

@@ -214,7 +214,6 @@ class ShearSkin:
     """Source and DAQ of one skin. Run `watch_source` next to `samples`: without it every sample has a fault."""
 
     def __init__(self, source: Keithley6430, daq: Daq, gauge_ohm: float = GAUGE_OHM) -> None:
-        """Use both instruments, not yet open."""
         self._source = source
         self._daq = daq
         self._validator = SampleValidator(source.current_a, source.period_s, daq.period_s, gauge_ohm)

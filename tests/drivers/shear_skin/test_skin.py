@@ -71,11 +71,15 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         changed.set()
 
     played = EmulatedKeithley6430(circuit)
+
+    def answer(data: bytes) -> bytes:
+        return played.feed(data)  # replaced by some tests
+
     way_in: PtyServer | SocketServer
     if serial_source:
-        way_in = PtyServer(lambda data: played.feed(data), folder / "source", lambda _: ready.release(), answer_s=0.0)
+        way_in = PtyServer(answer, folder / "source", lambda _: ready.release(), answer_s=0.0)
     else:
-        way_in = SocketServer(lambda: lambda data: played.feed(data), on_port=lambda _: ready.release(), answer_s=0.0)
+        way_in = SocketServer(lambda: answer, on_port=lambda _: ready.release(), answer_s=0.0)
     outages = FaultyServer(way_in)
     players = [outages.run]
     scanner = SocketServer(lambda: EmulatedScanner(circuit).feed, on_port=lambda _: ready.release(), answer_s=0.0)

@@ -127,9 +127,7 @@ class RecordedRun:
                 files[name] = str(copy)
 
             def with_copies(section: dict[str, Any]) -> dict[str, Any]:
-                return {
-                    key: files.get(value, value) if isinstance(value, str) else value for key, value in section.items()
-                }
+                return {key: files.get(str(value), value) for key, value in section.items()}
 
             with reading(self.path):
                 content = json.loads(self._attached[CONFIGURATION], object_hook=with_copies)

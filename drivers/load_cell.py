@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 from shearloop.drivers import serial_sensor
+from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.connection import Diagnostics, LinkEvent, ReconnectPolicy, SerialLink
-from shearloop.drivers.yaml_files import CalibrationModel, Finite, Positive
 
 BAUD_RATE = 115200
 # Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second.

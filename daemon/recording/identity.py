@@ -125,9 +125,8 @@ def map_paths(section: Model, change: Callable[[str, Path], Path]) -> Model:
         elif isinstance(value, ConfigModel):
             changed[key] = map_paths(value, change)
         elif isinstance(value, dict):
-            changed[key] = {
-                name: map_paths(item, change) if isinstance(item, ConfigModel) else item for name, item in value.items()
-            }
+            # The fingertips by name.
+            changed[key] = {name: map_paths(item, change) for name, item in value.items()}
     return section.model_copy(update=changed)
 
 

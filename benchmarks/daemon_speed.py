@@ -70,7 +70,7 @@ class PlayedBoard:
         return sent_ns
 
     def send_in_packets(self, line: bytes) -> int:
-        """Write a line in high-speed USB packets, over the time that a Teensy 4 takes for it."""
+        """Write a line in high-speed USB packets, over a Teensy 4's transfer time."""
         begun = time.monotonic_ns()
         for start in range(0, len(line), USB_PACKET_BYTES):
             # Busy: a sleep would be a tenth of a millisecond too long.

@@ -1,4 +1,4 @@
-"""Bank cells and matches beside the peers, and whether the fast matchers find the reference's cells.
+"""Time per bank cell and per match against the peers, and agreement of the pruned matchers with the reference.
 
     python -m benchmarks.matching_speed --bank run/paper.bank --mesh MESH --recordings FOLDER --out FILE
 
@@ -45,8 +45,8 @@ MATCHERS: dict[str, tuple[type[Matcher], type[PrunedMatcher | PrunedZeroLagMatch
 # Peers and own methods by the row they are compared with.
 RATIOS = {
     "batch, two threads": ("pyEIT", "direct", "batch, one thread"),
-    "all lags, fast": ("all lags, numpy float32 FFT",),
-    "zero lag, fast": ("zero lag, numpy float32", "zero lag, FAISS flat"),
+    "all lags, pruned": ("all lags, numpy float32 FFT",),
+    "zero lag, pruned": ("zero lag, numpy float32", "zero lag, FAISS flat"),
 }
 
 
@@ -105,11 +105,11 @@ def match_methods(bank: Bank, frames: FloatArray) -> dict[str, tuple[Run, int]]:
         ]
 
     methods: dict[str, tuple[Run, int]] = {
-        "zero lag, fast": (lambda: [zero.match(frame, runner_up=False) for frame in frames], n),
-        "zero lag, fast, with runner-up": (lambda: [zero.match(frame) for frame in frames], n),
+        "zero lag, pruned": (lambda: [zero.match(frame, runner_up=False) for frame in frames], n),
+        "zero lag, pruned, with runner-up": (lambda: [zero.match(frame) for frame in frames], n),
         "zero lag, numpy float32": (lambda: [int(np.argmax(signals @ frame)) for frame in single], n),
-        "all lags, fast": (lambda: [every.match(frame, runner_up=False) for frame in frames], n),
-        "all lags, fast, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
+        "all lags, pruned": (lambda: [every.match(frame, runner_up=False) for frame in frames], n),
+        "all lags, pruned, with runner-up": (lambda: [every.match(frame) for frame in frames], n),
         "all lags, numpy float32 FFT": (by_fft, 4),
     }
     try:

@@ -75,7 +75,7 @@ class LoopCase:
             acceleration_limit_rad_per_s2=1e9, travel_limit_rad=1e6, age_limit_s=10.0, stale_periods=np.inf,
         )  # fmt: skip
         controller = TwistController(settings)
-        # So many known measurements that the gain is kp from the start.
+        # Enough known measurements for a gain of kp from the start.
         controller.start(0, 0.0, 0.0, 1e9)
         controller.set_point(0.0)
         return controller
@@ -89,12 +89,12 @@ CASES = (
 
 
 def simulated_boundary(case: LoopCase, age_s: float, lost: int) -> float:
-    """Return the gain at which a disturbance stops dying out, to half a per cent; inf above HIGHEST."""
+    """Return the gain where a disturbance stops dying out, to half a per cent; inf above HIGHEST."""
     return _bisect(lambda kp: _grows(case, age_s, lost, kp), 1.005)
 
 
 def computed_boundary(case: LoopCase, age_s: float, lost: int) -> float:
-    """Return the gain at which the loop's equations become unstable; inf above HIGHEST."""
+    """Return the gain where the loop's equations become unstable; inf above HIGHEST."""
     if not lost:
         return gain_limit(case.model(age_s), HIGHEST)
     return _bisect(lambda kp: spectral_radius(case, age_s, lost, kp) >= 1.0, 1.0005)

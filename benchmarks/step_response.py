@@ -200,7 +200,7 @@ def judge_steps(rows: Sequence[FloatArray], settled_s: float) -> dict[str, float
 
 @cache
 def calibrated_creep() -> Creep:
-    """Return the creep that ten held twists of one gel reveal beside the load cell: a fingertip's calibration."""
+    """Return the creep that ten held twists of one gel reveal, with the load cell: a fingertip's calibration."""
     rng = np.random.default_rng(26)
     plants = [TwinPlant(SimulatedTool(), each, rng) for each in (EIT, LOAD_CELL)]
     plants[1].sees_gel = False

@@ -239,7 +239,7 @@ class Daemon:
 
     @property
     def finished(self) -> bool:
-        """Whether the experiment that ends the daemon is done, or there is none."""
+        """Whether the experiment that ends the daemon is done; True without one."""
         return self._experiment is None or self._experiment.done or not self._config.stop_when_done
 
     async def stopped(self) -> None:

@@ -5,7 +5,6 @@ Trehan et al. 2025, section 2: the heatmap holds, for every k and σ, the larges
 module is the reference in float64; `pruned_matching` is faster and is tested against it.
 """
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -167,19 +166,6 @@ def unit_magnitudes(differences: ArrayLike) -> FloatArray:
         raise MatchingError("the difference is zero in all channels: there is nothing to match")
     magnitudes /= largest
     return np.asarray(magnitudes / np.linalg.norm(magnitudes, axis=1, keepdims=True))
-
-
-def unit_magnitude(difference: ArrayLike) -> FloatArray:
-    """Return the magnitudes of one (896,) difference, of norm 1; errors as `unit_magnitudes`."""
-    magnitudes = np.abs(np.asarray(difference, dtype=np.float64))
-    if magnitudes.shape == (N_CHANNELS,):
-        largest = float(magnitudes.max())
-        if 0 < largest < np.inf:
-            magnitudes /= largest
-            magnitudes /= math.sqrt(float(magnitudes @ magnitudes))
-            return magnitudes
-    (found,) = unit_magnitudes(np.asarray(difference)[None])
-    return np.asarray(found)
 
 
 def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal | None:

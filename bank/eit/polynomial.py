@@ -38,19 +38,6 @@ class Polynomial:
     x_high: float
     spread: tuple[tuple[float, ...], ...]
 
-    def __post_init__(self) -> None:
-        """Refuse numbers that no fit gives."""
-        size = len(self.coefficients)
-        numbers = [*self.coefficients, self.centre, self.residual_std, self.x_low, self.x_high, *sum(self.spread, ())]
-        if not np.isfinite(numbers).all():
-            raise CalibrationError("a polynomial has numbers that are not finite")
-        if size < 1 or len(self.spread) != size or {len(row) for row in self.spread} != {size} or self.n <= size:
-            raise CalibrationError(
-                f"{size} coefficients do not go with {len(self.spread)} rows of spread, n = {self.n}"
-            )
-        if self.x_low > self.x_high or self.residual_std < 0 or min(np.diag(self.spread)) < 0:
-            raise CalibrationError("a polynomial's range is empty, or its deviation negative")
-
     @classmethod
     def fit(cls, x: FloatArray, y: FloatArray, degree: int) -> Self:
         """Fit a polynomial to (n,) points; raises CalibrationError when they do not determine it and its residual."""
@@ -87,8 +74,8 @@ class Polynomial:
         """Return y at x with the 95 % prediction interval of a single new measurement.
 
         y ± t s √(1 + pᵀ S p), with p the powers of x − centre, S the spread, s the residual_std, and t Student's
-        quantile at 97.5 % with n − len(coefficients) degrees of freedom. Assumes
-        independent Gaussian residuals of one size.
+        quantile at 97.5 % with n − len(coefficients) degrees of freedom. It assumes independent Gaussian residuals of
+        one size.
         """
         powers = (x - self.centre) ** np.arange(len(self.coefficients))
         t = float(stdtrit(self.n - len(powers), (1 + CONFIDENCE) / 2))

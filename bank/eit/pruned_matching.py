@@ -34,7 +34,7 @@ from shearloop.bank.eit.matching import (
     Matcher,
     ReferenceMatcher,
     ZeroLagMatcher,
-    unit_magnitude,
+    unit_magnitudes,
 )
 from shearloop.bank.errors import MatchingError
 
@@ -240,7 +240,7 @@ class _PruningMatcher(Matcher):
         Without `runner_up`, that is None. Raises MatchingError as `heatmap` does.
         """
         if len(self._cells) >= self._min_cells:
-            frame = unit_magnitude(difference)
+            (frame,) = unit_magnitudes(np.asarray(difference)[None])
             with suppress(_UndecidedError):
                 return self._search(frame, runner_up)
         match = super().match(difference)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 # A match is ambiguous if a cell scores within the first number of the best and lies further away in k (an eighth of
 # the fingertip) or in sigma (this ratio).
 _ALIKE, _FAR_K_CM, _FAR_SIGMA = 0.002, 0.55, 1.5
-# Drop of the score at which a cell's weight falls by e. Chosen on synthetic and recorded slices: from 0.0003 to 0.001
+# A cell's weight falls by e with this drop of its score. Chosen on synthetic and recorded slices: from 0.0003 to 0.001
 # the error stays the same and the largest jump falls to a fifth.
 _SCORE_SCALE, _LEAST_WEIGHT = 0.0005, 1e-9
 # A weighted mean finds a sampled Gaussian peak if its standard deviation is at least 0.6 cells, so weights reach this
@@ -116,7 +116,7 @@ def find_numbering(idle: FloatArray, homogeneous: FloatArray) -> ElectrodeNumber
 
 
 def resolve_half_turn(found: ElectrodeNumbering, touch: FloatArray, bank: Bank) -> ElectrodeNumbering:
-    """Return the numbering or its half turn, by which matches a touch better; idle frames cannot decide.
+    """Return the numbering or its half turn, choosing the better match of a touch; idle frames cannot decide.
 
     touch (896,) is the change of the idle frame by a grip, in volts.
     """

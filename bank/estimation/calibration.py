@@ -1,4 +1,4 @@
-"""Calibration of one estimator: what it knows of its fingertips, its features of a frame, and its file.
+"""Calibration of one estimator: its fingertips, its features of a frame, and its file.
 
 The file is a zip of a YAML header and NumPy arrays with checksums. It keeps any tree of frozen dataclasses of numbers,
 texts, tuples and arrays. Equal calibrations are equal bytes: fixed dates, fixed order, no compression.
@@ -20,7 +20,6 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.channels import CHANNEL_TABLE_HASH, N_CHANNELS
 from shearloop.bank.eit.polynomial import Polynomial
-from shearloop.bank.eit.stored import check_made_with, check_version
 from shearloop.bank.errors import CalibrationError
 from shearloop.bank.estimation.bank_match import (
     NOT_TURNED,
@@ -52,7 +51,7 @@ Quantity = Literal["torque", "diameter"]
 # What the user guarantees, with the end of a sentence that says so.
 Assumption = Literal["full range", "load timing"]
 _ASSUMPTION_TEXTS: dict[Assumption, str] = {
-    "full range": "no torque is beyond those of its slices (--assume-full-range)",
+    "full range": "no torque exceeds its slices (--assume-full-range)",
     "load timing": "the load cell's delay is as given (--load-cell-delay-s)",
 }
 # Columns of the paper's features (k, sigma, sigma²).
@@ -60,7 +59,7 @@ PAPER_COLUMNS: dict[Quantity, slice] = {"torque": slice(1, 3), "diameter": slice
 TORQUE_DEGREE, DIAMETER_DEGREE = 2, 1
 # Two cells of the paper's bank.
 _LEAST_MARGIN_K_CM = 0.05
-# A tool whose diameter differs by a larger share is another tool.
+# Tools differ if their diameters differ by a larger share.
 LARGEST_TOOL_SHARE = 0.15
 
 
@@ -68,7 +67,7 @@ LARGEST_TOOL_SHARE = 0.15
 class OutputModel:
     """How one quantity is predicted: its regressor, and for differences the detector of novel ones.
 
-    k_range holds the least and largest k in cm at which the bank matched, or nothing without a bank.
+    k_range holds the least and largest matched k in cm, or nothing without a bank.
     """
 
     regressor: IntervalRegressor | PolynomialRegressor
@@ -190,8 +189,16 @@ class Calibration:
         header, arrays = _read_members(path)
         if header.get("kind") != _FILE_KIND:
             raise CalibrationError(f"{path} is not an estimator's calibration: make one with `shearloop calibrate`")
-        check_version(path, header, FORMAT_VERSION)
-        check_made_with(path, header, {"channel_table": CHANNEL_TABLE_HASH})
+        version, table = header.get("format_version"), str(header.get("channel_table"))
+        if version != FORMAT_VERSION:
+            raise CalibrationError(
+                f"{path}: the calibration has format version {version}, expected {FORMAT_VERSION}; calibrate again"
+            )
+        if table != CHANNEL_TABLE_HASH:
+            raise CalibrationError(
+                f"{path}: the calibration was made with the channel table {table[:12]}…, expected "
+                f"{CHANNEL_TABLE_HASH[:12]}…; calibrate again"
+            )
         try:
             restored: Self = _from_plain(cls, header["content"], "", arrays)
         except (KeyError, TypeError, ValueError, IndexError, StopIteration, CalibrationError) as error:

@@ -2,7 +2,7 @@
 
 A fingertip is recognised by its pattern of voltages. From day to day the pattern changes by a common gain and a few
 per cent: the median deviation is 0.03 to 0.07 for the same fingertip and 0.15 to 0.19 for another one. A linear
-discriminant detects the grip. It ignores the directions in which twisting and the gel's slow recovery move a frame.
+discriminant detects the grip. It ignores the motion of a frame by twisting and by the gel's slow recovery.
 """
 
 import math
@@ -45,7 +45,7 @@ _LEAST_IDLE, _LEAST_GRIPPED = 5, 20
 # The first frame of a session counts as idle unless it is clearly nearer to the gripped frame. Below the second
 # deviation it is from the calibration's own session, and its score decides.
 _CLEARLY_NEARER, _SAME_SESSION, _GRIPPED_SCORE = 0.8, 0.01, 0.5
-# A grip ends when its score falls below this share of its mean over so many frames.
+# A grip ends when its score falls below this share of its mean over this many frames.
 _LOOSE_SHARE, _LEVEL_FRAMES = 0.5, 60
 
 
@@ -150,7 +150,7 @@ class ReferenceFrames:
         self.counts = np.isfinite(self.frames).sum(axis=-1).ravel()
 
     def gains(self, frame: FloatArray) -> FloatArray:
-        """Return the common gains (…, 1) of a frame over each known one, NaN where there is none."""
+        """Return the common gains (…, 1) of a frame over each known one, NaN without one."""
         gains = [gain if gain > 0 else math.nan for gain in _medians(frame / self.frames, self.counts)]
         return np.array(gains).reshape(*self.frames.shape[:-1], 1)
 
@@ -300,7 +300,7 @@ def _medians(rows: FloatArray, counts: IntArray) -> list[float]:
 def _discriminant(parts: list[FloatArray]) -> FloatArray:
     """Return weights of idle, gripped and perhaps released frames: 0 for the mean idle frame, 1 for the gripped one.
 
-    Directions in which the parts vary, and the direction from idle to released, have no weight.
+    Directions of variation within the parts, and the one from idle to released, have no weight.
     """
     means = [part.mean(axis=0) for part in parts]
     spread = np.linalg.svd(np.vstack([part - mean for part, mean in zip(parts, means, strict=True)]), False)[2]

@@ -41,7 +41,7 @@ def fit(
 
     Slices with torque give a torque, those with diameters a diameter. `timed_by` are recordings of other fingertips,
     which show the torques' delay if these do not. `find_delay` may be a cached `find_load_delay`. With `full_range` the
-    user guarantees that no torque lies beyond those of the slices: intervals do not extend to such ones.
+    user guarantees that no torque exceeds the slices: intervals do not extend further.
 
     Raises CalibrationError for recordings that do not determine the calibration, for torques clearly stamped at other
     times than the frames unless `trust_times` is set, and for missing physics.

@@ -52,7 +52,7 @@ _LEAST_DIAMETERS, _LEAST_LEFT = 3, 2
 # Directions of motion within recordings that the diameter's line shrinks, and the most frames that they are fitted to.
 _N_NUISANCE, _MOST_FRAMES = 16, 500
 # The tools differ along a direction where the positions vary by this factor more than their noise. At least this share
-# of the variation along the clearest direction counts as the tools', whatever the noise.
+# of the variation along the clearest direction counts as the tools', at any noise.
 _CLEAR, _LEAST_SHARE = 2.0, 0.2
 # Centred positions have one direction less than their number; the last one is rounding.
 _ROUNDING = 1e-9
@@ -60,7 +60,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Physics:
-    """What is known before calibration: the bank, and the mesh of the reconstruction."""
+    """Knowledge before calibration: the bank, and the mesh of the reconstruction."""
 
     bank: Bank | None = None
     mesh: "Mesh | None" = None
@@ -89,7 +89,7 @@ def tools_of(recordings: Sequence[FrameSeries]) -> list[Measured]:
 def fit_raw(
     blank: Calibration, recordings: list[FrameSeries], physics: Physics, timing_uncertainty_s: float
 ) -> Calibration:
-    """Return a blank calibration fitted to raw frames, whose torques may be off by the uncertainty in time.
+    """Return a blank calibration fitted to raw frames; their torques may be off by the uncertainty in time.
 
     Raises CalibrationError for recordings that do not determine it.
     """
@@ -232,7 +232,7 @@ def fit_cylinders(grips: Sequence[CylinderGrip]) -> IntervalRegressor:
         rest = [other for other in grips if other.diameter_mm != one.diameter_mm]
         if len({other.diameter_mm for other in rest}) >= _LEAST_LEFT:
             squares.append(float(((fit_line(rest).predict(one.means) - one.diameter_mm) ** 2).mean()))
-    # Each recording is one instance, whatever its frames: too few for a quantile.
+    # Each recording counts once, which is too few for a quantile.
     half_width = max(TWO_SIDED_95 * math.sqrt(np.mean(squares)), LEAST_HALF_WIDTH * float(np.ptp(diameters)))
     low, high = float(diameters.min()), float(diameters.max())
     half_span = 0.5 * (high - low)
@@ -248,7 +248,7 @@ def fit_line(grips: Sequence[CylinderGrip]) -> Ridge:
 
     The noise of the idle frame is constant within a recording, like the diameter, so a regression on single frames
     confuses the two. Here a recording counts as one position of known noise. Motion within recordings is shrunk, and
-    the line uses only directions in which positions differ by more than their noise, by the amount that they would
+    the line uses only directions where positions differ by more than their noise, by the amount that they would
     differ without it (errors in variables, Fuller 1987). Averaging reciprocal channels and smoothing along neighbours,
     as the paper did with its cylinders, lowers the noise.
     """

@@ -9,7 +9,7 @@ from shearloop.bank.estimation.values import FrameSeries
 
 # A large step exceeds the steps of twisting under load by this factor.
 _LARGE_STEP = 1.4
-# Frames below this share of the way from idle to loaded, in a median of so many, are idle. Gripped and not twisted they
+# Frames below this share of the way from idle to loaded, in this running median, are idle. Gripped and not twisted they
 # are at 0.57 and more, in recovery from a touch or a release at 0.41 and less.
 _IDLE_SHARE, _MEDIAN_FRAMES = 0.45, 5
 # Fewer loaded frames have no second differences to show the noise.

@@ -111,7 +111,7 @@ class Intervals:
 
 
 def student_inflation(n: int) -> float:
-    """Return how much wider a 95 % interval is whose width comes from n values alone (Student 1908)."""
+    """Return the factor on a 95 % interval's width if n values determine it (Student 1908)."""
     return float(stdtrit(n - 1, (1 + LEVEL) / 2)) / TWO_SIDED_95
 
 

@@ -75,7 +75,7 @@ DelayFinder: TypeAlias = Callable[[FrameSeries], LoadDelay | None]
 
 
 def check_load_delay(recordings: Sequence[FrameSeries], find: DelayFinder = find_load_delay) -> None:
-    """Raise CalibrationError for a recording whose torques are clearly stamped at other times than its frames."""
+    """Raise CalibrationError for a recording with torques clearly stamped at other times than its frames."""
     for one in recordings:
         found = find(one)
         if found is not None and (unusual := _unusual(one, found)):
@@ -257,5 +257,5 @@ def _cross_validated_residual(moves: FloatArray, changes: FloatArray) -> FloatAr
 
 
 def _explained(total: FloatArray, rest: FloatArray) -> FloatArray:
-    """Return the explained shares of (s,) sums of squares; 0 for a shift at which no load changes."""
+    """Return the explained shares of (s,) sums of squares; 0 for a shift without a change of load."""
     return np.where(total > 0, 1.0 - rest / np.where(total > 0, total, 1.0), 0.0)

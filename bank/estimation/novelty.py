@@ -1,6 +1,6 @@
 """Novelty detection for calibrations of slices: which differences the calibration covers.
 
-Differences vary about their mean along a few directions. The mean squared residual beside these directions is the Q
+Differences vary about their mean along a few directions. The mean squared residual off these directions is the Q
 residual, the squared distance along them is Hotelling's T² (principal component analysis for process monitoring). Both
 are in units of each channel's own spread: on recorded slices some channels vary ten times as much as others. The
 limits come from stretches of time that were left out in turn (docs/charts.md).
@@ -78,7 +78,7 @@ class ReciprocityCheck:
         return cls(mean, spread, directions[: min(_RECIPROCITY_DIRECTIONS, len(pairs) // 2)], largest_residual)
 
     def residual(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return the median squared residual of a (896,) difference beside the directions."""
+        """Return the median squared residual of a (896,) difference off the directions."""
         both = usable[_FIRST] & usable[_SECOND]
         x = (reciprocal_means(difference) - self.mean) / self.spread
         return float(np.median((x - _coordinates(self.directions, x, both) @ self.directions)[both] ** 2))
@@ -177,10 +177,10 @@ class NoveltyDetector:
         return float((scores**2 / self.variances[:_T2_DIRECTIONS]).sum())
 
     def response_share(self, difference: FloatArray, usable: BoolArray) -> float:
-        """Return the share of the mean in a (896,) difference, by its part beside the main directions.
+        """Return the share of the mean in a (896,) difference, by its part off the main directions.
 
         A smaller response, as where a foreign signal replaces it, moves a difference along the main directions like
-        another torque. A torque leaves the part beside them alone (partial regression, Frisch–Waugh).
+        another torque. A torque leaves the other part alone (partial regression, Frisch–Waugh).
         """
         mean = self.mean / self.spread
         rest = (mean - _coordinates(self.directions, mean, usable) @ self.directions)[usable]

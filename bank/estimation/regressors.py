@@ -66,7 +66,7 @@ class Ridge:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TobitRidge:
-    """A ridge with readings of no load as bounds; `sign` is the direction in which the lever is pushed.
+    """A ridge with readings of no load as bounds; `sign` is the direction of the lever's push.
 
     It predicts a latent value. Where that is below zero along the sign, the lever does not touch: no torque.
     """
@@ -145,7 +145,7 @@ class InverseCalibration:
     def fit(cls, frames: FloatArray, values: FloatArray, degree: int, n_drift: int, *, trend: bool = False) -> Self:
         """Fit to (n, d + 1) frames of (n,) values in time order; the last column is each frame's time.
 
-        Any unit of time will do in which frames are about one apart.
+        Frames should be about one unit of time apart.
         """
         frames, t = frames[:, :-1], frames[:, -1]
         n, n_trend = len(values), N_TREND * trend
@@ -182,7 +182,7 @@ class InverseCalibration:
         )  # fmt: skip
 
     def predict(self, features: FloatArray) -> FloatArray:
-        """Return the values of (…, d + 1) frames, whose last column is the time; NaN channels are ignored.
+        """Return the values of (…, d + 1) frames; the last column is the time, and NaN channels are ignored.
 
         A time before the last fitted one counts as that one: the user started counting again.
         """

@@ -281,7 +281,7 @@ def _position_noise_mm(calibration: Calibration) -> float:
 
 
 def _widened(value: _Interval, error: float) -> _Interval:
-    """Return a value whose interval includes an independent error."""
+    """Return a value with an independent error added to its interval."""
     return value[0], math.hypot(value[1], error), math.hypot(value[2], error)
 
 

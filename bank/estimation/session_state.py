@@ -430,7 +430,7 @@ class PaperState:
     held_frames = 1
 
     def __init__(self, baseline_frames: int, average_frames: int, max_gap_s: float) -> None:
-        """Begin a session whose first `baseline_frames` are untouched; a longer gap restarts the average."""
+        """Begin a session with `baseline_frames` untouched frames; a longer gap restarts the average."""
         self._baseline_frames = baseline_frames
         self._max_gap_s = max_gap_s
         self._tare_frames: list[FloatArray] = []
@@ -481,7 +481,7 @@ class PaperState:
 
     @cached_property
     def _noise(self) -> FloatArray:
-        """Standard deviation of one frame, (896,) in volts, at least that of the converter's rounding.
+        """Standard deviation of one frame, (896,) in volts, at least the converter's rounding.
 
         A few frames know the variance of one channel badly: each is drawn towards the mean of all (Smyth 2004).
         """

@@ -110,7 +110,7 @@ class TactileFrame:
 
     @classmethod
     def of(cls, t_s: float, channels: FloatArray, usable: BoolArray | None = None) -> "TactileFrame":
-        """Return a frame whose channels that are not finite are unusable."""
+        """Return a frame; channels that are not finite are unusable."""
         # Contiguous memory makes sums over channels reproducible to the bit.
         channels = np.ascontiguousarray(channels)
         finite = np.isfinite(channels)

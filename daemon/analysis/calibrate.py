@@ -27,7 +27,7 @@ class CalibrationOptions:
     """What the user says about the recordings.
 
     time_range are shares (0 to 1) of each recording. load_cell_delay_s is subtracted from the load cell's times, and
-    then these are not checked. With assume_full_range no torque beyond those of the slices will occur.
+    then these are not checked. With assume_full_range no torque will exceed the slices.
     """
 
     sides: tuple[str, ...] | None = None
@@ -200,7 +200,7 @@ def _report_timing(
         report.result["widening"] = widening = round(torque.regressor.timing_widening, 2)
         report.sentences.append(
             f"Could not verify the load cell's timestamps: the load changed too few times. They may be "
-            f"{uncertainty_s:.2g} s off, so the intervals are wider, those of loads {widening:.2g} times. Record more "
+            f"{uncertainty_s:.2g} s off, so the intervals are wider, for loads {widening:.2g} times. Record more "
             "changes of load, such as ten twists, or confirm the load cell's clock with --load-cell-delay-s 0."
         )
 

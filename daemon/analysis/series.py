@@ -79,7 +79,7 @@ def series_of(recording: Recording, sides: tuple[str, ...] | None = None, tool_m
 
 
 def part_of(series: FrameSeries, start: float, stop: float) -> FrameSeries:
-    """Return the frames between two shares (0 to 1) of a series, in time order; UserError where there are none."""
+    """Return the frames between two shares (0 to 1) of a series, in time order; UserError for an empty part."""
     n = len(series.t_s)
     first, end = round(start * n), round(stop * n)
     if first == end:

@@ -72,7 +72,7 @@ _CLIPPED = frozenset({ControllerReason.TRAVEL, ControllerReason.SPEED})
 
 @dataclass(frozen=True, slots=True)
 class WristCommand:
-    """The wrist speed for now, and every reason for which it differs from the ideal one."""
+    """The wrist speed for now, and all reasons for a difference from the ideal one."""
 
     speed_rad_per_s: float
     reasons: tuple[ControllerReason, ...] = ()

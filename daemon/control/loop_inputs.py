@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 class TorqueSample:
     """One torque of one source, with the time of its measurement (`t_mid_ns`) and of its arrival (`t_ns`).
 
-    `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the band within which friction
+    `torque_nm` is None if it is not valid, for `reason`. `low_nm` and `high_nm` bound the friction band that
     hides the torque.
     """
 
@@ -70,7 +70,7 @@ class GripperStatus:
 class TorqueSource:
     """A source of torques: its period and the averaging window of one torque.
 
-    `has_friction_band`: friction hides the torque within a band, in which the wrist turns without a change.
+    `has_friction_band`: friction hides the torque within a band; the wrist turns through it without a change.
     `from_robot`: the torque comes with the robot's state, so its age is checked there. `measures_torque` is False for a
     fingertip without a calibration; a silent one is a fault all the same.
     """

@@ -175,7 +175,7 @@ def _at(coefficients: FloatArray, x: ComplexArray) -> ComplexArray:
 
 
 def _gain_margin(ratio: ComplexArray) -> float:
-    """Return the smallest factor above 1 by which the ratio passes through −1, linear between its samples."""
+    """Return the smallest factor above 1 that makes the ratio pass through −1, linear between its samples."""
     imaginary, real = ratio.imag, ratio.real
     across = np.flatnonzero(imaginary[:-1] * imaginary[1:] < 0.0)
     share = imaginary[across] / (imaginary[across] - imaginary[across + 1])
@@ -262,7 +262,7 @@ def noise_share(kp: float, ki: float) -> float:
 
 
 def gain_for_noise(noise_nm: float, allowed_nm: float) -> float:
-    """Return the largest kp, up to MOST_GAIN, at which noise moves the torque by at most `allowed_nm`."""
+    """Return the largest kp, up to MOST_GAIN, that keeps the noise of the torque within `allowed_nm`."""
     kps = np.geomspace(LEAST_GAIN, MOST_GAIN, 200)
     fitting = [float(kp) for kp in kps if noise_share(float(kp), integral_gain(float(kp))) * noise_nm <= allowed_nm]
     return max(fitting, default=LEAST_GAIN)

@@ -335,5 +335,5 @@ class SafetyMonitor:
 
 
 def _counted(held_ns: int, passed_ns: int, *, held: bool) -> int:
-    """Return a hold timer after `passed_ns` in which the fault was present or absent."""
+    """Return a hold timer after `passed_ns` with or without the fault."""
     return held_ns + passed_ns if held else max(0, held_ns - round(DECAY * passed_ns))

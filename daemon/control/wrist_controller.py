@@ -24,7 +24,7 @@ MOST_PENDING = 64
 LONGEST_STEP_NS = 50_000_000
 # The largest drift of the torque at a fixed angle that counts as creep.
 CREEP_LIMIT_NM_PER_S = 0.005
-# Either way from the angle at which the loop was closed.
+# Either way from the wrist angle of the closed loop's start.
 TRAVEL_LIMIT_RAD = 3.2
 # Innovations are clipped to three times the noise, and never below this.
 LEAST_INNOVATION_LIMIT_NM = 0.01
@@ -32,7 +32,7 @@ LEAST_INNOVATION_LIMIT_NM = 0.01
 
 @dataclass(frozen=True, slots=True)
 class WristVelocity:
-    """The wanted wrist speed, and the reasons for which it differs from the set point's."""
+    """The wanted wrist speed, and the reasons for a difference from the set point."""
 
     speed_rad_per_s: float = 0.0
     reasons: tuple[str, ...] = ()

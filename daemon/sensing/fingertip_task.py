@@ -121,12 +121,12 @@ class EstimatorTask:
             await self.next()
 
     def tare(self) -> None:
-        """Take a new homogeneous frame from frames whose acquisition begins after now."""
+        """Take a new homogeneous frame from frames acquired entirely after now."""
         self._tare_from_ns = self._clock.now_ns()
         self._tared.clear()
 
     async def tare_and_wait(self) -> str:
-        """Take a new homogeneous frame and wait for it; the error, which is empty, as for other sensors."""
+        """Take a new homogeneous frame and wait until it is complete; return an empty error."""
         self.tare()
         await self._tared.wait()
         return ""

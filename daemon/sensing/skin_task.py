@@ -13,8 +13,8 @@ from shearloop.daemon.errors import UserError
 from shearloop.daemon.logs import log_link
 from shearloop.daemon.messaging.messages import Scalar, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
+from shearloop.daemon.sensing.load_cell_task import ZeroWaiters
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator, SkinReading
-from shearloop.daemon.waiting import Waiting
 from shearloop.drivers.connection import DEFAULT_BAUD, Link, LinkEvent, SerialLink, TcpLink
 from shearloop.drivers.serial_sensor import InputKind, OnRaw, RawEvent, ignore_raw
 from shearloop.drivers.shear_skin import (
@@ -69,7 +69,7 @@ class SkinTask:
         self._on_torque = on_torque
         self._on_raw = on_raw(SKIN)
         self._radius_m = _radius_m(config)
-        self._zero_waiters = Waiting()
+        self._zero_waiters = ZeroWaiters()
         self._reason = ""
         self._valid = 0
 
@@ -84,9 +84,9 @@ class SkinTask:
                 reading = self._estimator.update(sample)
                 self._publish(sample, reading)
                 if self._estimator.refused:
-                    self._zero_waiters.tell(f"the skin's zero was refused: {self._estimator.refused}")
+                    self._zero_waiters.finish(f"the skin's zero was refused: {self._estimator.refused}")
                 elif self._estimator.zero is not None:
-                    self._zero_waiters.tell("")
+                    self._zero_waiters.finish("")
 
     def tare(self) -> None:
         """Take a new zero from samples measured from now on."""

@@ -4,8 +4,6 @@ import asyncio
 import math
 import time
 from collections.abc import AsyncGenerator, Callable, Coroutine, Mapping
-from dataclasses import dataclass, field
-from enum import Enum, auto
 from typing import TypeVar
 
 from shearloop.drivers.connection import LinkEvent, ReconnectPolicy
@@ -126,17 +124,21 @@ class RobotiqGripper:
                 raise GripperFaultError(f"{fault.sentence} An operator has to confirm that the fingers are clear.")
             if blocking_fault(readout) is None:
                 return self._state(readout, t_ns)
-        sequence = ActivationSequence()
-        while not sequence.done:
-            request = sequence.step(readout, t_ns)
-            if request is not None:
-                self._last_move = None
-                await _uninterrupted(self._write(request))
-            elif not sequence.done:
-                await asyncio.sleep(self._poll_s)
-            if not sequence.done:
-                readout, t_ns = await _uninterrupted(self._read())
-        return self._state(readout, t_ns)
+        self._last_move = None
+        await _uninterrupted(self._write(Reset()))
+        not_reset = "The gripper does not take the reset; check that nothing else commands it."
+        await self._wait_until(
+            lambda now: not now.act and now.sta is ActivationStatus.RESET, RESET_DEADLINE_NS, not_reset
+        )
+        resume_ns = self._clock_ns() + PAUSE_NS
+        await self._wait_until(lambda _: self._clock_ns() >= resume_ns, RESET_DEADLINE_NS, not_reset)
+        # A rising edge of ACT, which also ends every fault.
+        await _uninterrupted(self._write(Activate()))
+        return await self._wait_until(
+            _is_active,
+            ACTIVATION_DEADLINE_NS,
+            "The gripper's activation does not end; clear the fingers and activate it again.",
+        )
 
     async def move(self, command: GripperCommand) -> SentCommand:
         """Start a motion and return the command as sent; `finish` waits for its end.
@@ -154,13 +156,30 @@ class RobotiqGripper:
 
     async def finish(self, sent: SentCommand) -> GripperState:
         """Return the state at the end of the motion: at its target, or on an object."""
-        watch = MotionWatch(sent.request, self._clock_ns())
-        while True:
-            readout, t_ns = await _uninterrupted(self._read())
+
+        def has_finished(readout: Readout) -> bool:
             if self._last_move is not sent.request:
                 raise GripperRefusedError("Another command took over before the gripper had finished its motion.")
-            if watch.has_finished(readout, t_ns):
+            blocking = blocking_fault(readout)
+            if blocking is not None:
+                raise GripperFaultError(blocking)
+            return object_status(readout, sent.request) is not ObjectStatus.MOVING
+
+        return await self._wait_until(
+            has_finished,
+            MOTION_DEADLINE_NS,
+            "The gripper does not finish its motion; check that nothing else commands it.",
+        )
+
+    async def _wait_until(self, done: Callable[[Readout], bool], deadline_ns: int, failure: str) -> GripperState:
+        """Return the first state that is `done`; GripperFaultError after the deadline."""
+        since_ns = self._clock_ns()
+        while True:
+            readout, t_ns = await _uninterrupted(self._read())
+            if done(readout):
                 return self._state(readout, t_ns)
+            if t_ns - since_ns > deadline_ns:
+                raise GripperFaultError(failure)
             await asyncio.sleep(self._poll_s)
 
     async def halt(self) -> None:
@@ -273,76 +292,10 @@ class RobotiqGripper:
         return state
 
 
-class _Phase(Enum):
-    START = auto()
-    RESETTING = auto()
-    PAUSE = auto()
-    ACTIVATING = auto()
-    DONE = auto()
-
-
-@dataclass(slots=True)
-class ActivationSequence:
-    """Reset, wait, pause, activate, wait: a rising edge of ACT, which also ends every fault. No clock."""
-
-    _phase: _Phase = field(default=_Phase.START, init=False)
-    _since_ns: int = field(default=0, init=False)
-
-    @property
-    def done(self) -> bool:
-        """Whether the gripper is active."""
-        return self._phase is _Phase.DONE
-
-    def step(self, readout: Readout, t_ns: int) -> Request | None:
-        """Return the request to send now, if any. Raises GripperFaultError when the activation fails or hangs."""
-        match self._phase:
-            case _Phase.START:
-                self._enter(_Phase.RESETTING, t_ns)
-                return Reset()
-            case _Phase.RESETTING:
-                if not readout.act and readout.sta is ActivationStatus.RESET:
-                    self._enter(_Phase.PAUSE, t_ns)
-                elif t_ns - self._since_ns > RESET_DEADLINE_NS:
-                    raise GripperFaultError("The gripper does not take the reset; check that nothing else commands it.")
-            case _Phase.PAUSE:
-                if t_ns - self._since_ns >= PAUSE_NS:
-                    self._enter(_Phase.ACTIVATING, t_ns)
-                    return Activate()
-            case _Phase.ACTIVATING:
-                self._await_active(readout, t_ns)
-            case _Phase.DONE:
-                pass
-        return None
-
-    def _enter(self, phase: _Phase, t_ns: int) -> None:
-        self._phase, self._since_ns = phase, t_ns
-
-    def _await_active(self, readout: Readout, t_ns: int) -> None:
-        if readout.act and readout.flt >= _LEAST_ACTIVATION_FAULT and readout.flt != _NO_COMMUNICATION:
-            raise GripperFaultError(fault_of(readout.flt).sentence)
-        if readout.act and readout.sta is ActivationStatus.ACTIVE:
-            self._enter(_Phase.DONE, t_ns)
-        elif t_ns - self._since_ns > ACTIVATION_DEADLINE_NS:
-            raise GripperFaultError("The gripper's activation does not end; clear the fingers and activate it again.")
-
-
-@dataclass(slots=True)
-class MotionWatch:
-    """Detects the end of a motion that began at `since_ns`. No clock."""
-
-    request: GripperMove
-    since_ns: int
-
-    def has_finished(self, readout: Readout, t_ns: int) -> bool:
-        """Return whether the fingers stopped, at the target or on an object; GripperFaultError if they never will."""
-        blocking = blocking_fault(readout)
-        if blocking is not None:
-            raise GripperFaultError(blocking)
-        if object_status(readout, self.request) is not ObjectStatus.MOVING:
-            return True
-        if t_ns - self.since_ns > MOTION_DEADLINE_NS:
-            raise GripperFaultError("The gripper does not finish its motion; check that nothing else commands it.")
-        return False
+def _is_active(readout: Readout) -> bool:
+    if readout.act and readout.flt >= _LEAST_ACTIVATION_FAULT and readout.flt != _NO_COMMUNICATION:
+        raise GripperFaultError(fault_of(readout.flt).sentence)
+    return readout.act and readout.sta is ActivationStatus.ACTIVE
 
 
 def object_status(readout: Readout, last: GripperMove | None) -> ObjectStatus:

@@ -3,7 +3,7 @@
 `worker` runs 125 cycles a second; `CommandHandler` decides in each what the robot is sent; `UrArm` wraps ur-rtde.
 """
 
-from shearloop.drivers.ur.client import UrLinkEvent, UrRobot, ignore_state
+from shearloop.drivers.ur.client import UrLinkEvent, UrRobot
 from shearloop.drivers.ur.controller import ControllerInfo, query_controller
 from shearloop.drivers.ur.messages import (
     ARRIVED,
@@ -36,7 +36,6 @@ __all__ = [
     "UrSettings",
     "WristSpeed",
     "ZeroForceTorque",
-    "ignore_state",
     "query_controller",
     "read_settings",
 ]

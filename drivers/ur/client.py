@@ -83,8 +83,6 @@ class UrRobot:
         # How many states have come, and how many times our program was paused and did not stop on request.
         self.states = 0
         self.failed_program_stops = 0
-        # Receives each state, and whether it is the newest of those that were read at once.
-        self.on_state: Callable[[RobotState, bool], None] = ignore_state
         self._on_link = on_link or (lambda _event: None)
         self._state: RobotState | None = None
         self._connection: WorkerConnection | None = None
@@ -192,11 +190,10 @@ class UrRobot:
 
     def handle_messages(self, messages: Sequence[tuple[int, Message]]) -> None:
         """Handle the messages of one read, in order."""
-        newest = next((message for _, message in reversed(messages) if isinstance(message, RobotState)), None)
         for number, message in messages:
             match message:
                 case RobotState():
-                    self._handle_state(message, newest=message is newest)
+                    self._handle_state(message)
                 case CommandReply():
                     on_reply = self._replies.pop(number, None)
                     if on_reply is not None:
@@ -204,7 +201,7 @@ class UrRobot:
                 case Failed():
                     raise LostError(message.kind, message.sentence)
 
-    def _handle_state(self, state: RobotState, *, newest: bool) -> None:
+    def _handle_state(self, state: RobotState) -> None:
         before, self._state = self._state, state
         # Each worker counts from zero.
         self.failed_program_stops += state.failed_program_stops
@@ -213,7 +210,6 @@ class UrRobot:
         else:
             self.failed_program_stops -= before.failed_program_stops
         self.states += 1
-        self.on_state(state, newest)
         if self._next is not None:
             self._next.set_result(state)
             self._next = None
@@ -382,7 +378,3 @@ async def _finish(ending: Coroutine[Any, Any, None]) -> None:
     except asyncio.CancelledError:
         await task
         raise
-
-
-def ignore_state(_state: RobotState, _newest: bool) -> None:
-    """Do nothing with a state."""

@@ -14,8 +14,8 @@ Estimate the torque along a recording:
     session = shearloop.EstimatorSession(calibration, bank)
     [series] = shearloop.read_series("twists.mcap", calibration.sides)
     for t_s, channels in zip(series.t_s, series.channels):
-        estimate = session.estimate(shearloop.TactileFrame(t_s, channels))
-        print(t_s, estimate.torque)
+        estimate = session.estimate(shearloop.TactileFrame.of(t_s, channels))
+        print(t_s, estimate.torque_nm)
 
 Follow a running daemon:
 

@@ -186,13 +186,20 @@ def test_the_readmes_path_from_the_demo_to_a_calibration_of_ones_own(tree: Tree)
         assert "phase=done reason=" in ran, ran
     summary = tree.shell(f"{PROGRAM} recording info recordings/first/*.mcap").stdout
     assert re.search(r"ran +hold 0.10 N·m", summary)
-    for topic in ("eit.estimate.both", "eit.frame.left", "load.torque", "robot.state", "gripper.state", "loop.state"):
+    for topic in (
+        "eit.estimate.combined",
+        "eit.frame.left",
+        "load.torque",
+        "robot.state",
+        "gripper.state",
+        "loop.state",
+    ):
         assert topic in summary
     comparison = tree.shell(f"{replay} --publish ipc://{tree.root}/replay").stderr
     same = re.findall(r"(\S+): (\d+) of (\d+) equal the recorded ones, bit for bit", comparison)
     assert [topic for topic, *_ in same] == ["eit.estimate", "eit.frame", "load.torque"]
     assert all(made == recorded and int(made) > 100 for _, made, recorded in same)
-    assert "estimator motion_regression, torque from" in tree.shell(calibrate).stdout
+    assert "Estimator motion_regression, torque from" in tree.shell(calibrate).stdout
     figures = dict(
         line.split(maxsplit=1) for line in tree.shell(evaluate).stdout.splitlines() if re.match(r"\w+ +\S+$", line)
     )

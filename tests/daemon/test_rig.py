@@ -11,7 +11,7 @@ from shearloop.daemon.config import DaemonConfig
 from shearloop.daemon.control.loop_inputs import TorqueSource
 from shearloop.daemon.rig import Rig
 from shearloop.drivers.ur.client import UrLinkEvent
-from tests.daemon.cell import Published
+from tests.daemon.control.cell import Published
 
 SOURCES = {"right": TorqueSource(name="right", period_s=0.5)}
 

@@ -231,7 +231,7 @@ def judge_level(estimates: Sequence[Estimate], truth_nm: FloatArray, level: floa
 
 def estimate_frames(tracker: EstimatorSession, faulty: FaultyFrames) -> list[Estimate]:
     """Return the estimates of faulty frames in order, as in a live session that starts with them."""
-    tracker.tare()
+    tracker.reset()
     found = []
     for i, (t_s, channels) in enumerate(zip(faulty.series.t_s, faulty.series.channels, strict=True)):
         usable = None if faulty.usable is None else faulty.usable[i]

@@ -242,7 +242,7 @@ _TURNED_ELECTRODES = 5
 class ForeignMixture:
     """Misfits of later slices, in units of their limit, for one origin, kind and share of a foreign frame.
 
-    The misfit is that of reciprocal channels. `passing` is the share that the validity check accepts, `passing_best`
+    The misfit is from reciprocal channels. `passing` is the share that the validity check accepts, `passing_best`
     the best limit's; `auc` is how often a mixed slice has a larger misfit than a good one.
     """
 

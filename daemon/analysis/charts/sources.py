@@ -21,7 +21,7 @@ from shearloop.drivers.eit_kit import FRAME_PERIOD_S
 
 # Frames before the judged part of a stream that fill an estimator's memory.
 WARM_UP_FRAMES = 15
-# The default bank: that of config/banks/demo.yaml.
+# The default bank, as in config/banks/demo.yaml.
 GRID = Grid(np.linspace(2.9, 4.1, 50), np.linspace(0.9, 2.3, 50))
 MESH_SIZE_CM = 0.2
 # Synthetic frames come from a finer mesh than the bank they are matched with, from cells between that bank's.

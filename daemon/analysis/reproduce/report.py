@@ -1,4 +1,4 @@
-"""The numbers and figures of a reproduction, next to those of the paper."""
+"""The numbers and figures of a reproduction, next to the paper's."""
 
 import json
 from dataclasses import dataclass

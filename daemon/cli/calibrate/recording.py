@@ -35,7 +35,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--assume-full-range",
         action="store_true",
-        help="no torque will exceed those of the slices: intervals do not extend beyond them",
+        help="no torque will exceed the slices: intervals do not extend beyond them",
     )
     parser.add_argument(
         "--tool-mm",
@@ -46,7 +46,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
     parser.epilog = (
         "A recording has to hold some seconds idle, the grip, several twists (best ten) with the load cell recorded, "
-        "and some seconds idle after the release. docs/estimators.md describes the estimators and what they need."
+        "and some seconds idle after the release. docs/estimators.md describes the estimators and their needs."
     )
 
 

@@ -3,8 +3,8 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable
-from contextlib import AsyncExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AsyncExitStack, contextmanager
 
 from shearloop.drivers.emulators.ur.control_script import armed_hz
 from shearloop.drivers.emulators.ur.robot import (
@@ -145,33 +145,21 @@ class Controller:
                     continue
                 self._send(writer, answer_dashboard(self.robot, line.decode("utf-8", "replace")).encode() + b"\n")
 
-    def _connection(self, writer: asyncio.StreamWriter) -> "_Connection":
-        return _Connection(writer, self._writers, self._connections)
-
-
-class _Connection(suppress):
-    """Registers an open connection, and ends quietly when the peer breaks it."""
-
-    def __init__(
-        self,
-        writer: asyncio.StreamWriter,
-        writers: set[asyncio.StreamWriter],
-        tasks: set[asyncio.Task[None]],
-    ) -> None:
-        super().__init__(ConnectionError)
-        self._writer, self._writers, self._tasks = writer, writers, tasks
-
-    def __enter__(self) -> None:
-        self._writers.add(self._writer)
+    @contextmanager
+    def _connection(self, writer: asyncio.StreamWriter) -> Iterator[None]:
+        """Register an open connection, and end quietly when the peer breaks it."""
+        self._writers.add(writer)
         task = asyncio.current_task()
         if task is not None:
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
-
-    def __exit__(self, *exc_info: object) -> bool:
-        self._writers.discard(self._writer)
-        self._writer.close()
-        return bool(super().__exit__(*exc_info))  # type: ignore[arg-type]  # object is wide enough for all three
+            self._connections.add(task)
+            task.add_done_callback(self._connections.discard)
+        try:
+            yield
+        except ConnectionError:
+            pass
+        finally:
+            self._writers.discard(writer)
+            writer.close()
 
 
 # ---- the dashboard server: UR's "Dashboard Server e-Series" page -----------------------------------------------------

@@ -96,7 +96,7 @@ def test_assumptions_are_kept(motion_calibration, recorded, sliced, tmp_path):
     assert timed.assumption_text == "the load cell's delay is as given (--load-cell-delay-s)"
     path = tmp_path / "new.cal"
     fit("regression", [sliced()], "slices", full_range=True).save(path)
-    assert Calibration.load(path).assumption_text == "no torque is beyond those of its slices (--assume-full-range)"
+    assert Calibration.load(path).assumption_text == "no torque exceeds its slices (--assume-full-range)"
 
 
 @pytest.mark.parametrize(

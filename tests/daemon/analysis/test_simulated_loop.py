@@ -68,5 +68,5 @@ def test_a_slipping_grip_ends_in_a_held_wrist() -> None:
         run(plant, controller, plant.period_s)
     controller.set_point(0.10)
     trace = run(plant, controller, scenario.hold_s)
-    assert trace.mean_difference[-1]
+    assert trace.held[-1]
     assert np.ptp(trace.angle_rad) < (0.1 + 0.06 + 0.01) / 0.2

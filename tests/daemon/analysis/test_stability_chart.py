@@ -149,7 +149,7 @@ def test_the_passing_share_of_a_foreign_frame_follows_from_its_size() -> None:
         scaled = (frames[..., order].mean(axis=-2) - pairs.mean(axis=0)) / spread
         return scaled - scaled @ directions.T @ directions
 
-    limit = ReciprocityCheck.fit(past).largest_misfit
+    limit = ReciprocityCheck.fit(past).largest_residual
     own = [one for one in found if one.kind == "another fingertip"]
     # What is off adds channel by channel: the two, in their shares.
     expected = [
@@ -158,9 +158,9 @@ def test_the_passing_share_of_a_foreign_frame_follows_from_its_size() -> None:
     for one, misfits in zip(own, expected, strict=True):
         np.testing.assert_allclose(one.misfits, misfits, rtol=1e-6)
         assert one.auc == pytest.approx(mannwhitneyu(misfits, expected[0]).statistic / len(later) ** 2)
-        assert one.accepted <= (misfits <= 1.0).mean()
-    assert own[0].accepted == 1.0
-    assert {one.accepted for one in own if one.share >= 0.2} == {0.0}
+        assert one.passing <= (misfits <= 1.0).mean()
+    assert own[0].passing == 1.0
+    assert {one.passing for one in own if one.share >= 0.2} == {0.0}
     assert {one.passing_best for one in own if one.share >= 0.2} == {0.0}
     assert len(detectability_figure("slices", found).axes) == 2
 
@@ -172,4 +172,4 @@ def test_a_recording_that_no_estimator_can_be_calibrated_on_is_one_sentence(
     one = Split(slices.title, slices.past.between(0, 1), slices.future, slices.whole)
     with pytest.raises(UserError, match="no estimator can be calibrated on it"):
         chart([one], bank, own_fingertip(0.4).mesh(), tmp_path, tmp_path, SerialExecutor())
-    assert "fused is left out" in capsys.readouterr().out
+    assert "motion_regression is left out" in capsys.readouterr().out

@@ -328,7 +328,7 @@ def test_calibrate_says_that_times_could_not_be_checked_and_what_that_costs(twis
     assert main(calibrate) == 0
     told = capsys.readouterr().out
     assert "Could not verify the load cell's timestamps: the load changed too few times. They may be 0.75 s off" in told
-    assert re.search(r"intervals are wider, those of loads \d\.\d times\. Record more changes of load", told)
+    assert re.search(r"intervals are wider, for loads \d\.\d times\. Record more changes of load", told)
     assert main([*calibrate, "--load-cell-delay-s", "0"]) == 0
     assert "Could not verify" not in capsys.readouterr().out
     looked, of_side = [], load_delay._delay_of_side

@@ -179,12 +179,12 @@ async def test_tare_takes_the_zero_anew_and_refuses_a_loaded_one(tmp_path: Path)
         bench.skin.push(0.8)
         assert await bench.command("tare", source="skin") == {"ok": True, "tared": ["skin"]}
         await bench.says("the zero was refused and is taken again")
-        why = await bench.daemon._tare_to_the_end()
+        why = await bench.daemon._tare()
         assert "the skin's zero was refused" in why
         bench.skin.push(0.0)
         bench.fresh()
         await bench.valid()
-        assert await bench.daemon._tare_to_the_end() == ""
+        assert await bench.daemon._tare() == ""
         refused = await bench.command("tare", source="left")
         assert refused == {"ok": False, "reason": "there is no sensor 'left' to tare; there are skin"}
 
@@ -195,7 +195,7 @@ async def test_a_zero_that_cannot_be_taken_says_why_in_time(tmp_path: Path, monk
         await bench.valid()
         bench.instruments.command("open 2")
         await bench.says("gauge 2 is open")
-        assert "could not be taken within 0.3 s" in (why := await bench.daemon._tare_to_the_end())
+        assert "could not be taken within 0.3 s" in (why := await bench.daemon._tare())
         assert "gauge 2 is open" in why
 
 

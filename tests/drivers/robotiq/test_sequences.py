@@ -6,24 +6,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shearloop.drivers.robotiq.gripper import (
-    ACTIVATION_DEADLINE_NS,
-    MOTION_DEADLINE_NS,
-    PAUSE_NS,
-    RESET_DEADLINE_NS,
-    ActivationSequence,
-    MotionWatch,
-    object_status,
-)
+from shearloop.drivers.robotiq.gripper import PAUSE_NS, RobotiqGripper, object_status
 from shearloop.drivers.robotiq.messages import (
     Activate,
     ActivationStatus,
+    GripperCommand,
     GripperFaultError,
     GripperMove,
     ObjectStatus,
     Readout,
+    Request,
     Reset,
 )
+from tests.drivers.robotiq.gripper_rig import CALIBRATION
 
 S = 10**9
 RESET = Readout(False, False, ActivationStatus.RESET, ObjectStatus.MOVING, 0, 0, 3, 0)
@@ -32,46 +27,57 @@ ACTIVE = Readout(True, True, ActivationStatus.ACTIVE, ObjectStatus.AT_TARGET, 0,
 GO = GripperMove(100, 255, 0)
 
 
-def after_activate() -> ActivationSequence:
-    sequence = ActivationSequence()
-    assert sequence.step(ACTIVE, 0) == Reset()
-    assert sequence.step(ACTIVE, S) is None
-    assert sequence.step(RESET, 2 * S) is None
-    assert sequence.step(RESET, 2 * S + PAUSE_NS - 1) is None
-    assert sequence.step(RESET, 2 * S + PAUSE_NS) == Activate()
-    return sequence
+class Client:
+    """Returns the readouts one by one, then the last one for ever; its clock advances at each look."""
+
+    name = "here"
+
+    def __init__(self, *readouts: Readout) -> None:
+        self.readouts = list(readouts)
+        self.requests: list[tuple[Request, int]] = []
+        self.now_ns = 0
+
+    def clock_ns(self) -> int:
+        self.now_ns += S // 10
+        return self.now_ns
+
+    async def connect(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+    async def read(self) -> Readout:
+        return self.readouts.pop(0) if len(self.readouts) > 1 else self.readouts[0]
+
+    async def write(self, request: Request) -> None:
+        self.requests.append((request, self.now_ns))
+
+    @property
+    def gripper(self) -> RobotiqGripper:
+        return RobotiqGripper(self, CALIBRATION, poll_s=0.0, clock_ns=self.clock_ns)
 
 
-def test_activation_is_a_reset_a_rest_and_a_rising_edge() -> None:
-    sequence = after_activate()
-    assert sequence.step(RESET, 3 * S) is None
-    assert sequence.step(ACTIVATING, 4 * S) is None
-    assert not sequence.done
-    assert sequence.step(ACTIVE, 5 * S) is None
-    assert sequence.done
-    assert sequence.step(ACTIVE, 6 * S) is None
+async def test_activation_is_a_reset_a_pause_and_a_rising_edge() -> None:
+    # Silent during the pause is no obstacle, and the old active state is not the new one.
+    client = Client(ACTIVE, ACTIVE, *[RESET] * 6, replace(ACTIVATING, flt=9), ACTIVATING, ACTIVE)
+    state = await client.gripper.activate(operator_confirmed=True)
+    assert state.activation is ActivationStatus.ACTIVE
+    (reset, reset_ns), (activate, activate_ns) = client.requests
+    assert (reset, activate) == (Reset(), Activate())
+    assert activate_ns - reset_ns >= PAUSE_NS
+    assert client.readouts == [ACTIVE]
 
 
-def test_the_old_active_state_is_not_taken_for_the_new_one() -> None:
-    sequence = ActivationSequence()
-    assert sequence.step(ACTIVE, 0) == Reset()
-    assert sequence.step(ACTIVE, S) is None
-    assert not sequence.done
-
-
-def test_activation_that_hangs_or_fails_says_so() -> None:
-    stuck = ActivationSequence()
-    stuck.step(ACTIVE, 0)
-    with pytest.raises(GripperFaultError, match="does not take the reset"):
-        stuck.step(ACTIVE, RESET_DEADLINE_NS + 1)
-    sequence = after_activate()
-    with pytest.raises(GripperFaultError, match="clear what blocks"):
-        sequence.step(replace(ACTIVATING, flt=13), 4 * S)
-    sequence = after_activate()
-    with pytest.raises(GripperFaultError, match="does not end"):
-        sequence.step(ACTIVATING, 2 * S + PAUSE_NS + ACTIVATION_DEADLINE_NS + 1)
-    # Having been silent during the rest is no obstacle.
-    assert after_activate().step(replace(ACTIVATING, flt=9), 4 * S) is None
+@pytest.mark.parametrize(
+    ("readouts", "failure"),
+    [
+        ((ACTIVE,), "does not take the reset"),
+        ((ACTIVE, *[RESET] * 6, replace(ACTIVATING, flt=13)), "clear what blocks"),
+        ((ACTIVE, *[RESET] * 6, ACTIVATING), "does not end"),
+    ],
+)
+async def test_activation_that_hangs_or_fails_is_reported(readouts: tuple[Readout, ...], failure: str) -> None:
+    with pytest.raises(GripperFaultError, match=failure):
+        await Client(*readouts).gripper.activate(operator_confirmed=True)
 
 
 @given(st.sampled_from([status for status in ObjectStatus if status >= 0]), st.integers(0, 255), st.booleans())
@@ -93,24 +99,31 @@ def test_a_gripper_that_is_not_active_holds_nothing(sta: ActivationStatus) -> No
         assert object_status(replace(held, sta=sta), last) is ObjectStatus.UNKNOWN
 
 
-def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before() -> None:
-    watch = MotionWatch(GO, 0)
-    assert not watch.has_finished(ACTIVE, S)
-    assert not watch.has_finished(replace(ACTIVE, pre=100, obj=ObjectStatus.MOVING), S)
-    assert watch.has_finished(replace(ACTIVE, pre=100, obj=ObjectStatus.CONTACT_CLOSING), S)
-    with pytest.raises(GripperFaultError, match="does not finish"):
-        watch.has_finished(ACTIVE, MOTION_DEADLINE_NS + 1)
+@pytest.mark.parametrize("obj", [ObjectStatus.CONTACT_CLOSING, ObjectStatus.AT_TARGET])
+async def test_a_motion_ends_at_its_target_or_on_an_object_and_not_before(obj: ObjectStatus) -> None:
+    client = Client(ACTIVE)
+    gripper = client.gripper
+    sent = await gripper.move(GripperCommand(50.0))
+    taken_up = replace(ACTIVE, pre=sent.request.position)
+    client.readouts = [ACTIVE, replace(taken_up, obj=ObjectStatus.MOVING), replace(taken_up, obj=obj), RESET]
+    assert (await gripper.finish(sent)).object is obj
+    assert client.readouts == [RESET]
 
 
 @pytest.mark.parametrize(
-    ("readout", "said"),
+    ("readout", "failure"),
     [
+        (ACTIVE, "does not finish"),
         (replace(ACTIVE, flt=8), "too hot"),
         (replace(ACTIVE, flt=14), "too much current"),
         (RESET, "has to be activated"),
         (ACTIVATING, "still activating"),
     ],
 )
-def test_a_motion_that_will_never_end_is_reported(readout: Readout, said: str) -> None:
-    with pytest.raises(GripperFaultError, match=said):
-        MotionWatch(GO, 0).has_finished(readout, S)
+async def test_a_motion_that_will_never_end_is_reported(readout: Readout, failure: str) -> None:
+    client = Client(ACTIVE)
+    gripper = client.gripper
+    sent = await gripper.move(GripperCommand(50.0))
+    client.readouts = [readout]
+    with pytest.raises(GripperFaultError, match=failure):
+        await gripper.finish(sent)

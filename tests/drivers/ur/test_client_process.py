@@ -188,18 +188,6 @@ async def test_stops_in_vain_are_counted_across_processes() -> None:
     assert robot.failed_program_stops == 5
 
 
-async def test_of_states_that_are_read_at_once_only_the_last_is_the_newest() -> None:
-    robot = UrRobot(SETTINGS)
-    newest: list[bool] = []
-    robot.on_state = lambda _, is_newest: newest.append(is_newest)
-    flight = Flight()
-    flight.fly(1)
-    connection = WorkerConnection(SETTINGS, robot.handle_messages)
-    connection.pipe_data_received(1, 3 * encode(flight.state) + encode(CommandReply(), 1))
-    connection.pipe_data_received(1, encode(flight.state))
-    assert newest == [False, False, True, True]
-
-
 async def test_loss_that_nobody_retrieves_is_no_complaint_of_asyncio() -> None:
     complaints: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: complaints.append(context))

@@ -15,7 +15,7 @@ from shearloop.daemon.control.step_runner import Action, ExperimentPhase, GripTo
 from shearloop.drivers.emulators.scene import Twin, TwinSettings
 from shearloop.drivers.ur.command_handler import CommandHandler
 from shearloop.drivers.ur.messages import Enable, MoveLinear, Stop, Unlock, WristSpeed
-from tests.daemon.loop.rig import EIT, new_loop
+from tests.daemon.control.loop_rig import EIT, new_loop
 from tests.drivers.ur.flight import CYCLE_NS, SETTINGS, FakeArm
 from tests.drivers.ur.test_limits import LIMITS
 

@@ -1,4 +1,4 @@
-"""The wrist closes in on an angle, decided upon at each of the robot's states."""
+"""The wrist's speed for a set point, and its approach to an angle."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -15,6 +15,53 @@ from shearloop.daemon.control.wrist_controller import WristController
 from shearloop.drivers.ur.client import UrRobot
 from shearloop.drivers.ur.messages import Command, CommandReply
 from tests.drivers.ur.flight import SETTINGS, flying
+
+CYCLE_NS = 8_000_000
+CONFIG = LoopConfig()
+# A tenth of what the wrist resolves.
+CLOSE_RAD = 2e-5
+# Without anything under way: what is sent shows in the angle at once.
+AT_ONCE = LoopConfig(actuation_s=0.0)
+
+
+def wrist(config: LoopConfig = AT_ONCE) -> WristController:
+    return WristController(TorqueSource(name="load_cell", period_s=0.1), config)
+
+
+def test_a_wrist_that_stands_sets_out_for_however_little() -> None:
+    turn = wrist().turn(MoveToAngle(0.1 * CLOSE_RAD, 0.2), 10**9, 0.0, 0.0)
+    assert turn.speed_rad_per_s == pytest.approx(0.1 * CLOSE_RAD * CONFIG.angle_bandwidth_per_s)
+
+
+def test_a_held_angle_is_kept() -> None:
+    one, angle_rad, errors_rad = wrist(), 0.0, []
+    for cycle in range(1000):
+        speed = one.turn(MoveToAngle(0.15, 0.2), 10**9 + cycle * CYCLE_NS, angle_rad, 0.0).speed_rad_per_s
+        one.on_speed_sent(speed)
+        angle_rad += speed * CYCLE_NS / 1e9
+        errors_rad.append(abs(angle_rad - 0.15))
+    # From two seconds after the arrival on.
+    assert max(errors_rad[375:]) < 1.1 * CLOSE_RAD
+
+
+@pytest.mark.parametrize("allowed_rad_per_s", [1e-5, 4e-5, 1e-3, 0.2])
+@pytest.mark.parametrize("bandwidth_per_s", [0.02, 5.0, 40.0])
+def test_however_slow_it_turns_to_an_angle_and_back_and_stays_there(
+    allowed_rad_per_s: float, bandwidth_per_s: float
+) -> None:
+    one, angle_rad, t_ns = wrist(AT_ONCE.model_copy(update={"angle_bandwidth_per_s": bandwidth_per_s})), 0.0, 10**9
+    way_rad = 200 * CYCLE_NS / 1e9 * allowed_rad_per_s
+    # As long as the way takes, and as its last part does at this bandwidth.
+    cycles = round(300 + 12.0 / bandwidth_per_s / (CYCLE_NS / 1e9))
+    for goal_rad in (way_rad, -way_rad):
+        for _ in range(2 * cycles):
+            speed = one.turn(MoveToAngle(goal_rad, allowed_rad_per_s), t_ns, angle_rad, 0.0).speed_rad_per_s
+            assert abs(speed) <= allowed_rad_per_s
+            one.on_speed_sent(speed)
+            angle_rad += speed * CYCLE_NS / 1e9
+            t_ns += CYCLE_NS
+        assert angle_rad == pytest.approx(goal_rad, abs=1.5 * CLOSE_RAD)
+
 
 FASTEST_PER_S = next(
     float(each.le) for each in LoopConfig.model_fields["angle_bandwidth_per_s"].metadata if hasattr(each, "le")

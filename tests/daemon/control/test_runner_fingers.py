@@ -4,7 +4,7 @@ import pytest
 
 from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.runner import WRENCH
-from tests.daemon.cell import driven, no_tick
+from tests.daemon.control.cell import driven, no_tick
 
 GRIP = {"do": "grip", "width_mm": 10.0}
 

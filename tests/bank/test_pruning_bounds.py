@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from shearloop.bank.eit import pruned_matching
 from shearloop.bank.eit.channels import N_CHANNELS
 from shearloop.bank.eit.compression import COARSE_RANK, ROUNDING, columns
-from shearloop.bank.eit.matching import Matcher, unit_magnitude
+from shearloop.bank.eit.matching import Matcher, unit_magnitudes
 from shearloop.bank.eit.pruned_matching import AllLagsBounds, ZeroLagBounds
 from tests.bank.small_banks import BANK, PAIRS, assert_same, both, cells, without_runner_up
 
@@ -26,7 +26,8 @@ def test_where_bounds_do_not_help_all_is_scored(slow, fast, monkeypatch, limit, 
 def test_no_bound_is_below_its_score(cell, noise, seed) -> None:
     """Also of frames that are a cell's own signal, where next to nothing is left out of the bank's basis."""
     _, fast = PAIRS[1]
-    frame = unit_magnitude(BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS))
+    noisy = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS)
+    (frame,) = unit_magnitudes(noisy[None])
     signals = np.abs(BANK[0][BANK[1]].astype(np.float64))
     scores = (signals @ frame) / np.linalg.norm(signals, axis=1)
     found = ZeroLagBounds(fast._bank, frame)
@@ -59,7 +60,7 @@ def test_no_group_of_cells_is_bounded_below_one_of_them() -> None:
 def test_no_bound_at_any_lag_is_below_its_score(cell, noise, seed) -> None:
     slow, fast = PAIRS[0]
     frame = BANK[0][cell] + noise * np.random.default_rng(seed).normal(size=N_CHANNELS)
-    found = AllLagsBounds(fast._bank, fast._spectra, unit_magnitude(frame), fast._score)
+    found = AllLagsBounds(fast._bank, fast._spectra, unit_magnitudes(frame[None])[0], fast._score)
     scores = slow.heatmap(frame)[BANK[1]]
     best, reached = found.reached
     assert 0 < reached <= scores[best] + 1e-12

@@ -14,7 +14,7 @@ from shearloop.daemon.control.loop_inputs import TorqueSample
 from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.control.safety import Response
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from tests.daemon.cell import SPEED_M_PER_S, Cell, driven
+from tests.daemon.control.cell import SPEED_M_PER_S, Cell, driven
 
 TURN = {"do": "turn_to", "angle_rad": 0.5}
 TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}

@@ -13,7 +13,7 @@ from shearloop.daemon.control.runner import WRENCH
 from shearloop.daemon.control.safety import FaultCode
 from shearloop.daemon.control.step_runner import ExperimentPhase
 from shearloop.drivers.ur.messages import MoveLinear, Stop, WristSpeed
-from tests.daemon.cell import SPEED_M_PER_S, driven, no_tick
+from tests.daemon.control.cell import SPEED_M_PER_S, driven, no_tick
 from tests.drivers.ur.flight import SETTINGS
 
 
@@ -287,3 +287,37 @@ async def test_a_paused_program_that_could_not_be_stopped_is_counted_in_health()
         cell.robot.flight.arm.protective_stop()
         await cell.cycles(200)
         assert cell.runner.diagnostics()["errors"] == {"hung": 2, "paused program not stopped": 2}
+
+
+TURN = WristSpeed(0.3, 4.0)
+
+
+async def test_a_wrist_speed_is_sent_at_each_state() -> None:
+    async with driven() as cell:
+        await cell.start(TWIST)
+        await cell.cycles(20)
+        cell.robot.commands.clear()
+        await cell.cycles(50)
+        assert cell.robot.commands == [TURN] * 50
+        assert cell.robot.flight.wrist_speed == pytest.approx(0.3)
+
+
+async def test_a_process_that_dies_with_a_command_of_the_loop_has_refused_none() -> None:
+    """Nobody has sent one that could be mended; what helps is told instead."""
+    async with driven() as cell:
+        await cell.start(TWIST)
+        # What is clipped is told in each cycle, so that one is unanswered whenever the process dies.
+        cell.robot.flight.arm.be(wrench=(0.0, 0.0, 0.9 * SETTINGS.limits.force_n.hard, 0.0, 0.0, 0.0))
+        await cell.cycles(20)
+        cell.control_loop.inputs.lost["robot"] = "The robot's process died of SIGKILL."
+        cell.robot.die(50)
+        cell.runner.decide_now()
+        assert cell.phase is ExperimentPhase.STOPPED
+        assert "a command was refused" not in cell.why
+        assert "ended before it answered" in cell.why
+        assert cell.why.endswith("once the robot is connected again, `shearloop command unlock`.")
+        # Neither was the stop that comes next, of which there is nobody to hear.
+        cell.runner.decide_now()
+        told = " ".join(cell.control_loop.status.decision.reasons)
+        assert "not connected" in told
+        assert "a command was refused" not in told

@@ -6,7 +6,7 @@ import pytest
 
 from shearloop.daemon.control.safety import Fault, FaultCode
 from shearloop.daemon.control.step_runner import ExperimentPhase
-from tests.daemon.cell import driven
+from tests.daemon.control.cell import driven
 from tests.drivers.ur.flight import CYCLE_NS
 
 TWIST = {"do": "twist", "angles_rad": [1.0], "speed_rad_per_s": 0.3}

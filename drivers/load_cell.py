@@ -14,6 +14,7 @@ from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Literal, Self
 
+from shearloop.drivers.calibration_files import CalibrationModel, Finite, Positive
 from shearloop.drivers.connection import Diagnostics, LinkEvent, ReconnectPolicy, SerialLink
 from shearloop.drivers.serial_sensor import (
     InputKind,
@@ -24,7 +25,6 @@ from shearloop.drivers.serial_sensor import (
     ignore_raw,
     transfer_ns,
 )
-from shearloop.drivers.yaml_files import CalibrationModel, Finite, Positive
 
 BAUD_RATE = 115200
 # Measured on the paper's rig (4882 lines in 447 s); the data sheet says 10 samples a second.

@@ -15,18 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from shearloop.bank.eit.channels import N_LINE_VALUES, ZERO_SLOTS
 from shearloop.bank.estimation import Measured
 from shearloop.daemon.clock import Clock
 from shearloop.daemon.config import DaemonConfig
-from shearloop.daemon.config_file import mistakes
 from shearloop.daemon.errors import UserError
 from shearloop.daemon.messaging.messages import EitEstimate, EitFrame, EitHeatmap, LoadTorque, SkinShear
 from shearloop.daemon.messaging.publisher import Publisher
 from shearloop.daemon.recording import schema
-from shearloop.daemon.recording.identity import map_paths
 from shearloop.daemon.recording.reader import check_identity, open_recording, reading
 from shearloop.daemon.rig import load_cell_calibration
 from shearloop.daemon.sensing.estimators import COMBINED, LiveEstimator, open_combined, open_estimator
@@ -37,6 +34,7 @@ from shearloop.daemon.sensing.tool_diameter import tool_from_bytes
 from shearloop.drivers.eit_kit import Frame, FrameParser
 from shearloop.drivers.load_cell import LoadParser
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
+from shearloop.yaml_files import validated
 
 # Topics that a replay computes. All others are sent as they were recorded.
 COMPUTED_TOPICS = (EitFrame.topic, EitEstimate.topic, LoadTorque.topic, SkinShear.topic)
@@ -103,21 +101,20 @@ class RecordedRun:
             raise UserError(
                 f"{self.path} has no configuration because no daemon recorded it; give one with --config CONFIG"
             )
-        with reading(self.path):
-            content = json.loads(self._attached[schema.CONFIGURATION])
-        try:
-            config = DaemonConfig.model_validate(content)
-        except ValidationError as error:
-            raise UserError(
-                f"{self.path}: its configuration does not fit this version: {mistakes(error, DaemonConfig)}; "
-                "give one with --config CONFIG"
-            ) from error
         with tempfile.TemporaryDirectory(prefix="shearloop-replay-") as folder:
-            files: dict[Path, Path] = {}
+            files: dict[str, str] = {}
             for number, (name, data) in enumerate(self._attached.items()):
-                files[Path(name)] = Path(folder) / f"{number}-{Path(name).name}"
-                files[Path(name)].write_bytes(data)
-            yield map_paths(config, lambda _, path: files.get(path, path))
+                copy = Path(folder) / f"{number}-{Path(name).name}"
+                copy.write_bytes(data)
+                files[name] = str(copy)
+
+            def with_copies(section: dict[str, Any]) -> dict[str, Any]:
+                return {key: files.get(str(value), value) for key, value in section.items()}
+
+            with reading(self.path):
+                content = json.loads(self._attached[schema.CONFIGURATION], object_hook=with_copies)
+            where = f"{self.path}: its configuration does not fit this version"
+            yield validated(content, DaemonConfig, where, UserError, cure="; give one with --config CONFIG")
 
     def events(self) -> Iterator[RecordedEvent]:
         """Yield the events in recorded order."""

@@ -163,18 +163,6 @@ def read_settings(path: Path) -> UrSettings:
     Raises:
         DriverError: the file cannot be read, or settings are wrong; the message names every mistake.
     """
-    from pydantic import TypeAdapter, ValidationError
+    from shearloop.yaml_files import load_model
 
-    from shearloop.drivers.yaml_files import read_yaml
-
-    content = read_yaml(path)
-    try:
-        return TypeAdapter(UrSettings).validate_python(content)
-    except ValidationError as error:
-        known = {"missing": "it is missing", "unexpected_keyword_argument": "this is not a known key"}
-        mistakes = "; ".join(
-            f"{'.'.join(map(str, mistake['loc'])) or 'the file'}: "
-            + known.get(mistake["type"], mistake["msg"].removeprefix("Value error, "))
-            for mistake in error.errors()
-        )
-        raise DriverError(f"{path}: {mistakes}.") from error
+    return load_model(path, UrSettings, DriverError)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from shearloop.drivers.calibration_files import load_calibration, save_calibration
 from shearloop.drivers.errors import DeviceCalibrationError
 from shearloop.drivers.load_cell import (
     COUNTS_MAX,
@@ -23,7 +24,6 @@ from shearloop.drivers.load_cell import (
     describe_errors,
 )
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
-from shearloop.drivers.yaml_files import load_calibration, save_calibration
 
 TORQUE_LINES = LoadCalibration.of_torque_lines()
 STREAMS = {
@@ -216,8 +216,8 @@ def test_a_calibration_survives_its_file(tmp_path: Path) -> None:
         ("tare_counts: .nan\nscale_n_per_count: 2.0e-5\n", "tare_counts"),
         ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nsign: 0\n", "sign"),
         ("tare_counts: 1.0\nscale_n_per_count: 2.0e-5\nlever_arm_m: -0.035\n", "lever_arm_m"),
-        ("[1, 2", "is not YAML"),
-        ("", "the file"),
+        ("[1, 2", "line 1, column 6: "),
+        ("", "the calibration is empty"),
     ],
 )
 def test_a_calibration_file_that_is_wrong_is_refused_by_name_and_key(tmp_path: Path, text: str, said: str) -> None:

@@ -45,7 +45,7 @@ async def emulator(*arguments: str) -> AsyncIterator[tuple[asyncio.subprocess.Pr
 
 async def take(kit: EitKit, n_frames: int) -> list[Frame]:
     frames: list[Frame] = []
-    async with aclosing(kit.frames()) as arriving:
+    async with aclosing(kit.readings()) as arriving:
         async for frame in arriving:
             frames.append(frame)
             if len(frames) == n_frames:
@@ -104,7 +104,7 @@ async def test_faults_are_switched_on_by_argument_and_by_standard_input(tmp_path
     async with emulator(*arguments, "--fault", "cut-line@1", "--fault", "unplug:0.1@3") as (process, port):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=port)
         frames: list[Frame] = []
-        async with aclosing(kit.frames()) as arriving:
+        async with aclosing(kit.readings()) as arriving:
             async for frame in arriving:
                 frames.append(frame)
                 if len(frames) == 5:

@@ -19,7 +19,7 @@ class Board:
         # Later than all that a test asks for.
         self._seq = Clock().now_ns() + 10**9
 
-    async def samples(self) -> AsyncGenerator[LoadSample]:
+    async def readings(self) -> AsyncGenerator[LoadSample]:
         while True:
             yield await self.sent.get()
             self.sent.task_done()

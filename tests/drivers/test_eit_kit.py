@@ -38,7 +38,7 @@ async def running(board: EitKitBoard) -> AsyncIterator[EitKitBoard]:
 
 async def take(kit: EitKit, n_frames: int) -> list[Frame]:
     frames: list[Frame] = []
-    async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
+    async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
         async for frame in arriving:
             frames.append(frame)
             if len(frames) == n_frames:
@@ -76,7 +76,7 @@ async def test_the_rate_is_told_once_it_is_measured(tmp_path: Path) -> None:
     async with running(EitKitBoard(cycle(some_lines(4)), period_s=PERIOD_S, link=tmp_path / "eit")):
         kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
         assert kit.diagnostics()["measured_hz"] is None
-        async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
+        async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
             async for _ in arriving:
                 if kit.diagnostics()["measured_hz"] is not None:
                     break
@@ -88,7 +88,7 @@ async def test_a_reader_that_stops_for_a_while_loses_nothing(tmp_path: Path) -> 
     async with running(EitKitBoard(lines, period_s=PERIOD_S, link=tmp_path / "eit")) as board:
         kit = EitKit(zero_slots=ZERO_SLOTS, path=tmp_path / "eit", frame_period_s=PERIOD_S)
         frames = []
-        async with asyncio.timeout(DEADLINE_S), aclosing(kit.frames()) as arriving:
+        async with asyncio.timeout(DEADLINE_S), aclosing(kit.readings()) as arriving:
             async for frame in arriving:
                 frames.append(frame)
                 if len(frames) == 5:

@@ -54,7 +54,7 @@ async def a_rig(
     cell = rig.cell = LoadCell(calibration, path=link, policy=ReconnectPolicy(0.001, 0.002), on_event=rig.on_event)
 
     async def listen() -> None:
-        async with contextlib.aclosing(cell.samples()) as samples:
+        async with contextlib.aclosing(cell.readings()) as samples:
             async for sample in samples:
                 rig.on_sample(sample)
 

@@ -71,11 +71,15 @@ async def a_bench(folder: Path, *, serial_source: bool, adc: bool, deadline_s: f
         changed.set()
 
     played = EmulatedKeithley6430(circuit)
+
+    def answer(data: bytes) -> bytes:
+        return played.feed(data)  # replaced by some tests
+
     way_in: PtyServer | SocketServer
     if serial_source:
-        way_in = PtyServer(played.feed, folder / "source", lambda _: ready.release(), answer_s=0.0)
+        way_in = PtyServer(answer, folder / "source", lambda _: ready.release(), answer_s=0.0)
     else:
-        way_in = SocketServer(lambda: played.feed, on_port=lambda _: ready.release(), answer_s=0.0)
+        way_in = SocketServer(lambda: answer, on_port=lambda _: ready.release(), answer_s=0.0)
     outages = FaultyServer(way_in)
     players = [outages.run]
     scanner = SocketServer(lambda: EmulatedScanner(circuit).feed, on_port=lambda _: ready.release(), answer_s=0.0)
@@ -223,16 +227,16 @@ async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=1.0) as bench:
         await bench.next_says()
         openings = bench.skin.source_diagnostics()["connections"]
-        sound = bench.played.interpreter.feed
+        sound = bench.played.feed
 
         def switched_off_after_it_said_that_it_is_on(data: bytes) -> bytes:
             reply = sound(data)
             if b"OUTP?" in data:
                 bench.circuit.output_on = False
-                bench.played.interpreter.feed = sound  # type: ignore[method-assign]
+                bench.played.feed = sound  # type: ignore[method-assign]
             return reply
 
-        bench.played.interpreter.feed = switched_off_after_it_said_that_it_is_on  # type: ignore[method-assign]
+        bench.played.feed = switched_off_after_it_said_that_it_is_on  # type: ignore[method-assign]
         await bench.next_says(SkinFault.SOURCE_OFF)
         assert not bench.circuit.output_on
         assert bench.skin.source_diagnostics()["connections"] == openings
@@ -241,11 +245,11 @@ async def test_a_source_that_is_switched_off_between_two_questions_stays_off_too
 async def test_a_source_that_says_nonsense_is_not_believed(tmp_path: Path) -> None:
     async with a_bench(tmp_path, serial_source=False, adc=False, deadline_s=0.1) as bench:
         await bench.next_says()
-        sound = bench.played.interpreter.feed
-        bench.played.interpreter.feed = lambda data: sound(data) and b"%%%\n"  # type: ignore[method-assign]  # a bad cable
+        sound = bench.played.feed
+        bench.played.feed = lambda data: sound(data) and b"%%%\n"  # type: ignore[method-assign]  # a bad cable
         await bench.until(lambda: bench.source_errors.get("not understood", 0) >= 3)
         await bench.next_says(SkinFault.SOURCE_LOST)
-        bench.played.interpreter.feed = sound  # type: ignore[method-assign]
+        bench.played.feed = sound  # type: ignore[method-assign]
         await bench.next_says()
 
 
@@ -269,15 +273,15 @@ async def test_a_source_that_breaks_off_in_the_middle_of_an_answer_is_named_coun
 ) -> None:
     async with a_bench(tmp_path, serial_source=serial_source, adc=True) as bench:
         await bench.next_says()
-        sound = bench.played.interpreter.feed
+        sound = bench.played.feed
 
         def broken_off_at_the_query(data: bytes) -> bytes:
             if query.encode() in data:
                 bench.source.command("break-off")
-                bench.played.interpreter.feed = sound  # type: ignore[method-assign]
+                bench.played.feed = sound  # type: ignore[method-assign]
             return sound(data)
 
-        bench.played.interpreter.feed = broken_off_at_the_query  # type: ignore[method-assign]
+        bench.played.feed = broken_off_at_the_query  # type: ignore[method-assign]
         await bench.until(lambda: bench.skin.source_diagnostics()["connections"] == 2)
         await bench.next_says()
         # On a busy machine the converter board may be late too, which is no news here.

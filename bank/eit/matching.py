@@ -105,10 +105,9 @@ class Matcher(ABC):
         """Return the maximum of one (896,) difference's heatmap and its runner-up. Errors as `heatmaps`."""
         return best_match(self.heatmap(difference), self.k_grid, self.sigma_grid)
 
-    def _chunks(self, size: int = CHUNK_CELLS) -> Iterator[IntArray]:
-        """Yield the numbers of all valid cells, `size` at a time."""
-        for start in range(0, len(self._cells), size):
-            yield self._cells[start : start + size]
+    def _chunks(self) -> Iterator[IntArray]:
+        for start in range(0, len(self._cells), CHUNK_CELLS):
+            yield self._cells[start : start + CHUNK_CELLS]
 
     def _unit_signals(self, cells: IntArray) -> FloatArray:
         magnitudes = self._magnitudes(cells)

@@ -47,13 +47,6 @@ class Match:
     runner_up_cell: tuple[int, int] | None
 
 
-@dataclass(frozen=True, slots=True)
-class NoSignal:
-    """A difference that noise alone explains; do not match it."""
-
-    why: str
-
-
 class Matcher(ABC):
     """Scores differences against all valid cells of a bank; keeps no state between calls."""
 
@@ -167,8 +160,8 @@ def unit_magnitudes(differences: ArrayLike) -> FloatArray:
     return np.asarray(magnitudes / np.linalg.norm(magnitudes, axis=1, keepdims=True))
 
 
-def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal | None:
-    """Return why an (896,) difference is no signal, or None where it exceeds the noise.
+def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> str | None:
+    """Return why an (896,) difference is no signal and must not be matched, or None where it exceeds the noise.
 
     noise_std is the difference's standard deviation from noise alone, (896,) or one number. For independent Gaussian
     noise Σ (difference/noise_std)² is χ² distributed with 896 degrees of freedom; a signal exceeds its quantile at
@@ -185,7 +178,7 @@ def signal_above_noise(difference: ArrayLike, noise_std: ArrayLike) -> NoSignal 
         energy = float(np.sum((values / noise) ** 2))
     if energy > _MIN_ENERGY:
         return None
-    return NoSignal(
+    return (
         f"no signal above the noise: the difference is {np.sqrt(energy / N_CHANNELS):.2f} times the noise, "
         f"and a signal needs {np.sqrt(_MIN_ENERGY / N_CHANNELS):.2f} times"
     )

@@ -98,13 +98,9 @@ class Gauge:
         length_m = self.strips * self.strip_length_m
         return self.resistivity_ohm_m * length_m / (self.channel_width_m * self.channel_height_m)
 
-    def power_w(self, voltage_v: float) -> float:
-        """Return the heat V² w h / (ρ N L)."""
-        return voltage_v**2 / self.resistance_ohm
-
     def power_at_current_w(self, current_a: float = EXCITATION_A) -> float:
         """Return the heat where a current source feeds the gauge, 5 mA in the paper."""
-        return self.power_w(current_a * self.resistance_ohm)
+        return (current_a * self.resistance_ohm) ** 2 / self.resistance_ohm
 
     def joule_heating_k(self, current_a: float = EXCITATION_A) -> float:
         """Return the steady temperature rise of the gauge's area in still air."""

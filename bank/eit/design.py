@@ -55,8 +55,8 @@ class MeasuredFrames:
             )
         # Sizes that overflow as a square, or vanish, give no number.
         with np.errstate(all="ignore"):
-            noise = self.noise_v / np.sqrt((self.differences**2).mean())
-        if not _MIN_NOISE <= noise < np.inf:
+            usable = _MIN_NOISE <= self.relative_noise < np.inf
+        if not usable:
             raise CalibrationError(
                 "the gripped frames have no noise to design for: they are all alike, multiples of a few, or not from a "
                 "board; record frames as they come"
@@ -65,7 +65,7 @@ class MeasuredFrames:
     @property
     def relative_noise(self) -> float:
         """The noise as a share of the differences, both as RMS."""
-        return self.noise_v / float(np.sqrt((self.differences**2).mean()))
+        return float(self.noise_v / np.sqrt((self.differences**2).mean()))
 
 
 @dataclass(frozen=True, slots=True)

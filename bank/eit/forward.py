@@ -16,7 +16,7 @@ from skfem.helpers import dot, grad
 
 from shearloop.bank.arrays import BoolArray, FloatArray, IntArray
 from shearloop.bank.eit.channels import CHANNELS, N_CHANNELS, N_ELECTRODES, STIMULATION_CURRENT
-from shearloop.bank.eit.mesh import Mesh, require_fingertip
+from shearloop.bank.eit.mesh import Mesh, require_fingertip, rows_of_edges
 from shearloop.bank.errors import ConductivityError
 
 # The node of zero potential; only differences of potentials leave this module.
@@ -213,7 +213,9 @@ def assemble(mesh: Mesh) -> tuple[Terms, Terms]:
     n_triangles = len(mesh.triangles)
     stiffness = Terms(inside.indices[0], inside.indices[1], inside.data, np.tile(np.arange(n_triangles), 9))
 
-    edges = FacetBasis(domain, ElementTriP1(), facets=_facets_of(domain, mesh.electrode_edges), intorder=2)
+    electrode_edges, facets = np.sort(mesh.electrode_edges, axis=1), domain.facets.T.astype(np.int64)
+    numbers = rows_of_edges(electrode_edges, facets, len(mesh.nodes))
+    edges = FacetBasis(domain, ElementTriP1(), facets=numbers, intorder=2)
     impedance = mesh.contact_impedance[mesh.electrode_of_edge]
     z = np.repeat(impedance[:, None], edges.dx.shape[1], axis=1)
     mass, load = _mass.coo_data(edges, z=z), _load.coo_data(edges, z=z)
@@ -248,11 +250,3 @@ def _terms(mesh: Mesh) -> tuple[Terms, IntArray]:
     stiffness, contact = assemble(mesh)
     terms: Any = (np.concatenate(pair) for pair in zip(stiffness, contact, strict=True))
     return Terms(*terms), elimination_order(mesh, stiffness)
-
-
-def _facets_of(domain: MeshTri, edges: IntArray) -> IntArray:
-    wanted = np.sort(edges, axis=1) @ [domain.nvertices, 1]
-    numbers = np.sort(domain.facets, axis=0).T.astype(np.int64) @ [domain.nvertices, 1]
-    order = np.argsort(numbers)
-    found: IntArray = order[np.searchsorted(numbers, wanted, sorter=order)]
-    return found

@@ -8,8 +8,8 @@ import pytest
 
 from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin import membrane as membrane_model
+from shearloop.bank.skin.membrane import GAUGE_FACTOR, Section, response_of_strains, section_membrane
 from shearloop.bank.skin.membrane import PAPER_SECTION as SECTION
-from shearloop.bank.skin.membrane import Section, gauge_factor, response_of_strains, section_membrane
 from shearloop.bank.skin.plane_strain import (
     CondensedSkin,
     ContactError,
@@ -163,7 +163,7 @@ def ring_sensitivity(section: Section) -> float:
     r = np.linspace(inner, outer, 2001)
     stress = p_wave * along(r) + lame * (a - b / r**2 + d * (np.log(r) + 1))
     moment_nmm = section.width_mm * np.trapezoid(stress * r, r)
-    return float(gauge_factor() * along(np.array(section.mid_radius_mm)) / (moment_nmm / outer))
+    return float(GAUGE_FACTOR * along(np.array(section.mid_radius_mm)) / (moment_nmm / outer))
 
 
 @pytest.mark.parametrize("thickness_mm", [0.1, 0.4, 0.7])

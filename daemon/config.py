@@ -1,7 +1,6 @@
 """The daemon's configuration. Units are in the keys; unknown keys are refused; loaded values do not change."""
 
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -280,7 +279,7 @@ class DaemonConfig(ConfigModel):
     def _ports(self) -> dict[str, list[str]]:
         """Return the configuration keys of each serial port and socket."""
         found: dict[str, list[str]] = {}
-        for key, section in _sections(self, ""):
+        for key, section in self.walk():
             match section:
                 case SerialDevice(serial_number=str(number)):
                     found.setdefault(f"the port with the serial number {number}", []).append(key)
@@ -300,14 +299,3 @@ class DaemonConfig(ConfigModel):
 def load_daemon_config(path: Path) -> DaemonConfig:
     """Return the configuration of a YAML file; raises UserError with every mistake."""
     return load_yaml_model(path, DaemonConfig)
-
-
-def _sections(section: ConfigModel, key: str) -> Iterator[tuple[str, ConfigModel]]:
-    """Yield every section within a section, with its key in the file."""
-    for name in type(section).model_fields:
-        value, own = getattr(section, name), f"{key}.{name}".lstrip(".")
-        inner = {f"{own}.{part}": item for part, item in value.items()} if isinstance(value, dict) else {own: value}
-        for path, item in inner.items():
-            if isinstance(item, ConfigModel):
-                yield path, item
-                yield from _sections(item, path)

@@ -165,7 +165,9 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
     The copy is `out`, or the source without `.partial`, or NAME.repaired.mcap. Raises UserError if the copy exists or
     cannot be written, and if the source has no intact message.
     """
-    out = out or _default_copy(source)
+    if out is None:
+        name = source.name.removesuffix(PARTIAL)
+        out = source.with_name(name if name != source.name else f"{source.stem}.repaired.mcap")
     if out.exists():
         raise UserError(f"{out} exists already; move it away, or name another file with --out")
     condition = FileCondition.of_file(source)
@@ -223,29 +225,23 @@ def intact_records(path: Path, condition: FileCondition, progress: Progress = la
         raise UserError(f"{path}: the recording cannot be read: {error.strerror}") from error
 
 
-def _default_copy(source: Path) -> Path:
-    if source.name.endswith(PARTIAL):
-        return source.with_name(source.name.removesuffix(PARTIAL))
-    return source.with_name(f"{source.stem}.repaired.mcap")
-
-
 def _intact_records(file: IO[bytes], condition: FileCondition, progress: Progress) -> Iterator[McapRecord]:
     reader = StreamReader(file, emit_chunks=True, record_size_limit=_LARGEST_RECORD_BYTES).records
     while True:
         try:
-            record = next(reader, None)
+            record = next(reader)
             inside = _chunk_records(record, condition) if isinstance(record, Chunk) else [record]
         # The library raises many types of exceptions for a damaged record.
         except (McapError, ValueError, EOFError, ArithmeticError, LookupError, TypeError, struct.error, MemoryError):
             return
-        if record is None:
+        except StopIteration:
             return
         condition.intact_bytes = file.tell()
         progress(condition.intact_bytes)
         if isinstance(record, Footer):
             condition.closed = True
             return
-        yield from (one for one in inside if one is not None)
+        yield from inside
 
 
 def _chunk_records(chunk: Chunk, condition: FileCondition) -> list[McapRecord]:

@@ -214,7 +214,7 @@ class FingertipTask:
 
     async def read(self) -> None:
         """Publish and queue every frame until cancelled."""
-        async with contextlib.aclosing(self._board.frames()) as frames:
+        async with contextlib.aclosing(self._board.readings()) as frames:
             async for frame in frames:
                 self._publisher.publish(frame_message(self.name, frame))
                 self.estimator_task.submit(frame)

@@ -84,6 +84,16 @@ def accept_number(low: float, high: float) -> Handler:
     return check
 
 
+def accept_word(*words: str) -> Handler:
+    """Return a handler that refuses other words."""
+
+    def check(text: str) -> None:
+        if text.upper() not in words:
+            raise ScpiError(ILLEGAL_VALUE)
+
+    return check
+
+
 def parse_boolean(text: str) -> bool:
     """Return a command's truth value; ScpiError for other text."""
     values = {"ON": True, "1": True, "OFF": False, "0": False}

@@ -132,7 +132,7 @@ async def test_only_allowed_clients_connect_and_only_encrypted(
                 await asking.send(encode({"command": "status"}))
                 assert not await asking.poll(SILENCE_MS), who
                 assert not await hearing.poll(0), who
-            assert daemon._command_facts()["errors"]["key is not allowed"] >= 1
+            assert daemon._command_diagnostics()["errors"]["key is not allowed"] >= 1
             await _stop_without_a_key(daemon, connect)
         finally:
             daemon.stop()

@@ -11,6 +11,7 @@ from shearloop.daemon.messaging.client import receive_messages
 from shearloop.daemon.messaging.messages import LoadTorque, decode, encode
 from shearloop.daemon.messaging.publisher import Publisher
 from tests.daemon.conftest import DEADLINE_S
+from tests.daemon.sample_messages import sample
 
 
 def until(is_so: Callable[[], bool]) -> None:
@@ -73,38 +74,25 @@ def test_subscriptions_to_unknown_topics_are_not_kept(tmp_path: Path) -> None:
         publisher.close()
 
 
-def reading(number: int) -> LoadTorque:
-    return LoadTorque(
-        source="load_cell",
-        t_mono_ns=number,
-        torque_nm=0.1,
-        raw=1.0,
-        saturated=False,
-        spike=False,
-        valid=True,
-        reason="",
-    )
-
-
 def test_subscribers_come_and_go_while_messages_are_sent(tmp_path: Path) -> None:
     address = f"ipc://{tmp_path}/publish"
     with zmq.Context() as context, closing(Publisher(context, address, Clock())) as publisher:
-        for number in range(100):
-            publisher.publish(reading(number))
+        for _ in range(100):
+            publisher.publish(sample(LoadTorque))
         with context.socket(zmq.SUB) as one:
             one.setsockopt(zmq.RCVTIMEO, round(DEADLINE_S * 1000))
             one.connect(address)
             one.subscribe("load.")
             until(lambda: publisher.has_subscriber("load.torque"))
             assert not publisher.has_subscriber("health")
-            publisher.publish(reading(100))
+            publisher.publish(sample(LoadTorque))
             topic, payload = one.recv_multipart()
             assert topic == b"load.torque"
             assert decode(payload)["seq"] == 100, "messages without a subscriber are numbered too"
             with context.socket(zmq.SUB) as two:
                 two.connect(address)
                 two.subscribe("health")
-                publisher.publish(reading(101))
+                publisher.publish(sample(LoadTorque))
                 until(lambda: publisher.has_subscriber("health"))
             until(lambda: not publisher.has_subscriber("health"))
         until(lambda: not publisher.has_subscribers())

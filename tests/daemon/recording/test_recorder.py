@@ -26,6 +26,7 @@ from shearloop.daemon.recording.recorder import Recorder
 from shearloop.daemon.recording.repair import repair, summarise
 from shearloop.drivers.serial_sensor import InputKind, RawEvent
 from tests.daemon.conftest import deadline
+from tests.daemon.sample_messages import sample
 
 IDENTITY = Identity(basic_identity("a test"), (AttachedFile("configuration.json", "application/json", b"{}"),))
 
@@ -33,31 +34,14 @@ IDENTITY = Identity(basic_identity("a test"), (AttachedFile("configuration.json"
 def frame(clock: Clock, number: int) -> dict:
     rng = np.random.default_rng(number)
     channels = np.round(rng.uniform(0.01, 0.5, len(LINE_SLOTS)), 4)
-    message = EitFrame(
-        source="right",
-        t_mono_ns=clock.now_ns() - 300_000_000,
-        channels=channels,
-        line=line_of_channels(channels),
-        frame=number,
-        age_s=0.3,
-        saturated=0,
-        dead=0,
-        repeated=False,
-    )
+    arrays = {"channels": channels, "line": line_of_channels(channels)}
+    times = {"t_mono_ns": clock.now_ns() - 300_000_000, "age_s": 0.3}
+    message = sample(EitFrame, source="right", frame=number, repeated=False, **arrays, **times)
     return wire_map(message, clock.unix_s(message.t_mono_ns), number)
 
 
 def torque(clock: Clock, number: int, torque_nm: float = 0.1) -> dict:
-    message = LoadTorque(
-        source="load_cell",
-        t_mono_ns=clock.now_ns(),
-        torque_nm=torque_nm,
-        raw=1.0,
-        saturated=False,
-        spike=False,
-        valid=True,
-        reason="",
-    )
+    message = sample(LoadTorque, source="load_cell", torque_nm=torque_nm)
     return wire_map(message, clock.unix_s(message.t_mono_ns), number)
 
 

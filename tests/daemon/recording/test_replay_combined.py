@@ -19,9 +19,8 @@ from shearloop.daemon.app import Daemon
 from shearloop.daemon.config import load_daemon_config
 from shearloop.drivers.eit_kit import ADC_STEP_V
 from tests.daemon.conftest import DEADLINE_S, shearloop
-from tests.daemon.recording.test_replay import measured, replayed
+from tests.daemon.recording.test_replay import Messages, measured, replayed
 
-Messages = list[tuple[str, dict[str, Any]]]
 N_FRAMES = 120
 GRIPPED = slice(25, 110)
 PERIOD_S = 0.5408

@@ -22,8 +22,6 @@ from shearloop.daemon.cli import main
 from shearloop.daemon.config_file import load_yaml_model
 from shearloop.daemon.recording.writer import RecordingWriter
 
-STEPS = np.linspace(1.2, 2.2, 8)
-
 
 @pytest.fixture(scope="session")
 def built(shared: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -47,16 +45,15 @@ def test_a_design_is_a_configuration_that_builds(built: Path) -> None:
     assert bank.valid.any()
 
 
-@pytest.fixture(scope="module")
 def step_frames() -> np.ndarray:
-    """Return frames of the step model at eight places."""
+    """Return the model's frames (8, 896) of steps of eight sizes."""
     mesh = load_geometry(OWN_FINGERTIP)
-    signals = simulated_signals(ForwardModel(mesh), "step", [Setting(k, 1.0) for k in STEPS.tolist()])
-    return 0.01 * np.abs(signals)
+    steps = [Setting(k, 1.0) for k in np.linspace(1.2, 2.2, 8).tolist()]
+    return 0.01 * np.abs(simulated_signals(ForwardModel(mesh), "step", steps))
 
 
-def test_a_design_without_a_sigma_is_a_configuration_of_one_column(step_frames: np.ndarray, tmp_path: Path) -> None:
-    frames = step_frames.copy()
+def test_a_design_without_a_sigma_is_a_configuration_of_one_column(tmp_path: Path) -> None:
+    frames = step_frames()
     # A third of a frame's size: a coarse mesh and few cells, built in no time.
     frames += np.random.default_rng(0).normal(0.0, 8e-4, frames.shape)
     design = design_bank(
@@ -69,14 +66,14 @@ def test_a_design_without_a_sigma_is_a_configuration_of_one_column(step_frames: 
     assert len(plan.definition.sigma_grid) == 1
     build_bank(*plan, tmp_path / "step.bank")
     place = RefinedMatcher(Bank.open(tmp_path / "step.bank"), NOT_TURNED).match(frames[4])
-    assert abs(place.k - STEPS[4]) < 2 * np.diff(plan.definition.k_grid)[0]
+    assert abs(place.k - np.linspace(1.2, 2.2, 8)[4]) < 2 * np.diff(plan.definition.k_grid)[0]
 
 
 @pytest.mark.parametrize(("noise_v", "mixed_up"), [(1e-4, False), (5e-3, True)])
 def test_frames_that_no_model_explains_are_called_so_on_the_screen_and_in_the_configuration(
-    step_frames: np.ndarray, noise_v: float, mixed_up: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    noise_v: float, mixed_up: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    frames = step_frames.copy()
+    frames = step_frames()
     rng = np.random.default_rng(0)
     frames = frames[:, rng.permutation(N_CHANNELS)] if mixed_up else frames
     frames += rng.normal(0.0, noise_v, frames.shape)

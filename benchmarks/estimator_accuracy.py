@@ -16,13 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
 from shearloop.bank.eit.mesh import load_mesh
 from shearloop.bank.errors import BankError
 from shearloop.bank.estimation import FrameSeries, Name, Physics, fit
-from shearloop.bank.estimation.interval_regressor import STRENGTHS
-from shearloop.bank.estimation.regressors import Ridge, best_strength, later_splits, ranked_channels
+from shearloop.bank.estimation.interval_regressor import STRENGTHS, best_strength
+from shearloop.bank.estimation.regressors import Ridge, ranked_channels
 from shearloop.daemon.analysis.evaluate import EstimateTrack, draw_tracks, estimate_series, figures_of
 from shearloop.daemon.analysis.series import part_of, read_series, series_of
 from shearloop.daemon.cli.demo_calibration import calibrate, record
@@ -141,16 +140,10 @@ def over_channels(torque: FrameSeries) -> dict[int, float]:
     past, future = part_of(torque, 0, SLICE_SHARES[0]), part_of(torque, SLICE_SHARES[0], 1)
     frames, values = past.channels[:, 0], past.torque_at_frames()
     order = ranked_channels(frames, values)
-    splits = list(later_splits(len(values)))
     found = {}
     for count in CHANNEL_COUNTS:
         best = frames[:, order[:count]]
-
-        def error(strength: float, rows: IntArray, later: IntArray, best: FloatArray = best) -> float:
-            ridge = Ridge.fit(best[rows], values[rows], strength)
-            return float(((ridge.predict(best[later]) - values[later]) ** 2).mean())
-
-        ridge = Ridge.fit(best, values, best_strength(STRENGTHS, error, splits))
+        ridge = Ridge.fit(best, values, best_strength(best, values, Ridge.fit, STRENGTHS)[0])
         predicted = ridge.predict(future.channels[:, 0][:, order[:count]])
         found[count] = float(np.corrcoef(predicted, future.torque_at_frames())[0, 1])
     return found

@@ -179,7 +179,7 @@ class ReplayPipeline:
                 await self._estimate(source, frame)
                 pair = self._pairing.add(source, frame.t_mid_ns, frame) if self._pairing is not None else None
                 if pair is not None:
-                    await self._estimate(COMBINED, *pair[1])
+                    await self._estimate(COMBINED, *pair)
         elif source == LOAD_CELL and self._load_parser is not None:
             for sample in self._load_parser.handle(event):
                 self._publisher.publish(load_message(sample))

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from shearloop.bank.eit.channels import CHANNELS, LINE_SLOTS, ZERO_SLOTS, line_of_channels
 from shearloop.daemon.cli import EXIT_USAGE, main
 from shearloop.drivers.eit_kit import ADC_STEP_V, EitKit, Frame
+from tests.daemon.conftest import shearloop
 from tests.running import take
 
 # Guards against a test that hangs; none of them waits for so long.
@@ -23,25 +24,10 @@ PERIOD_S = 0.5408
 @asynccontextmanager
 async def emulator(*arguments: str) -> AsyncIterator[tuple[asyncio.subprocess.Process, str]]:
     """Run `shearloop emulate eit-kit` as a process of its own and hand over the path that it prints."""
-    process = await asyncio.create_subprocess_exec(
-        sys.executable,
-        *("-m", "shearloop", "emulate", "eit-kit", *arguments),
-        stdin=asyncio.subprocess.PIPE,
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-    )
-    try:
-        async with asyncio.timeout(DEADLINE_S):
-            assert process.stdout is not None
-            path = (await process.stdout.readline()).decode().strip()
-            assert path, (await process.stderr.read()).decode() if process.stderr else ""
-            yield process, path
-    finally:
-        if process.returncode is None:
-            process.terminate()
-        await process.communicate()
-        # The transport closes its pipes one step later.
-        await asyncio.sleep(0)
+    async with shearloop("emulate", "eit-kit", *arguments, stdin=asyncio.subprocess.PIPE) as process:
+        path = (await process.stdout.readline()).decode().strip()
+        assert path, (await process.stderr.read()).decode()
+        yield process, path
 
 
 def recording(folder: Path, n_frames: int) -> tuple[Path, NDArray[np.float64]]:

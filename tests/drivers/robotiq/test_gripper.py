@@ -1,4 +1,4 @@
-"""What the gripper does when it is asked, by both ways in, and what of it is refused."""
+"""Commands to the gripper on both connections."""
 
 import asyncio
 from pathlib import Path

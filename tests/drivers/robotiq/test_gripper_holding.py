@@ -18,7 +18,7 @@ from tests.drivers.robotiq.gripper_rig import STEP_S, WAYS, Rig, a_rig
 
 @contextlib.asynccontextmanager
 async def holding(way: str, tmp_path: Path) -> AsyncIterator[tuple[Rig, AsyncIterator[GripperState]]]:
-    """Return a rig whose gripper holds an object and stands, with time stopped, and its states."""
+    """Return a rig whose gripper holds an object, with stopped time, and its states."""
     async with a_rig(way, tmp_path) as rig, contextlib.aclosing(rig.driver.states()) as states, asyncio.timeout(20):
         await anext(states)
         await rig.driver.activate()
@@ -35,7 +35,7 @@ async def holding(way: str, tmp_path: Path) -> AsyncIterator[tuple[Rig, AsyncIte
 async def test_command_of_another_master_is_seen_at_the_next_poll(
     way: str, tmp_path: Path, asked: dict[str, Any]
 ) -> None:
-    """It holds as before, which is what position and object tell; but whether it does is no longer what we asked."""
+    """Position and object stay the same, but the target is no longer ours."""
     async with holding(way, tmp_path) as (rig, states):
         for name, wanted in asked.items():
             setattr(rig.model.command, name, wanted)

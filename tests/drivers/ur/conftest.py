@@ -1,4 +1,4 @@
-"""A controller in a process of its own, shared by the tests of a module; the daemon's ends of pipes to our process."""
+"""An emulated controller in its own process, one for each module; the daemon's ends of a worker's pipes."""
 
 import asyncio
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ from tests.emulator_process import EmulatorProcess as ControllerProcess
 
 @pytest.fixture(scope="module")
 def controller_process() -> Iterator[ControllerProcess]:
-    """A controller that unlocks after a second, not five."""
+    """A controller that unlocks after one second instead of five."""
     options = ("--rate-hz", "250", "--unlock-wait-s", "1.0", "--power-on-s", "0.1")
     process = ControllerProcess("ur", *options, module=1, ready="listening")
     yield process
@@ -27,7 +27,7 @@ def controller(controller_process: ControllerProcess) -> Iterator[ControllerProc
 
 @pytest.fixture
 def daemon(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
-    """The daemon of a process that does not end, and sets no alarm."""
+    """The daemon of a worker that neither exits nor sets alarms."""
     daemon = Daemon(monkeypatch)
     yield daemon
     daemon.close()

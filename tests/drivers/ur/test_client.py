@@ -1,4 +1,4 @@
-"""The whole driver over real TCP: the real ur-rtde in its process, an emulated controller in another."""
+"""The whole driver over TCP: ur-rtde in the worker, an emulated controller in another process."""
 
 import asyncio
 import os
@@ -22,7 +22,7 @@ STOPPED_WITHIN_S = 0.2
 
 
 async def turn(robot: UrRobot, controller: ControllerProcess, speed: float = 0.5) -> None:
-    """Turn the wrist, and return when it is up to speed."""
+    """Turn the wrist and return when it has reached its speed."""
     since_ns = time.monotonic_ns()
     reply = await robot.send(WristSpeed(speed, 4.0))
     assert reply.accepted, reply.refusal
@@ -116,7 +116,7 @@ async def test_twist_stops_when_the_client_is_killed(controller: ControllerProce
 
 
 async def test_stalled_samples_end_the_motion(controller: ControllerProcess) -> None:
-    """Longer than data are believed, and back before the robot's watchdog has noticed: the program must not turn on."""
+    """Longer than `state_timeout_s`, shorter than the watchdog's time: the wrist must not turn on."""
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         await turn(robot, controller)
@@ -252,7 +252,7 @@ async def test_connection_that_is_refused_is_explained(
 async def test_leaving_stops_the_arm_and_ends_the_program(
     told: signal.Signals | None, controller: ControllerProcess
 ) -> None:
-    """Also where a terminal, or a service manager, tells every process of the daemon to end."""
+    """Also when a terminal or service manager signals every process."""
     async with running(settings_for(controller.host)) as robot:
         await enable(robot)
         await turn(robot, controller)

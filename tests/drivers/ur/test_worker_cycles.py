@@ -1,4 +1,4 @@
-"""What the robot's own process does and sends in each cycle, in a time of its own."""
+"""The worker's cycles in their own time."""
 
 from itertools import pairwise
 
@@ -78,14 +78,14 @@ def test_protective_stop_is_reported_in_its_cycle(daemon: Daemon, monkeypatch: p
 
 
 def test_end_of_a_recovery_is_reported_at_once(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Announced as being made ready, and given up in the same cycle: all is as before the announcement."""
+    """The recovery is announced and given up in the same cycle."""
     arm = TimedArm()
     arm.be(robot_mode=3)
     given_up = CommandHandler.tick
 
     def tick(handler: CommandHandler, reading: RtdeSample, now_ns: int) -> tuple[int, CommandReply] | None:
         if now_ns > 1000.1e9 and handler._recovery is not None:
-            handler._recovery.give_up("Nobody waits for it.")
+            handler._recovery.give_up("The recovery is given up.")
         return given_up(handler, reading, now_ns)
 
     monkeypatch.setattr("shearloop.drivers.ur.command_handler.CommandHandler.tick", tick)

@@ -1,4 +1,4 @@
-"""The pipe of the robot's own process: what waits for what, what is dropped, and what is bounded."""
+"""The worker's pipe: order, dropped states, bounds."""
 
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, WristSpeed
@@ -13,7 +13,7 @@ def test_state_is_dropped_while_others_are_unsent(daemon: Daemon) -> None:
     unsent = daemon.pipe._unsent
     daemon.pipe.send_latest(state)
     assert daemon.pipe._unsent == unsent
-    daemon.hear()
+    daemon.receive()
     daemon.pipe.send_latest(state)
     assert not daemon.pipe._unsent
 
@@ -21,9 +21,9 @@ def test_state_is_dropped_while_others_are_unsent(daemon: Daemon) -> None:
 def test_each_command_is_answered_at_once(daemon: Daemon) -> None:
     flight = flying()
     for acceleration, accepted in ((4.0, True), (-4.0, False)):
-        daemon.say(WristSpeed(0.1, acceleration))
+        daemon.send(WristSpeed(0.1, acceleration))
         worker._handle_commands(daemon.pipe, flight.handler, flight.state)
-        assert [message.accepted for _, message in daemon.hear() if isinstance(message, CommandReply)] == [accepted]
+        assert [message.accepted for _, message in daemon.receive() if isinstance(message, CommandReply)] == [accepted]
 
 
 def test_unsent_output_is_bounded(daemon: Daemon) -> None:

@@ -1,11 +1,12 @@
 """An emulated controller in its own process, one for each module; the daemon's ends of a worker's pipes."""
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 
 import pytest
 
-from tests.drivers.ur.process import Daemon
+from tests.drivers.ur.process import Daemon, Timed
 from tests.emulator_process import EmulatorProcess as ControllerProcess
 
 
@@ -31,3 +32,9 @@ def daemon(monkeypatch: pytest.MonkeyPatch) -> Iterator[Daemon]:
     daemon = Daemon(monkeypatch)
     yield daemon
     daemon.close()
+
+
+@pytest.fixture
+def timed(daemon: Daemon, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Timed]:
+    """Run a worker in its own time."""
+    return partial(Timed, daemon, monkeypatch)

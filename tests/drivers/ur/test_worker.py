@@ -6,6 +6,7 @@ from pathlib import Path
 
 from shearloop.drivers.ur import worker
 from shearloop.drivers.ur.messages import CommandReply, Disconnect, Enable, Message, RtdeSample, Unlock, WristSpeed
+from tests.drivers.ur.flight import Flight, flying
 from tests.drivers.ur.process import CyclingArm, Daemon, fly
 
 ROOT = Path(__file__).parents[3]
@@ -144,3 +145,32 @@ def test_exception_ends_the_process_and_is_printed() -> None:
     ended = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, timeout=30, check=False)
     assert ended.returncode == worker.EXIT_FAILED
     assert b"ValueError: an unforeseen error" in ended.stderr
+
+
+def test_state_is_dropped_while_others_are_unsent(daemon: Daemon) -> None:
+    state = Flight().state
+    while not daemon.pipe._unsent:
+        daemon.pipe.send(state)
+    unsent = daemon.pipe._unsent
+    daemon.pipe.send_latest(state)
+    assert daemon.pipe._unsent == unsent
+    daemon.receive()
+    daemon.pipe.send_latest(state)
+    assert not daemon.pipe._unsent
+
+
+def test_each_command_is_answered_at_once(daemon: Daemon) -> None:
+    flight = flying()
+    for acceleration, accepted in ((4.0, True), (-4.0, False)):
+        daemon.send(WristSpeed(0.1, acceleration))
+        worker._handle_commands(daemon.pipe, flight.handler, flight.state)
+        assert [message.accepted for _, message in daemon.receive() if isinstance(message, CommandReply)] == [accepted]
+
+
+def test_unsent_output_is_bounded(daemon: Daemon) -> None:
+    state = Flight().state
+    for _ in range(10_000):
+        daemon.pipe.send(state)
+        if not daemon.pipe.open:
+            return
+    raise AssertionError("it grows and grows")

@@ -3,9 +3,9 @@
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator
+from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
 from shearloop.daemon.errors import UserError
 from shearloop.yaml_files import load_model
@@ -41,6 +41,17 @@ class ConfigModel(BaseModel):
 
 
 Model = TypeVar("Model", bound=BaseModel)
+
+
+def either(one: str, other: str) -> Any:
+    """Return a model's validator: exactly one of two keys must be given."""
+
+    def check(section: Model) -> Model:
+        if (getattr(section, one) is None) == (getattr(section, other) is None):
+            raise ValueError(f"give either {one} or {other}, and not both")
+        return section
+
+    return model_validator(mode="after")(check)
 
 
 def load_yaml_model(path: str | Path, model: type[Model]) -> Model:

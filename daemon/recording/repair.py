@@ -4,13 +4,11 @@ It reads record by record up to the first damaged one. Without it, a user who lo
 readers need the index that is written when a file is closed.
 """
 
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from mcap.exceptions import McapError
 from mcap.records import Attachment, Channel, Chunk, Footer, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
@@ -154,8 +152,6 @@ def summarise(path: Path, progress: Progress = lambda _: None) -> RecordingSumma
                 summary.dropped = int(record.metadata.get("dropped", "0"))
             case Attachment():
                 summary.attachments.append(record.name)
-            case _:
-                pass
     return summary
 
 
@@ -178,6 +174,7 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
         with replace_file(out) as file:
             writer = new_writer(file)
             for record in intact_records(source, condition, progress):
+                # The copy has its own header and index.
                 match record:
                     case Schema() if record.id not in schemas:
                         schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
@@ -200,9 +197,6 @@ def repair(source: Path, out: Path | None = None, progress: Progress = lambda _:
                         writer.add_attachment(
                             record.create_time, record.log_time, record.name, record.media_type, record.data
                         )
-                    case _:
-                        # The copy has its own header and index.
-                        pass
             writer.finish()  # type: ignore[no-untyped-call]  # mcap has no return annotation here
             if not messages:
                 raise UserError(f"{source}: it holds no intact message, so nothing can be saved")
@@ -231,10 +225,10 @@ def _intact_records(file: IO[bytes], condition: FileCondition, progress: Progres
         try:
             record = next(reader)
             inside = _chunk_records(record, condition) if isinstance(record, Chunk) else [record]
+        except OSError:
+            raise
         # The library raises many types of exceptions for a damaged record.
-        except (McapError, ValueError, EOFError, ArithmeticError, LookupError, TypeError, struct.error, MemoryError):
-            return
-        except StopIteration:
+        except Exception:  # noqa: BLE001
             return
         condition.intact_bytes = file.tell()
         progress(condition.intact_bytes)

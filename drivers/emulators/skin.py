@@ -8,7 +8,7 @@ from pathlib import Path
 from random import Random
 from typing import TypeAlias
 
-from shearloop.drivers.emulators import scpi
+from shearloop.drivers.emulators import number_between, scpi
 from shearloop.drivers.emulators.boards import EmulatedAdcBoard
 from shearloop.drivers.emulators.ports import PtyServer, SocketServer
 
@@ -109,11 +109,11 @@ class Circuit:
             case ["swapped"]:
                 self.swapped = True
             case ["drift", ("1" | "2") as gauge, share]:
-                per_s = _parse_between(share, -1.0, 1.0, "a share per second")
+                per_s = number_between(share, -1.0, 1.0, "not a share per second from -1 to 1")
                 self._drifted[gauge] = self._drift(gauge, time_s)
                 self._drifting[gauge] = (per_s, time_s)
             case ["leads", ohm]:
-                self.lead_ohm = _parse_between(ohm, 0.0, OPEN_OHM, "a resistance in Ω")
+                self.lead_ohm = number_between(ohm, 0.0, OPEN_OHM, "not a resistance in Ω from 0 to 1e+09")
             case ["mend"]:
                 self.mend()
             case _:
@@ -134,16 +134,6 @@ class Circuit:
     def _drift(self, gauge: str, time_s: float) -> float:
         per_s, since_s = self._drifting.get(gauge, (0.0, time_s))
         return self._drifted.get(gauge, 0.0) + per_s * (time_s - since_s)
-
-
-def _parse_between(text: str, low: float, high: float, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise ValueError(f"{text!r} is not {what} from {low:g} to {high:g}")
-    return value
 
 
 class EmulatedKeithley6430(scpi.ScpiInterpreter):

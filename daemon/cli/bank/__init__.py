@@ -138,8 +138,8 @@ def _plot(args: argparse.Namespace) -> int:
     from shearloop.daemon.bank_config import load_bank_plan
 
     drawn = {}
-    model, k, sigma = overrides(args)
-    plan = load_bank_plan(args.config, model=model, k=k, sigma=sigma) if args.config is not None else None
+    replaced = overrides(args)
+    plan = load_bank_plan(args.config, *replaced) if args.config is not None else None
     if args.path is not None:
         drawn["bank_signals"] = figures.signal_figure(figures.grid_of_bank(Bank.open(args.path)))
     elif plan is not None:

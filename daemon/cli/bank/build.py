@@ -72,8 +72,7 @@ def _build(args: argparse.Namespace) -> int:
     jobs = len(os.sched_getaffinity(0)) if args.jobs is None else args.jobs
     if jobs < 1:
         raise UserError(f"--jobs must be 1 or more, not {jobs}")
-    model, k, sigma = overrides(args)
-    plans = load_bank_plans(args.config, model=model, k=k, sigma=sigma)
+    plans = load_bank_plans(args.config, *overrides(args))
     paths = _paths(args.out, list(plans))
     # In a folder the names are the banks' own, and an unusable bank is built again.
     if paths == [args.out]:

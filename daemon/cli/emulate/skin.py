@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from shearloop.daemon.cli.emulate import console
 from shearloop.daemon.errors import UserError
+from shearloop.drivers.emulators import number_between
 
 if TYPE_CHECKING:
     from shearloop.daemon.synthetic_skin import SyntheticSkin
@@ -84,13 +85,7 @@ class PushedSkin:
 
 
 def _newtons(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not abs(value) <= 20.0:
-        raise ValueError(f"{text!r} is no force of at most 20 N; write for instance 0.5")
-    return value
+    return number_between(text, -20.0, 20.0, "no force of at most 20 N; write for instance 0.5")
 
 
 def _add_address(parser: argparse.ArgumentParser, prefix: str, link_help: str, port_help: str) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from shearloop.drivers.emulators import number_between
 from shearloop.drivers.emulators.ports import Outage, PtyServer, SocketServer
 from shearloop.drivers.emulators.robotiq.gripper import Gripper
 
@@ -294,9 +295,9 @@ class GripperPlayer:
             case ["object", "none"]:
                 self._object_mm = None
             case ["object", width]:
-                self._object_mm = _number(width, 0.0, 140.0, "a width in mm")
+                self._object_mm = number_between(width, 0.0, 140.0, "not a width in mm from 0 to 140")
             case ["fault", code]:
-                self._gripper.fail(int(_number(code, 0, 15, "a fault code")))
+                self._gripper.fail(int(number_between(code, 0, 15, "not a fault code from 0 to 15")))
             case ["cool"]:
                 self._gripper.clear_minor()
             case ["lose", *seconds] if len(seconds) < 2:
@@ -329,14 +330,4 @@ class GripperPlayer:
 
 
 def _seconds(words: list[str]) -> float:
-    return _number(words[0], 0.0, 86400.0, "a time in seconds") if words else 0.0
-
-
-def _number(text: str, low: float, high: float, what: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = float("nan")
-    if not low <= value <= high:
-        raise ValueError(f"{text!r} is not {what} from {low:g} to {high:g}")
-    return value
+    return number_between(words[0], 0.0, 86400.0, "not a time in seconds from 0 to 86400") if words else 0.0

@@ -47,12 +47,11 @@ class SmallDisk(io.FileIO):
 
 
 def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path) -> None:
-    clock = Clock()
     for n, room in enumerate(np.random.default_rng(3).integers(2_000, 40_000, 50)):
-        recorder = Recorder(tmp_path / str(n), IDENTITY, clock, open_file=SmallDisk.opener([], int(room)))
+        recorder = Recorder(tmp_path / str(n), IDENTITY, Clock(), open_file=SmallDisk.opener([], int(room)))
         safe = -1
         for number in range(12):
-            recorder.record_message("eit.frame", frame(clock, number))
+            recorder.record_message("eit.frame", frame(number))
             recorder.write()
             if not recorder.failure:
                 safe = number
@@ -68,11 +67,10 @@ def test_a_full_disk_keeps_all_flushed_data(tmp_path: Path) -> None:
 
 
 def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path) -> None:
-    clock = Clock()
     disks: list[SmallDisk] = []
-    recorder = Recorder(tmp_path, IDENTITY, clock, open_file=SmallDisk.opener(disks, 20_000))
+    recorder = Recorder(tmp_path, IDENTITY, Clock(), open_file=SmallDisk.opener(disks, 20_000))
     for number in range(20):
-        recorder.record_message("eit.frame", frame(clock, number))
+        recorder.record_message("eit.frame", frame(number))
         recorder.write()
     assert "No space left on device" in recorder.failure
     facts = recorder.diagnostics()
@@ -91,20 +89,19 @@ def test_no_data_is_missing_when_the_disk_has_room_again(tmp_path: Path) -> None
 
 
 def test_a_file_that_cannot_be_started_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Clock()
     opener = SmallDisk.opener([], 0, 100_000, 0, 0, 0, 100_000)
     with pytest.raises(UserError, match="cannot record there: No space left on device"):
-        Recorder(tmp_path, IDENTITY, clock, open_file=opener)
+        Recorder(tmp_path, IDENTITY, Clock(), open_file=opener)
     assert list(tmp_path.iterdir()) == []
-    recorder = Recorder(tmp_path, IDENTITY, clock, open_file=opener)
+    recorder = Recorder(tmp_path, IDENTITY, Clock(), open_file=opener)
     # Each item asks for another file, as all do after an hour; the disk has room for one at last.
     monkeypatch.setattr(recorder_module, "LONGEST_IDLE_FILE_S", -1.0)
     for number in range(3):
-        recorder.record_message("load.torque", torque(clock, number))
+        recorder.record_message("load.torque", torque(number))
     recorder.write()
     assert "No space left on device" in recorder.failure
     assert list(tmp_path.iterdir()) == [recorder.path]
-    recorder.record_message("load.torque", torque(clock, 3))
+    recorder.record_message("load.torque", torque(3))
     recorder.write()
     assert recorder.failure == ""
     recorder.close()
@@ -112,18 +109,17 @@ def test_a_file_that_cannot_be_started_is_removed(tmp_path: Path, monkeypatch: p
 
 
 def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path: Path) -> None:
-    clock = Clock()
-    recorder = Recorder(tmp_path, IDENTITY, clock, max_waiting_bytes=100_000)
+    recorder = Recorder(tmp_path, IDENTITY, Clock(), max_waiting_bytes=100_000)
     for number in range(20):
-        recorder.record_message("eit.frame", frame(clock, number))
+        recorder.record_message("eit.frame", frame(number))
     dropped = recorder.diagnostics()["errors"]["dropped"]
     recorder.write()
     recorder.record_experiment("one")
-    recorder.record_message("load.torque", torque(clock, 0))
+    recorder.record_message("load.torque", torque(0))
     recorder.write()
     recorder.record_experiment("two")
     for number in range(20):
-        recorder.record_message("eit.frame", frame(clock, number))
+        recorder.record_message("eit.frame", frame(number))
     later = recorder.diagnostics()["errors"]["dropped"] - dropped
     recorder.write()
     recorder.record_experiment("three")
@@ -137,16 +133,15 @@ def test_the_queue_is_bounded_and_drops_are_counted_in_their_own_file(tmp_path: 
 
 @pytest.mark.parametrize("small_disk", ["64k"], indirect=True)
 async def test_a_real_full_disk_is_reported_and_the_file_can_be_repaired(small_disk: Path, tmp_path: Path) -> None:
-    clock = Clock()
     flushed: asyncio.Queue[str] = asyncio.Queue()
-    recorder = Recorder(small_disk, IDENTITY, clock, on_failure=flushed.put_nowait)
+    recorder = Recorder(small_disk, IDENTITY, Clock(), on_failure=flushed.put_nowait)
     task = asyncio.create_task(recorder.run())
     why, number = "", 0
     async with deadline("the recorder did not report the full disk"):
         while not why:
             assert number < 1000, "a disk of 64 kB took a thousand frames, and is not full"
             for _ in range(5):
-                recorder.record_message("eit.frame", frame(clock, number))
+                recorder.record_message("eit.frame", frame(number))
                 number += 1
             why = await flushed.get()
     task.cancel()

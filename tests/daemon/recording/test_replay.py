@@ -38,14 +38,12 @@ REFERENCE = Path(__file__).parents[2] / "data" / "replayed_stream.json"
 RELATIVE = 1e-9
 
 
-async def replayed(
-    path: Path, speed: float, address: str, config: DaemonConfig | None = None
-) -> tuple[Messages, ReplayComparison]:
+async def replayed(path: Path, speed: float, config: DaemonConfig | None = None) -> tuple[Messages, ReplayComparison]:
     """Return all that a replay publishes, and how it compares."""
     run, clock, seen = RecordedRun(path), ReplayClock(), []
     with contextlib.ExitStack() as opened:
         config = config or opened.enter_context(run.configuration())
-        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), address, clock)
+        publisher = Publisher(opened.enter_context(zmq.asyncio.Context()), "tcp://127.0.0.1:*", clock)
         opened.callback(publisher.close)
         publisher.add_listener(lambda topic, content: seen.append((topic, content)))
         replay = Replay(run, ReplayPipeline(config, run.replay_events(), publisher), publisher, clock)
@@ -120,11 +118,11 @@ def test_a_replay_equals_the_recording_at_any_speed(
 
 def _same_at_any_speed(path: Path, live: list[Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     address = f"ipc://{tmp_path}/replay"
-    fast, comparison = asyncio.run(replayed(path, math.inf, address))
+    fast, comparison = asyncio.run(replayed(path, math.inf))
     assert comparison.compared["eit.frame"] > 50
     assert comparison.compared["eit.estimate"] > 50
     assert comparison.different == Counter(), comparison.examples
-    slow, _ = asyncio.run(replayed(path, 5.0, address))
+    slow, _ = asyncio.run(replayed(path, 5.0))
     assert measured(slow) == measured(fast)
     assert [c["latency_s"] for t, c in slow if t == "eit.estimate"] == [0.0] * comparison.compared["eit.estimate"]
     # And the same as what subscribers saw, but for messages under way when the daemon was stopped.
@@ -147,7 +145,7 @@ def test_a_real_recording_gives_the_stored_estimates(shared: Path, config: Write
     configured = load_daemon_config(config())
     averaging = {"right": configured.fingertips["right"].model_copy(update={"average_frames": 5})}
     configured = configured.model_copy(update={"fingertips": averaging})
-    messages, _ = asyncio.run(replayed(path, math.inf, f"ipc://{tmp_path}/replay", configured))
+    messages, _ = asyncio.run(replayed(path, math.inf, configured))
     estimates = [content for topic, content in messages if topic == "eit.estimate"]
     assert [content["frame"] for content in estimates] == list(range(832))
     torques = [content for topic, content in messages if topic == "load.torque"]
@@ -183,10 +181,9 @@ def test_a_real_recording_gives_the_stored_estimates(shared: Path, config: Write
     ],
 )
 def test_mistakes_end_in_one_sentence(
-    arguments: list[str], message: str, mat_folder: Callable[..., Path], tmp_path: Path, capsys: Any
+    arguments: list[str], message: str, imported: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import_mat([mat_folder()], tmp_path / "imported.mcap")
-    assert main(["replay", *(one.format(imported=tmp_path / "imported.mcap") for one in arguments)]) == 2
+    assert main(["replay", *(one.format(imported=imported) for one in arguments)]) == 2
     assert message in capsys.readouterr().err
 
 

@@ -42,14 +42,13 @@ def test_a_later_file_replays_frame_numbers_tares_and_tools(
     assert zeroed >= ZEROED
     held: list[object] = []
     monkeypatch.setattr(LiveEstimator, "set_tool", lambda _self, tool: held.append(tool))
-    again, _ = asyncio.run(replayed(later, math.inf, f"ipc://{tmp_path}/replay"))
+    again, _ = asyncio.run(replayed(later, math.inf))
     assert held == [OTHER_TOOL], "which was told before the file began"
     estimates = {content["frame"]: content for topic, content in again if topic == "eit.estimate"}
     assert min(estimates) >= BEGUN
     said = ("reason", "valid", "k", "sigma", "score", "torque_nm")
     after = [one for one in live if one["frame"] >= zeroed]
     assert len(after) > ENOUGH - ZEROED - 10
-    assert [[estimates[one["frame"]][key] for key in said] for one in after] == [
-        [one[key] for key in said] for one in after
-    ]
+    for one in after:
+        assert [estimates[one["frame"]][key] for key in said] == [one[key] for key in said]
     assert estimates[zeroed]["reason"].startswith("taking the homogeneous frame, 1 of")

@@ -20,10 +20,10 @@ from shearloop.bank.arrays import FloatArray
 from shearloop.bank.skin.calibration import SkinCalibration, load_calibration
 from shearloop.daemon.analysis.charts.drawing import figure, look, save
 from shearloop.daemon.control.control_loop import ControlLoop
-from shearloop.daemon.control.experiment_schema import ExperimentFile
+from shearloop.daemon.control.experiment_schema import ExperimentFile, TareStep
 from shearloop.daemon.control.loop_inputs import ArmStatus, TorqueSample, TorqueSource
 from shearloop.daemon.control.settings import LoopConfig
-from shearloop.daemon.control.step_runner import Action, ExperimentPhase, Tare
+from shearloop.daemon.control.step_runner import Action, ExperimentPhase
 from shearloop.daemon.sensing.skin_estimator import SkinEstimator
 from shearloop.daemon.sensing.skin_task import SKIN, skin_torque
 from shearloop.daemon.synthetic_skin import SyntheticSkin
@@ -153,7 +153,7 @@ class SkinLoop:
         self.set_point_n.append(math.nan if wanted_nm is None else wanted_nm / RADIUS_MM * 1e3)
 
     def _begin(self, action: Action | None) -> None:
-        if isinstance(action, Tare):
+        if isinstance(action, TareStep):
             self.estimator.tare()
             self._zero_begun = True
 

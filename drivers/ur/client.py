@@ -16,26 +16,11 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, cast
 
 from shearloop.drivers.errors import DeviceLostError, DriverError, ProtocolError, is_cancelled
-from shearloop.drivers.ur import error_messages
-from shearloop.drivers.ur.messages import (
-    RECOVERY_HANG_S,
-    Command,
-    CommandReply,
-    Configure,
-    Disconnect,
-    Failed,
-    FailureKind,
-    Heartbeat,
-    Message,
-    MessageDecoder,
-    RobotState,
-    WorkerPhase,
-    encode,
-)
+from shearloop.drivers.ur import error_messages, messages
 from shearloop.drivers.ur.settings import UrSettings
 
 LinkStatus = Literal["starting", "up", "down"]
-LossKind = FailureKind | Literal["crashed", "hung", "garbled"]
+LossKind = messages.FailureKind | Literal["crashed", "hung", "garbled"]
 
 PAUSES_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 # After this time without a loss the pauses start again with the shortest.
@@ -84,12 +69,12 @@ class UrRobot:
         self.states = 0
         self.failed_program_stops = 0
         self._on_link = on_link or (lambda _event: None)
-        self._state: RobotState | None = None
+        self._state: messages.RobotState | None = None
         self._connection: WorkerConnection | None = None
-        self._replies: dict[int, Callable[[CommandReply], None]] = {}
+        self._replies: dict[int, Callable[[messages.CommandReply], None]] = {}
         self._number = 0
         self._lost_s = -math.inf
-        self._next: asyncio.Future[RobotState] | None = None
+        self._next: asyncio.Future[messages.RobotState] | None = None
 
     @property
     def takes_over(self) -> bool:
@@ -97,35 +82,35 @@ class UrRobot:
         return time.monotonic() - self._lost_s < TAKES_OVER_S
 
     @property
-    def state(self) -> RobotState | None:
+    def state(self) -> messages.RobotState | None:
         """The latest state, or None while there is no connection."""
         return self._state
 
-    async def next_state(self) -> RobotState:
+    async def next_state(self) -> messages.RobotState:
         """Return the next state; waits through losses of the connection."""
         if self._next is None:
             self._next = asyncio.get_running_loop().create_future()
         return await asyncio.shield(self._next)
 
-    async def send(self, command: Command) -> CommandReply:
+    async def send(self, command: messages.Command) -> messages.CommandReply:
         """Send a command and return its reply."""
-        replied: asyncio.Future[CommandReply] = asyncio.get_running_loop().create_future()
+        replied: asyncio.Future[messages.CommandReply] = asyncio.get_running_loop().create_future()
 
-        def on_reply(reply: CommandReply) -> None:
+        def on_reply(reply: messages.CommandReply) -> None:
             if not replied.done():
                 replied.set_result(reply)
 
         self.send_nowait(command, on_reply)
         return await replied
 
-    def send_nowait(self, command: Command, on_reply: Callable[[CommandReply], None]) -> None:
+    def send_nowait(self, command: messages.Command, on_reply: Callable[[messages.CommandReply], None]) -> None:
         """Send a command and pass its reply to `on_reply`.
 
         When the worker dies first, the command is refused and not sent again. An exception in `on_reply` ends the
         connection; where that has ended, it goes to the event loop's handler.
         """
         if self._connection is None or self._state is None:
-            on_reply(CommandReply(refusal=f"The robot is not connected. {self.link.sentence}"))
+            on_reply(messages.CommandReply(refusal=f"The robot is not connected. {self.link.sentence}"))
             return
         self._number += 1
         self._replies[self._number] = on_reply
@@ -183,24 +168,28 @@ class UrRobot:
         replies, self._replies = self._replies, {}
         for on_reply in replies.values():
             try:
-                on_reply(CommandReply(refusal="The robot's process ended before it answered; nothing is sent again."))
+                on_reply(
+                    messages.CommandReply(
+                        refusal="The robot's process ended before it answered; nothing is sent again."
+                    )
+                )
             except Exception as error:  # noqa: BLE001 - the others get their replies, and the worker ends, all the same
                 context = {"message": "a callback for a reply of the robot's process failed", "exception": error}
                 asyncio.get_running_loop().call_exception_handler(context)
 
-    def handle_message(self, number: int, message: Message) -> None:
+    def handle_message(self, number: int, message: messages.Message) -> None:
         """Handle a message of the worker."""
         match message:
-            case RobotState():
+            case messages.RobotState():
                 self._handle_state(message)
-            case CommandReply():
+            case messages.CommandReply():
                 on_reply = self._replies.pop(number, None)
                 if on_reply is not None:
                     on_reply(message)
-            case Failed():
+            case messages.Failed():
                 raise LostError(message.kind, message.sentence)
 
-    def _handle_state(self, state: RobotState) -> None:
+    def _handle_state(self, state: messages.RobotState) -> None:
         before, self._state = self._state, state
         # Each worker counts from zero.
         self.failed_program_stops += state.failed_program_stops
@@ -224,7 +213,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
     def __init__(
         self,
         settings: UrSettings,
-        on_message: Callable[[int, Message], None],
+        on_message: Callable[[int, messages.Message], None],
         *,
         takes_over: bool = False,
     ) -> None:
@@ -232,7 +221,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         self._settings = settings
         self._on_message = on_message
         self._takes_over = takes_over
-        self._decoder = MessageDecoder()
+        self._decoder = messages.MessageDecoder()
         self._received_s = self._sent_s = time.monotonic()
         # Done when the worker has ended and all of its output was read.
         self._ended = asyncio.get_running_loop().create_future()
@@ -241,23 +230,23 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         self._closed: asyncio.Future[Exception | None] = asyncio.get_running_loop().create_future()
         self._stderr_tail = b""
         self._activity = "starting"
-        self._state: RobotState | None = None
+        self._state: messages.RobotState | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Configure the worker."""
         self._process = cast(asyncio.SubprocessTransport, transport)
         self._stdin = cast(asyncio.WriteTransport, self._process.get_pipe_transport(0))
-        self.send(Configure(self._settings, self._takes_over))
+        self.send(messages.Configure(self._settings, self._takes_over))
 
     @property
     def pid(self) -> int | None:
         """The worker's process id."""
         return self._process.get_pid()
 
-    def send(self, message: Message, number: int = 0) -> None:
+    def send(self, message: messages.Message, number: int = 0) -> None:
         """Send a message to the worker."""
         self._sent_s = time.monotonic()
-        self._stdin.write(encode(message, number))
+        self._stdin.write(messages.encode(message, number))
 
     def pipe_data_received(self, fd: int, data: bytes) -> None:
         """Handle output where it is read: waking a task for each of 125 states a second would double the cost."""
@@ -270,9 +259,9 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         self._received_s = time.monotonic()
         try:
             for number, message in self._decoder.feed(data):
-                if isinstance(message, WorkerPhase):
+                if isinstance(message, messages.WorkerPhase):
                     self._activity = message.activity
-                elif isinstance(message, RobotState):
+                elif isinstance(message, messages.RobotState):
                     self._state, self._activity = message, "controlling"
                 self._on_message(number, message)
         except ProtocolError as error:
@@ -309,7 +298,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
         while True:
             left_s = longest_s - (time.monotonic() - self._sent_s)
             if left_s <= 0:
-                self.send(Heartbeat())
+                self.send(messages.Heartbeat())
                 left_s = longest_s
             await asyncio.sleep(left_s)
             if self._stdin.get_write_buffer_size() > MOST_UNSENT:
@@ -319,7 +308,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
     async def end(self) -> None:
         """Disconnect the worker, and kill it after `FAREWELL_S`."""
         if self._process.get_returncode() is None:
-            self.send(Disconnect())
+            self.send(messages.Disconnect())
         # The end of its input disconnects the worker too.
         self._stdin.close()
         await asyncio.wait([self._ended], timeout=FAREWELL_S)
@@ -335,7 +324,7 @@ class WorkerConnection(asyncio.SubprocessProtocol):
     def _timeout_s(self) -> float:
         if self._state is None:
             return self._settings.connect_timeout_s + GRACE_S
-        return (RECOVERY_HANG_S if self._state.recovering else self._settings.hang_timeout_s) + GRACE_S
+        return (messages.RECOVERY_HANG_S if self._state.recovering else self._settings.hang_timeout_s) + GRACE_S
 
     def _died(self) -> LostError:
         status = self._process.get_returncode() or 0

@@ -1,11 +1,11 @@
 """The analysis of Trehan et al. 2025 (Sensors 25, 5159): torque and diameter from best matches of recorded slices."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from shearloop.bank.arrays import FloatArray, IntArray
 from shearloop.bank.eit.bank_file import Bank
@@ -44,7 +44,7 @@ class Inputs:
 
     torque: TorqueSlices | None
     diameter: DiameterSlices | None
-    raw_difference: NDArray[np.float64] | None
+    raw_difference: FloatArray | None
     notes: tuple[str, ...]
 
 
@@ -78,7 +78,7 @@ def read_inputs(recordings: Path) -> Inputs:
     return Inputs(torque, diameter, raw, tuple(notes))
 
 
-def _raw_difference(folder: Path, notes: list[str]) -> NDArray[np.float64] | None:
+def _raw_difference(folder: Path, notes: list[str]) -> FloatArray | None:
     frame, homogeneous = folder / RAW_FRAME, folder / RAW_HOMOGENEOUS
     absent = [path.name for path in (frame, homogeneous) if not path.exists()]
     if absent:
@@ -87,7 +87,7 @@ def _raw_difference(folder: Path, notes: list[str]) -> NDArray[np.float64] | Non
     return np.abs(channels_of_line(read_line(frame)) - channels_of_line(read_line(homogeneous)))
 
 
-# Called with the number of slices matched since the last call.
+# Called with the number of slices matched so far.
 Progress = Callable[[int], object]
 
 FEWEST_SLICES = 3
@@ -184,7 +184,7 @@ def match_slices(differences: FloatArray, bank: Bank, progress: Progress) -> Mat
     parts = []
     for start in range(0, len(differences), _BATCH):
         parts.append(matcher.heatmaps(differences[start : start + _BATCH]))
-        progress(len(parts[-1]))
+        progress(min(start + _BATCH, len(differences)))
     heatmaps = np.concatenate(parts)
     best = tuple(best_match(heatmap, bank.k_grid, bank.sigma_grid) for heatmap in heatmaps)
     return Matches(
@@ -261,7 +261,10 @@ def score_models(slices: TorqueSlices, raw_difference: FloatArray | None, mesh: 
         matching[model] = float(matching_scores(slices.differences, searched).mean()) if len(searched) else None
         if raw_difference is not None:
             centred = simulated_signals(forward, model, centred_settings(model, middle))
-            envelope[model] = _envelope_score_or_none(raw_difference, centred)
+            envelope[model] = None
+            # A signal without peaks has no score.
+            with suppress(MatchingError):
+                envelope[model] = mean_envelope_score(raw_difference, centred) if len(centred) else None
     return ModelScores(envelope or None, matching)
 
 
@@ -307,15 +310,3 @@ def _fit_or_note(x: FloatArray, y: FloatArray, degree: int, what: str, notes: li
     except CalibrationError as error:
         notes.append(f"no fit of {what}: {error}")
         return None
-
-
-def _envelope_score_or_none(raw_difference: FloatArray, signals: FloatArray) -> float | None:
-    try:
-        return mean_envelope_score(raw_difference, signals) if len(signals) else None
-    except MatchingError:  # a signal without peaks: nothing to compare
-        return None
-
-
-def all_notes(results: Iterable[TorqueResult | DiameterResult | None]) -> list[str]:
-    """Return the notes of the existing results."""
-    return [note for result in results if result is not None for note in result.notes]

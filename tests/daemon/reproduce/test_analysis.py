@@ -25,7 +25,7 @@ from shearloop.daemon.recording.matlab import DiameterSlices, TorqueSlices, read
 @pytest.fixture(scope="module")
 def bank(coarse_mesh: Mesh, tmp_path_factory: pytest.TempPathFactory):
     grid = Grid(np.linspace(2.6, 3.6, 7), np.linspace(1.0, 2.0, 8))
-    return cached_bank("small", grid, coarse_mesh, tmp_path_factory.mktemp("banks"), 1, lambda *_: None)
+    return cached_bank("small", grid, coarse_mesh, tmp_path_factory.mktemp("banks"))
 
 
 def slices_of(signals: NDArray, columns: list[int], torque: list[float]) -> TorqueSlices:
